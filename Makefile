@@ -1,0 +1,33 @@
+# Everything a newcomer needs: `make demo` and `make test` set up a virtual environment by themselves.
+PYTHON ?= python3.11
+VENV ?= .venv
+BIN = $(VENV)/bin
+OUT ?= runs/demo
+# Worker processes of the tests; two suit a small machine.
+WORKERS ?= 2
+
+.PHONY: demo test lint bench clean help
+
+help:  ## what there is to make
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,dev]'
+	@touch $@
+
+demo: $(VENV)/.installed  ## the main job: supports and heuristics compared on Lotka-Volterra
+	$(BIN)/jaxlfi compare lotka_volterra --preset quick --seeds 5 --out $(OUT)
+
+test: $(VENV)/.installed  ## all tests
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+lint: $(VENV)/.installed  ## style
+	$(BIN)/ruff check .
+
+bench: $(VENV)/.installed  ## benchmarks against NumPy, numba and PyTorch
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	$(BIN)/python -m experiments.benchmarks
+
+clean:  ## remove the environment and caches
+	rm -rf $(VENV) .pytest_cache .ruff_cache *.egg-info

@@ -1,0 +1,1 @@
+"""Tasks: simulators with named parameters, supports and summaries."""

@@ -1,0 +1,198 @@
+"""Which choices move the result: one change at a time from `quick`, on Lotka-Volterra.
+
+    python -m experiments.ablation --seeds 20 --out experiments/results/ablation
+
+Every variant runs the same configurations (supports and heuristics) on the same seeds, each seed with its own
+observation. All lanes of a variant are one vmapped program, sharded over the processor's cores. A variant whose array
+file exists is not run again; the table is drawn from the saved arrays.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import time
+from pathlib import Path
+
+if __name__ == "__main__" and "XLA_FLAGS" not in os.environ:
+    os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={os.cpu_count() or 1}"
+
+import jax
+import numpy as np
+
+from envs.lotka_volterra import task as lotka_volterra
+from jaxlfi import compile_cache
+from jaxlfi.bayessim import Settings
+from jaxlfi.describe import versions
+from jaxlfi.estimator import Estimator
+from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Matched, Mode
+from jaxlfi.history import theta_error, trajectory_error
+from jaxlfi.keys import run_keys
+from jaxlfi.lanes import Lane, LaneEngine, rounds, stack_inputs
+from jaxlfi.observation import simulate_observation
+from jaxlfi.presets import QUICK
+from jaxlfi.progress import Progress
+
+MATRIX: dict[str, tuple[str, str]] = {
+    "ok": ("ok", "none"),
+    "misspecified": ("misspecified", "none"),
+    "broad": ("broad", "none"),
+    "misspecified+edge": ("misspecified", "edge"),
+    "misspecified+mode": ("misspecified", "mode"),
+    "misspecified+centre": ("misspecified", "centre"),
+}
+"""Configurations: (support, heuristic)."""
+
+BOOTSTRAP = 10_000
+"""Resamples of the seeds for an interval."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One row of the ablation.
+
+    Attributes:
+        change: what differs from `quick`, in words.
+        settings: the numbers of the run.
+        edge: EDGE as this variant reads it.
+    """
+
+    change: str
+    settings: Settings
+    edge: Edge = Edge()
+
+    def heuristic(self, name: str) -> Heuristic:
+        """A heuristic with its defaults; MODE pairs components where networks start anew."""
+        mode = Mode() if self.settings.estimator.warm_start else Matched(Mode())
+        return {"none": Fixed(), "edge": self.edge, "mode": mode, "centre": Centre()}[name]
+
+
+def variants(base: Settings = QUICK) -> dict[str, Variant]:
+    """The rows of the table, by name."""
+
+    def estimator(change: str, **fields) -> Variant:
+        return Variant(change, base.replace(estimator=base.estimator.replace(**fields)))
+
+    def run(change: str, **fields) -> Variant:
+        return Variant(change, base.replace(**fields))
+
+    return {
+        "quick": Variant("the preset itself", base),
+        "warm": estimator("warm start instead of a fresh network each round", warm_start=True),
+        "last-weights": estimator("last weights, no validation split", validation=0.0),
+        "zscore": estimator("plain z-score of the summaries", normaliser="zscore"),
+        "relu": estimator("ReLU instead of tanh", activation="relu"),
+        "narrow": estimator("64 units a layer", hidden=(64,) * len(base.estimator.hidden)),
+        "slow-rate": estimator("learning rate 1e-4", learning_rate=1e-4),
+        "decay": estimator("weight decay 0.1", weight_decay=0.1),
+        "ensemble": estimator("a mixture of three networks", members=3),
+        "zone-only": Variant("EDGE: mass in the zone only, no tail (reading G)", base, Edge(tail=0.0)),
+        "zone-width": Variant(
+            "EDGE: delta as an absolute width (reading F)", base, Edge(zone_fraction=0.0, zone_width=0.1)
+        ),
+        "paper-correction": run("posterior times the reference prior (reading A, paper)", correction="paper"),
+        "importance": run("importance-weighted loss (reading A, importance)", correction="importance"),
+        "reject": run("draws outside the support rejected (reading E)", restriction="reject"),
+        "not-defensive": run("no defensive share of proposals", defensive=0.0),
+    }
+
+
+def run_variant(variant: Variant, seeds: int) -> dict[str, np.ndarray]:
+    """All configurations and seeds of one variant.
+
+    Returns:
+        Arrays with leading axes [configuration, seed]: theta_error, trajectory_error, attempted and succeeded (a round
+        each, trailing axis), final support bounds; and the seconds of all lanes together.
+    """
+    task = lotka_volterra()
+    lanes = [
+        Lane(label, support, task.support(support), variant.heuristic(heuristic), seed)
+        for label, (support, heuristic) in MATRIX.items()
+        for seed in range(seeds)
+    ]
+    observed = np.stack([simulate_observation(run_keys(jax.random.key(lane.seed)).observe, task) for lane in lanes])
+    x = np.asarray(jax.vmap(task.summary)(observed))
+    inputs, _ = stack_inputs(lanes, observed, x)
+    engine = LaneEngine(task, variant.settings, inputs)
+    state = engine.start()
+    engine.compile(state)
+    started = time.perf_counter()
+    rows = []
+    with Progress("rounds", variant.settings.rounds) as progress:
+        for index, state, row in rounds(engine, state, 0, variant.settings.rounds):
+            rows.append(row)
+            progress.advance(index + 1)
+    seconds = time.perf_counter() - started
+
+    def arranged(values):
+        values = np.asarray(values)
+        return values.reshape(len(MATRIX), seeds, *values.shape[1:])
+
+    last = [{name: value[i] for name, value in rows[-1].items()} for i in range(len(lanes))]
+    return {
+        "theta_error": arranged([theta_error(row) for row in last]),
+        "theta_error_by_parameter": arranged([row["sample_theta_error"].mean(0) for row in last]),
+        "trajectory_error": arranged([trajectory_error(row) for row in last]),
+        "attempted": arranged(np.stack([row["attempted"] for row in rows], axis=1)),
+        "succeeded": arranged(np.stack([row["succeeded"] for row in rows], axis=1)),
+        "support_low": arranged(rows[-1]["support_low"]),
+        "support_high": arranged(rows[-1]["support_high"]),
+        "seconds": np.asarray(seconds),
+    }
+
+
+def interval(errors: np.ndarray) -> tuple[float, float]:
+    """95 % bootstrap interval of the mean over seeds."""
+    draws = np.random.default_rng(0).choice(errors, (BOOTSTRAP, errors.size)).mean(axis=1)
+    return tuple(np.percentile(draws, [2.5, 97.5]))
+
+
+def table(folder: Path) -> str:
+    """The ablation as Markdown, from the saved arrays: mean [95 % interval] and median of the summed error."""
+    lines = [
+        "| variant | change | " + " | ".join(MATRIX) + " | minutes |",
+        "|---|---|" + "---|" * (len(MATRIX) + 1),
+    ]
+    for name, variant in variants().items():
+        path = folder / f"{name}.npz"
+        if not path.exists():
+            continue
+        with np.load(path) as arrays:
+            cells = []
+            for errors in arrays["theta_error"]:
+                low, high = interval(errors)
+                cells.append(f"{errors.mean():.2f} [{low:.2f}, {high:.2f}] ({np.median(errors):.2f})")
+            minutes = float(arrays["seconds"]) / 60
+        lines.append(f"| `{name}` | {variant.change} | " + " | ".join(cells) + f" | {minutes:.1f} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Run the variants that are missing and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--variants", nargs="+", choices=list(variants()), default=list(variants()))
+    parser.add_argument("--out", type=Path, default=Path("experiments/results/ablation"))
+    arguments = parser.parse_args()
+    compile_cache.enable()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for name in arguments.variants:
+        path = arguments.out / f"{name}.npz"
+        if path.exists():
+            print(f"{name}: {path} is there already")
+            continue
+        variant = variants()[name]
+        print(f"{name}: {variant.change}", flush=True)
+        arrays = run_variant(variant, arguments.seeds)
+        np.savez(path, **arrays, configurations=np.array(list(MATRIX)))
+        config = {"change": variant.change, "seeds": arguments.seeds, "versions": versions()}
+        config["settings"] = repr(variant.settings)
+        config["edge"] = repr(variant.edge)
+        path.with_suffix(".json").write_text(json.dumps(config, indent=2) + "\n")
+    (arguments.out / "table.md").write_text(table(arguments.out))
+    print(f"wrote {arguments.out / 'table.md'}")
+    print(table(arguments.out))
+
+
+if __name__ == "__main__":
+    main()

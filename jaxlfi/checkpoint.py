@@ -1,0 +1,111 @@
+"""Checkpoint: what a run that was killed needs to go on, written as each round ends.
+
+A folder of .npz files, each replaced as a whole: `start.npz` with the observations, `round_000.npz` and so on with what each
+round did, and `state.npz` with the last state, which says how many rounds are done. Only the state is rewritten, so
+that a round costs the same early and late. A round that was written but that the state does not count yet is done
+again, to the same end.
+"""
+
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxlfi import atomic
+
+FOLDER = "checkpoint"
+_DONE, _TRAJECTORY = "rounds_done", "final_trajectory"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used; it is left as it is."""
+
+
+class Checkpoint:
+    """The checkpoint of all lanes of a command, in `folder/checkpoint`."""
+
+    def __init__(self, folder: Path):
+        """Nothing is read or written yet."""
+        self.folder = folder / FOLDER
+
+    def write_start(self, observed: np.ndarray, x: np.ndarray) -> None:
+        """Keep the lanes' observations, shape [L, T, C], and their summaries, shape [L, S]."""
+        self.folder.mkdir(parents=True)
+        atomic.write_arrays(self.folder / "start.npz", {"observed": observed, "x": x}, durable=True)
+
+    def read_start(self) -> tuple[np.ndarray, np.ndarray]:
+        """The lanes' observations and summaries."""
+        start = self._read("start.npz")
+        return self._named(start, "start.npz", "observed"), self._named(start, "start.npz", "x")
+
+    def write_round(self, index: int, state: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
+        """Keep a round's record and the state after it; of the trajectories, only the last round's are kept."""
+        rows = dict(rows)
+        final_trajectory = rows.pop(_TRAJECTORY)
+        atomic.write_arrays(
+            self.folder / _round_name(index), rows | {"seconds": np.asarray(seconds)}, compress=False, durable=True
+        )
+        leaves = {name: np.asarray(leaf) for name, leaf in _named_leaves(state).items()}
+        extra = {_DONE: np.asarray(index + 1), _TRAJECTORY: final_trajectory}
+        atomic.write_arrays(self.folder / "state.npz", leaves | extra, compress=False, durable=True)
+
+    def rounds_done(self) -> int:
+        """How many rounds the state has behind it."""
+        if not (self.folder / "state.npz").exists():
+            return 0
+        return int(self._named(self._read("state.npz"), "state.npz", _DONE))
+
+    def read_rounds(self, count: int) -> tuple[list[dict[str, np.ndarray]], list[float], np.ndarray | None]:
+        """Records of the first rounds, their seconds, and the last round's trajectories."""
+        rows, seconds = [], []
+        for index in range(count):
+            arrays = self._read(_round_name(index))
+            seconds.append(float(self._named(arrays, _round_name(index), "seconds")))
+            rows.append({name: value for name, value in arrays.items() if name != "seconds"})
+        trajectory = self._named(self._read("state.npz"), "state.npz", _TRAJECTORY) if count else None
+        return rows, seconds, trajectory
+
+    def read_state(self, template: Any) -> Any:
+        """The last state.
+
+        Args:
+            template: a state of the same shapes, or of `jax.ShapeDtypeStruct`.
+        """
+        arrays = self._read("state.npz")
+        names = _named_leaves(template)
+        for name, leaf in names.items():
+            array = self._named(arrays, "state.npz", name)
+            if array.shape != leaf.shape or array.dtype != leaf.dtype:
+                raise CheckpointError(
+                    f"{self.folder / 'state.npz'}: expected {name} of shape {leaf.shape} and type {leaf.dtype}, "
+                    f"got {array.shape} and {array.dtype}"
+                )
+        return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in names])
+
+    def remove(self) -> None:
+        """Clean up after a run that is complete."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _read(self, name: str) -> dict[str, np.ndarray]:
+        path = self.folder / name
+        try:
+            return atomic.read_arrays(path)
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            raise CheckpointError(f"{path}: expected a whole checkpoint file, got a missing or damaged one") from error
+
+    def _named(self, arrays: dict[str, np.ndarray], file: str, name: str) -> np.ndarray:
+        if name not in arrays:
+            raise CheckpointError(f"{self.folder / file}: expected an array {name}, got none")
+        return arrays[name]
+
+
+def _round_name(index: int) -> str:
+    return f"round_{index:03d}.npz"
+
+
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}

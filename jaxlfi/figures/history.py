@@ -1,0 +1,354 @@
+"""History: the saved arrays of one inference run, as the figures take them."""
+
+import dataclasses
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxlfi.figures import density, statistics
+
+REQUIRED = (
+    "theta",
+    "counted",
+    "kept",
+    "failure",
+    "proposal_low",
+    "proposal_high",
+    "support_low",
+    "support_high",
+    "logits",
+    "means",
+    "scale_tril",
+)
+"""Arrays of history.npz that no figure can do without."""
+
+
+@dataclasses.dataclass(frozen=True)
+class History:
+    """One run; R rounds of A attempts, D parameters, K components, E networks, P passes, N posterior samples.
+
+    What a run does not have (a truth, a posterior that was simulated from, ...) is NaN or None.
+
+    Attributes:
+        folder: where it was read from.
+        configuration: what the run is called among others, "misspecified+edge".
+        seed: the run's seed.
+        config: config.json.
+        names: of the parameters, in inference coordinates.
+        units: of the parameters.
+        theta: proposals, shape [R, A, D].
+        counted: which attempts count, shape [R, A].
+        kept: which were added to the dataset, shape [R, A].
+        failure: 0 or the code of the reason, shape [R, A].
+        proposal_low: lower bounds of the support each round drew from, shape [R, D].
+        proposal_high: its upper bounds.
+        support_low: lower bounds after each round's adaptation, shape [R, D].
+        support_high: the upper bounds.
+        logits: posterior mixture of each round, shape [R, K].
+        means: its means, shape [R, K, D].
+        scale_tril: its Cholesky factors, shape [R, K, D, D].
+        loss: training loss of each pass, shape [R, E, P], or None.
+        validation_loss: the same on held-out simulations, or None.
+        theta_error: |theta - theta_gt| of posterior samples after each round, shape [R, N, D], or None.
+        trajectory_error: distance of their trajectories from the observed one, shape [R, N], NaN: failed.
+        attempted: simulations of each round, shape [R].
+        failed: failures of each round, shape [R].
+        seconds: time of each round, shape [R].
+        final_trajectory: simulations of the last posterior's samples, shape [N, T, C], or None.
+        observed: the observed trajectory, shape [T, C], or None.
+        truth: theta_gt, shape [D], NaN where unknown.
+        times: shape [T], or None.
+        channels: names of the trajectory's columns.
+        feasible_low: lower limits Phi, shape [D], or None.
+        feasible_high: upper limits Phi, or None.
+    """
+
+    folder: Path
+    configuration: str
+    seed: int
+    config: Mapping[str, Any]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    theta: np.ndarray
+    counted: np.ndarray
+    kept: np.ndarray
+    failure: np.ndarray
+    proposal_low: np.ndarray
+    proposal_high: np.ndarray
+    support_low: np.ndarray
+    support_high: np.ndarray
+    logits: np.ndarray
+    means: np.ndarray
+    scale_tril: np.ndarray
+    loss: np.ndarray | None
+    validation_loss: np.ndarray | None
+    theta_error: np.ndarray | None
+    trajectory_error: np.ndarray | None
+    attempted: np.ndarray
+    failed: np.ndarray
+    seconds: np.ndarray
+    final_trajectory: np.ndarray | None
+    observed: np.ndarray | None
+    truth: np.ndarray
+    times: np.ndarray | None
+    channels: tuple[str, ...]
+    feasible_low: np.ndarray | None
+    feasible_high: np.ndarray | None
+
+    @property
+    def rounds(self) -> int:
+        """Number of rounds R."""
+        return self.theta.shape[0]
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters D."""
+        return self.theta.shape[-1]
+
+    @property
+    def weighted_means(self) -> np.ndarray:
+        """Weighted mean of each round's mixture, shape [R, D]."""
+        return density.weighted_mean(self.logits, self.means)
+
+    @property
+    def accumulated_means(self) -> np.ndarray:
+        """Mean of all simulations kept up to each round, shape [R, D]; NaN before the first."""
+        kept = self.kept[..., None]
+        total = np.cumsum(np.where(kept, self.theta, 0.0).sum(1), axis=0)
+        count = np.cumsum(self.kept.sum(1))[:, None]
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    @property
+    def supports(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds from Theta_0 to the last adaptation, two arrays of shape [R + 1, D]."""
+        low = np.concatenate([self.proposal_low[:1], self.support_low])
+        return low, np.concatenate([self.proposal_high[:1], self.support_high])
+
+    @property
+    def adapts(self) -> bool:
+        """Whether any bound moved."""
+        return any(not np.allclose(bound, bound[:1]) for bound in self.supports)
+
+    @property
+    def predictions(self) -> np.ndarray | None:
+        """Simulations of the last posterior's samples that did not fail, shape [n, T, C], or None."""
+        if self.final_trajectory is None:
+            return None
+        valid = np.isfinite(self.final_trajectory).all((1, 2))
+        if self.trajectory_error is not None and self.trajectory_error.shape[1] == len(valid):
+            valid &= np.isfinite(self.trajectory_error[-1])
+        return self.final_trajectory[valid] if valid.any() else None
+
+    @property
+    def final_theta_error(self) -> float:
+        """Last round's |theta - theta_gt|, summed over parameters and averaged over samples."""
+        return float("nan") if self.theta_error is None else float(self.theta_error[-1].sum(-1).mean())
+
+    @property
+    def final_trajectory_error(self) -> float:
+        """Last round's distance from the observed trajectory, averaged over samples that did not fail."""
+        return (
+            float("nan")
+            if self.trajectory_error is None
+            else float(statistics.mean(self.trajectory_error[-1]))
+        )
+
+    @property
+    def success_rate(self) -> float:
+        """Share of all attempted simulations that did not fail."""
+        attempted = self.attempted.sum()
+        return float(1 - self.failed.sum() / attempted) if attempted else float("nan")
+
+
+def load(folder: Path | str, configuration: str | None = None) -> History:
+    """Read one run's folder.
+
+    Args:
+        folder: holds config.json of format "jaxlfi-run", history.npz and, mostly, observation.npz.
+        configuration: what to call the run; by default as config.json does, or by support and heuristic.
+
+    Raises:
+        ValueError: for a folder that is missing, of another kind or damaged.
+    """
+    folder = Path(folder)
+    config = read_config(folder)
+    if config["format"] != "jaxlfi-run":
+        raise ValueError(f"{folder}: expected config.json of format 'jaxlfi-run', got {config['format']!r}")
+    arrays = read_arrays(folder / "history.npz", REQUIRED)
+    observation = read_arrays(folder / "observation.npz") if (folder / "observation.npz").exists() else {}
+    _check_shapes(folder / "history.npz", arrays)
+    rounds, _attempts, dim = arrays["theta"].shape
+    trajectory = _trajectory(observation.get("trajectory"))
+    counted, failure = arrays["counted"].astype(bool), arrays["failure"]
+    return History(
+        folder=folder,
+        configuration=configuration or _configuration(config),
+        seed=config["seed"] if isinstance(config.get("seed"), int) else 0,
+        config=config,
+        names=_texts(
+            observation.get("names"), config.get("coordinates") or config.get("names"), dim, "theta {}"
+        ),
+        units=_texts(None, config.get("units"), dim, ""),
+        counted=counted,
+        kept=arrays["kept"].astype(bool),
+        failure=failure,
+        loss=_optional(arrays, "loss"),
+        validation_loss=_optional(arrays, "validation_loss"),
+        theta_error=_optional(arrays, "sample_theta_error"),
+        trajectory_error=_optional(arrays, "sample_trajectory_error"),
+        attempted=np.asarray(arrays.get("attempted", counted.sum(1))),
+        failed=_failed(arrays, counted, failure),
+        seconds=np.broadcast_to(np.asarray(arrays.get("seconds", np.nan), float), (rounds,)),
+        final_trajectory=_samples(_optional(arrays, "final_trajectory")),
+        observed=trajectory,
+        truth=_vector(observation.get("truth"), dim),
+        times=_times(observation.get("times"), trajectory),
+        channels=_texts(
+            observation.get("channels"),
+            config.get("channels"),
+            0 if trajectory is None else trajectory.shape[1],
+            "x{}",
+        ),
+        feasible_low=_limits(config, "low", dim),
+        feasible_high=_limits(config, "high", dim),
+        **{name: arrays[name] for name in REQUIRED if name not in ("counted", "kept", "failure")},
+    )
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """config.json of a folder, with its "format".
+
+    Raises:
+        ValueError: if there is none, or it is not one of ours.
+    """
+    path = folder / "config.json"
+    if not path.is_file():
+        raise ValueError(
+            f"{folder}: expected a folder with config.json, as `jaxlfi infer --out` writes, found none"
+        )
+    try:
+        config = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: expected JSON, but it cannot be read ({_one_line(error)})") from error
+    if not isinstance(config, dict) or not isinstance(config.get("format"), str):
+        raise ValueError(f"{path}: expected a JSON object with a 'format' that starts with 'jaxlfi-'")
+    return config
+
+
+def read_arrays(path: Path, required: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
+    """All arrays of an npz file.
+
+    Raises:
+        ValueError: if it is missing, damaged, or lacks one of the required arrays.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected the file, found none (has the run ended a round?)")
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        raise ValueError(
+            f"{path}: expected an npz file of arrays, but it cannot be read ({_one_line(error)})"
+        ) from error
+    if missing := [name for name in required if name not in arrays]:
+        raise ValueError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
+    return arrays
+
+
+def _one_line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Refuse arrays that do not agree with one another in rounds, attempts, parameters or components."""
+    if arrays["theta"].ndim != 3 or arrays["logits"].ndim != 2 or arrays["theta"].shape[0] < 1:
+        raise ValueError(
+            f"{path}: expected theta [rounds, attempts, parameters] and logits [rounds, components] of at "
+            f"least one round, got {arrays['theta'].shape} and {arrays['logits'].shape}"
+        )
+    (rounds, attempts, dim), components = arrays["theta"].shape, arrays["logits"].shape[1]
+    expected = dict.fromkeys(("counted", "kept", "failure"), (rounds, attempts))
+    expected |= {name: (rounds, dim) for name in REQUIRED if name.endswith(("_low", "_high"))}
+    expected |= {
+        "logits": (rounds, components),
+        "means": (rounds, components, dim),
+        "scale_tril": (rounds, components, dim, dim),
+    }
+    for name, shape in expected.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{path}: expected {name} of shape {shape}, got {arrays[name].shape}")
+    for name, shape in {
+        "sample_theta_error": (rounds, None, dim),
+        "sample_trajectory_error": (rounds, None),
+    }.items():
+        got = arrays[name].shape if name in arrays else shape
+        if len(got) != len(shape) or any(s not in (None, g) for s, g in zip(shape, got, strict=True)):
+            raise ValueError(
+                f"{path}: expected {name} of shape {shape}, got {got}".replace("None", "samples")
+            )
+
+
+def _optional(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
+    """An array that has something to show, or None."""
+    array = arrays.get(name)
+    return array if array is not None and array.size and np.isfinite(array).any() else None
+
+
+def _failed(arrays: Mapping[str, np.ndarray], counted: np.ndarray, failure: np.ndarray) -> np.ndarray:
+    if "failed" not in arrays:
+        return (counted & (failure != 0)).sum(1)
+    return np.asarray(arrays["failed"]).reshape(counted.shape[0], -1).sum(1)
+
+
+def _trajectory(array: np.ndarray | None) -> np.ndarray | None:
+    """A trajectory as [T, C]."""
+    return None if array is None or not array.size else np.asarray(array, float).reshape(array.shape[0], -1)
+
+
+def _samples(array: np.ndarray | None) -> np.ndarray | None:
+    """Trajectories as [N, T, C]."""
+    return None if array is None or array.ndim < 2 else array.reshape(*array.shape[:2], -1)
+
+
+def _vector(array: np.ndarray | None, dim: int) -> np.ndarray:
+    return np.full(dim, np.nan) if array is None or array.shape != (dim,) else np.asarray(array, float)
+
+
+def _times(array: np.ndarray | None, trajectory: np.ndarray | None) -> np.ndarray | None:
+    if trajectory is None:
+        return None
+    return array if array is not None and array.shape == trajectory.shape[:1] else np.arange(len(trajectory))
+
+
+def _texts(first: Any, second: Any, length: int, default: str) -> tuple[str, ...]:
+    """The first of two lists of texts that has the right length, or made-up ones."""
+    for given in (first, second):
+        if given is not None and len(given) == length and length:
+            return tuple(str(text) for text in given)
+    return tuple(default.format(i + 1) for i in range(length))
+
+
+def _limits(config: Mapping[str, Any], side: str, dim: int) -> np.ndarray | None:
+    limits = config.get(f"feasible_{side}")
+    if limits is None and isinstance(config.get("feasible"), Mapping):
+        limits = config["feasible"].get(side)
+    array = np.asarray([] if limits is None else limits, float)
+    return array if array.shape == (dim,) else None
+
+
+def _name(value: Any, default: str) -> str:
+    """A name given as text or as {"name": ...}."""
+    if isinstance(value, Mapping):
+        value = value.get("name")
+    return value if isinstance(value, str) and value else default
+
+
+def _configuration(config: Mapping[str, Any]) -> str:
+    if isinstance(config.get("configuration"), str) and config["configuration"]:
+        return config["configuration"]
+    support, heuristic = _name(config.get("support"), "support"), _name(config.get("heuristic"), "none")
+    return support if heuristic in ("none", "fixed") else f"{support}+{heuristic}"

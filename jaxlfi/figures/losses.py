@@ -1,0 +1,104 @@
+"""Training and validation losses: pass by pass within the rounds of one run, or round by round for many."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxlfi.figures import statistics
+from jaxlfi.figures.bands import draw_band, legend
+from jaxlfi.figures.collection import Runs
+from jaxlfi.figures.history import History
+from jaxlfi.figures.style import iteration_bar, iteration_colours, iterations_axis, looks
+
+PANELS = {"loss": "training loss", "validation_loss": "validation loss"}
+
+
+def passes(history: History, panel: str) -> np.ndarray | None:
+    """Loss after each pass, mean over the ensemble's networks, shape [R, P]; NaN after an early stop."""
+    values = getattr(history, panel)
+    return None if values is None else statistics.mean(np.where(np.isfinite(values), values, np.nan), 1)
+
+
+def by_round(history: History, panel: str) -> np.ndarray | None:
+    """One loss a round, shape [R]: the last pass' training loss, the best validation loss."""
+    values = passes(history, panel)
+    if values is None:
+        return None
+    if panel == "validation_loss":
+        return np.where(np.isnan(values).all(1), np.nan, np.where(np.isnan(values), np.inf, values).min(1))
+    last = values.shape[1] - 1 - np.argmax(~np.isnan(values[:, ::-1]), axis=1)
+    return values[np.arange(len(values)), last]
+
+
+def drawable(runs: Runs) -> bool:
+    """Whether losses were kept."""
+    return any(getattr(h, panel) is not None for hs in runs.values() for h in hs for panel in PANELS)
+
+
+def draw(figure: Figure, runs: Runs) -> None:
+    """Losses of one run pass by pass, or of several runs round by round.
+
+    Args:
+        figure: empty.
+        runs: configurations with their seeds.
+    """
+    every = [history for histories in runs.values() for history in histories]
+    shown = [panel for panel in PANELS if any(getattr(h, panel) is not None for h in every)]
+    axes = dict(zip(shown, figure.subplots(1, len(shown), squeeze=False, sharey=True)[0], strict=True))
+    if len(every) == 1:
+        for panel in shown:
+            draw_passes(axes[panel], every[0], panel)
+        _limit(list(axes.values()), [passes(every[0], panel) for panel in shown])
+        iteration_bar(figure, np.array(list(axes.values())), every[0].rounds)
+    else:
+        look = looks(list(runs))
+        for panel in shown:
+            for name, histories in runs.items():
+                values = [by_round(h, panel) for h in histories if getattr(h, panel) is not None]
+                if values:
+                    x = np.arange(1, every[0].rounds + 1)
+                    draw_band(
+                        axes[panel], x, statistics.mean(values, 0), statistics.sd(values, 0), look[name]
+                    )
+            iterations_axis(axes[panel], every[0].rounds)
+        seeds = max(len(histories) for histories in runs.values())
+        title = "last pass of training, best of validation" + (
+            f"; mean ± sd over {seeds} seeds" if seeds > 1 else ""
+        )
+        legend(figure, look, title)
+    for panel in shown:
+        axes[panel].set_title(PANELS[panel])
+        axes[panel].grid(True)
+    axes[shown[0]].set_ylabel("negative log-density")
+
+
+def draw_passes(axes: Axes, history: History, panel: str) -> None:
+    """One line a round over the passes of its training, coloured by iteration.
+
+    Args:
+        axes: to draw on.
+        history: the run.
+        panel: "loss" or "validation_loss".
+    """
+    values = passes(history, panel)
+    colours, norm = iteration_colours(history.rounds)
+    single = "o" if values.shape[1] == 1 else None
+    for i, line in enumerate(values):
+        axes.plot(np.arange(1, len(line) + 1), line, marker=single, color=colours(norm(i + 1)), linewidth=0.8)
+    axes.set_xlabel("pass")
+    if values.shape[1] > 1:
+        axes.set_xscale("log")
+        axes.set_xlim(1, values.shape[1])
+    else:
+        axes.set_xticks([1])
+
+
+def _limit(panels: list[Axes], values: list[np.ndarray]) -> None:
+    """Leave out of sight the few extreme values that would flatten everything else."""
+    every = np.concatenate([v[np.isfinite(v)] for v in values])
+    if not every.size:
+        return
+    low, high = np.quantile(every, [0.0, 0.99])
+    margin = 0.06 * (high - low) or 1.0
+    for axes in panels:
+        axes.set_ylim(low - margin, high + margin)

@@ -1,0 +1,200 @@
+"""The page: one self-contained HTML file with the results' table and the pictures."""
+
+import base64
+import dataclasses
+import html
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxlfi.figures import statistics
+from jaxlfi.figures.collection import Collection
+from jaxlfi.figures.style import Look, looks
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A picture on the page.
+
+    Attributes:
+        path: the png.
+        title: its heading.
+        caption: what is seen.
+        width: in inches, as on paper.
+    """
+
+    path: Path
+    title: str
+    caption: str
+    width: float
+
+
+_CSS = """
+:root { color-scheme: light; --ink: #1d2329; --soft: #5b6670; --line: #e2e6ea; --tint: #f6f8fa; }
+* { box-sizing: border-box; }
+body { margin: 0; background: #fff; color: var(--ink); font: 16px/1.55 system-ui, -apple-system, "Segoe UI",
+  Roboto, "Helvetica Neue", Arial, sans-serif; }
+main { max-width: 60rem; margin: 0 auto; padding: 2.5rem 1.25rem 4rem; }
+h1 { font-size: 1.7rem; line-height: 1.25; margin: 0 0 .25rem; }
+h2 { font-size: 1.1rem; margin: 2.75rem 0 .6rem; padding-top: .9rem; border-top: 1px solid var(--line); }
+p { margin: .4rem 0; } .soft, figcaption, caption { color: var(--soft); }
+code, pre { font: .86rem/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace;
+  background: var(--tint); border-radius: 4px; }
+code { padding: .1rem .3rem; overflow-wrap: anywhere; }
+pre { padding: .8rem 1rem; overflow: auto; max-height: 30rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; width: 100%; font-size: .86rem; font-variant-numeric: tabular-nums; }
+caption { caption-side: bottom; text-align: left; padding-top: .5rem; font-size: .86rem; }
+th, td { padding: .32rem .55rem; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; }
+thead th { font-weight: 600; border-bottom: 1px solid var(--line); }
+thead tr:last-child th { border-bottom: 2px solid var(--ink); font-weight: 400; color: var(--soft); }
+tbody tr { border-bottom: 1px solid var(--line); } td.first, th.first { padding-left: 1.2rem; }
+i.swatch { display: inline-block; width: .75rem; height: .75rem; border-radius: 2px; margin-right: .5rem; }
+figure { margin: 0; } figure img { display: block; max-width: 100%; height: auto; margin: .5rem 0; }
+figcaption { font-size: .9rem; max-width: 46rem; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.2rem; margin: 1rem 0 0;
+  font-size: .92rem; }
+dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
+summary { cursor: pointer; }
+.note { background: #fff7e6; border-left: 3px solid #f5a025; padding: .5rem .9rem; }
+nav a { color: #174ea6; margin-right: .9rem; text-decoration: none; font-size: .92rem; }
+@media print { main { max-width: none; padding: 0; } h2 { break-after: avoid; }
+  figure { break-inside: avoid; }
+  details, nav { display: none; } }
+"""
+
+_COLUMNS = {
+    "theta_error": "parameter error",
+    "trajectory_error": "trajectory error",
+    "success_rate": "success rate [%]",
+    "seconds": "time [s]",
+}
+
+
+def render(collection: Collection, pictures: Sequence[Picture]) -> str:
+    """The page as text.
+
+    Args:
+        collection: what was run.
+        pictures: in the order to show them.
+    """
+    config = collection.config
+    first = next(iter(collection.runs.values()))[0]
+    task = _short(config.get("task") or first.config.get("task") or collection.folder.name)
+    title = f"{task}: {len(collection.table)} run{'s' if len(collection.table) != 1 else ''} of jaxlfi"
+    shown = [(f"picture-{i}", picture) for i, picture in enumerate(pictures, 1)]
+    links = "".join(f'<a href="#{name}">{html.escape(picture.title)}</a>' for name, picture in shown)
+    parts = [
+        "<!DOCTYPE html>",
+        '<html lang="en"><head><meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{html.escape(title)}</title><style>{_CSS}</style></head><body><main>",
+        f"<h1>{html.escape(title)}</h1>",
+        _facts(collection),
+        _notes(collection),
+        f"<h2>Results</h2>{_table(collection)}",
+        f"<nav>{links}</nav>",
+        *(_figure(name, picture) for name, picture in shown),
+        f"<h2>Configuration</h2><details><summary>config.json</summary><pre>{_json(config)}</pre></details>",
+        "</main></body></html>",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _facts(collection: Collection) -> str:
+    """How the runs were made: what config.json says of it, else the first run's."""
+    first = next(iter(collection.runs.values()))[0]
+    configs = (collection.config, first.config)
+
+    def get(*names: str) -> Any:
+        return next((config[name] for config in configs for name in names if config.get(name)), None)
+
+    facts = {
+        "Parameters": ", ".join(
+            f"{n} [{u}]" if u else n for n, u in zip(first.names, first.units, strict=True)
+        ),
+        "Rounds": first.rounds,
+        "Seeds": max(len(histories) for histories in collection.runs.values()),
+        "Preset": get("preset"),
+        "Command": get("command_line", "command"),
+        "Versions": get("versions"),
+        "Platform": get("platform"),
+        "Started": get("started"),
+    }
+    lines = []
+    for name, value in facts.items():
+        if value in (None, "", {}):
+            continue
+        text = (
+            ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, Mapping) else _short(value)
+        )
+        text = html.escape(text)
+        lines.append(f"<dt>{name}</dt><dd>{f'<code>{text}</code>' if name == 'Command' else text}</dd>")
+    return f"<dl>{''.join(lines)}</dl>"
+
+
+def _notes(collection: Collection) -> str:
+    """Warnings the run left, and runs that are not in the pictures."""
+    notes = [str(text) for text in collection.config.get("warnings") or []]
+    if collection.unfinished:
+        names = ", ".join(str(Path(p).relative_to(collection.folder)) for p in collection.unfinished)
+        notes.append(f"Not finished, and left out of the pictures: {names}.")
+    return "".join(f'<p class="note">{html.escape(note)}</p>' for note in notes)
+
+
+def _table(collection: Collection) -> str:
+    """Mean, median and standard deviation over seeds of every measure, a line for each configuration."""
+    look = looks(list(collection.values("seed")))
+    head = "".join(f'<th class="first" colspan="3">{name}</th>' for name in _COLUMNS.values())
+    below = '<th class="first">mean</th><th>median</th><th>sd</th>' * len(_COLUMNS)
+    columns = {measure: collection.values(measure) for measure in _COLUMNS}
+    lines = []
+    for name, own in look.items():
+        cells = []
+        for measure, values in columns.items():
+            scaled = values[name] * (100 if measure == "success_rate" else 1)
+            spread = float(statistics.sd(scaled)) if len(scaled) > 1 else float("nan")
+            three = [_number(x) for x in (float(statistics.mean(scaled)), statistics.median(scaled), spread)]
+            cells.append('<td class="first">{}</td><td>{}</td><td>{}</td>'.format(*three))
+        seeds = len(values[name])
+        lines.append(f"<tr><td>{_swatch(own)}</td><td>{seeds}</td>{''.join(cells)}</tr>")
+    return (
+        f'<div class="wide"><table><thead><tr><th>configuration</th><th>seeds</th>{head}</tr>'
+        f"<tr><th></th><th></th>{below}</tr></thead><tbody>{''.join(lines)}</tbody>"
+        "<caption>Parameter error: |θ − θ<sub>gt</sub>| summed over parameters, mean over posterior samples. "
+        "Trajectory error: distance from the observed trajectory in its standard deviations, mean over the "
+        "samples that could be simulated. Success rate: of all attempted simulations.</caption></table></div>"
+    )
+
+
+def _swatch(own: Look) -> str:
+    return f'<i class="swatch" style="background:{own.colour}"></i>{html.escape(own.label)}'
+
+
+def _figure(name: str, picture: Picture) -> str:
+    data = base64.b64encode(picture.path.read_bytes()).decode("ascii")
+    # On a screen a paper's figure is shown somewhat larger than printed.
+    pixels = round(picture.width * 128)
+    title, caption = html.escape(picture.title), html.escape(picture.caption)
+    return (
+        f'<h2 id="{name}">{title}</h2><figure><img width="{pixels}" alt="{title}" '
+        f'src="data:image/png;base64,{data}"><figcaption>{caption}</figcaption></figure>'
+    )
+
+
+def _number(x: float) -> str:
+    if not np.isfinite(x):
+        return "–"
+    return f"{x:.0f}" if abs(x) >= 1000 else f"{x:.3g}"
+
+
+def _short(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def _json(config: Mapping[str, Any]) -> str:
+    return html.escape(json.dumps(config, indent=2, ensure_ascii=False))

@@ -1,0 +1,208 @@
+"""Report: all pictures of a run folder, and a page with them."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxlfi.figures import (
+    curves,
+    discrepancy,
+    efficiency,
+    losses,
+    page,
+    predictive,
+    samples,
+    seeds,
+    style,
+    supports,
+)
+from jaxlfi.figures.collection import Collection, Runs, open_collection, representative
+from jaxlfi.figures.history import History
+from jaxlfi.figures.page import Picture
+from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
+
+COLUMNS = ("ok", "misspecified", "broad", "misspecified+edge")
+"""The configurations shown side by side where a picture has room for four."""
+
+
+def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
+    """Draw all pictures that apply to a run folder and write a page that shows them.
+
+    Args:
+        folder: of one run, of several seeds, or of a comparison.
+        dpi: resolution of the pictures, which are as wide as a paper's column or text.
+
+    Returns:
+        The files written: FOLDER/report.html, then FOLDER/figures/*.png as they appear on it.
+
+    Raises:
+        ValueError: for a folder that is missing, of another kind or damaged; nothing is written then.
+    """
+    collection = open_collection(folder)
+    pictures: list[Picture] = []
+    with style.context():
+        for name, make in PICTURES.items():
+            made = make(collection)
+            if made is None:
+                continue
+            figure, title, caption = made
+            path = style.save(figure, collection.folder / "figures" / f"{name}.png", dpi)
+            pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
+    text = page.render(collection, pictures)
+    index = collection.folder / "report.html"
+    index.write_text(text, encoding="utf-8")
+    return [index, *(picture.path for picture in pictures)]
+
+
+Made = tuple[Figure, str, str] | None
+"""A figure with its title and caption, or None where there is nothing to draw."""
+
+
+def columns(runs: Runs, most: int = 4) -> tuple[list[History], list[str]]:
+    """One run for each of up to four configurations, the seed of median error, and the columns' titles."""
+    preferred = [name for name in COLUMNS if name in runs]
+    chosen = (
+        list(runs) if len(runs) <= most else [*preferred, *(n for n in runs if n not in preferred)][:most]
+    )
+    histories = [representative(runs[name]) for name in chosen]
+    look = style.looks(chosen)
+    titles = []
+    for name, history in zip(chosen, histories, strict=True):
+        seed = f"\n(seed {history.seed})" if len(runs[name]) > 1 else ""
+        titles.append(look[name].label + seed)
+    return histories, titles
+
+
+def _samples(collection: Collection) -> Made:
+    histories, titles = columns(collection.runs)
+    rows = len(samples.pairs(histories[0].dim))
+    figure = style.new_figure(TEXT_WIDTH, 0.75 + (rows * 2.2 if len(histories) == 1 else 2 * rows * 1.72))
+    samples.draw(figure, histories, titles)
+    first, second = ("Left", "Right") if len(histories) == 1 else ("Above", "Below")
+    caption = (
+        f"{first}: the parameters drawn in each iteration with the support they were drawn from; the bigger "
+        f"dots are the means of the data accumulated up to each iteration. {second}, closer: the last "
+        "posterior, with the support it is kept in and arrows along the weighted means of the iterations."
+        + _which_seed(collection.runs)
+    )
+    return figure, "Samples and posterior", caption
+
+
+def _efficiency(collection: Collection) -> Made:
+    figure = style.new_figure(TEXT_WIDTH, 2.1 + _legend_height(collection.runs))
+    efficiency.draw(figure, collection.runs)
+    caption = "Simulations attempted in each iteration, the share that succeeded, and the failures so far."
+    return figure, "Data efficiency", caption
+
+
+def _curves(collection: Collection) -> Made:
+    if not curves.drawable(collection.runs):
+        return None
+    dim = next(iter(collection.runs.values()))[0].dim
+    wide = dim > 4
+    rows = -(-dim // (3 if wide else 2))
+    known = any(h.theta_error is not None for histories in collection.runs.values() for h in histories)
+    figure = style.new_figure(
+        TEXT_WIDTH if wide and known else COLUMN_WIDTH, 2.3 + (1.2 * rows if known else 0.2)
+    )
+    curves.draw(figure, collection.runs)
+    caption = (
+        "exp(-loss) of posterior samples in each iteration, 1 is perfect: Euclidean distance to the observed "
+        "trajectory (per record, in its standard deviations; a failed simulation counts 0), and absolute "
+        "difference from each true parameter where it is known. Bands are standard errors."
+    )
+    return figure, "Accuracy over iterations", caption
+
+
+def _discrepancy(collection: Collection) -> Made:
+    if not discrepancy.drawable(collection.runs):
+        return None
+    panels = discrepancy.panels(collection.runs)
+    width = COLUMN_WIDTH if len(panels) <= 2 else TEXT_WIDTH
+    figure = style.new_figure(width, 0.6 + 1.7 * -(-len(panels) // 5) + _legend_height(collection.runs))
+    discrepancy.draw(figure, collection.runs)
+    caption = (
+        "Discrepancy of posterior samples after the last iteration from the true parameters and the observed "
+        "trajectory. Error bars are standard deviations over samples and seeds; failed simulations are left "
+        "out."
+    )
+    return figure, "Final discrepancy", caption
+
+
+def _supports(collection: Collection) -> Made:
+    dim = next(iter(collection.runs.values()))[0].dim
+    width = COLUMN_WIDTH if dim == 1 else TEXT_WIDTH
+    figure = style.new_figure(width, 0.6 + 1.6 * -(-dim // 4))
+    supports.draw(figure, collection.runs)
+    caption = "Bounds of the support from the first (iteration 0) to the last adaptation."
+    return figure, "Supports", caption
+
+
+def _losses(collection: Collection) -> Made:
+    if not losses.drawable(collection.runs):
+        return None
+    figure = style.new_figure(TEXT_WIDTH, 2.3 + _legend_height(collection.runs))
+    losses.draw(figure, collection.runs)
+    caption = "Negative log-density of the parameters, scaled to [-1, 1], under the network."
+    return figure, "Training", caption
+
+
+def _predictive(collection: Collection) -> Made:
+    runs = {
+        name: [h for h in histories if predictive.drawable(h)] for name, histories in collection.runs.items()
+    }
+    runs = {name: histories for name, histories in runs.items() if histories}
+    if not runs:
+        return None
+    histories, titles = columns(runs)
+    width = COLUMN_WIDTH if len(histories) == 1 else TEXT_WIDTH
+    figure = style.new_figure(width, 0.8 + 1.35 * len(histories[0].channels))
+    predictive.draw(figure, histories, titles)
+    caption = "Simulations of samples of the last posterior, against the observed trajectory." + _which_seed(
+        runs
+    )
+    return figure, "Posterior predictive", caption
+
+
+def _seeds(collection: Collection) -> Made:
+    values = collection.values("theta_error")
+    label = "parameter error (sum of |θ − θ$_{gt}$|)"
+    if not _positive(values):
+        values, label = collection.values("trajectory_error"), "trajectory error [observed sd]"
+    if not _positive(values) or max(len(v) for v in values.values()) < 2:
+        return None
+    figure = style.new_figure(COLUMN_WIDTH if len(values) <= 3 else TEXT_WIDTH, 2.6)
+    seeds.draw(figure, values, label)
+    caption = "Error after the last iteration, a point for each seed, on a logarithmic scale."
+    return figure, "Seeds", caption
+
+
+PICTURES: dict[str, Callable[[Collection], Made]] = {
+    "samples": _samples,
+    "efficiency": _efficiency,
+    "curves": _curves,
+    "discrepancy": _discrepancy,
+    "support": _supports,
+    "losses": _losses,
+    "predictive": _predictive,
+    "seeds": _seeds,
+}
+"""What makes each picture, by the name of its file."""
+
+
+def _which_seed(runs: Runs) -> str:
+    return " Of several seeds, that of median parameter error is shown." if _several(runs.values()) else ""
+
+
+def _several(groups: Sequence) -> bool:
+    return any(len(histories) > 1 for histories in groups)
+
+
+def _legend_height(runs: Runs) -> float:
+    return 0.15 * (1 + (len(runs) > 4))
+
+
+def _positive(values: dict[str, np.ndarray]) -> bool:
+    return any(np.any(np.isfinite(v) & (v > 0)) for v in values.values())

@@ -1,0 +1,257 @@
+"""How the figures look: one colour, marker and line for each configuration, sizes for a two-column paper."""
+
+import contextlib
+import dataclasses
+import textwrap
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import BoundaryNorm, Colormap, LinearSegmentedColormap, ListedColormap, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+COLUMN_WIDTH = 3.5
+"""Width of a paper's column in inches."""
+TEXT_WIDTH = 7.16
+"""Width of a paper's two columns in inches."""
+
+STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 7.0,
+    "axes.titlesize": 7.5,
+    "axes.labelsize": 7.0,
+    "axes.linewidth": 0.6,
+    "axes.edgecolor": "#555555",
+    "axes.titlepad": 3.0,
+    "axes.labelpad": 2.0,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.5,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "xtick.major.size": 2.0,
+    "ytick.major.size": 2.0,
+    "xtick.minor.size": 1.2,
+    "ytick.minor.size": 1.2,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.minor.width": 0.4,
+    "ytick.minor.width": 0.4,
+    "xtick.major.pad": 2.0,
+    "ytick.major.pad": 2.0,
+    "xtick.color": "#333333",
+    "ytick.color": "#333333",
+    "legend.fontsize": 7.0,
+    "legend.frameon": False,
+    "legend.handlelength": 2.2,
+    "legend.columnspacing": 1.4,
+    "legend.borderaxespad": 0.2,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 3.2,
+    "figure.facecolor": "white",
+    "figure.constrained_layout.w_pad": 0.03,
+    "figure.constrained_layout.h_pad": 0.03,
+}
+"""matplotlib settings of all figures, put in force by `context` and nowhere else."""
+
+SUPPORT_COLOURS = {
+    "ok": "#30B9EB",
+    "misspecified": "#C52B21",
+    "broad": "#15158B",
+    "broader": "#995FDD",
+    "broadest": "#369060",
+}
+"""Fixed supports: the hues the paper underlines them with, saturated."""
+
+HEURISTIC_COLOURS = {"edge": "#F5A025", "mode": "#025358", "centre": "#45200E"}
+"""Adapted supports. With the five above, any two stay apart (CIELAB 22) in each kind of colour blindness."""
+
+OTHER_COLOURS = ("#7F7F7F", "#C2578F", "#8A8A1F", "#4F7CAC", "#B0713B", "#2E2E2E")
+"""For configurations by any other name, in the order they come."""
+
+_MARKERS = {
+    "ok": ("o", "-"),
+    "misspecified": ("X", (0, (4, 1.2))),
+    "broad": ("s", (0, (1, 1))),
+    "broader": ("D", (0, (1, 2))),
+    "broadest": ("p", (0, (5, 1, 1, 1, 1, 1))),
+    "edge": ("^", "-"),
+    "mode": ("v", (0, (6, 1, 1, 1))),
+    "centre": ("P", (0, (3, 1, 1, 1, 1, 1))),
+}
+_OTHER_MARKERS = ("<", ">", "h", "d", "8", "*")
+_SHADES = {"ok": 0.45, "broad": -0.35, "broader": 0.25, "broadest": -0.2}
+
+TRUTH = {
+    "marker": "*",
+    "color": "#FFD400",
+    "markeredgecolor": "black",
+    "markeredgewidth": 0.6,
+    "markersize": 7.0,
+    "linestyle": "none",
+}
+"""How the true parameters are marked in planes of parameters."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """How one configuration is drawn.
+
+    Attributes:
+        label: its name for a reader.
+        colour: of lines, boxes and titles.
+        marker: matplotlib marker.
+        linestyle: matplotlib line style.
+    """
+
+    label: str
+    colour: str
+    marker: str
+    linestyle: str | tuple
+
+    @property
+    def line(self) -> dict:
+        """Keyword arguments of `Axes.plot`."""
+        return {
+            "color": self.colour,
+            "marker": self.marker,
+            "linestyle": self.linestyle,
+            "markeredgecolor": "white",
+            "markeredgewidth": 0.3,
+            "label": self.label,
+        }
+
+    @property
+    def density(self) -> Colormap:
+        """From white to the configuration's colour and on towards black."""
+        dark = shade(self.colour, -0.45)
+        return LinearSegmentedColormap.from_list(self.label, ["#FFFFFF", self.colour, dark])
+
+
+def shade(colour: str, amount: float) -> str:
+    """A colour mixed with white (amount > 0) or black (amount < 0)."""
+    end = 1.0 if amount > 0 else 0.0
+    mixed = [round(255 * (c + (end - c) * abs(amount))) for c in to_rgb(colour)]
+    return "#" + "".join(f"{c:02X}" for c in mixed)
+
+
+def looks(configurations: Sequence[str]) -> dict[str, Look]:
+    """The look of each configuration; a name from the paper has the same look in all figures.
+
+    Args:
+        configurations: names such as "ok" or "misspecified+edge"; any others are given spare colours.
+    """
+    result: dict[str, Look] = {}
+    spare = 0
+    for name in configurations:
+        support, _, heuristic = name.partition("+")
+        if not heuristic and support in SUPPORT_COLOURS:
+            colour, (marker, line) = SUPPORT_COLOURS[support], _MARKERS[support]
+        elif heuristic in HEURISTIC_COLOURS:
+            amount = _SHADES.get(support, 0.0)
+            colour, (marker, line) = HEURISTIC_COLOURS[heuristic], _MARKERS[heuristic]
+            colour = shade(colour, amount) if amount else colour
+        else:
+            colour, marker = (
+                OTHER_COLOURS[spare % len(OTHER_COLOURS)],
+                _OTHER_MARKERS[spare % len(_OTHER_MARKERS)],
+            )
+            line, spare = "-", spare + 1
+        result[name] = Look(configuration_label(name), colour, marker, line)
+    return result
+
+
+def configuration_label(name: str) -> str:
+    """A configuration's name for a reader: "misspecified + EDGE"."""
+    support, _, heuristic = name.partition("+")
+    support = "OK" if support == "ok" else plain(support)
+    if not heuristic:
+        return support
+    return f"{support} + {heuristic.upper() if heuristic in HEURISTIC_COLOURS else plain(heuristic)}"
+
+
+def plain(text: str) -> str:
+    """Text that matplotlib takes letter by letter (no mathematics), with spaces for underscores."""
+    return text.replace("$", r"\$").replace("_", " ")
+
+
+def symbol(d: int) -> str:
+    """theta_d, counted from 1 as in the paper."""
+    return rf"$\theta_{{{d + 1}}}$"
+
+
+def parameter_name(names: Sequence[str], d: int, width: int = 26) -> str:
+    """A parameter's symbol and name, broken where it is longer than `width`."""
+    return "\n".join(textwrap.wrap(f"{symbol(d)} {plain(names[d])}", width + len(symbol(d))))
+
+
+def unit_label(names: Sequence[str], units: Sequence[str], d: int) -> str:
+    """A parameter's unit in brackets, or ""; a logarithm's unit is the logarithm of the unit."""
+    unit = plain(units[d])
+    if unit in ("", "1", "-"):
+        return ""
+    if names[d].startswith("ln ") and not unit.startswith("ln"):
+        unit = f"ln({unit})"
+    return f"[{unit}]"
+
+
+def parameter_label(names: Sequence[str], units: Sequence[str], d: int, width: int = 26) -> str:
+    """Axis label: symbol and name, and the unit on a line of its own."""
+    unit = unit_label(names, units, d)
+    return parameter_name(names, d, width) + (f"\n{unit}" if unit else "")
+
+
+def iteration_colours(rounds: int) -> tuple[ListedColormap, BoundaryNorm]:
+    """One colour for each iteration, counted from 1, dark to light."""
+    base = matplotlib.colormaps["viridis"]
+    colours = [base(0.93 * i / max(rounds - 1, 1)) for i in range(rounds)]
+    edges = [i + 0.5 for i in range(rounds + 1)]
+    return ListedColormap(colours), BoundaryNorm(edges, rounds)
+
+
+def iterations_axis(axes: Axes, rounds: int, first: int = 1, label: bool = True) -> None:
+    """Integer ticks for iterations `first` to `rounds`, and the axis' label."""
+    axes.set_xlim(first - 0.35, rounds + 0.35)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
+    if label:
+        axes.set_xlabel("iteration")
+
+
+def iteration_bar(figure: Figure, axes: np.ndarray, rounds: int) -> Colorbar:
+    """A colorbar of iterations to the right of some axes."""
+    colours, norm = iteration_colours(rounds)
+    bar = figure.colorbar(
+        ScalarMappable(norm, colours), ax=list(axes.ravel()), label="iteration", aspect=40, pad=0.01
+    )
+    bar.locator = MaxNLocator(nbins=10, integer=True, min_n_ticks=1)
+    bar.minorticks_off()
+    bar.update_ticks()
+    return bar
+
+
+@contextlib.contextmanager
+def context() -> Iterator[None]:
+    """Put `STYLE` in force for figures made, drawn and saved inside; afterwards all is as before."""
+    with matplotlib.rc_context(STYLE):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure in inches, laid out without overlaps, outside of pyplot."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, path: Path, dpi: float) -> Path:
+    """Write a figure as png and return the path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=dpi)
+    return path

@@ -1,0 +1,90 @@
+"""Where the bounds of each parameter went, iteration by iteration."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jaxlfi.figures import statistics
+from jaxlfi.figures.bands import balanced
+from jaxlfi.figures.collection import Runs
+from jaxlfi.figures.history import History
+from jaxlfi.figures.style import Look, iterations_axis, looks, parameter_name, unit_label
+
+_TRUTH = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 0.9}
+_LIMIT = {"color": "#777777", "linestyle": (0, (1, 1.5)), "linewidth": 0.9}
+
+
+def adapting(runs: Runs) -> dict[str, Sequence[History]]:
+    """The configurations whose bounds move; all of them where none does."""
+    moving = {name: histories for name, histories in runs.items() if any(h.adapts for h in histories)}
+    return moving or dict(runs)
+
+
+def draw_bounds(axes: Axes, histories: Sequence[History], d: int, look: Look) -> None:
+    """Mean bounds of a parameter over seeds from Theta_0 (iteration 0) on, and each seed's as a thin line.
+
+    Args:
+        axes: to draw on.
+        histories: the seeds of one configuration.
+        d: index of the parameter.
+        look: of the configuration.
+    """
+    bounds = np.stack([np.stack(h.supports)[..., d] for h in histories])
+    low, high = statistics.mean(bounds, 0)
+    iteration = np.arange(bounds.shape[-1])
+    axes.fill_between(iteration, low, high, color=look.colour, alpha=0.07, linewidth=0)
+    if len(histories) > 1:
+        axes.plot(
+            iteration, bounds.reshape(-1, bounds.shape[-1]).T, color=look.colour, linewidth=0.35, alpha=0.5
+        )
+    for bound in (low, high):
+        axes.plot(iteration, bound, **look.line)
+
+
+def draw(figure: Figure, runs: Runs) -> None:
+    """One panel a parameter, with the configurations that adapt, the truth and the limits Phi.
+
+    Args:
+        figure: empty.
+        runs: configurations with their seeds.
+    """
+    shown = adapting(runs)
+    look = {name: own for name, own in looks(list(runs)).items() if name in shown}
+    first = next(iter(shown.values()))[0]
+    rows = -(-first.dim // 4)
+    columns = -(-first.dim // rows)
+    every = figure.subplots(rows, columns, squeeze=False).ravel()
+    for d, axes in enumerate(every):
+        if d >= first.dim:
+            axes.remove()
+            continue
+        for name, histories in shown.items():
+            draw_bounds(axes, histories, d, look[name])
+        if np.isfinite(first.truth[d]):
+            axes.axhline(first.truth[d], **_TRUTH, gid="truth")
+        for limit in (first.feasible_low, first.feasible_high):
+            if limit is not None:
+                axes.axhline(limit[d], **_LIMIT, gid="limit")
+        axes.set_title(parameter_name(first.names, d))
+        unit = unit_label(first.names, first.units, d)
+        if d % columns == 0 or unit != unit_label(first.names, first.units, d - 1):
+            axes.set_ylabel(f"bounds {unit}".strip())
+        axes.grid(True)
+        iterations_axis(axes, first.rounds, first=0, label=d + columns >= first.dim)
+    handles = [Line2D([], [], **own.line) for own in look.values()]
+    if np.isfinite(first.truth).any():
+        handles.append(Line2D([], [], label="truth", **_TRUTH))
+    if first.feasible_low is not None or first.feasible_high is not None:
+        handles.append(Line2D([], [], label=r"limits $\Phi$", **_LIMIT))
+    seeds = max(len(histories) for histories in shown.values())
+    columns = balanced(list(look.values()), figure.get_size_inches()[0]) if len(handles) > 5 else len(handles)
+    figure.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=columns,
+        title=f"mean bounds over {seeds} seeds, thin: each seed" if seeds > 1 else "bounds of one seed",
+        title_fontsize=7,
+    )

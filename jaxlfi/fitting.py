@@ -1,0 +1,171 @@
+"""Fitting q_phi to a masked dataset by Adam, as one scan over passes."""
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from jaxlfi.dataset import Dataset
+from jaxlfi.estimator import Estimator, Network, initialise
+from jaxlfi.normalise import fit_normaliser, normalised
+from jaxlfi.support import Support
+
+STEPS_PER_PASS = 50
+"""Where gradient steps are counted, how many make a pass (after which the validation loss is looked at)."""
+
+
+@struct.dataclass
+class FitInfo:
+    """What happened while fitting; P passes, E ensemble members.
+
+    Attributes:
+        loss: mean training loss of each pass, negative log-density of theta scaled to [-1, 1]^D, shape [E, P].
+        validation_loss: the same over the held-out simulations after each pass; NaN without any, shape [E, P].
+        chosen_pass: the pass the weights were taken from, shape [E].
+        nonfinite: gradient steps skipped because the loss or its gradient was not finite, shape [E].
+    """
+
+    loss: Float[Array, "*batch passes"]
+    validation_loss: Float[Array, "*batch passes"]
+    chosen_pass: Int[Array, "*batch"]
+    nonfinite: Int[Array, "*batch"]
+
+
+@struct.dataclass
+class _Training:
+    params: dict
+    optimiser: optax.OptState
+    nonfinite: Int[Array, ""]
+
+
+@struct.dataclass
+class _Best:
+    params: dict
+    loss: Float[Array, ""]
+    at: Int[Array, ""]
+
+
+def fit(
+    key: jax.Array,
+    estimator: Estimator,
+    network: Network,
+    dataset: Dataset,
+    weights: Float[Array, " cap"],
+    scale: Support,
+    expected_size: Int[Array, ""] | int,
+) -> tuple[Network, FitInfo]:
+    """Train q_phi over the dataset (Algorithm 1, line 13).
+
+    Args:
+        key: consumed.
+        estimator: settings.
+        network: the last round's network; its weights are the start under `warm_start`, else replaced by fresh ones.
+            Its normaliser is replaced where the network starts anew.
+        dataset: simulations; only the filled rows are used.
+        weights: weight of each row in the loss, shape [C]; all ones without importance correction.
+        scale: the box that is scaled to [-1, 1]^D (Phi).
+        expected_size: filled rows if no simulation had failed. It sets the number of minibatches of an epoch and,
+            unlike the size itself, is the same for all lanes of a vmap, which then step together.
+
+    Returns:
+        The trained network and what happened.
+    """
+    key_init, key_fit = jax.random.split(key)
+    if not estimator.warm_start:
+        network = Network(
+            params=initialise(key_init, estimator, scale.dim, dataset.x.shape[-1]),
+            normaliser=fit_normaliser(estimator.normaliser, dataset.x, dataset.valid),
+        )
+    x = normalised(estimator.normaliser, network.normaliser, dataset.x)
+    theta = scale.to_unit(dataset.theta)
+
+    def one(key, params):
+        return _fit_member(key, estimator, params, theta, x, weights, dataset.size, expected_size)
+
+    params, info = jax.vmap(one)(jax.random.split(key_fit, estimator.members), network.params)
+    return Network(params, network.normaliser), info
+
+
+def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
+    """One member's training: a scan over passes, each a loop over minibatches."""
+    capacity, dim = theta.shape
+    module = estimator.module(dim)
+    adam = optax.adamw(estimator.learning_rate, weight_decay=estimator.weight_decay)
+    optimiser = optax.chain(optax.clip_by_global_norm(estimator.clip_norm), adam)
+    passes = estimator.epochs or max(1, estimator.steps // STEPS_PER_PASS)
+    batches = -(-expected_size // estimator.batch_size) if estimator.epochs else STEPS_PER_PASS
+
+    key_split, key_passes = jax.random.split(key)
+    rows = _shuffled(key_split, jnp.arange(capacity), size)
+    held_out = jnp.floor(estimator.validation * size).astype(jnp.int32)
+    training = jnp.maximum(size - held_out, 1)
+    held_out_places = jnp.arange(max(1, int(estimator.validation * capacity)))
+    held_out_rows = jnp.take(rows, training + held_out_places, mode="clip")
+    held_out_weights = jnp.where(held_out_places < held_out, weights[held_out_rows], 0.0)
+    mean_weight = jnp.sum(jnp.where(jnp.arange(capacity) < size, weights, 0.0)) / jnp.maximum(size, 1)
+    weights = weights / jnp.maximum(mean_weight, 1e-30)
+
+    def loss_of(params, rows):
+        return -jnp.mean(weights[rows] * module.apply(params, x[rows]).log_prob(theta[rows]))
+
+    def gradient_step(rows, state, rate):
+        loss, gradient = jax.value_and_grad(loss_of)(state.params, rows)
+        finite = jnp.isfinite(loss) & jnp.isfinite(optax.global_norm(gradient))
+        gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
+        updates, moments = optimiser.update(gradient, state.optimiser, state.params)
+        # A step that is not finite moves nothing, also not by the momentum of the steps before.
+        updates = jax.tree.map(lambda u: jnp.where(finite, rate, 0.0) * u, updates)
+        params = optax.apply_updates(state.params, updates)
+        return _Training(params, moments, state.nonfinite + ~finite), jnp.where(finite, loss, 0.0), finite
+
+    def one_pass(carry, inputs):
+        state, best = carry
+        key, index = inputs
+        order = _shuffled(key, rows, training)
+        rate = _rate(estimator.schedule, index / passes)
+
+        def minibatch(b, loop):
+            state, total, count = loop
+            chosen = order[(b * estimator.batch_size + jnp.arange(estimator.batch_size)) % training]
+            state, loss, finite = gradient_step(chosen, state, rate)
+            return state, total + loss, count + finite
+
+        state, total, count = jax.lax.fori_loop(0, batches, minibatch, (state, 0.0, 0))
+        loss = total / count  # NaN where no step of the pass was finite
+        if not estimator.validation:
+            return (state, _Best(state.params, jnp.inf, index)), (loss, jnp.nan)
+        log_prob = module.apply(state.params, x[held_out_rows]).log_prob(theta[held_out_rows])
+        validation = -jnp.sum(held_out_weights * jnp.where(held_out_weights > 0, log_prob, 0.0))
+        validation = validation / jnp.sum(held_out_weights)
+        better = validation < best.loss
+        best = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old), _Best(state.params, validation, index), best
+        )
+        return (state, best), (loss, validation)
+
+    def guarded_pass(carry, inputs):
+        _, best = carry
+        stopped = inputs[1] - best.at > estimator.patience
+        return jax.lax.cond(stopped, lambda c, _: (c, (jnp.nan, jnp.nan)), one_pass, carry, inputs)
+
+    state = _Training(params, optimiser.init(params), jnp.asarray(0))
+    best = _Best(params, jnp.asarray(jnp.inf), jnp.asarray(0))
+    inputs = (jax.random.split(key_passes, passes), jnp.arange(passes))
+    body = guarded_pass if estimator.patience else one_pass
+    (state, best), (losses, validation_losses) = jax.lax.scan(body, (state, best), inputs)
+    info = FitInfo(losses, validation_losses, best.at, state.nonfinite)
+    return best.params, info
+
+
+def _shuffled(key: jax.Array, rows: Int[Array, " cap"], count: Int[Array, ""]) -> Int[Array, " cap"]:
+    """The first `count` rows in random order, the others behind them."""
+    rank = jnp.where(jnp.arange(rows.shape[0]) < count, jax.random.uniform(key, rows.shape), 2.0)
+    return rows[jnp.argsort(rank)]
+
+
+def _rate(schedule: str, progress: Array) -> Array:
+    """The learning rate's factor at a point of progress through the round."""
+    if schedule == "cosine":
+        return 0.5 * (1 + jnp.cos(jnp.pi * progress))
+    return jnp.ones_like(progress)

@@ -1,0 +1,39 @@
+"""Choice: one of several heuristics, picked by a leaf, so that they can be lanes of one compiled program."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Int
+
+from jaxlfi.belief import Belief
+from jaxlfi.heuristics.base import Adaptation, Heuristic
+from jaxlfi.mixture import GaussianMixture
+from jaxlfi.support import Support
+
+
+@struct.dataclass
+class Choice:
+    """Apply `rules[index]`. The index is a leaf: `vmap` over it compares heuristics within one program.
+
+    All rules are evaluated (they cost microseconds) and one result is kept. The evidence of every rule is kept, under
+    "0/mass_left" and so on by the rule's place: what the others would have seen is worth a look too.
+
+    Attributes:
+        index: which rule to follow, shape [].
+        rules: the heuristics to choose from.
+    """
+
+    index: Int[Array, "*batch"] | int
+    rules: tuple[Heuristic, ...]
+
+    def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
+        """Evaluate every rule and keep the chosen one's belief and shifts."""
+        outcomes = [rule(previous, posterior, feasible) for rule in self.rules]
+        evidence = {
+            f"{place}/{name}": seen
+            for place, (_, adaptation) in enumerate(outcomes)
+            for name, seen in adaptation.evidence.items()
+        }
+        kept = [(belief, adaptation.low_shift, adaptation.high_shift) for belief, adaptation in outcomes]
+        belief, low_shift, high_shift = jax.tree.map(lambda *all_: jnp.stack(all_)[self.index], *kept)
+        return belief, Adaptation(evidence, low_shift, high_shift)

@@ -1,0 +1,54 @@
+"""MODE: stretch a bound that the modes of the posterior move towards (Algorithm 3)."""
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from jaxlfi.belief import Belief
+from jaxlfi.heuristics.base import Adaptation, adapted, stretch
+from jaxlfi.mixture import GaussianMixture
+from jaxlfi.support import Support
+
+
+@struct.dataclass
+class Mode:
+    """Mode-oriented domain expansion (Algorithm 3; defaults of section V).
+
+    Components are compared by their index with those of the previous posterior, which means something where the
+    network is trained on from round to round; `Matched(Mode())` pairs them first and is for networks that start anew.
+    There is no adaptation after the first round, which has no previous posterior. All hyperparameters are leaves,
+    scalar or one value a dimension.
+
+    Attributes:
+        shift_threshold: nu_TH, in the units of theta.
+        proximity: rho, how near a bound a mode must be, as a fraction of the width.
+        mass_threshold: tau, on the accumulated weights of the modes that pass both tests.
+        expansion: eta, the step as a fraction of the current width.
+
+    Example:
+        >>> Mode(proximity=0.3).expansion
+        0.2
+    """
+
+    shift_threshold: Float[Array, ""] | Float[Array, " dim"] | float = 0.01
+    proximity: Float[Array, ""] | Float[Array, " dim"] | float = 0.4
+    mass_threshold: Float[Array, ""] | Float[Array, " dim"] | float = 0.05
+    expansion: Float[Array, ""] | Float[Array, " dim"] | float = 0.2
+
+    def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
+        """Algorithm 3; the evidence is the mode shifts [K, D] and the accumulated weights W_L and W_R, [D]."""
+        box = previous.support
+        shift = jnp.where(previous.informed, posterior.means - previous.mixture.means, 0.0)
+        position = (posterior.means - box.low) / box.width
+        leftwards = (shift < -self.shift_threshold) & (jnp.abs(position) < self.proximity)
+        rightwards = (shift > self.shift_threshold) & (jnp.abs(1 - position) < self.proximity)
+        weights = posterior.weights[:, None]
+        weight_left = jnp.sum(jnp.where(leftwards, weights, 0.0), axis=0)
+        weight_right = jnp.sum(jnp.where(rightwards, weights, 0.0), axis=0)
+        # The first round has nothing to compare with: no weight, whatever the thresholds.
+        weight_left, weight_right = (jnp.where(previous.informed, w, 0.0) for w in (weight_left, weight_right))
+        support = stretch(
+            box, feasible, weight_left > self.mass_threshold, weight_right > self.mass_threshold, self.expansion
+        )
+        evidence = {"mode_shift": shift, "weight_left": weight_left, "weight_right": weight_right}
+        return adapted(previous, posterior, support, evidence)

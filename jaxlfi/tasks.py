@@ -1,0 +1,68 @@
+"""Finding tasks by name: entry points of installed packages, or `module:factory`."""
+
+import importlib
+import os
+import sys
+from importlib.metadata import entry_points
+
+from jaxlfi.task import Task
+
+GROUP = "jaxlfi.tasks"
+"""The entry-point group; a package adds a task with `[project.entry-points."jaxlfi.tasks"]` in its pyproject.toml."""
+
+
+def names() -> list[str]:
+    """Names of all registered tasks."""
+    return sorted({point.name for point in entry_points(group=GROUP)})
+
+
+def load(reference: str) -> Task:
+    """The task of that name.
+
+    Args:
+        reference: a registered name, or "module:factory" for a callable without arguments that returns a `Task` (or
+            a `Task` itself) in a module that can be imported from the current folder.
+
+    Raises:
+        ValueError: for unknown names, modules that cannot be imported, and things that are no tasks.
+
+    Example:
+        >>> load("envs.gaussian_linear:task").name
+        'gaussian_linear'
+    """
+    made = _made(reference, _factory(reference))
+    if not isinstance(made, Task):
+        raise ValueError(f"task: expected {reference!r} to give a jaxlfi.Task, got {type(made).__name__}")
+    return made
+
+
+def _factory(reference: str):
+    """What a reference points to: a `Task` or something that makes one."""
+    if ":" in reference:
+        module_name, _, attribute = reference.partition(":")
+        if os.getcwd() not in sys.path:
+            sys.path.insert(0, os.getcwd())
+        # A third party's module may raise anything while it is imported.
+        try:
+            return getattr(importlib.import_module(module_name), attribute)
+        except Exception as error:
+            raise ValueError(f"task: cannot load {reference!r}: {type(error).__name__}: {error}") from error
+    points = {point.name: point for point in entry_points(group=GROUP)}
+    if reference not in points:
+        raise ValueError(f"task: expected one of {sorted(points)} or module:factory, got {reference!r}")
+    try:
+        return points[reference].load()
+    except Exception as error:
+        raise ValueError(
+            f"task: cannot load {reference!r} ({points[reference].value}): {type(error).__name__}: {error}"
+        ) from error
+
+
+def _made(reference: str, factory) -> object:
+    """Call a factory."""
+    if isinstance(factory, Task) or not callable(factory):
+        return factory
+    try:
+        return factory()
+    except Exception as error:
+        raise ValueError(f"task: {reference!r} failed: {type(error).__name__}: {error}") from error

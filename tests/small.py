@@ -1,0 +1,76 @@
+"""What the tests of whole runs share: settings that take milliseconds, and one engine for many runs."""
+
+import dataclasses
+import functools
+
+import jax
+import pytest
+
+from envs import gaussian_linear
+from jaxlfi import lanes
+from jaxlfi.bayessim import Settings
+from jaxlfi.estimator import Estimator
+
+TASK = "envs.gaussian_linear:task"
+SETTINGS = Settings(
+    estimator=Estimator(hidden=(16,), learning_rate=1e-2, epochs=0, steps=100, batch_size=20, warm_start=False),
+    rounds=2,
+    additions=20,
+    attempts=25,
+)
+FLAGS = (
+    "--hidden 16 --activation tanh --normaliser zscore --learning-rate 1e-2 --steps 100 --batch-size 20 "
+    "--validation 0 --rounds 2 --additions 20 --attempts 25 --no-figures --no-cache"
+).split()
+"""The same on the command line."""
+
+gaussian = functools.cache(gaussian_linear.task)
+"""One task object, so that programs compiled for it are found again."""
+
+
+def settings(**changes) -> Settings:
+    """The small settings with some of them replaced."""
+    return dataclasses.replace(SETTINGS, **changes)
+
+
+class SharedEngine(lanes.LaneEngine):
+    """An engine that compiles once however many runs use it."""
+
+    def compile(self, state) -> None:
+        """Compile the first time only."""
+        if hasattr(self._round, "lower"):
+            super().compile(state)
+
+
+def share_engine(monkeypatch) -> None:
+    """Let all sessions of a test use one engine: they must have the same lanes and observations."""
+    from jaxlfi import session
+
+    made = []
+
+    def engine(task, settings, inputs):
+        if not made:
+            made.append(SharedEngine(task, settings, inputs))
+        return made[0]
+
+    monkeypatch.setattr(session, "LaneEngine", engine)
+
+
+def command(*arguments: str) -> int:
+    """Run the command line in this process; its exit status."""
+    from jaxlfi import cli
+
+    try:
+        return cli.main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        return stop.code
+
+
+@pytest.fixture(autouse=True, scope="module")
+def unchecked_keys():
+    """Switch JAX's key-reuse checker off: it takes a vmapped scan over keys for a reuse (jax 0.9.2).
+
+    Import this into a module of tests that vmap whole runs. Unbatched runs are checked elsewhere.
+    """
+    with jax.debug_key_reuse(False):
+        yield

@@ -1,0 +1,97 @@
+"""Belief: the two ways to keep draws in the box, and the belief before any data."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from scipy import stats
+from strategies import keys, problems
+
+from jaxlfi.belief import RESTRICTIONS, Belief, uninformed
+from jaxlfi.mixture import GaussianMixture
+from jaxlfi.support import Support
+
+CLIPPED = jax.jit(RESTRICTIONS["clip"], static_argnames="n")
+REJECTED = jax.jit(RESTRICTIONS["reject"], static_argnames=("n", "tries"))
+
+N = 20_000
+MEAN, SCALE = np.array([0.4, 5.0]), np.array([1.5, 0.7])
+GAUSSIAN = Belief(
+    GaussianMixture(jnp.zeros(1), jnp.asarray(MEAN)[None].astype(jnp.float32), jnp.diag(jnp.asarray(SCALE))[None]),
+    Support([0.0, 3.0], [2.0, 5.5]),
+    jnp.asarray(True),
+)
+"""An axis-aligned Gaussian, a third to a half of which lies in its box."""
+
+
+def truncated(d: int):
+    """The marginal of GAUSSIAN given its box."""
+    low, high = float(GAUSSIAN.support.low[d]), float(GAUSSIAN.support.high[d])
+    return stats.truncnorm((low - MEAN[d]) / SCALE[d], (high - MEAN[d]) / SCALE[d], MEAN[d], SCALE[d])
+
+
+def test_both_ways_are_tested():
+    assert set(RESTRICTIONS) == {"clip", "reject"}
+
+
+@pytest.mark.parametrize("restriction", [CLIPPED, REJECTED], ids=["clip", "reject"])
+@given(problems(), keys())
+def test_draws_stay_in_the_box(restriction, problem, key):
+    belief, _, _ = problem
+    draws, box = jax.device_get((restriction(key, belief, n=50), belief.support))
+    assert draws.shape == (50, box.dim)
+    assert ((draws >= box.low) & (draws <= box.high)).all()
+
+
+def test_clipping_puts_the_outside_mass_on_the_bounds(key):
+    draws = np.asarray(CLIPPED(key, GAUSSIAN, n=N))
+    for d in range(2):
+        low, high = float(GAUSSIAN.support.low[d]), float(GAUSSIAN.support.high[d])
+        normal = stats.norm(MEAN[d], SCALE[d])
+        for atom, mass in ((low, normal.cdf(low)), (high, normal.sf(high))):
+            assert abs((draws[:, d] == atom).mean() - mass) < 5 * np.sqrt(mass * (1 - mass) / N) + 1e-9
+        inside = draws[(draws[:, d] > low) & (draws[:, d] < high), d]
+        assert stats.kstest(inside, truncated(d).cdf).pvalue > 1e-3
+
+
+def test_rejection_draws_the_truncated_density(key):
+    draws = np.asarray(REJECTED(key, GAUSSIAN, n=N, tries=64))
+    for d in range(2):
+        assert stats.kstest(draws[:, d], truncated(d).cdf).pvalue > 1e-3
+    assert abs(np.corrcoef(draws.T)[0, 1]) < 5 / np.sqrt(N)
+
+
+def test_rejection_far_outside_falls_back_to_uniform_draws(key):
+    far = Belief(
+        GaussianMixture(jnp.zeros(2), jnp.full((2, 2), 1e3), jnp.tile(jnp.eye(2), (2, 1, 1))),
+        GAUSSIAN.support,
+        jnp.asarray(True),
+    )
+    draws = np.asarray(REJECTED(key, far, n=5000, tries=2))
+    for d in range(2):
+        box = stats.uniform(float(far.support.low[d]), float(far.support.width[d]))
+        assert stats.kstest(draws[:, d], box.cdf).pvalue > 1e-3
+
+
+def test_rejection_falls_back_only_where_no_try_is_inside(key):
+    """Half the mass far outside, tries = 1: half the draws are uniform, half are the narrow component's."""
+    split = Belief(
+        GaussianMixture(jnp.zeros(2), jnp.array([[0.5], [100.0]]), jnp.full((2, 1, 1), 1e-3)),
+        Support([0.0], [1.0]),
+        jnp.asarray(True),
+    )
+    narrow = np.abs(np.asarray(REJECTED(key, split, n=4000, tries=1)) - 0.5) < 5e-3
+    assert abs(narrow.mean() - 0.505) < 5 * 0.5 / np.sqrt(4000)
+
+
+def test_the_uninformed_belief_covers_its_box():
+    box = Support([-1.0, 10.0], [3.0, 30.0])
+    belief = uninformed(box, 3)
+    assert not bool(belief.informed) and belief.informed.dtype == bool
+    assert belief.support is box
+    np.testing.assert_allclose(belief.mixture.weights, np.full(3, 1 / 3), rtol=1e-6)
+    np.testing.assert_allclose(belief.mixture.means, [[1.0, 20.0]] * 3)
+    np.testing.assert_allclose(belief.mixture.marginal_scales, [[2.0, 10.0]] * 3)
+    np.testing.assert_allclose(belief.mixture.covariance, np.diag([4.0, 100.0]), atol=1e-5)
+    assert jax.tree.structure(belief) == jax.tree.structure(GAUSSIAN)

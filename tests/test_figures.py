@@ -1,0 +1,712 @@
+"""Figures: what is drawn is what was saved, for runs of all kinds, and nothing else is touched."""
+
+import csv
+import json
+import sys
+import warnings
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.image import imread
+from matplotlib.lines import Line2D
+from scipy import stats
+
+from jaxlfi.figures import (
+    curves,
+    density,
+    discrepancy,
+    efficiency,
+    load,
+    losses,
+    open_collection,
+    predictive,
+    report,
+    representative,
+    samples,
+    seeds,
+    statistics,
+    style,
+    supports,
+)
+
+COMPARED = ("ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre")
+TRUTH = np.log([0.01, 0.5, 1.0, 0.01])
+NAMES = ("ln predator birth", "ln predator death", "ln prey birth", "ln prey death")
+
+
+def write_run(
+    folder: Path,
+    *,
+    configuration: str = "misspecified+edge",
+    seed: int = 0,
+    dim: int = 4,
+    rounds: int = 6,
+    attempts: int = 30,
+    components: int = 4,
+    passes: int = 12,
+    records: int = 151,
+    channels: tuple[str, ...] = ("predators X", "prey Y"),
+    truth: bool = True,
+    failures: float = 0.2,
+) -> Path:
+    """A run folder such as the command line writes, of an inference that never took place.
+
+    Args:
+        folder: to make.
+        configuration: support and heuristic.
+        seed: of the run.
+        dim: parameters.
+        rounds: rounds.
+        attempts: simulations a round.
+        components: of the mixture.
+        passes: of training.
+        records: of a trajectory.
+        channels: of a trajectory.
+        truth: whether it is known.
+        failures: share of the first round's simulations and samples that fail.
+    """
+    rng = np.random.default_rng([seed, *configuration.encode()])
+    support, _, heuristic = configuration.partition("+")
+    target = np.resize(TRUTH, dim)
+    low, high = {"ok": (-5.0, 2.0), "broad": (-6.0, 4.0), "broadest": (-7.0, 7.0)}.get(support, (-5.0, 2.0))
+    low, high = np.full(dim, low), np.full(dim, high)
+    if support == "misspecified":
+        low[0], high[1 % dim] = -3.0, -1.5 if dim > 1 else 2.0
+    arrays: dict[str, list] = {}
+
+    def keep(name: str, value: np.ndarray) -> None:
+        arrays.setdefault(name, []).append(value)
+
+    fraction = 1.0
+    mean, scale = (low + high) / 2, (high - low) / 3
+    for i in range(rounds):
+        theta = (
+            rng.uniform(low, high, (attempts, dim))
+            if i == 0
+            else mean + scale * rng.normal(size=(attempts, dim))
+        )
+        theta = theta.clip(low, high)
+        fraction = failures * (0.7**i)
+        failure = rng.binomial(1, fraction, attempts) * rng.integers(1, 3, attempts)
+        kept = (failure == 0) & (np.cumsum(failure == 0) <= int(0.8 * attempts))
+        last = np.flatnonzero(kept)[-1] + 1 if kept.sum() == int(0.8 * attempts) else attempts
+        counted = np.arange(attempts) < last
+        for name, value in {"theta": theta, "counted": counted, "kept": kept, "failure": failure}.items():
+            keep(name, value)
+        keep("proposal_low", low), keep("proposal_high", high)
+        reach = target.clip(low, high)
+        mean = reach + (mean - reach) * 0.55 + 0.06 * rng.normal(size=dim)
+        scale = np.maximum(scale * 0.72, 0.12)
+        low, high = low.copy(), high.copy()
+        if heuristic == "edge":
+            low = np.where(mean - 1.5 * scale < low, np.maximum(low - 0.35, -6.0), low)
+            high = np.where(mean + 1.5 * scale > high, np.minimum(high + 0.35, 4.0), high)
+        elif heuristic == "mode":
+            low, high = (
+                np.maximum(low - 0.1 * rng.random(dim), -6.0),
+                np.minimum(high + 0.15 * rng.random(dim), 4.0),
+            )
+        elif heuristic == "centre":
+            half = (high - low) / 2
+            low, high = np.maximum(mean - half, -6.0), np.minimum(mean + half, 4.0)
+        keep("support_low", low), keep("support_high", high)
+        logits = rng.normal(size=components)
+        logits[-1] = -np.inf if components > 1 else 0.0
+        means = mean + 0.6 * scale * rng.normal(size=(components, dim))
+        factor = np.tril(0.3 * rng.normal(size=(components, dim, dim))) * (1 - np.eye(dim)) + 0.9 * np.eye(
+            dim
+        )
+        tril = scale[:, None] * factor
+        keep("logits", logits), keep("means", means), keep("scale_tril", tril)
+        steps = np.arange(1, passes + 1)
+        loss = -1.2 * i + 6 * np.exp(-4 * steps / passes) + 0.1 * rng.normal(size=(2, passes))
+        keep("loss", loss)
+        keep("validation_loss", loss + 0.6 + 0.8 * (steps / passes) ** 2)
+        draws = (mean + scale * rng.normal(size=(20, dim))).clip(low, high)
+        keep("sample_theta", draws)
+        keep("sample_theta_error", np.abs(draws - target) if truth else np.full((20, dim), np.nan))
+        error = 0.4 + np.abs(draws - target).mean(-1) * rng.uniform(0.5, 1.0, 20)
+        keep("sample_trajectory_error", np.where(rng.random(20) < fraction / 2, np.nan, error))
+    stacked = {name: np.stack(values) for name, values in arrays.items()}
+    counted, failure = stacked["counted"], stacked["failure"]
+    stacked["attempted"] = counted.sum(1)
+    stacked["succeeded"] = stacked["kept"].sum(1)
+    stacked["failed"] = np.stack([(counted & (failure == code)).sum(1) for code in (1, 2)], -1)
+    times = np.arange(records) * 0.2
+    phase = np.arange(len(channels)) * 1.3
+
+    def wave(shift: float) -> np.ndarray:
+        return 120 * np.exp(1.1 * np.sin(0.75 * times[:, None] + phase + shift)) / (1 + phase)
+
+    spread = stacked["sample_theta_error"][-1].mean() if truth else 0.4
+    predicted = np.stack([wave(0.5 * spread * rng.normal()) * np.exp(0.15 * rng.normal()) for _ in range(20)])
+    folder.mkdir(parents=True)
+    np.savez(
+        folder / "history.npz",
+        **stacked,
+        reasons=np.array(["too_many_events", "non_finite"]),
+        seconds=rng.uniform(1, 2, rounds),
+        final_trajectory=predicted,
+    )
+    names = np.array([NAMES[d % 4] + ("" if d < 4 else f" {d}") for d in range(dim)])
+    np.savez(
+        folder / "observation.npz",
+        trajectory=wave(0.0) * rng.lognormal(0, 0.1, (records, len(channels))),
+        x=np.zeros(9),
+        truth=target if truth else np.full(dim, np.nan),
+        names=names,
+        channels=np.array(channels, dtype=str),
+        times=times,
+    )
+    config = {
+        "format": "jaxlfi-run",
+        "task": "lotka_volterra",
+        "names": names.tolist(),
+        "units": ["ln(1/time)"] * dim,
+        "configuration": None,
+        "support": {"name": support, "low": stacked["proposal_low"][0].tolist()},
+        "heuristic": {"name": heuristic or "none", "matched": False, "hyperparameters": {}},
+        "preset": "quick",
+        "seed": seed,
+        "feasible_low": [-6.0] * dim,
+        "feasible_high": [4.0] * dim,
+        "command_line": "jaxlfi infer lotka_volterra --out <somewhere>",
+        "versions": {"python": "3.11.7", "jax": "0.9.2"},
+        "platform": {"system": "Linux", "cores": 2},
+    }
+    (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+def write_compare(folder: Path, configurations=COMPARED, count: int = 3, **options) -> Path:
+    """A folder of several configurations with several seeds each, and its table."""
+    rows = []
+    for name in configurations:
+        for seed in range(count):
+            run = load(
+                write_run(folder / name / f"seed_{seed:03d}", configuration=name, seed=seed, **options)
+            )
+            errors = run.final_theta_error, run.final_trajectory_error
+            rows.append([name, seed, *errors, run.success_rate, run.seconds.sum()])
+    config = {"format": "jaxlfi-compare", "task": "lotka_volterra", "preset": "quick"}
+    config |= {"command_line": "jaxlfi compare lotka_volterra --preset quick --seeds 3"}
+    (folder / "config.json").write_text(json.dumps(config))
+    with (folder / "table.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(
+            ["configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds"]
+        )
+        writer.writerows([["" if value != value else value for value in row] for row in rows])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """A comparison of six configurations with three seeds each."""
+    return open_collection(write_compare(tmp_path_factory.mktemp("compare")))
+
+
+@pytest.fixture(autouse=True)
+def untouched():
+    """Every test leaves matplotlib's settings alone, keeps out of pyplot, and warns of nothing."""
+    before = dict(matplotlib.rcParams)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+    assert dict(matplotlib.rcParams) == before
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    assert pyplot is None or not pyplot.get_fignums()
+
+
+def drawn(draw, *arguments, width=style.TEXT_WIDTH, height=4.0, **options):
+    """A figure after `draw`."""
+    with style.context():
+        figure = style.new_figure(width, height)
+        draw(figure, *arguments, **options)
+    return figure
+
+
+def panel(figure, title):
+    """The axes of a title."""
+    return next(axes for axes in figure.axes if axes.get_title().replace("\n", " ").endswith(title))
+
+
+def line(axes, label) -> Line2D:
+    """The line of a label."""
+    return next(artist for artist in axes.lines if artist.get_label() == label)
+
+
+def marked(axes, gid):
+    """What was drawn under a name."""
+    return [artist for artist in axes.get_children() if artist.get_gid() == gid]
+
+
+def points_of(image: Path) -> np.ndarray:
+    """A png as [height, width, 4]."""
+    return imread(image)
+
+
+# The mixture
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (2, 0), (3,)])
+def test_marginal_density_is_scipys_and_integrates_to_one(pair):
+    rng = np.random.default_rng(5)
+    logits, means = rng.normal(size=3), rng.normal(size=(3, 4))
+    tril = np.tril(0.3 * rng.normal(size=(3, 4, 4))) + 0.6 * np.eye(4)
+    tril[:, range(4), range(4)] = np.abs(tril[:, range(4), range(4)]) + 0.2
+    weight = density.weights(logits)
+    mean, covariance = density.marginal(means, tril, pair)
+    axis = np.linspace(-8, 8, 241)
+    points = np.stack(np.meshgrid(*[axis] * len(pair)), -1)
+    ours = density.density(points, weight, mean, covariance)
+    full = tril @ np.swapaxes(tril, 1, 2)
+    each = [
+        stats.multivariate_normal(m[list(pair)], c[np.ix_(pair, pair)])
+        for m, c in zip(means, full, strict=True)
+    ]
+    expected = sum(
+        w * normal.pdf(points) for w, normal in zip(np.exp(logits) / np.exp(logits).sum(), each, strict=True)
+    )
+    np.testing.assert_allclose(ours, expected.reshape(ours.shape), rtol=1e-9, atol=1e-12)
+    assert ours.sum() * (axis[1] - axis[0]) ** len(pair) == pytest.approx(1.0, abs=2e-3)
+
+
+def test_absent_components_and_volumeless_ones_weigh_nothing():
+    np.testing.assert_allclose(density.weights(np.array([0.0, -np.inf, 0.0])), [0.5, 0.0, 0.5])
+    assert np.isnan(density.weights(np.full(2, -np.inf))).all()
+    flat = density.density(np.zeros((1, 1)), np.ones(1), np.zeros((1, 1)), np.zeros((1, 1, 1)))
+    assert flat == [0.0]
+
+
+def test_grid_does_not_step_over_a_narrow_peak():
+    mean, scale = np.array([0.1234]), np.array([0.003])
+    grid = density.grid(-5, 5, mean, scale)
+    assert np.all(np.diff(grid) > 0)
+    assert grid[0] == -5
+    assert grid[-1] == 5
+    assert np.abs(grid - mean).min() < scale / 4
+
+
+# Statistics that leave NaN out
+
+
+def test_mean_and_sd_leave_nan_out():
+    values = np.array([[1.0, np.nan, 3.0], [np.nan] * 3])
+    np.testing.assert_allclose(statistics.mean(values, 1), [2.0, np.nan])
+    np.testing.assert_allclose(statistics.sd(values, 1), [np.sqrt(2.0), np.nan])
+    assert statistics.sd(np.array([4.0])) == 0
+    assert statistics.median(np.array([np.nan, 1.0, 5.0])) == 3.0
+    assert np.isnan(statistics.median(np.array([np.nan])))
+
+
+# What the pictures draw
+
+
+def test_samples_shows_proposals_boxes_means_and_truth(compared):
+    history = representative(compared.runs["misspecified+edge"])
+    figure = drawn(samples.draw, [history], height=5.0)
+    axes = figure.axes[0]
+    failed, kept, mean = (collection.get_offsets() for collection in axes.collections[:3])
+    np.testing.assert_allclose(kept, history.theta[history.kept][:, :2])
+    np.testing.assert_allclose(failed, history.theta[history.counted & (history.failure != 0)][:, :2])
+    accumulated = [history.theta[: i + 1][history.kept[: i + 1]].mean(0)[:2] for i in range(history.rounds)]
+    np.testing.assert_allclose(mean, accumulated)
+    boxes = np.array([[*box.get_xy(), box.get_width(), box.get_height()] for box in axes.patches])
+    low, high = history.proposal_low[:, :2], history.proposal_high[:, :2]
+    np.testing.assert_allclose(boxes, np.concatenate([low, high - low], 1))
+    assert len({to_hex(box.get_edgecolor()) for box in axes.patches}) == history.rounds
+    np.testing.assert_allclose(marked(axes, "truth")[0].get_xydata(), TRUTH[None, :2])
+    assert axes.get_xlabel() == "$\\theta_{1}$ ln predator birth\n[ln(1/time)]"
+
+
+def test_samples_shows_the_last_mixture_and_the_way_of_its_mean(compared):
+    history = representative(compared.runs["ok"])
+    figure = drawn(samples.draw, [history], height=5.0)
+    axes = figure.axes[1]
+    w = np.exp(history.logits) / np.exp(history.logits).sum(1, keepdims=True)
+    path = (w[..., None] * history.means).sum(1)[:, :2]
+    np.testing.assert_allclose(marked(axes, "weighted mean")[0].get_xydata(), path)
+    mesh = next(artist for artist in axes.collections if hasattr(artist, "get_coordinates"))
+    corners = np.asarray(mesh.get_coordinates())
+    area = np.diff(corners[0, :, 0])[None, :] * np.diff(corners[:, 0, 1])[:, None]
+    inside = float((np.asarray(mesh.get_array()).reshape(area.shape) * area).sum())
+    assert inside == pytest.approx(1.0, abs=0.05)
+    box = axes.patches[0]
+    np.testing.assert_allclose(box.get_xy(), history.support_low[-1, :2])
+
+
+def test_samples_pairs_all_parameters():
+    assert samples.pairs(1) == [(0,)]
+    assert samples.pairs(2) == [(0, 1)]
+    assert samples.pairs(3) == [(0, 1), (2, 0)]
+    assert samples.pairs(4) == [(0, 1), (2, 3)]
+    assert samples.pairs(5) == [(0, 1), (2, 3), (4, 0)]
+
+
+def test_efficiency_lines_are_means_over_seeds(compared):
+    figure = drawn(efficiency.draw, compared.runs)
+    histories = compared.runs["broad"]
+    attempted = np.stack([h.attempted for h in histories])
+    failed = np.stack([h.failed for h in histories])
+    draws = {
+        "attempted simulations": attempted,
+        "success rate [%]": 100 * (attempted - failed) / attempted,
+        "cumulated failures": failed.cumsum(1),
+    }
+    for title, values in draws.items():
+        shown = line(panel(figure, title), "broad")
+        np.testing.assert_allclose(shown.get_xdata(), np.arange(1, histories[0].rounds + 1))
+        np.testing.assert_allclose(shown.get_ydata(), values.mean(0))
+
+
+def test_curves_are_means_of_exp_of_negative_losses(compared):
+    figure = drawn(curves.draw, compared.runs, alpha=0.5)
+    histories = compared.runs["misspecified+mode"]
+    error = np.stack([h.trajectory_error for h in histories])
+    assert np.isnan(error).any()
+    expected = np.where(np.isnan(error), 0.0, np.exp(-0.5 * error)).mean((0, 2))
+    label = "misspecified + MODE"
+    np.testing.assert_allclose(line(panel(figure, "trajectory"), label).get_ydata(), expected)
+    for d, name in enumerate(NAMES):
+        theta = np.stack([h.theta_error[..., d] for h in histories])
+        np.testing.assert_allclose(
+            line(panel(figure, name), label).get_ydata(), np.exp(-0.5 * theta).mean((0, 2))
+        )
+
+
+def test_discrepancy_bars_are_means_with_standard_deviations(compared):
+    figure = drawn(discrepancy.draw, compared.runs)
+    for place, (name, histories) in enumerate(compared.runs.items()):
+        trajectory = np.concatenate([h.trajectory_error[-1] for h in histories])
+        trajectory = trajectory[~np.isnan(trajectory)]
+        expected = {"trajectory": trajectory}
+        expected |= {
+            n: np.concatenate([h.theta_error[-1, :, d] for h in histories]) for d, n in enumerate(NAMES)
+        }
+        for title, values in expected.items():
+            bars = panel(figure, title).containers
+            drawn_bars = [bar for bar in bars if bar.get_label() == style.configuration_label(name)]
+            patch = drawn_bars[0].patches[0]
+            assert patch.get_height() == pytest.approx(values.mean())
+            assert to_hex(patch.get_facecolor()) == style.looks([name])[name].colour.lower()
+            assert patch.get_x() + patch.get_width() / 2 == pytest.approx(place)
+            (low, high) = drawn_bars[0].errorbar.lines[2][0].get_segments()[0][:, 1]
+            assert high - low == pytest.approx(2 * values.std(ddof=1))
+
+
+def test_support_draws_the_configurations_that_adapt(compared):
+    assert set(supports.adapting(compared.runs)) == {n for n in COMPARED if "+" in n}
+    assert set(supports.adapting({"ok": compared.runs["ok"]})) == {"ok"}
+    figure = drawn(supports.draw, compared.runs)
+    axes = panel(figure, NAMES[1])
+    histories = compared.runs["misspecified+edge"]
+    upper = np.stack([np.concatenate([h.proposal_high[:1], h.support_high])[:, 1] for h in histories]).mean(0)
+    shown = [artist.get_ydata() for artist in axes.lines if artist.get_label() == "misspecified + EDGE"]
+    assert any(np.allclose(values, upper) for values in shown)
+    assert marked(axes, "truth")[0].get_ydata()[0] == pytest.approx(TRUTH[1])
+    assert sorted(limit.get_ydata()[0] for limit in marked(axes, "limit")) == [-6.0, 4.0]
+
+
+def test_losses_of_one_run_by_pass_and_of_many_by_round(compared):
+    history = compared.runs["ok"][0]
+    figure = drawn(losses.draw, {"ok": [history]})
+    for i, shown in enumerate(panel(figure, "training loss").lines):
+        np.testing.assert_allclose(shown.get_ydata(), history.loss[i].mean(0))
+    figure = drawn(losses.draw, compared.runs)
+    best = np.stack([h.validation_loss.mean(1).min(-1) for h in compared.runs["ok"]]).mean(0)
+    np.testing.assert_allclose(line(panel(figure, "validation loss"), "OK").get_ydata(), best)
+
+
+def test_losses_end_at_an_early_stop(tmp_path):
+    folder = write_run(tmp_path / "run", rounds=2)
+    change(
+        folder,
+        "history.npz",
+        lambda a: a["loss"].__setitem__((slice(None), slice(None), slice(5, None)), np.nan),
+    )
+    history = load(folder)
+    np.testing.assert_allclose(losses.by_round(history, "loss"), history.loss[:, :, 4].mean(1))
+
+
+def test_predictive_bands_are_quantiles_over_the_observation(compared):
+    history = compared.runs["ok"][0]
+    figure = drawn(predictive.draw, [history])
+    axes = figure.axes[1]
+    simulated = history.final_trajectory[np.isfinite(history.trajectory_error[-1]), :, 1]
+    np.testing.assert_allclose(marked(axes, "median")[0].get_ydata(), np.median(simulated, axis=0))
+    np.testing.assert_allclose(marked(axes, "observed")[0].get_ydata(), history.observed[:, 1])
+    assert marked(axes, "observed")[0].get_marker() == "None"
+    band = axes.collections[0].get_paths()[0].vertices[:, 1]
+    assert band.max() == pytest.approx(np.quantile(simulated, 0.95, axis=0).max())
+
+
+def test_predictive_shows_few_records_as_points(tmp_path):
+    history = load(write_run(tmp_path / "run", records=21))
+    observed = marked(drawn(predictive.draw, [history]).axes[0], "observed")[0]
+    assert (observed.get_marker(), observed.get_linestyle()) == ("o", "None")
+
+
+def test_seeds_marks_mean_and_median(compared):
+    values = compared.values("theta_error")
+    figure = drawn(seeds.draw, values, "error")
+    (axes,) = figure.axes
+    assert axes.get_yscale() == "log"
+    means = [mark.get_ydata()[0] for mark in marked(axes, "mean")]
+    np.testing.assert_allclose(means, [v.mean() for v in values.values()])
+    for name, every in values.items():
+        np.testing.assert_allclose(marked(axes, name)[0].get_ydata(), every)
+        medians = [artist.get_ydata() for artist in axes.lines]
+        assert any(len(m) == 2 and np.allclose(m, np.median(every)) for m in medians)
+
+
+# Colours
+
+
+def test_a_configuration_has_one_look_everywhere():
+    together = style.looks([*COMPARED, "broader", "broadest", "mine", "other+mine"])
+    for name in COMPARED:
+        assert style.looks([name])[name] == together[name]
+    assert len({look.colour for look in together.values()}) == len(together)
+    assert len({look.marker for look in together.values()}) == len(together)
+    assert together["misspecified+edge"].label == "misspecified + EDGE"
+    assert style.looks(["broad+edge"])["broad+edge"].colour != together["misspecified+edge"].colour
+
+
+def test_colours_stay_apart_for_the_colour_blind():
+    colours = [*style.SUPPORT_COLOURS.values(), *style.HEURISTIC_COLOURS.values()]
+    # Machado, Oliveira and Fernandes (2009), severity 1.
+    deficiencies = {
+        "normal": np.eye(3),
+        "protan": [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ],
+        "deutan": [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.011820, 0.042940, 0.968881],
+        ],
+        "tritan": [
+            [1.255528, -0.076749, -0.178779],
+            [-0.078411, 0.930809, 0.147602],
+            [0.004733, 0.691367, 0.303900],
+        ],
+    }
+    for matrix in deficiencies.values():
+        lab = np.array(
+            [cielab(np.clip(np.asarray(matrix) @ linear(to_rgb(colour)), 0, 1)) for colour in colours]
+        )
+        distance = np.linalg.norm(lab[:, None] - lab[None], axis=-1)[np.triu_indices(len(lab), 1)]
+        assert distance.min() > 20
+
+
+def linear(rgb) -> np.ndarray:
+    """sRGB to linear light."""
+    rgb = np.asarray(rgb)
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+
+
+def cielab(rgb: np.ndarray) -> np.ndarray:
+    """Linear light to CIELAB (D65)."""
+    matrix = [
+        [0.4124564, 0.3575761, 0.1804375],
+        [0.2126729, 0.7151522, 0.0721750],
+        [0.0193339, 0.1191920, 0.9503041],
+    ]
+    xyz = np.asarray(matrix) @ rgb / [0.95047, 1.0, 1.08883]
+    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def test_labels_name_symbol_and_unit():
+    assert style.parameter_label(["ln rate"], ["1/s"], 0) == "$\\theta_{1}$ ln rate\n[ln(1/s)]"
+    assert style.parameter_label(["a_b", "cost$"], ["", "N"], 1) == "$\\theta_{2}$ cost\\$\n[N]"
+    assert style.parameter_label(["a_b"], [""], 0) == "$\\theta_{1}$ a b"
+
+
+# Whole reports
+
+
+def names_of(paths: list[Path]) -> list[str]:
+    """File names without their folders."""
+    return [path.name for path in paths]
+
+
+EVERYTHING = ["samples", "efficiency", "curves", "discrepancy", "support", "losses", "predictive", "seeds"]
+
+
+def test_report_of_a_comparison(compared):
+    paths = report(compared.folder, dpi=40)
+    assert names_of(paths) == ["report.html", *(f"{name}.png" for name in EVERYTHING)]
+    for path in paths[1:]:
+        pixels = points_of(path)
+        assert pixels[..., :3].std() > 0.02
+        assert pixels.shape[1] in (round(40 * style.TEXT_WIDTH), round(40 * style.COLUMN_WIDTH))
+    page = paths[0].read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64,") == len(EVERYTHING)
+    assert "http" not in page.replace("http-equiv", "")
+    assert "jaxlfi compare lotka_volterra" in page
+    for name, values in compared.values("theta_error").items():
+        row = next(text for text in page.splitlines() if style.configuration_label(name) in text)
+        for number in (values.mean(), np.median(values), values.std(ddof=1)):
+            assert f">{number:.3g}<" in row
+
+
+@pytest.mark.parametrize(
+    ("options", "missing"),
+    [
+        ({"dim": 1, "channels": ("x",)}, {"seeds"}),
+        ({"dim": 3, "truth": False}, {"seeds"}),
+        ({"dim": 4, "rounds": 1, "passes": 1, "components": 1, "records": 21}, {"seeds"}),
+        ({"dim": 2, "failures": 1.0, "records": 1}, {"seeds", "predictive"}),
+    ],
+    ids=["one", "unknown-truth", "one-round", "all-failed"],
+)
+def test_report_of_one_run(tmp_path, options, missing):
+    paths = report(write_run(tmp_path / "run", **options), dpi=30)
+    assert names_of(paths[1:]) == [f"{name}.png" for name in EVERYTHING if name not in missing]
+    assert all(path.stat().st_size > 1000 for path in paths)
+    assert "&lt;somewhere&gt;" in paths[0].read_text(encoding="utf-8")
+
+
+def test_report_of_seeds(tmp_path):
+    for seed in range(3):
+        write_run(tmp_path / f"seed_{seed:03d}", seed=seed, dim=2)
+    (tmp_path / "config.json").write_text(json.dumps({"format": "jaxlfi-runs", "task": "two"}))
+    collection = open_collection(tmp_path)
+    errors = sorted(h.final_theta_error for h in collection.runs["misspecified+edge"])
+    assert representative(collection.runs["misspecified+edge"]).final_theta_error == errors[1]
+    np.testing.assert_allclose(sorted(collection.values("theta_error")["misspecified+edge"]), errors)
+    assert names_of(report(tmp_path, dpi=30)[1:]) == [f"{name}.png" for name in EVERYTHING]
+
+
+def test_report_of_a_comparison_without_truth(tmp_path):
+    write_compare(tmp_path, ("mine", "other+rule"), 2, truth=False, dim=1, rounds=2)
+    drawn_pictures = names_of(report(tmp_path, dpi=30)[1:])
+    assert drawn_pictures == [f"{name}.png" for name in EVERYTHING]
+
+
+def change(folder: Path, file: str, edit) -> None:
+    """Edit the arrays of a file."""
+    with np.load(folder / file) as stored:
+        arrays = dict(stored)
+    edit(arrays)
+    np.savez(folder / file, **arrays)
+
+
+def test_report_of_a_run_with_nothing_but_what_is_required(tmp_path):
+    folder = write_run(tmp_path / "run", dim=2)
+    needed = [
+        "theta",
+        "counted",
+        "kept",
+        "failure",
+        "proposal_low",
+        "proposal_high",
+        "support_low",
+        "support_high",
+    ]
+    needed += ["logits", "means", "scale_tril"]
+    change(folder, "history.npz", lambda a: [a.pop(name) for name in list(a) if name not in needed])
+    (folder / "observation.npz").unlink()
+    (folder / "config.json").write_text(json.dumps({"format": "jaxlfi-run"}))
+    assert names_of(report(folder, dpi=30)) == ["report.html", "samples.png", "efficiency.png", "support.png"]
+    history = load(folder)
+    assert history.names == ("theta 1", "theta 2")
+    np.testing.assert_array_equal(history.failed, (history.counted & (history.failure > 0)).sum(1))
+
+
+def test_report_survives_a_posterior_that_is_not_finite(tmp_path):
+    folder = write_run(tmp_path / "run", rounds=3)
+    change(folder, "history.npz", lambda a: [a[name].__setitem__(-1, np.nan) for name in ("logits", "means")])
+    figure = drawn(samples.draw, [load(folder)])
+    assert any("not finite" in text.get_text() for text in figure.axes[1].texts)
+
+
+def test_unfinished_runs_are_named_and_left_out(tmp_path):
+    write_compare(tmp_path, ("ok", "misspecified"), 2, dim=2, rounds=3)
+    (tmp_path / "ok" / "seed_001" / "history.npz").unlink()
+    shorter = tmp_path / "misspecified" / "seed_000"
+    change(
+        shorter, "history.npz", lambda a: a.update({n: v[:2] for n, v in a.items() if v.shape[:1] == (3,)})
+    )
+    collection = open_collection(tmp_path)
+    assert {name: len(runs) for name, runs in collection.runs.items()} == {"ok": 1, "misspecified": 1}
+    assert {Path(path).parent.name for path in collection.unfinished} == {"ok", "misspecified"}
+    assert "misspecified/seed_000" in report(tmp_path, dpi=30)[0].read_text(encoding="utf-8")
+
+
+# Folders that are none
+
+
+def spoil_array(name, edit):
+    """Spoil one array of history.npz."""
+    return lambda folder: change(folder, "history.npz", lambda a: a.__setitem__(name, edit(a[name])))
+
+
+SPOILED = {
+    "no config": (lambda f: (f / "config.json").unlink(), "found none"),
+    "config is no JSON": (lambda f: (f / "config.json").write_text("{"), "expected JSON"),
+    "config of another program": (lambda f: (f / "config.json").write_text("[1]"), "'format'"),
+    "foreign format": (lambda f: (f / "config.json").write_text('{"format": "other"}'), "got 'other'"),
+    "no history": (lambda f: (f / "history.npz").unlink(), "expected the file"),
+    "history is no npz": (lambda f: (f / "history.npz").write_bytes(b"PK\x03\x04 broken"), "cannot be read"),
+    "empty history": (lambda f: (f / "history.npz").write_bytes(b""), "cannot be read"),
+    "missing array": (lambda f: change(f, "history.npz", lambda a: a.pop("means")), "missing means"),
+    "wrong shape": (spoil_array("support_low", lambda v: v[:, :1]), "expected support_low of shape (2, 4)"),
+    "wrong samples": (
+        spoil_array("sample_theta_error", lambda v: v[0]),
+        "expected sample_theta_error of shape",
+    ),
+    "no rounds": (spoil_array("theta", lambda v: v[:0]), "at least one round"),
+    "pickles": (spoil_array("theta", lambda v: np.array([{}], dtype=object)), "cannot be read"),
+}
+
+
+@pytest.mark.parametrize(("spoil", "message"), SPOILED.values(), ids=SPOILED)
+def test_damaged_folders_are_refused_in_one_line(tmp_path, spoil, message):
+    folder = write_run(tmp_path / "run", rounds=2)
+    spoil(folder)
+    with pytest.raises(ValueError, match="expected") as caught:
+        report(folder)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not (folder / "figures").exists()
+    assert not (folder / "report.html").exists()
+
+
+def test_missing_and_empty_folders_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="expected a run folder, found none"):
+        report(tmp_path / "nowhere")
+    (tmp_path / "config.json").write_text('{"format": "jaxlfi-compare"}')
+    with pytest.raises(ValueError, match="expected finished rounds"):
+        report(tmp_path)
+    with pytest.raises(ValueError, match="found a file"):
+        report(tmp_path / "config.json")
+
+
+def test_a_damaged_table_and_unlike_runs_are_refused(tmp_path):
+    write_compare(tmp_path, ("ok", "misspecified"), 1, dim=2, rounds=2)
+    table = tmp_path / "table.csv"
+    whole = table.read_text()
+    table.write_text(whole.replace("theta_error", "error", 1))
+    with pytest.raises(ValueError, match=r"table\.csv: expected a table.*missing theta_error"):
+        report(tmp_path)
+    table.write_text(whole)
+    write_run(tmp_path / "broad" / "seed_000", configuration="broad", dim=3, rounds=2)
+    with pytest.raises(ValueError, match="expected runs of the same parameters"):
+        report(tmp_path)
+
+
+def test_configurations_come_in_the_order_of_the_config_or_the_papers(tmp_path, compared):
+    assert list(compared.runs) == list(COMPARED)
+    order = ["misspecified+edge", "ok", "mine"]
+    write_compare(tmp_path, order, 1, dim=1, rounds=1)
+    config = {"format": "jaxlfi-compare", "configurations": order}
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    assert list(open_collection(tmp_path).runs) == order

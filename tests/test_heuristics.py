@@ -1,0 +1,611 @@
+"""EDGE, MODE and CENTRE: against the paper's pseudocode, by their laws, and by the contract all heuristics keep."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from oracles import heuristics as oracle
+from scipy.optimize import linear_sum_assignment
+from strategies import floats, problems, vectors
+
+from jaxlfi.belief import Belief, uninformed
+from jaxlfi.heuristics import HEURISTICS, Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, stretch
+from jaxlfi.heuristics.matching import match
+from jaxlfi.mixture import GaussianMixture
+from jaxlfi.support import Support
+
+RULES = {name: rule() for name, rule in HEURISTICS.items()} | {
+    "matched": Matched(Mode()),
+    "choice": Choice(1, (Edge(), Mode(), Centre())),
+}
+apply = jax.jit(lambda rule, previous, posterior, feasible: rule(previous, posterior, feasible))
+
+
+def edges(zone_width: float = 1.0) -> st.SearchStrategy[Edge]:
+    """Edge with hyperparameters for which either outcome is likely."""
+    return st.builds(
+        Edge, floats(0.02, 0.4), floats(0.001, 0.6), floats(0.01, 1.5), floats(0, zone_width), floats(0, 1)
+    )
+
+
+def modes() -> st.SearchStrategy[Mode]:
+    """Mode with hyperparameters for which either outcome is likely."""
+    return st.builds(Mode, floats(0.0, 0.6), floats(0.1, 1.2), floats(0.0, 0.6), floats(0.01, 1.5))
+
+
+def any_rule() -> st.SearchStrategy[Heuristic]:
+    """One of the paper's heuristics."""
+    return st.one_of(edges(), modes(), st.just(Centre()))
+
+
+def decided(rule, previous, posterior, feasible, margin: float = 1e-3) -> bool:
+    """Whether every comparison the rule makes is decided by more than rounding."""
+    evidence = {name: np.asarray(seen) for name, seen in apply(rule, *(previous, posterior, feasible))[1].evidence.items()}
+    gaps = [np.ones(1)]
+    if isinstance(rule, Edge):
+        gaps += [evidence[side] - rule.mass_threshold for side in ("mass_left", "mass_right")]
+    if isinstance(rule, Mode):
+        box, means = previous.support, np.asarray(posterior.means)
+        z = (means - np.asarray(box.low)) / np.asarray(box.width)
+        gaps += [np.abs(evidence["mode_shift"]) - rule.shift_threshold]
+        gaps += [np.abs(z) - rule.proximity, np.abs(1 - z) - rule.proximity]
+        gaps += [evidence[side] - rule.mass_threshold for side in ("weight_left", "weight_right")]
+    return min(np.abs(gap).min() for gap in gaps) > margin
+
+
+def moved(belief: Belief, scale, shift) -> Belief:
+    """The belief in the coordinates scale * theta + shift, scale positive."""
+    box = belief.support
+    mixture = belief.mixture.affine(scale, shift)
+    return Belief(mixture, Support(scale * box.low + shift, scale * box.high + shift), belief.informed)
+
+
+def reflected(belief: Belief) -> Belief:
+    """The belief about -theta."""
+    mixture = belief.mixture
+    return Belief(
+        GaussianMixture(mixture.logits, -mixture.means, mixture.scale_tril),
+        Support(-belief.support.high, -belief.support.low),
+        belief.informed,
+    )
+
+
+def example(weights=(0.7, 0.3), before=((0.5, 3.0), (3.5, 4.0)), now=((0.1, 3.2), (3.9, 4.0))):
+    """Two components in the box [0, 4] x [2, 6], whose means moved."""
+    tril = jnp.array([[[0.4, 0.0], [0.1, 0.3]], [[0.2, 0.0], [-0.1, 0.5]]])
+    mixture = lambda means: GaussianMixture(jnp.log(jnp.array(weights)), jnp.array(means), tril)  # noqa: E731
+    box, feasible = Support([0.0, 2.0], [4.0, 6.0]), Support([-1.0, 0.0], [4.5, 20.0])
+    return Belief(mixture(before), box, jnp.asarray(True)), mixture(now), feasible
+
+
+# ---------------------------------------------------------------------------------------- the paper's pseudocode
+
+
+def random_cases(seed: int, n: int = 400, components: int = 3, dim: int = 3):
+    """Cases around boxes that touch Phi on some sides, stacked; components near the bounds, unlike on either side."""
+    draw = np.random.default_rng(seed)
+    low = draw.uniform(-3, 2, (n, dim))
+    width = draw.uniform(0.5, 5, (n, dim))
+    gaps = draw.uniform(0, 3, (2, n, dim)) * (draw.uniform(size=(2, n, dim)) > 0.25)
+    # Skewed towards the left bound, so that swapped sides cannot go unseen.
+    means = low[:, None] + width[:, None] * draw.beta(0.8, 1.3, (n, components, dim)) * 1.2 - 0.1
+    before = means + draw.normal(0.1, 0.4, means.shape)
+    tril = np.tril(draw.normal(0, 0.2, (n, components, dim, dim)), -1)
+    tril[..., np.arange(dim), np.arange(dim)] = draw.uniform(0.02, 0.4, (n, components, dim))
+    logits = draw.normal(0, 1, (2, n, components))
+    as_jax = lambda value: jnp.asarray(value, jnp.float32)  # noqa: E731
+    mixtures = [
+        GaussianMixture(as_jax(logits[i]), as_jax(mean), as_jax(tril)) for i, mean in enumerate((before, means))
+    ]
+    support = Support(as_jax(low), as_jax(low + width))
+    feasible = Support(as_jax(low - gaps[0]), as_jax(low + width + gaps[1]))
+    feasible = Support(jnp.minimum(feasible.low, support.low), jnp.maximum(feasible.high, support.high))
+    return Belief(mixtures[0], support, jnp.ones(n, bool)), mixtures[1], feasible
+
+
+def against_oracle(rule, cases, expected, names, thresholds, margins):
+    """Compare bounds and evidence case by case; return which way each bound went, [N, D] each.
+
+    Cases in which a comparison is within `margins` of a tie are left out: float32 and float64 may differ.
+    """
+    belief, adaptation = jax.device_get(jax.jit(jax.vmap(lambda *case: rule(*case)))(*cases))
+    previous, posterior, feasible = jax.device_get(cases)
+    compared = 0
+    for i in range(previous.informed.shape[0]):
+        pick = lambda leaf, i=i: np.asarray(leaf[i], np.float64)  # noqa: E731
+        box, phi = jax.tree.map(pick, (previous.support, feasible))
+        now, before = jax.tree.map(pick, (posterior, previous.mixture))
+        weights = np.exp(now.logits) / np.exp(now.logits).sum()
+        low, high, *evidence = expected(box, phi, weights, now, before)
+        for name, value in zip(names, evidence, strict=True):
+            np.testing.assert_allclose(adaptation.evidence[name][i], value, atol=2e-5, err_msg=name)
+        if any((np.abs(value - thresholds) < margins).any() for value in evidence):
+            continue
+        np.testing.assert_allclose(belief.support.low[i], low, atol=1e-5)
+        np.testing.assert_allclose(belief.support.high[i], high, atol=1e-5)
+        compared += 1
+    assert compared > 0.8 * previous.informed.shape[0]
+    np.testing.assert_array_equal(adaptation.low_shift, belief.support.low - previous.support.low)
+    np.testing.assert_array_equal(adaptation.high_shift, belief.support.high - previous.support.high)
+    return np.asarray(adaptation.low_shift), np.asarray(adaptation.high_shift)
+
+
+def every_outcome_occurs(cases, low_shift, high_shift, expansion):
+    """A bound that stayed, one that took the whole step and one that Phi stopped, on either side."""
+    previous, _, feasible = jax.device_get(cases)
+    step = expansion * np.asarray(previous.support.high - previous.support.low)
+    for shift, room in (
+        (-low_shift, previous.support.low - feasible.low),
+        (high_shift, feasible.high - previous.support.high),
+    ):
+        free = room > step + 1e-4
+        assert (free & (shift > 0)).sum() > 20
+        assert (~free & (shift > 0) & (shift < step - 1e-4)).sum() > 10
+        assert (free & (shift == 0)).sum() > 20
+
+
+@pytest.mark.parametrize(
+    ("rule", "seed"),
+    [
+        (Edge(), 0),
+        (Edge(zone_fraction=0.2, mass_threshold=0.1, expansion=0.5), 1),
+        (Edge(zone_fraction=0.0, zone_width=0.1, mass_threshold=0.05), 2),
+        (Edge(zone_fraction=0.1, mass_threshold=0.08, tail=0.0), 3),
+    ],
+    ids=["defaults", "wide", "absolute", "zone-alone"],
+)
+def test_edge_is_algorithm_2(rule, seed):
+    def expected(box, phi, weights, now, before):
+        scales = np.sqrt((now.scale_tril**2).sum(-1))
+        return oracle.edge(
+            box.low, box.high, phi.low, phi.high, weights, now.means, scales,
+            rule.zone_fraction, rule.mass_threshold, rule.expansion, rule.zone_width, rule.tail,
+        )  # fmt: skip
+
+    cases = random_cases(seed)
+    shifts = against_oracle(rule, cases, expected, ("mass_left", "mass_right"), rule.mass_threshold, 1e-4)
+    every_outcome_occurs(cases, *shifts, rule.expansion)
+
+
+@pytest.mark.parametrize(
+    ("rule", "seed"),
+    [(Mode(), 10), (Mode(shift_threshold=0.2, proximity=0.7, mass_threshold=0.3, expansion=0.6), 11)],
+    ids=["defaults", "strict"],
+)
+def test_mode_is_algorithm_3(rule, seed):
+    def expected(box, phi, weights, now, before):
+        return oracle.mode(
+            box.low, box.high, phi.low, phi.high, weights, now.means, before.means,
+            rule.shift_threshold, rule.proximity, rule.mass_threshold, rule.expansion, 1,
+        )  # fmt: skip
+
+    cases = random_cases(seed)
+    shifts = against_oracle(rule, cases, expected, ("weight_left", "weight_right"), rule.mass_threshold, 1e-4)
+    every_outcome_occurs(cases, *shifts, rule.expansion)
+
+
+def test_mode_does_nothing_in_the_first_iteration_of_algorithm_3():
+    box = oracle.mode([0.0], [1.0], [-1.0], [2.0], [1.0], np.array([[0.1]]), np.array([[0.9]]), 0.0, 1.0, 0.0, 0.2, 0)
+    assert (box[0], box[1]) == (0.0, 1.0)
+
+
+def test_centre_is_algorithm_4():
+    def expected(box, phi, weights, now, before):
+        return oracle.centre(box.low, box.high, phi.low, phi.high, weights, now.means)
+
+    cases = random_cases(20)
+    low_shift, high_shift = against_oracle(Centre(), cases, expected, (), 0.0, 0.0)
+    previous, _, feasible = jax.device_get(cases)
+    room_left, room_right = previous.support.low - feasible.low, feasible.high - previous.support.high
+    for stopped in (low_shift == -room_left, high_shift == room_right):
+        assert 50 < (stopped & (low_shift != 0)).sum() < 1000
+
+
+def test_edge_by_hand():
+    """Half of the mass left of 0.4 = 10 % of [0, 4] moves that bound by 20 %, the right one stays."""
+    box, feasible = Support([0.0], [4.0]), Support([-10.0], [10.0])
+    posterior = GaussianMixture(jnp.zeros(1), jnp.array([[0.4]]), jnp.array([[[1.0]]]))
+    belief, adaptation = Edge()(Belief(posterior, box, jnp.asarray(False)), posterior, feasible)
+    np.testing.assert_allclose(adaptation.evidence["mass_left"], [0.5], rtol=1e-6)
+    np.testing.assert_allclose(adaptation.evidence["mass_right"], [6.8714e-4], rtol=1e-3)
+    np.testing.assert_allclose(belief.support.low, [-0.8], rtol=1e-6)
+    np.testing.assert_array_equal(belief.support.high, [4.0])
+
+
+def test_mode_by_hand():
+    previous, posterior, feasible = example()
+    belief, adaptation = Mode()(previous, posterior, feasible)
+    # Dimension 0: 0.7 moved left next to the left bound (clamped at -0.8), 0.3 right next to the right one (at 4.5).
+    np.testing.assert_allclose(adaptation.evidence["mode_shift"], [[-0.4, 0.2], [0.4, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(adaptation.evidence["weight_left"], [0.7, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(adaptation.evidence["weight_right"], [0.3, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(belief.support.low, [-0.8, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(belief.support.high, [4.5, 6.0], rtol=1e-6)
+
+
+def test_centre_by_hand():
+    previous, posterior, feasible = example()
+    belief, adaptation = Centre()(previous, posterior, feasible)
+    np.testing.assert_allclose(adaptation.evidence["weighted_mean"], [1.24, 3.44], rtol=1e-6)
+    np.testing.assert_allclose(belief.support.low, [-0.76, 1.44], rtol=1e-5)
+    np.testing.assert_allclose(belief.support.high, [3.24, 5.44], rtol=1e-6)
+
+
+def test_stretch_moves_only_the_chosen_bounds_and_not_beyond_phi():
+    box, feasible = Support([0.0, 0.0, 0.0], [1.0, 2.0, 1.0]), Support([-0.1, -9.0, 0.0], [5.0, 9.0, 1.2])
+    left, right = jnp.array([True, False, True]), jnp.array([False, True, True])
+    stretched = stretch(box, feasible, left, right, 0.3)
+    np.testing.assert_allclose(stretched.low, [-0.1, 0.0, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(stretched.high, [1.0, 2.6, 1.2], rtol=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------------- the laws
+
+
+@pytest.mark.parametrize("name", RULES)
+@given(problems())
+def test_the_support_stays_in_phi(name, problem):
+    support, feasible = jax.device_get((apply(RULES[name], *problem)[0].support, problem[2]))
+    assert (support.low >= feasible.low).all() and (support.high <= feasible.high).all()
+    assert (support.low < support.high).all()
+
+
+@given(st.one_of(edges(), modes()), problems())
+def test_edge_and_mode_only_grow_and_by_no_more_than_a_step(rule, problem):
+    old, new = jax.device_get((problem[0].support, apply(rule, *problem)[0].support))
+    assert (new.low <= old.low).all() and (new.high >= old.high).all()
+    step = rule.expansion * old.width + 1e-5
+    assert (old.low - new.low <= step).all() and (new.high - old.high <= step).all()
+
+
+@given(problems())
+def test_centre_keeps_the_width_and_is_centred_where_phi_lets_it(problem):
+    previous, posterior, feasible = problem
+    new = apply(Centre(), *problem)[0].support
+    np.testing.assert_allclose(new.width, previous.support.width, atol=1e-5)
+    mean, half = np.asarray(posterior.mean), 0.5 * np.asarray(previous.support.width)
+    fits = (mean - half >= np.asarray(feasible.low)) & (mean + half <= np.asarray(feasible.high))
+    np.testing.assert_allclose(np.asarray(new.centre)[fits], mean[fits], atol=1e-5)
+
+
+def test_centre_of_a_box_wider_than_phi_is_phi():
+    previous, posterior, _ = example()
+    feasible = Support([1.0, 2.5], [3.0, 20.0])
+    new = Centre()(previous, posterior, feasible)[0].support
+    np.testing.assert_array_equal(new.low, [1.0, 2.5])
+    np.testing.assert_array_equal(new.high, [3.0, 6.5])
+
+
+def test_centre_does_not_leave_phi_by_rounding():
+    """Boxes as wide as Phi, where high - (high - low) is below low in float32 for many pairs."""
+    draw = np.random.default_rng(0)
+    low = (draw.normal(size=1000) * 10.0 ** draw.uniform(-3, 3, 1000)).astype(np.float32)
+    high = (low + 10.0 ** draw.uniform(-3, 3, 1000)).astype(np.float32)
+    assert (high - (high - low) < low).any()
+    feasible = Support(jnp.asarray(low), jnp.asarray(high))
+    far_left = GaussianMixture(jnp.zeros(1), feasible.low[None] - 1e4, jnp.eye(1000)[None])
+    far_right = GaussianMixture(jnp.zeros(1), feasible.high[None] + 1e4, jnp.eye(1000)[None])
+    for posterior in (far_left, far_right):
+        new = apply(Centre(), Belief(posterior, feasible, jnp.asarray(True)), posterior, feasible)[0].support
+        assert bool(jnp.all((new.low >= feasible.low) & (new.high <= feasible.high)))
+
+
+@given(any_rule(), problems())
+def test_reflection_swaps_left_and_right(rule, problem):
+    assume(decided(rule, *problem, margin=1e-5))
+    previous, posterior, feasible = problem
+    belief, adaptation = apply(rule, *problem)
+    turned = reflected(previous)
+    mirror = reflected(Belief(posterior, feasible, previous.informed))
+    mirrored, seen = apply(rule, turned, mirror.mixture, mirror.support)
+    np.testing.assert_allclose(mirrored.support.low, -belief.support.high, atol=1e-5)
+    np.testing.assert_allclose(mirrored.support.high, -belief.support.low, atol=1e-5)
+    np.testing.assert_allclose(seen.low_shift, -adaptation.high_shift, atol=2e-5)
+    swapped = {"mass_left": "mass_right", "mass_right": "mass_left",
+               "weight_left": "weight_right", "weight_right": "weight_left"}  # fmt: skip
+    for name, value in adaptation.evidence.items():
+        sign = 1.0 if name in swapped else -1.0
+        np.testing.assert_allclose(seen.evidence[swapped.get(name, name)], sign * value, atol=1e-5)
+
+
+@given(any_rule(), problems(), st.data())
+def test_translation_and_scaling_are_followed(rule, problem, data):
+    assume(decided(rule, *problem))
+    previous, posterior, feasible = problem
+    dim = previous.support.dim
+    scale = jnp.asarray(data.draw(vectors(0.1, 10.0, dim)))
+    shift = jnp.asarray(data.draw(vectors(-5.0, 5.0, dim)))
+    belief, _ = apply(rule, *problem)
+    if isinstance(rule, Edge):
+        rule = rule.replace(zone_width=rule.zone_width * scale)
+    if isinstance(rule, Mode):
+        rule = rule.replace(shift_threshold=rule.shift_threshold * scale)
+    phi = moved(Belief(posterior, feasible, previous.informed), scale, shift)
+    elsewhere, _ = apply(rule, moved(previous, scale, shift), phi.mixture, phi.support)
+    tolerance = 1e-4 * np.asarray(scale) + 1e-4
+    for there, here in ((elsewhere.support.low, belief.support.low), (elsewhere.support.high, belief.support.high)):
+        assert (np.abs(np.asarray(there - (scale * here + shift))) <= tolerance).all()
+
+
+@given(any_rule(), problems(components=4), st.permutations(range(4)))
+def test_the_order_of_components_does_not_matter(rule, problem, order):
+    """To EDGE and CENTRE; to MODE if both beliefs are reordered alike."""
+    assume(decided(rule, *problem, margin=1e-5))
+    previous, posterior, feasible = problem
+    order = jnp.asarray(order)
+    belief, _ = apply(rule, *problem)
+    if isinstance(rule, Mode):
+        previous = Belief(previous.mixture.permute(order), previous.support, previous.informed)
+    permuted, _ = apply(rule, previous, posterior.permute(order), feasible)
+    np.testing.assert_allclose(permuted.support.low, belief.support.low, atol=1e-5)
+    np.testing.assert_allclose(permuted.support.high, belief.support.high, atol=1e-5)
+
+
+@given(st.one_of(edges(), modes(), st.just(Centre())), problems(), st.data())
+def test_the_order_of_dimensions_does_not_matter(rule, problem, data):
+    dim = problem[0].support.dim
+    order = np.asarray(data.draw(st.permutations(range(dim))))
+    spread = 1 + 0.3 * np.arange(dim, dtype=np.float32)
+    rule = jax.tree.map(lambda value: jnp.asarray(value * spread), rule)
+    assume(decided(rule, *problem, margin=1e-5))
+
+    def reorder(tree):
+        def leaf(value):
+            value = np.asarray(value)
+            if value.ndim == 3:
+                covariance = (value @ np.swapaxes(value, 1, 2))[:, order][:, :, order]
+                return jnp.asarray(np.linalg.cholesky(covariance.astype(float)), jnp.float32)
+            return jnp.asarray(value[..., order])
+
+        return jax.tree.map(leaf, tree)
+
+    def keep_logits(mixture):
+        return GaussianMixture(mixture.logits, *(reorder(part) for part in (mixture.means, mixture.scale_tril)))
+
+    previous, posterior, feasible = problem
+    belief, _ = apply(rule, *problem)
+    turned = Belief(keep_logits(previous.mixture), reorder(previous.support), previous.informed)
+    reordered, _ = apply(reorder(rule), turned, keep_logits(posterior), reorder(feasible))
+    np.testing.assert_allclose(reordered.support.low, np.asarray(belief.support.low)[order], atol=1e-4)
+    np.testing.assert_allclose(reordered.support.high, np.asarray(belief.support.high)[order], atol=1e-4)
+
+
+@given(st.one_of(edges(), modes()), problems())
+def test_a_scalar_hyperparameter_is_a_constant_vector(rule, problem):
+    dim = problem[0].support.dim
+    as_vectors = jax.tree.map(lambda value: jnp.asarray(np.full(dim, value, np.float32)), rule)
+    chex.assert_trees_all_equal(apply(rule, *problem), apply(as_vectors, *problem))
+
+
+@given(problems(), vectors(0.25, 0.75, 3))
+def test_no_mass_at_the_edges_is_a_fixed_point_of_edge(problem, places):
+    previous, posterior, feasible = problem
+    box = previous.support
+    means = jnp.broadcast_to(box.low + box.width * places[: box.dim], posterior.means.shape)
+    narrow = 0.02 * jnp.broadcast_to(jnp.diag(box.width), posterior.scale_tril.shape)
+    inside = GaussianMixture(posterior.logits, means, narrow)
+    belief, adaptation = apply(Edge(), previous, inside, feasible)
+    chex.assert_trees_all_equal(belief.support, box)
+    assert not bool(jnp.any(adaptation.low_shift)) and not bool(jnp.any(adaptation.high_shift))
+
+
+@given(problems(), floats(-1.0, 0.0), floats(-1.0, 0.0))
+def test_mode_does_nothing_after_the_first_round(problem, shift_threshold, mass_threshold):
+    """Whatever the thresholds are, where a mode is and how it moved: there is nothing to compare with."""
+    previous, posterior, feasible = problem
+    rule = Mode(shift_threshold=shift_threshold, proximity=2.0, mass_threshold=0.0)
+    first = Belief(previous.mixture, previous.support, jnp.asarray(False))
+    for wrapped in (rule, Matched(rule)):
+        belief, adaptation = apply(wrapped, first, posterior, feasible)
+        chex.assert_trees_all_equal(belief.support, previous.support)
+        assert not np.asarray(adaptation.evidence["mode_shift"]).any()
+        assert bool(belief.informed)
+        chex.assert_trees_all_equal(belief.mixture, posterior)
+
+
+@given(problems(components=4))
+def test_choice_is_the_rule_it_chooses(problem):
+    rules = (Edge(), Mode(), Centre(), Fixed())
+    for index, rule in enumerate(rules):
+        belief, adaptation = apply(Choice(index, rules), *problem)
+        expected, alone = apply(rule, *problem)
+        chex.assert_trees_all_close(belief, expected, rtol=1e-6)
+        chex.assert_trees_all_close(adaptation.low_shift, alone.low_shift, atol=1e-6)
+        for name, value in alone.evidence.items():
+            np.testing.assert_allclose(adaptation.evidence[f"{index}/{name}"], value, atol=1e-6)
+
+
+def test_choice_keeps_what_every_rule_saw():
+    _, adaptation = Choice(1, (Edge(), Mode(), Centre()))(*example())
+    assert set(adaptation.evidence) == {
+        "0/mass_left", "0/mass_right", "1/mode_shift", "1/weight_left", "1/weight_right", "2/weighted_mean",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("rule", "hyperparameter"),
+    [
+        (Edge(mass_threshold=0.01), {"mass_threshold": [0.01, 2.0]}),
+        (Edge(mass_threshold=0.01), {"expansion": [0.2, 0.0]}),
+        (Mode(), {"shift_threshold": [0.01, 9.0]}),
+        (Mode(), {"proximity": [0.4, 0.0]}),
+        (Mode(), {"mass_threshold": [0.05, 2.0]}),
+        (Mode(), {"expansion": [0.2, 0.0]}),
+    ],
+)
+def test_hyperparameters_act_on_their_own_dimension(rule, hyperparameter):
+    """Both dimensions adapt with the scalar; a vector that forbids it in the second leaves the first as it was."""
+    problem = example(before=((0.5, 2.5), (0.6, 2.6)), now=((0.1, 2.1), (0.2, 2.2)))
+    free = rule(*problem)[0].support
+    assert bool(jnp.all(free.low < problem[0].support.low))
+    vector = rule.replace(**{name: jnp.array(value) for name, value in hyperparameter.items()})
+    held = vector(*problem)[0].support
+    np.testing.assert_allclose(held.low, [free.low[0], problem[0].support.low[1]], rtol=1e-6)
+
+
+def test_reading_f_zone_width_is_absolute_and_zone_fraction_relative():
+    previous, posterior, feasible = example()
+    box = previous.support
+    masses = {
+        label: rule(previous, posterior, feasible)[1].evidence["mass_left"]
+        for label, rule in {"F": Edge(zone_fraction=0.0, zone_width=0.3), "both": Edge(zone_width=0.3)}.items()
+    }
+    np.testing.assert_allclose(masses["F"], posterior.marginal_cdf(box.low + 0.3), rtol=1e-5)
+    np.testing.assert_allclose(masses["both"], posterior.marginal_cdf(box.low + 0.3 + 0.1 * box.width), rtol=1e-5)
+
+
+@pytest.mark.parametrize("tail", [0.0, 0.25, 1.0])
+def test_reading_g_tail_weighs_the_mass_beyond_the_bound(tail):
+    previous, posterior, feasible = example()
+    box = previous.support
+    evidence = Edge(tail=tail)(previous, posterior, feasible)[1].evidence
+    cdf = posterior.marginal_cdf
+    beyond, zone = cdf(box.low), cdf(box.low + 0.1 * box.width) - cdf(box.low)
+    np.testing.assert_allclose(evidence["mass_left"], zone + tail * beyond, rtol=1e-4)
+    beyond, zone = 1 - cdf(box.high), cdf(box.high) - cdf(box.high - 0.1 * box.width)
+    np.testing.assert_allclose(evidence["mass_right"], zone + tail * beyond, rtol=1e-4, atol=1e-7)
+
+
+def test_reading_g_keeps_edge_working_when_the_mode_has_left_the_box():
+    previous, posterior, feasible = example()
+    gone = GaussianMixture(posterior.logits, jnp.array([[-3.0, 4.0], [-3.5, 4.0]]), 0.1 * posterior.scale_tril)
+    with_tail, zone_alone = (Edge(tail=tail)(previous, gone, feasible)[0].support for tail in (1.0, 0.0))
+    np.testing.assert_allclose(with_tail.low, [-0.8, 2.0], rtol=1e-6)
+    np.testing.assert_array_equal(zone_alone.low, [0.0, 2.0])
+
+
+# ------------------------------------------------------------------------------------------------------- matching
+
+
+def apart(components: int, seed: int) -> GaussianMixture:
+    """Components a unit or more apart in each dimension."""
+    draw = np.random.default_rng(seed)
+    places = np.stack([draw.permutation(components), draw.permutation(components)], axis=1) + 0.5
+    return GaussianMixture(
+        jnp.asarray(draw.normal(size=components), jnp.float32),
+        jnp.asarray(places, jnp.float32),
+        jnp.asarray(draw.uniform(0.1, 1.0, (components, 1, 1)) * np.eye(2), jnp.float32),
+    )
+
+
+@pytest.mark.parametrize("components", [1, 4, 8])
+@given(st.data())
+def test_matching_undoes_any_relabelling(components, data):
+    """Up to six components every permutation is tried; eight are matched greedily."""
+    before = apart(components, data.draw(st.integers(0, 1000)))
+    steps = jnp.asarray(data.draw(vectors(-0.3, 0.3, components, 2)))
+    now = GaussianMixture(before.logits, before.means + steps, before.scale_tril)
+    box = Support([0.0, 0.0], [float(components), float(components)])
+    previous = Belief(before, box, jnp.asarray(True))
+    feasible = Support([-9.0, -9.0], [99.0, 99.0])
+    relabelled = now.permute(jnp.asarray(data.draw(st.permutations(range(components)))))
+    chex.assert_trees_all_equal(
+        apply(Matched(Mode()), previous, relabelled, feasible), apply(Mode(), previous, now, feasible)
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_matching_is_the_cheapest_assignment(seed):
+    draw = np.random.default_rng(seed)
+    before, now = (
+        GaussianMixture(jnp.zeros(5), jnp.asarray(means, jnp.float32), jnp.tile(jnp.eye(2), (5, 1, 1)))
+        for means in draw.normal(size=(2, 5, 2)) * [1.0, 30.0]
+    )
+    # Distances count in widths: the second dimension must not drown the first.
+    box = Support([0.0, 0.0], [1.0, 30.0])
+    cost = (((np.asarray(before.means)[:, None] - np.asarray(now.means)[None]) / [1.0, 30.0]) ** 2).sum(-1)
+    np.testing.assert_array_equal(jax.jit(match)(before, now, box), linear_sum_assignment(cost)[1])
+
+
+# --------------------------------------------------------------------------------------------------- the contract
+
+
+@pytest.fixture(params=RULES)
+def rule(request):
+    """Every heuristic by name, and the two wrappers."""
+    return RULES[request.param]
+
+
+def stack(*trees):
+    """Trees as one batch."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def variants():
+    """Three problems of one shape with different outcomes."""
+    return [example(), example(weights=(0.2, 0.8)), example(now=((2.0, 2.2), (2.0, 5.9)))]
+
+
+def test_heuristics_are_heuristics(rule):
+    assert isinstance(rule, Heuristic)
+
+
+def test_the_next_belief_holds_the_posterior(rule):
+    previous, posterior, feasible = example()
+    belief, adaptation = apply(rule, Belief(previous.mixture, previous.support, jnp.asarray(False)), posterior, feasible)
+    assert bool(belief.informed)
+    chex.assert_trees_all_equal(belief.mixture, posterior)
+    chex.assert_trees_all_equal_shapes_and_dtypes(belief, previous)
+    assert adaptation.low_shift.shape == adaptation.high_shift.shape == (2,)
+    assert all(seen.shape[-1] == 2 for seen in adaptation.evidence.values())
+
+
+def test_fixed_never_moves():
+    for problem in variants():
+        belief, adaptation = Fixed()(*problem)
+        assert belief.support is problem[0].support
+        assert adaptation.evidence == {} and not bool(jnp.any(adaptation.low_shift + adaptation.high_shift))
+
+
+def test_eager_is_jitted(rule):
+    chex.assert_trees_all_close(rule(*example()), apply(rule, *example()), rtol=1e-6, atol=1e-6)
+
+
+def test_vmap_is_a_loop(rule):
+    one_by_one = stack(*(apply(rule, *problem) for problem in variants()))
+    together = jax.jit(jax.vmap(lambda *problem: rule(*problem)))(*stack(*variants()))
+    chex.assert_trees_all_close(together, one_by_one, rtol=1e-6, atol=1e-6)
+
+
+def test_vmap_over_hyperparameters_is_a_loop(rule):
+    lanes = [rule, jax.tree.map(lambda value: value * 2, rule)]
+    if not jax.tree.leaves(rule):
+        pytest.skip("no hyperparameters")
+    together = jax.jit(jax.vmap(lambda lane: lane(*example())))(stack(*lanes))
+    chex.assert_trees_all_close(together, stack(*(apply(lane, *example()) for lane in lanes)), rtol=1e-6, atol=1e-6)
+
+
+def test_pytree_round_trip(rule):
+    for tree in (rule, apply(rule, *example())):
+        leaves, structure = jax.tree.flatten(tree)
+        again = jax.tree.unflatten(structure, leaves)
+        chex.assert_trees_all_equal(again, tree)
+        assert jax.tree.structure(again) == structure
+    assert all(isinstance(leaf, float | int) for leaf in jax.tree.leaves(rule))
+
+
+def test_other_hyperparameters_compile_nothing(rule):
+    traces = []
+
+    @jax.jit
+    def counted(rule, previous, posterior, feasible):
+        traces.append(None)
+        return rule(previous, posterior, feasible)
+
+    for lane in (rule, jax.tree.map(lambda value: value * 2, rule)):
+        for problem in variants():
+            counted(lane, *problem)
+    assert len(traces) == 1
+
+
+def test_derivatives_are_finite(rule):
+    previous, posterior, feasible = example()
+
+    def bounds(box, posterior):
+        support = rule(Belief(previous.mixture, box, previous.informed), posterior, feasible)[0].support
+        return jnp.sum(support.low) + 2.0 * jnp.sum(support.high)
+
+    chex.assert_tree_all_finite(jax.jit(jax.grad(bounds, argnums=(0, 1)))(previous.support, posterior))
