@@ -14,16 +14,19 @@ import os
 import time
 from pathlib import Path
 
-if __name__ == "__main__" and "XLA_FLAGS" not in os.environ:
-    os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={os.cpu_count() or 1}"
+from jaxlfi import compile_cache
+
+if __name__ == "__main__":  # before jax starts
+    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={os.cpu_count() or 1}")
+    compile_cache.enable()
 
 import jax
 import numpy as np
+from rich.console import Console
 
 from envs.lotka_volterra import task as lotka_volterra
-from jaxlfi import compile_cache
 from jaxlfi.bayessim import Settings
-from jaxlfi.describe import versions
+from jaxlfi.describe import heuristic_to_json, settings_to_json
 from jaxlfi.estimator import Estimator
 from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Matched, Mode
 from jaxlfi.history import theta_error, trajectory_error
@@ -31,7 +34,8 @@ from jaxlfi.keys import run_keys
 from jaxlfi.lanes import Lane, LaneEngine, rounds, stack_inputs
 from jaxlfi.observation import simulate_observation
 from jaxlfi.presets import QUICK
-from jaxlfi.progress import Progress
+from jaxlfi.progress import RoundProgress
+from jaxlfi.run_store import environment
 
 MATRIX: dict[str, tuple[str, str]] = {
     "ok": ("ok", "none"),
@@ -118,10 +122,10 @@ def run_variant(variant: Variant, seeds: int) -> dict[str, np.ndarray]:
     engine.compile(state)
     started = time.perf_counter()
     rows = []
-    with Progress("rounds", variant.settings.rounds) as progress:
-        for index, state, row in rounds(engine, state, 0, variant.settings.rounds):
+    with RoundProgress(Console(), variant.settings.rounds, 0, f"{len(lanes)} lanes") as progress:
+        for _, state, row in rounds(engine, state, 0, variant.settings.rounds):
             rows.append(row)
-            progress.advance(index + 1)
+            progress.advance()
     seconds = time.perf_counter() - started
 
     def arranged(values):
@@ -174,7 +178,6 @@ def main() -> None:
     parser.add_argument("--variants", nargs="+", choices=list(variants()), default=list(variants()))
     parser.add_argument("--out", type=Path, default=Path("experiments/results/ablation"))
     arguments = parser.parse_args()
-    compile_cache.enable()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.variants:
         path = arguments.out / f"{name}.npz"
@@ -185,9 +188,13 @@ def main() -> None:
         print(f"{name}: {variant.change}", flush=True)
         arrays = run_variant(variant, arguments.seeds)
         np.savez(path, **arrays, configurations=np.array(list(MATRIX)))
-        config = {"change": variant.change, "seeds": arguments.seeds, "versions": versions()}
-        config["settings"] = repr(variant.settings)
-        config["edge"] = repr(variant.edge)
+        config = {
+            "change": variant.change,
+            "seeds": arguments.seeds,
+            "settings": settings_to_json(variant.settings),
+            "edge": heuristic_to_json(variant.edge),
+            **environment(),
+        }
         path.with_suffix(".json").write_text(json.dumps(config, indent=2) + "\n")
     (arguments.out / "table.md").write_text(table(arguments.out))
     print(f"wrote {arguments.out / 'table.md'}")

@@ -51,6 +51,13 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], compress: bool = True, d
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz, each verified by its checksum."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+    """All arrays of an .npz, each verified by its checksum.
+
+    Raises:
+        ValueError: for a file that is missing, damaged, or something else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except Exception as error:  # zipfile, zlib, numpy and the operating system each have their own for a damaged file
+        raise ValueError(f"{path}: expected a whole .npz file, got a missing or damaged one") from error

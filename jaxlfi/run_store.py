@@ -17,7 +17,6 @@ import shlex
 import shutil
 import sys
 import tempfile
-import zipfile
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -264,8 +263,8 @@ def read_belief(folder: Path) -> Belief:
         mixture = GaussianMixture(arrays["logits"], arrays["means"], arrays["scale_tril"])
         # jnp: plain arrays would be checked as a reader's bounds are, and adapted boxes may be degenerate.
         support = Support(jnp.asarray(arrays["support_low"]), jnp.asarray(arrays["support_high"]))
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise StoreError(f"expected a posterior, got a missing or damaged {folder / 'posterior.npz'}") from error
+    except (ValueError, KeyError) as error:
+        raise StoreError(f"{folder / 'posterior.npz'}: expected a whole posterior, got {error}") from error
     return Belief(mixture, support, jnp.asarray(True))
 
 

@@ -264,12 +264,15 @@ def support_warnings(folder: Path, plan: Plan) -> Iterator[str]:
             continue
         masses = np.stack([np.stack(_edge_mass(belief)) for belief in own])  # [seed, side, D]
         bounds = own[0].support.low, own[0].support.high
-        for side, d in np.argwhere(np.any(masses > WARNING_MASS, axis=0)):
-            count, typical = np.sum(masses[:, side, d] > WARNING_MASS), np.median(masses[:, side, d])
+        places = [
+            f"{plan.task.coordinates[d]} {('lower', 'upper')[side]} {float(bounds[side][d]):.4g} "
+            f"({np.sum(masses[:, side, d] > WARNING_MASS)} of {len(own)} seeds)"
+            for side, d in np.argwhere(np.any(masses > WARNING_MASS, axis=0))
+        ]
+        if places:
             yield (
-                f"{configuration}: posterior mass piles up on the {('lower', 'upper')[side]} bound "
-                f"{float(bounds[side][d]):.4g} of {plan.task.coordinates[d]} in {count} of {len(own)} seeds "
-                f"(median {typical:.2f} of the mass); widen the support there, or adapt it with --heuristic edge"
+                f"{configuration}: more than {WARNING_MASS} of the posterior mass lies along a bound: "
+                f"{', '.join(places)}. Widen the support there, or adapt it with --heuristic edge."
             )
 
 

@@ -5,6 +5,7 @@ import functools
 
 import jax
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from envs import gaussian_linear
 from jaxlfi import lanes
@@ -20,7 +21,7 @@ SETTINGS = Settings(
 )
 FLAGS = (
     "--hidden 16 --activation tanh --normaliser zscore --learning-rate 1e-2 --steps 100 --batch-size 20 "
-    "--validation 0 --rounds 2 --additions 20 --attempts 25 --no-figures --no-cache"
+    "--validation 0 --rounds 2 --additions 20 --attempts 25 --no-figures"
 ).split()
 """The same on the command line."""
 
@@ -43,8 +44,8 @@ class SharedEngine(lanes.LaneEngine):
 
 
 def share_engine(monkeypatch) -> None:
-    """Let all sessions of a test use one engine: they must have the same lanes and observations."""
-    from jaxlfi import session
+    """Let all sessions of a test use one task and one engine: they must have the same lanes and observations."""
+    from jaxlfi import session, tasks
 
     made = []
 
@@ -54,6 +55,7 @@ def share_engine(monkeypatch) -> None:
         return made[0]
 
     monkeypatch.setattr(session, "LaneEngine", engine)
+    monkeypatch.setattr(tasks, "load", lambda reference: gaussian())
 
 
 def command(*arguments: str) -> int:
@@ -67,10 +69,20 @@ def command(*arguments: str) -> int:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def unchecked_keys():
-    """Switch JAX's key-reuse checker off: it takes a vmapped scan over keys for a reuse (jax 0.9.2).
+def whole_runs(tmp_path_factory):
+    """What tests of whole runs need of jax; import this into their module.
 
-    Import this into a module of tests that vmap whole runs. Unbatched runs are checked elsewhere.
+    A cache of compiled programs, shared with processes that a test starts: compiling is nearly all that these tests
+    wait for. And no key-reuse checker: it takes a vmapped scan over keys for a reuse (jax 0.9.2). Unbatched runs are
+    checked elsewhere.
     """
-    with jax.debug_key_reuse(False):
+    folder = str(tmp_path_factory.getbasetemp() / "xla")
+    with pytest.MonkeyPatch.context() as patch, jax.debug_key_reuse(False):
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", folder)
+        patch.setenv("TF_CPP_MIN_LOG_LEVEL", "3")
+        before = jax.config.jax_compilation_cache_dir
+        jax.config.update("jax_compilation_cache_dir", folder)
+        compilation_cache.reset_cache()  # so that the new folder is looked at
         yield
+        jax.config.update("jax_compilation_cache_dir", before)
+        compilation_cache.reset_cache()

@@ -145,6 +145,19 @@ class TestDistribution:
             assert stats.chisquare(counts, count * probabilities).pvalue > 1e-3, i
         assert (trajectory[..., 1 - species] == populations[1 - species]).all()
 
+    def test_waiting_time_is_independent_of_the_reaction(self):
+        """One predator, one prey: who dies first is a fair coin, whenever it is."""
+        count, rate, interval = 8192, 0.5, 0.02
+        process = lv.JumpProcess(1, 1, duration=20.0, interval=interval, record="before")
+        log_rates = [-np.inf, np.log(rate), -np.inf, np.log(rate)]
+        trajectory, _ = draw(24, log_rates, count, batched(process))
+        wait = interval * (trajectory.sum(-1) == 2).sum(-1)
+        predator_first = trajectory[:, -1, 1] == 1  # a lone prey stays, a lone predator dies on
+        assert abs(predator_first.mean() - 0.5) < 4 * 0.5 / np.sqrt(count)
+        error = 1 / (2 * rate) / np.sqrt(count)
+        assert abs(wait.mean() - interval / 2 - 1 / (2 * rate)) < 4 * error
+        assert abs(wait[predator_first].mean() - wait[~predator_first].mean()) < 4 * 2 * error
+
     def test_predator_birth_is_a_yule_process_at_constant_prey(self):
         rate, initial, prey, count = 0.7, 20, 10, 4096
         process = lv.JumpProcess(initial, prey, duration=2.0, interval=2.0, record="before")

@@ -11,7 +11,7 @@ from jaxlfi.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.describe import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json
 from jaxlfi.heuristics import Centre, Edge, Fixed, Matched, Mode
 from jaxlfi.presets import PRESETS
-from tests.small import FLAGS, TASK, command, share_engine, unchecked_keys  # noqa: F401 - a fixture
+from tests.small import FLAGS, TASK, command, share_engine, whole_runs  # noqa: F401 - a fixture
 
 ROUNDS, ADDITIONS, ATTEMPTS, DIM, COMPONENTS, OBS, SAMPLES = 2, 20, 25, 2, 4, 2, 20
 
@@ -165,7 +165,7 @@ def test_a_run_killed_at_any_write_resumes_to_the_same_bits(tmp_path, monkeypatc
         if not out.exists():  # not yet created: nothing was begun, and nothing is in the way
             continue
         created += 1
-        assert command("resume", out, "--no-figures", "--no-cache") == 0
+        assert command("resume", out, "--no-figures") == 0
         for seed in ("seed_000", "seed_001"):
             for name in ("posterior.npz", "dataset.npz"):
                 assert_same_arrays(tmp_path / "whole" / seed / name, out / seed / name)
@@ -216,7 +216,7 @@ def test_a_damaged_checkpoint_is_refused_and_left_alone(stopped, tmp_path, capsy
         pytest.skip("without a state a run begins with its first round")
     before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
     capsys.readouterr()
-    assert command("resume", out, "--no-figures", "--no-cache") == 2
+    assert command("resume", out, "--no-figures") == 2
     message = capsys.readouterr().err
     assert message.count("\n") == 1 and file in message and "expected" in message
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before

@@ -45,7 +45,7 @@ def density(points: np.ndarray, weight: np.ndarray, mean: np.ndarray, covariance
     return total
 
 
-def grid(low: float, high: float, mean: np.ndarray, scale: np.ndarray, points: int = 120) -> np.ndarray:
+def grid(low: float, high: float, mean: np.ndarray, scale: np.ndarray, points: int = 180) -> np.ndarray:
     """Points over an interval, closer around the components, so that no peak falls between them.
 
     Args:

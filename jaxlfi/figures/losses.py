@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from jaxlfi.figures import statistics
 from jaxlfi.figures.bands import draw_band, legend
@@ -86,11 +87,13 @@ def draw_passes(axes: Axes, history: History, panel: str) -> None:
     for i, line in enumerate(values):
         axes.plot(np.arange(1, len(line) + 1), line, marker=single, color=colours(norm(i + 1)), linewidth=0.8)
     axes.set_xlabel("pass")
-    if values.shape[1] > 1:
+    if values.shape[1] > 30:
         axes.set_xscale("log")
-        axes.set_xlim(1, values.shape[1])
+        axes.xaxis.set_minor_formatter(NullFormatter())
     else:
-        axes.set_xticks([1])
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
+    if values.shape[1] > 1:
+        axes.set_xlim(1, values.shape[1])
 
 
 def _limit(panels: list[Axes], values: list[np.ndarray]) -> None:

@@ -42,7 +42,8 @@ def closer_limits(histories: Sequence[History], d: int) -> tuple[float, float]:
     """Axis limits of a parameter around the last mixtures, the way to them, and the truth."""
     shown = [np.concatenate([h.weighted_means[:, d] for h in histories]), [h.truth[d] for h in histories]]
     for history in histories:
-        heavy = density.weights(history.logits[-1]) > 0.01
+        weight = density.weights(history.logits[-1])
+        heavy = weight > 0.2 * weight.max()
         mean = history.means[-1, heavy, d]
         scale = np.sqrt(np.sum(history.scale_tril[-1, heavy, d] ** 2, axis=-1))
         shown += [mean - 3 * scale, mean + 3 * scale]

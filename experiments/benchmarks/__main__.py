@@ -1,0 +1,8 @@
+"""All benchmarks, each in a process of its own: `python -m experiments.benchmarks`."""
+
+import subprocess
+import sys
+
+for name in ("lotka_volterra", "training"):
+    print(f"# {name}\n", flush=True)
+    subprocess.run([sys.executable, "-m", f"experiments.benchmarks.{name}"], check=True)

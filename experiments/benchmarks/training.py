@@ -1,0 +1,241 @@
+"""Speed of training and of whole runs: `python -m experiments.benchmarks.training`.
+
+Prints
+
+* milliseconds a gradient step (batch of 100, four full-covariance Gaussians in four dimensions), for the network of each
+  preset, ours and PyTorch's (needs the `bench` extra), against the floor of its matrix products: their operations, divided by
+  the rate at which this machine multiplies large matrices;
+* a whole inference run of `quick` compiled as one program, against its rounds called one by one, and against its
+  parts (proposals, simulation, update) called one by one;
+* seconds of compilation, cold and from the cache on disk.
+
+Best and median of several calls are shown, since other programs may share the machine. One device, all its cores.
+"""
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.lotka_volterra import task as lotka_volterra
+from jaxlfi import bayessim, dataset
+from jaxlfi.estimator import Estimator, Network, initialise
+from jaxlfi.fitting import fit
+from jaxlfi.heuristics import Edge
+from jaxlfi.normalise import fit_normaliser
+from jaxlfi.presets import PRESETS
+from jaxlfi.simulation import simulate, within_budget
+
+BATCH, DIM, OBS = 100, 4, 9
+ROWS = 1000
+REPEATS = 5
+
+
+def measure(call: Callable[[], object], repeats: int = REPEATS) -> tuple[float, float]:
+    """Best and median seconds of a call, after one that warms it up."""
+    call()
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds), statistics.median(seconds)
+
+
+def products(estimator: Estimator) -> int:
+    """Floating-point operations of a step's matrix products: forward, and twice that backward."""
+    heads = estimator.components * (1 + DIM + DIM * (DIM + 1) // 2)
+    layers = (OBS, *estimator.hidden, heads)
+    return 3 * 2 * BATCH * sum(a * b for a, b in zip(layers, layers[1:], strict=False))
+
+
+def matrix_rate() -> float:
+    """Operations a second of a large float32 matrix product."""
+    a = jnp.ones((2048, 2048))
+    multiply = jax.jit(jnp.matmul)
+    best, _ = measure(lambda: jax.block_until_ready(multiply(a, a)))
+    return 2 * 2048**3 / best
+
+
+def our_step(estimator: Estimator, passes: int) -> tuple[float, float]:
+    """Best and median seconds of one of our gradient steps, in a fit of many."""
+    estimator = estimator.replace(epochs=passes, steps=0, members=1)
+    task = lotka_volterra()
+    key = jax.random.key(0)
+    data = dataset.Dataset(
+        theta=task.feasible.sample(key, ROWS),
+        x=jax.random.normal(key, (ROWS, OBS)),
+        round=jnp.zeros(ROWS, jnp.int32),
+        size=jnp.asarray(ROWS),
+    )
+    network = Network(
+        initialise(key, estimator, DIM, OBS), fit_normaliser(estimator.normaliser, data.x, data.valid)
+    )
+    run = jax.jit(
+        lambda key: fit(key, estimator, network, data, jnp.ones(ROWS), task.feasible, ROWS)[1].loss
+    )
+    steps = passes * ROWS // BATCH
+    return tuple(seconds / steps for seconds in measure(lambda: jax.block_until_ready(run(key))))
+
+
+def torch_step(estimator: Estimator, steps: int) -> tuple[float, float] | None:
+    """The same step as a PyTorch user writes it; None where PyTorch is not installed."""
+    try:
+        import torch
+    except ImportError:
+        return None
+    components, below = estimator.components, DIM * (DIM - 1) // 2
+    activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.SiLU}[estimator.activation]
+    layers: list[torch.nn.Module] = []
+    width = OBS
+    for units in estimator.hidden:
+        layers += [torch.nn.Linear(width, units), activation()]
+        width = units
+    network = torch.nn.Sequential(*layers, torch.nn.Linear(width, components * (1 + 2 * DIM + below)))
+    optimiser = torch.optim.Adam(network.parameters(), lr=float(estimator.learning_rate))
+    x, theta = torch.randn(ROWS, OBS), torch.rand(ROWS, DIM) * 2 - 1
+    row, column = torch.tril_indices(DIM, DIM, -1)
+
+    def loss_of(x, theta):
+        parts = torch.split(network(x), [components, components * DIM, components * DIM, components * below], dim=-1)
+        logits, means, diagonal, lower = parts
+        factor = torch.diag_embed(torch.exp(diagonal.view(-1, components, DIM)))
+        factor[..., row, column] = lower.view(-1, components, below)
+        mixture = torch.distributions.MixtureSameFamily(
+            torch.distributions.Categorical(logits=logits),
+            torch.distributions.MultivariateNormal(
+                means.view(-1, components, DIM), scale_tril=factor, validate_args=False
+            ),
+        )
+        return -mixture.log_prob(theta).mean()
+
+    def train():
+        for _ in range(steps):
+            rows = torch.randint(ROWS, (BATCH,))
+            optimiser.zero_grad()
+            loss_of(x[rows], theta[rows]).backward()
+            optimiser.step()
+
+    return tuple(seconds / steps for seconds in measure(train, repeats=3))
+
+
+def step_table() -> None:
+    """Milliseconds a gradient step."""
+    rate = matrix_rate()
+    print(f"Large matrix products run at {rate / 1e9:.0f} GFLOP/s here.\n")
+    print(f"{'gradient step':<24}{'ours, ms':>12}{'(median)':>10}{'PyTorch, ms':>13}{'(median)':>10}{'floor, ms':>11}")
+    for preset, passes, steps in (("quick", 100, 300), ("paper", 4, 20)):
+        estimator = PRESETS[preset].estimator
+        best, median = our_step(estimator, passes)
+        other = torch_step(estimator, steps)
+        layers = "x".join(map(str, estimator.hidden))
+        torch_cells = f"{other[0] * 1e3:>13.2f}{other[1] * 1e3:>10.2f}" if other else f"{'not installed':>23}"
+        print(
+            f"{preset + ' ' + layers:<24}{best * 1e3:>12.3f}{median * 1e3:>10.3f}{torch_cells}"
+            f"{products(estimator) / rate * 1e3:>11.3f}"
+        )
+    print()
+
+
+def run_table() -> None:
+    """A whole run, one program or many."""
+    task, settings, heuristic = lotka_volterra(), PRESETS["quick"], Edge()
+    support = task.support("misspecified")
+    observed = jax.jit(lambda key: task.summary(task.simulate(key, task.truth)[0]))(jax.random.key(1))
+    key = jax.random.key(0)
+
+    whole = jax.jit(lambda key: bayessim.run(key, task, settings, heuristic, observed, support))
+    start = jax.jit(lambda key: bayessim.init(key, task, support, settings, observed))
+    step = jax.jit(lambda key, state, i: bayessim.step(key, task, settings, heuristic, observed, state, i))
+    propose = jax.jit(lambda key, belief: bayessim.propose(key, task, settings, belief))
+    attempt = jax.jit(lambda key, theta: simulate(key, task, theta))
+
+    @jax.jit
+    def update(key, state, i, theta, x, failure):
+        attempts = within_budget(theta, x, failure, settings.additions)
+        return bayessim.update(key, task, settings, heuristic, observed, state, i, attempts)
+
+    spent = dict.fromkeys(("proposals", "simulation", "update"), 0.0)
+
+    def stepwise():
+        key_init, key_rounds = jax.random.split(key)
+        state = start(key_init)
+        for i in range(settings.rounds):
+            state, _ = step(jax.random.fold_in(key_rounds, i), state, i)
+        jax.block_until_ready(state)
+
+    def timed(name, call, *arguments):
+        begin = time.perf_counter()
+        result = jax.block_until_ready(call(*arguments))
+        spent[name] += time.perf_counter() - begin
+        return result
+
+    def by_parts():
+        spent.update(dict.fromkeys(spent, 0.0))
+        key_init, key_rounds = jax.random.split(key)
+        state = start(key_init)
+        for i in range(settings.rounds):
+            key_propose, key_simulate, key_update = jax.random.split(jax.random.fold_in(key_rounds, i), 3)
+            theta = timed("proposals", propose, key_propose, state.belief)
+            x, failure = timed("simulation", attempt, key_simulate, theta)
+            state, _ = timed("update", update, key_update, state, i, theta, x, failure)
+
+    print(f"{'a whole run of quick, one lane':<40}{'best, s':>10}{'median, s':>11}")
+    for name, call in (
+        ("one compiled program", lambda: jax.block_until_ready(whole(key))),
+        ("its rounds, one call each", stepwise),
+        ("its parts, one call each", by_parts),
+    ):
+        best, median = measure(call)
+        print(f"{name:<40}{best:>10.2f}{median:>11.2f}")
+    print("parts of the last: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in spent.items()) + "\n")
+
+
+_COMPILE_ONE_RUN = """
+import time
+from jaxlfi import compile_cache
+compile_cache.enable()
+import jax, jax.numpy as jnp
+from envs.lotka_volterra import task as factory
+from jaxlfi import bayessim
+from jaxlfi.heuristics import Edge
+from jaxlfi.presets import QUICK
+task = factory()
+run = jax.jit(lambda key: bayessim.run(key, task, QUICK, Edge(), jnp.zeros(9), task.support("ok")))
+lowered = run.lower(jax.random.key(0))
+start = time.perf_counter()
+lowered.compile()
+print(time.perf_counter() - start)
+"""
+
+
+def compile_table() -> None:
+    """Seconds of compiling a whole run, in fresh processes that share an empty cache."""
+    print(f"{'compiling a whole run of quick':<40}{'s':>10}")
+    with tempfile.TemporaryDirectory() as cache:
+        environment = {**os.environ, "XDG_CACHE_HOME": cache}
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        for name in ("cold", "from the cache on disk"):
+            done = subprocess.run(
+                [sys.executable, "-c", _COMPILE_ONE_RUN], env=environment, capture_output=True, text=True, check=True
+            )
+            print(f"{name:<40}{float(np.float64(done.stdout.strip())):>10.2f}")
+    print()
+
+
+def main() -> None:
+    """All three tables."""
+    step_table()
+    run_table()
+    compile_table()
+
+
+if __name__ == "__main__":
+    main()

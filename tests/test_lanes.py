@@ -1,0 +1,124 @@
+"""Lanes: many runs as one program give what each gives alone, on one device and on two."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlfi import bayessim, lanes
+from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
+from jaxlfi.history import own_evidence
+from jaxlfi.keys import run_keys
+from jaxlfi.lanes import Lane, LaneEngine, stack_heuristics, stack_inputs
+from jaxlfi.run_store import read_belief
+from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
+
+OBSERVED = np.array([0.8, -0.6], np.float32)
+
+
+def lane(support: str, heuristic, seed: int) -> Lane:
+    """A lane of the Gaussian task."""
+    return Lane(support, support, gaussian().support(support), heuristic, seed)
+
+
+LANES = [
+    lane("ok", Fixed(), 0),
+    lane("misspecified", Edge(), 0),
+    lane("misspecified", Matched(Mode()), 1),
+    lane("broad", Edge(expansion=0.5), 1),
+    lane("misspecified", Centre(), 2),
+]
+
+
+@pytest.fixture(scope="module")
+def stepped():
+    """The five lanes after two rounds, with every round's record."""
+    observed = np.tile(OBSERVED, (len(LANES), 1))
+    inputs, places = stack_inputs(LANES, observed, observed)
+    engine = LaneEngine(gaussian(), SETTINGS, inputs)
+    state, rows = engine.start(), []
+    for index in range(SETTINGS.rounds):
+        state, row = engine.round(state, index)
+        rows.append(row)
+    return engine.fetch(state), rows, places
+
+
+@pytest.mark.parametrize("index", range(len(LANES)))
+def test_each_lane_is_the_pure_run_of_its_seed(stepped, index):
+    state, _, _ = stepped
+    own = LANES[index]
+    key = run_keys(jax.random.key(own.seed)).run
+    alone, _ = _run(key, own.heuristic, own.support)
+    for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_allclose(ours[index], theirs, rtol=2e-3, atol=2e-3)
+
+
+@jax.jit
+def _run(key, heuristic, support):
+    return bayessim.run(key, gaussian(), SETTINGS, heuristic, jnp.asarray(OBSERVED), support)
+
+
+def test_lanes_of_one_seed_share_their_first_draws(stepped):
+    _, rows, _ = stepped
+    theta = rows[0]["theta"]
+    unit = [(t - np.asarray(x.support.low)) / np.asarray(x.support.width) for t, x in zip(theta, LANES, strict=True)]
+    np.testing.assert_allclose(unit[0], unit[1], atol=1e-5)
+    assert not np.allclose(unit[1], unit[2], atol=1e-2)
+
+
+def test_evidence_is_the_lanes_own(stepped):
+    _, rows, places = stepped
+    seen = [
+        {name for name in own_evidence(rows[0], place) if name.startswith("evidence/")} for place in places
+    ]
+    assert seen[0] == set()
+    assert seen[1] == seen[3] == {"evidence/mass_left", "evidence/mass_right"}
+    assert seen[2] == {"evidence/mode_shift", "evidence/weight_left", "evidence/weight_right"}
+    assert seen[4] == {"evidence/weighted_mean"}
+
+
+def test_one_kind_of_rule_needs_no_choice():
+    stacked, places = stack_heuristics([Edge(), Edge(mass_threshold=0.5)])
+    assert isinstance(stacked, Edge) and places == [None, None]
+    np.testing.assert_allclose(stacked.mass_threshold, [0.005, 0.5])
+
+
+def test_rules_of_one_structure_share_a_place_in_the_choice():
+    stacked, places = stack_heuristics([Edge(), Fixed(), Edge(expansion=0.3)])
+    assert isinstance(stacked, Choice) and places == [0, 1, 0]
+    np.testing.assert_allclose(stacked.rules[0].expansion[jnp.array([0, 2])], [0.2, 0.3])
+
+
+def test_inputs_are_padded_to_the_devices():
+    observed = np.tile(OBSERVED, (3, 1))
+    inputs, _ = stack_inputs(LANES[:3], observed, observed)
+    engine = LaneEngine(gaussian(), SETTINGS, inputs)
+    assert engine.place(jnp.arange(3)).tolist() == [0, 1, 2]  # one device: nothing to pad
+    assert engine.fetch(jnp.arange(4)).tolist() == [0, 1, 2]
+
+
+def test_two_devices_give_what_one_gives(tmp_path):
+    arguments = ["compare", TASK, "--configurations", "ok", "misspecified+edge", "misspecified+mode", *FLAGS, "--seeds", "1"]
+    assert command(*arguments, "--out", tmp_path / "one") == 0
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    subprocess.run(
+        [sys.executable, "-m", "jaxlfi", *arguments, "--out", str(tmp_path / "two")],
+        env=environment, check=True, capture_output=True,
+    )  # fmt: skip
+    from jaxlfi.run_store import read_config
+
+    assert read_config(tmp_path / "one")["devices"] == 1
+    assert read_config(tmp_path / "two")["devices"] == 2  # three lanes: one of them is padding
+    for configuration in ("ok", "misspecified+edge", "misspecified+mode"):
+        one, two = (read_belief(tmp_path / name / configuration / "seed_000") for name in ("one", "two"))
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
+            np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-3)
+
+
+def test_stacking_makes_a_leading_axis():
+    stacked = lanes.stack([Edge(mass_threshold=0.1), Edge(mass_threshold=np.float32(0.2))])
+    assert all(leaf.shape == (2,) and leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(stacked))
