@@ -50,5 +50,5 @@ def task(process: JumpProcess = JumpProcess()) -> Task:
         truth=TRUTH,
         failures=("too_many_events",),
         channels=("predators", "prey"),
-        times=np.arange(round(process.duration / process.interval) + 1) * process.interval,
+        times=np.arange(process.intervals + 1) * process.interval,
     )

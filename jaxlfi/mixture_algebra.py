@@ -1,4 +1,4 @@
-"""Products, quotients, unions and reductions of Gaussian mixtures: the algebra of the paper's equation (1)."""
+"""Products, quotients, unions and reductions of Gaussian mixtures: the algebra of equation (1)."""
 
 from collections.abc import Callable
 
@@ -25,7 +25,8 @@ class Pairing:
     Pair i * K_b + j is component i of `a` with component j of `b`.
 
     Attributes:
-        indefinite: pairs of present components whose precision difference is not positive definite, shape [K_a * K_b].
+        indefinite: pairs of present components whose precision difference is not positive definite, shape
+            [K_a * K_b].
         fell_back: whether every pair was dropped, so that `a` itself was returned, shape [].
     """
 
@@ -49,8 +50,8 @@ def drop(ratio: Float[Array, "*pairs dim"]) -> tuple[Float[Array, "*pairs dim"],
 def floor(ratio: Float[Array, "*pairs dim"]) -> tuple[Float[Array, "*pairs dim"], bool]:
     """Widen the divisor where it is too narrow, until the quotient keeps `FLOOR` of the dividend's precision.
 
-    The pair is then the exact quotient by that wider Gaussian. Far from the divisor's mean it may still be carried a
-    long way off, by up to 1 / FLOOR times their distance.
+    The pair is then the exact quotient by that wider Gaussian. Far from the divisor's mean it may still be
+    carried a long way off, by up to 1 / FLOOR times their distance.
     """
     return jnp.minimum(ratio, jnp.sqrt(1.0 - FLOOR)), True
 
@@ -63,8 +64,8 @@ def skip(ratio: Float[Array, "*pairs dim"]) -> tuple[Float[Array, "*pairs dim"],
 POLICIES: dict[str, Policy] = {"drop": drop, "floor": floor, "skip": skip}
 """What to do with a pair whose precision difference is not positive definite, by name.
 
-A policy takes the divisor's inverse scales in the dividend's whitened principal directions, shape [..., D] (one or more
-is not below 1), and returns those to divide by and whether the pair is kept.
+A policy takes the divisor's inverse scales in the dividend's whitened principal directions, shape [..., D]
+(one or more is not below 1), and returns those to divide by and whether the pair is kept.
 """
 
 
@@ -72,42 +73,46 @@ def product(a: GaussianMixture, b: GaussianMixture) -> tuple[GaussianMixture, Pa
     """The product a(theta) b(theta), one component for each pair.
 
     N(m_1, P_1) N(m_2, P_2) = c N(m, P) with P = P_1 + P_2, P m = P_1 m_1 + P_2 m_2 and
-    log c = (ld_1 + ld_2 - ld - m_1'P_1 m_1 - m_2'P_2 m_2 + m'P m - D log 2 pi) / 2, where ld = log |P| (section 2.4 of
-    the notes on likelihood-free inference).
+    log c = (ld_1 + ld_2 - ld - m_1'P_1 m_1 - m_2'P_2 m_2 + m'P m - D log 2 pi) / 2, where ld = log |P|.
 
     Args:
         a: mixture of K_a components in D dimensions.
         b: mixture of K_b components in D dimensions.
 
     Returns:
-        The mixture of K_a * K_b components, pair i * K_b + j being that of a_i and b_j; its logits are the logs of
-        w_i v_j c_ij, so that their logsumexp is the log of the integral of a * b. And the pairing, which reports nothing.
+        The mixture of K_a * K_b components, pair i * K_b + j being that of a_i and b_j; its logits are the
+        logs of w_i v_j c_ij, so that their logsumexp is the log of the integral of a * b. And the pairing, in
+        which no pair is indefinite.
     """
     pairs = _paired(a, b)
     mixture = _combined(pairs, pairs.ratio, 1.0)
     return mixture, Pairing(jnp.zeros_like(pairs.absent), jnp.asarray(False))
 
 
-def quotient(a: GaussianMixture, b: GaussianMixture, policy: str = "floor") -> tuple[GaussianMixture, Pairing]:
+def quotient(
+    a: GaussianMixture, b: GaussianMixture, policy: str = "floor"
+) -> tuple[GaussianMixture, Pairing]:
     """The quotient a(theta) / b(theta), one component for each pair.
 
     N(m_1, P_1) / N(m_2, P_2) = c N(m, P) with P = P_1 - P_2, P m = P_1 m_1 - P_2 m_2 and
-    log c = (ld_1 - ld_2 - ld - m_1'P_1 m_1 + m_2'P_2 m_2 + m'P m + D log 2 pi) / 2, where ld = log |P|. Exact where b
-    has one component and no pair is indefinite.
+    log c = (ld_1 - ld_2 - ld - m_1'P_1 m_1 + m_2'P_2 m_2 + m'P m + D log 2 pi) / 2, where ld = log |P|. Exact
+    where b has one component and no pair is indefinite.
 
-    The quotient by a mixture is no mixture. For several components this returns sum_ij w_i v_j a_i / b_j, each pair
-    divided by itself: the mean over b's components of a / b_j in place of a / (the mean of b_j). It is never below the
-    true quotient (Jensen), equals it where b's components coincide, does not change when one of them is split in two,
-    and is poor where they lie apart: far from b_j, a_i / b_j is large although another component covers the place.
+    The quotient by a mixture is no mixture. For several components this returns sum_ij w_i v_j a_i / b_j,
+    each pair divided by itself: the mean over b's components of a / b_j in place of a / (the mean of b_j). It
+    is never below the true quotient (Jensen), equals it where b's components coincide, does not change when
+    one of them is split in two, and is poor where they lie apart: far from b_j, a_i / b_j is large although
+    another component covers the place.
 
     Args:
         a: the dividend, K_a components in D dimensions.
         b: the divisor, K_b components in D dimensions.
-        policy: what to do with pairs whose precision difference is not positive definite, a name in `POLICIES`.
+        policy: what to do with pairs whose precision difference is not positive definite: a name in
+            `POLICIES`, static.
 
     Returns:
-        The mixture of K_a * K_b components, ordered and weighted as in `product`, and which pairs were indefinite. Where
-        the policy leaves no pair at all, the mixture has a's components, uncorrected.
+        The mixture of K_a * K_b components, ordered and weighted as in `product`, and which pairs were
+        indefinite. Where the policy leaves no pair at all, the mixture has a's components, uncorrected.
 
     Raises:
         ValueError: for an unknown policy.
@@ -140,7 +145,7 @@ def pool(mixtures: GaussianMixture) -> GaussianMixture:
     Returns:
         One mixture of E * K components.
     """
-    flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])  # noqa: E731
+    flat = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])
     return GaussianMixture(
         logits=flat(jax.nn.log_softmax(mixtures.logits, axis=-1)),
         means=flat(mixtures.means),
@@ -149,20 +154,20 @@ def pool(mixtures: GaussianMixture) -> GaussianMixture:
 
 
 def reduce(mixture: GaussianMixture, components: int) -> GaussianMixture:
-    """Merge components two by two until `components` are left, keeping the whole mixture's mean and covariance.
+    """Merge components two by two until `components` are left; the mixture keeps its mean and covariance.
 
-    Each merge replaces the pair of least cost B_ij = ((w_i + w_j) ld_ij - w_i ld_i - w_j ld_j) / 2, ld the log-determinants
-    of the covariances, by the Gaussian of the pair's own mean and covariance. B bounds the Kullback-Leibler divergence
-    from the mixture before to that after the merge (Runnalls, 2007, "Kullback-Leibler approach to Gaussian mixture
-    reduction"). Absent components go first and change nothing.
+    Each merge replaces the pair of least cost B_ij = ((w_i + w_j) ld_ij - w_i ld_i - w_j ld_j) / 2, ld the
+    log-determinants of the covariances, by the Gaussian of the pair's own mean and covariance. B bounds the
+    Kullback-Leibler divergence from the mixture before to that after the merge (Runnalls, 2007,
+    "Kullback-Leibler approach to Gaussian mixture reduction"). Absent components go first and change nothing.
 
     Args:
         mixture: K components in D dimensions.
         components: how many to keep, at most K; static.
 
     Returns:
-        The mixture of `components` components, in the order of the first of each merged group; absent ones where the
-        mixture had fewer than that.
+        The mixture of `components` components, in the order of the first of each merged group; absent ones
+        where the mixture had fewer than that.
 
     Raises:
         ValueError: if `components` is not between 1 and K.
@@ -210,8 +215,8 @@ class _Pairs:
 def _paired(a: GaussianMixture, b: GaussianMixture) -> _Pairs:
     """Whiten every component of b by every component of a.
 
-    In y, a's component is standard normal and b's has precision B'B, so that sums and differences of precisions are
-    1 +- t^2: no large matrices are subtracted and every decision is free of theta's units.
+    In y, a's component is standard normal and b's has precision B'B, so that sums and differences of
+    precisions are 1 +- t^2: no large matrices are subtracted and every decision is free of theta's units.
     """
 
     def one_pair(mean_1, factor_1, mean_2, factor_2):
@@ -232,11 +237,15 @@ def _paired(a: GaussianMixture, b: GaussianMixture) -> _Pairs:
 def _combined(pairs: _Pairs, ratio: Float[Array, "pairs dim"], sign: float) -> GaussianMixture:
     """Multiply (sign 1) or divide (sign -1) each pair, with b's inverse scales replaced by `ratio`."""
     # Narrower or wider about the same mean: offsets, in units of b's scales, change in proportion.
-    offset = pairs.offset * jnp.where(pairs.ratio > 0, ratio / jnp.where(pairs.ratio > 0, pairs.ratio, 1.0), 1.0)
+    offset = pairs.offset * jnp.where(
+        pairs.ratio > 0, ratio / jnp.where(pairs.ratio > 0, pairs.ratio, 1.0), 1.0
+    )
     precision = 1.0 + ratio**2 if sign > 0 else (1.0 - ratio) * (1.0 + ratio)
     mean = pairs.origin + jnp.einsum("pij,pj->pi", pairs.frame, sign * ratio / precision * offset)
     scale_tril = _triangular(pairs.frame / jnp.sqrt(precision)[:, None, :])
-    exponent = sign * pairs.log_peak - 0.5 * jnp.sum(jnp.log(precision) + sign * offset**2 / precision, axis=-1)
+    exponent = sign * pairs.log_peak - 0.5 * jnp.sum(
+        jnp.log(precision) + sign * offset**2 / precision, axis=-1
+    )
     return GaussianMixture(jnp.where(pairs.absent, -jnp.inf, pairs.log_weight + exponent), mean, scale_tril)
 
 
@@ -276,7 +285,7 @@ def _merged(parts: _Components, i: Int[Array, ""], j: Int[Array, ""]) -> _Compon
 
 def _merge_cost(parts: _Components, i: Int[Array, ""], j: Int[Array, ""]) -> Float[Array, ""]:
     """Runnalls's bound B_ij; -inf where one of the two is absent, which costs nothing to remove."""
-    log_det = lambda factor: 2.0 * jnp.sum(jnp.log(jnp.diagonal(factor)))  # noqa: E731
+    log_det = lambda factor: 2.0 * jnp.sum(jnp.log(jnp.diagonal(factor)))
     weight_i, weight_j = parts.weights[i], parts.weights[j]
     merged = _merged(parts, i, j)
     # Differences of log-determinants keep the precision that small components need.

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from scipy import stats
-from strategies import keys, problems
 
 from jaxlfi.belief import RESTRICTIONS, Belief, uninformed
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.support import Support
+from tests.strategies import keys, problems
 
 CLIPPED = jax.jit(RESTRICTIONS["clip"], static_argnames="n")
 REJECTED = jax.jit(RESTRICTIONS["reject"], static_argnames=("n", "tries"))
@@ -18,7 +18,9 @@ REJECTED = jax.jit(RESTRICTIONS["reject"], static_argnames=("n", "tries"))
 N = 20_000
 MEAN, SCALE = np.array([0.4, 5.0]), np.array([1.5, 0.7])
 GAUSSIAN = Belief(
-    GaussianMixture(jnp.zeros(1), jnp.asarray(MEAN)[None].astype(jnp.float32), jnp.diag(jnp.asarray(SCALE))[None]),
+    GaussianMixture(
+        jnp.zeros(1), jnp.asarray(MEAN)[None].astype(jnp.float32), jnp.diag(jnp.asarray(SCALE))[None]
+    ),
     Support([0.0, 3.0], [2.0, 5.5]),
     jnp.asarray(True),
 )

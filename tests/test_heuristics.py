@@ -1,4 +1,4 @@
-"""EDGE, MODE and CENTRE: against the paper's pseudocode, by their laws, and by the contract all heuristics keep."""
+"""EDGE, MODE and CENTRE: against the paper's pseudocode, their laws, and the contract all heuristics keep."""
 
 import chex
 import jax
@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from oracles import heuristics as oracle
 from scipy.optimize import linear_sum_assignment
-from strategies import floats, problems, vectors
 
-from jaxlfi.belief import Belief, uninformed
+from jaxlfi.belief import Belief
 from jaxlfi.heuristics import HEURISTICS, Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, stretch
 from jaxlfi.heuristics.matching import match
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.support import Support
+from tests.oracles import heuristics as oracle
+from tests.strategies import floats, problems, vectors
 
 RULES = {name: rule() for name, rule in HEURISTICS.items()} | {
     "matched": Matched(Mode()),
@@ -43,7 +43,10 @@ def any_rule() -> st.SearchStrategy[Heuristic]:
 
 def decided(rule, previous, posterior, feasible, margin: float = 1e-3) -> bool:
     """Whether every comparison the rule makes is decided by more than rounding."""
-    evidence = {name: np.asarray(seen) for name, seen in apply(rule, *(previous, posterior, feasible))[1].evidence.items()}
+    evidence = {
+        name: np.asarray(seen)
+        for name, seen in apply(rule, *(previous, posterior, feasible))[1].evidence.items()
+    }
     gaps = [np.ones(1)]
     if isinstance(rule, Edge):
         gaps += [evidence[side] - rule.mass_threshold for side in ("mass_left", "mass_right")]
@@ -76,29 +79,31 @@ def reflected(belief: Belief) -> Belief:
 def example(weights=(0.7, 0.3), before=((0.5, 3.0), (3.5, 4.0)), now=((0.1, 3.2), (3.9, 4.0))):
     """Two components in the box [0, 4] x [2, 6], whose means moved."""
     tril = jnp.array([[[0.4, 0.0], [0.1, 0.3]], [[0.2, 0.0], [-0.1, 0.5]]])
-    mixture = lambda means: GaussianMixture(jnp.log(jnp.array(weights)), jnp.array(means), tril)  # noqa: E731
+    mixture = lambda means: GaussianMixture(jnp.log(jnp.array(weights)), jnp.array(means), tril)
     box, feasible = Support([0.0, 2.0], [4.0, 6.0]), Support([-1.0, 0.0], [4.5, 20.0])
     return Belief(mixture(before), box, jnp.asarray(True)), mixture(now), feasible
 
 
-# ---------------------------------------------------------------------------------------- the paper's pseudocode
+# ------------------------------------------------------------------------------ the paper's pseudocode
 
 
 def random_cases(seed: int, n: int = 400, components: int = 3, dim: int = 3):
-    """Cases around boxes that touch Phi on some sides, stacked; components near the bounds, unlike on either side."""
+    """Cases around boxes that touch Phi on some sides, stacked; components lie unlike on either side."""
     draw = np.random.default_rng(seed)
     low = draw.uniform(-3, 2, (n, dim))
     width = draw.uniform(0.5, 5, (n, dim))
     gaps = draw.uniform(0, 3, (2, n, dim)) * (draw.uniform(size=(2, n, dim)) > 0.25)
-    # From 0.6 widths left of the box to as much right of it; more to the left, so that swapped sides are seen.
+    # From 0.6 widths left of the box to as much right of it; more to the left, so that swapped sides are
+    # seen.
     means = low[:, None] + width[:, None] * (draw.beta(1.2, 1.7, (n, components, dim)) * 2.2 - 0.6)
     before = means + draw.normal(0.1, 0.4, means.shape)
     tril = np.tril(draw.normal(0, 0.2, (n, components, dim, dim)), -1)
     tril[..., np.arange(dim), np.arange(dim)] = draw.uniform(0.02, 0.4, (n, components, dim))
     logits = draw.normal(0, 1, (2, n, components))
-    as_jax = lambda value: jnp.asarray(value, jnp.float32)  # noqa: E731
+    as_jax = lambda value: jnp.asarray(value, jnp.float32)
     mixtures = [
-        GaussianMixture(as_jax(logits[i]), as_jax(mean), as_jax(tril)) for i, mean in enumerate((before, means))
+        GaussianMixture(as_jax(logits[i]), as_jax(mean), as_jax(tril))
+        for i, mean in enumerate((before, means))
     ]
     support = Support(as_jax(low), as_jax(low + width))
     feasible = Support(as_jax(low - gaps[0]), as_jax(low + width + gaps[1]))
@@ -115,7 +120,7 @@ def against_oracle(rule, cases, expected, names, thresholds, margins):
     previous, posterior, feasible = jax.device_get(cases)
     compared = 0
     for i in range(previous.informed.shape[0]):
-        pick = lambda leaf, i=i: np.asarray(leaf[i], np.float64)  # noqa: E731
+        pick = lambda leaf, i=i: np.asarray(leaf[i], np.float64)
         box, phi = jax.tree.map(pick, (previous.support, feasible))
         now, before = jax.tree.map(pick, (posterior, previous.mixture))
         weights = np.exp(now.logits) / np.exp(now.logits).sum()
@@ -161,9 +166,19 @@ def test_edge_is_algorithm_2(rule, seed):
     def expected(box, phi, weights, now, before):
         scales = np.sqrt((now.scale_tril**2).sum(-1))
         return oracle.edge(
-            box.low, box.high, phi.low, phi.high, weights, now.means, scales,
-            rule.zone_fraction, rule.mass_threshold, rule.expansion, rule.zone_width, rule.tail,
-        )  # fmt: skip
+            box.low,
+            box.high,
+            phi.low,
+            phi.high,
+            weights,
+            now.means,
+            scales,
+            rule.zone_fraction,
+            rule.mass_threshold,
+            rule.expansion,
+            rule.zone_width,
+            rule.tail,
+        )
 
     cases = random_cases(seed)
     shifts = against_oracle(rule, cases, expected, ("mass_left", "mass_right"), rule.mass_threshold, 1e-4)
@@ -178,9 +193,19 @@ def test_edge_is_algorithm_2(rule, seed):
 def test_mode_is_algorithm_3(rule, seed):
     def expected(box, phi, weights, now, before):
         return oracle.mode(
-            box.low, box.high, phi.low, phi.high, weights, now.means, before.means,
-            rule.shift_threshold, rule.proximity, rule.mass_threshold, rule.expansion, 1,
-        )  # fmt: skip
+            box.low,
+            box.high,
+            phi.low,
+            phi.high,
+            weights,
+            now.means,
+            before.means,
+            rule.shift_threshold,
+            rule.proximity,
+            rule.mass_threshold,
+            rule.expansion,
+            1,
+        )
 
     cases = random_cases(seed)
     shifts = against_oracle(rule, cases, expected, ("weight_left", "weight_right"), rule.mass_threshold, 1e-4)
@@ -188,7 +213,9 @@ def test_mode_is_algorithm_3(rule, seed):
 
 
 def test_mode_does_nothing_in_the_first_iteration_of_algorithm_3():
-    box = oracle.mode([0.0], [1.0], [-1.0], [2.0], [1.0], np.array([[0.1]]), np.array([[0.9]]), 0.0, 1.0, 0.0, 0.2, 0)
+    box = oracle.mode(
+        [0.0], [1.0], [-1.0], [2.0], [1.0], np.array([[0.1]]), np.array([[0.9]]), 0.0, 1.0, 0.0, 0.2, 0
+    )
     assert (box[0], box[1]) == (0.0, 1.0)
 
 
@@ -218,7 +245,8 @@ def test_edge_by_hand():
 def test_mode_by_hand():
     previous, posterior, feasible = example()
     belief, adaptation = Mode()(previous, posterior, feasible)
-    # Dimension 0: 0.7 moved left next to the left bound (clamped at -0.8), 0.3 right next to the right one (at 4.5).
+    # Dimension 0: 0.7 moved left next to the left bound, 0.3 right next to the right one, where Phi ends at
+    # 4.5.
     np.testing.assert_allclose(adaptation.evidence["mode_shift"], [[-0.4, 0.2], [0.4, 0.0]], atol=1e-6)
     np.testing.assert_allclose(adaptation.evidence["weight_left"], [0.7, 0.0], rtol=1e-6)
     np.testing.assert_allclose(adaptation.evidence["weight_right"], [0.3, 0.0], rtol=1e-6)
@@ -242,7 +270,7 @@ def test_stretch_moves_only_the_chosen_bounds_and_not_beyond_phi():
     np.testing.assert_allclose(stretched.high, [1.0, 2.6, 1.2], rtol=1e-6)
 
 
-# ------------------------------------------------------------------------------------------------------- the laws
+# -------------------------------------------------------------------------------------------- the laws
 
 
 @pytest.mark.parametrize("name", RULES)
@@ -304,8 +332,12 @@ def test_reflection_swaps_left_and_right(rule, problem):
     np.testing.assert_allclose(mirrored.support.low, -belief.support.high, atol=1e-5)
     np.testing.assert_allclose(mirrored.support.high, -belief.support.low, atol=1e-5)
     np.testing.assert_allclose(seen.low_shift, -adaptation.high_shift, atol=2e-5)
-    swapped = {"mass_left": "mass_right", "mass_right": "mass_left",
-               "weight_left": "weight_right", "weight_right": "weight_left"}  # fmt: skip
+    swapped = {
+        "mass_left": "mass_right",
+        "mass_right": "mass_left",
+        "weight_left": "weight_right",
+        "weight_right": "weight_left",
+    }
     for name, value in adaptation.evidence.items():
         sign = 1.0 if name in swapped else -1.0
         np.testing.assert_allclose(seen.evidence[swapped.get(name, name)], sign * value, atol=1e-5)
@@ -326,7 +358,10 @@ def test_translation_and_scaling_are_followed(rule, problem, data):
     phi = moved(Belief(posterior, feasible, previous.informed), scale, shift)
     elsewhere, _ = apply(rule, moved(previous, scale, shift), phi.mixture, phi.support)
     tolerance = 1e-4 * np.asarray(scale) + 1e-4
-    for there, here in ((elsewhere.support.low, belief.support.low), (elsewhere.support.high, belief.support.high)):
+    for there, here in (
+        (elsewhere.support.low, belief.support.low),
+        (elsewhere.support.high, belief.support.high),
+    ):
         assert (np.abs(np.asarray(there - (scale * here + shift))) <= tolerance).all()
 
 
@@ -363,7 +398,9 @@ def test_the_order_of_dimensions_does_not_matter(rule, problem, data):
         return jax.tree.map(leaf, tree)
 
     def keep_logits(mixture):
-        return GaussianMixture(mixture.logits, *(reorder(part) for part in (mixture.means, mixture.scale_tril)))
+        return GaussianMixture(
+            mixture.logits, *(reorder(part) for part in (mixture.means, mixture.scale_tril))
+        )
 
     previous, posterior, feasible = problem
     belief, _ = apply(rule, *problem)
@@ -421,8 +458,13 @@ def test_choice_is_the_rule_it_chooses(problem):
 def test_choice_keeps_what_every_rule_saw():
     _, adaptation = Choice(1, (Edge(), Mode(), Centre()))(*example())
     assert set(adaptation.evidence) == {
-        "0/mass_left", "0/mass_right", "1/mode_shift", "1/weight_left", "1/weight_right", "2/weighted_mean",
-    }  # fmt: skip
+        "0/mass_left",
+        "0/mass_right",
+        "1/mode_shift",
+        "1/weight_left",
+        "1/weight_right",
+        "2/weighted_mean",
+    }
 
 
 @pytest.mark.parametrize(
@@ -437,7 +479,7 @@ def test_choice_keeps_what_every_rule_saw():
     ],
 )
 def test_hyperparameters_act_on_their_own_dimension(rule, hyperparameter):
-    """Both dimensions adapt with the scalar; a vector that forbids it in the second leaves the first as it was."""
+    """Both dimensions adapt with the scalar; a vector that forbids it in the second spares the first."""
     problem = example(before=((0.5, 2.5), (0.6, 2.6)), now=((0.1, 2.1), (0.2, 2.2)))
     free = rule(*problem)[0].support
     assert bool(jnp.all(free.low < problem[0].support.low))
@@ -451,10 +493,15 @@ def test_reading_f_zone_width_is_absolute_and_zone_fraction_relative():
     box = previous.support
     masses = {
         label: rule(previous, posterior, feasible)[1].evidence["mass_left"]
-        for label, rule in {"F": Edge(zone_fraction=0.0, zone_width=0.3), "both": Edge(zone_width=0.3)}.items()
+        for label, rule in {
+            "F": Edge(zone_fraction=0.0, zone_width=0.3),
+            "both": Edge(zone_width=0.3),
+        }.items()
     }
     np.testing.assert_allclose(masses["F"], posterior.marginal_cdf(box.low + 0.3), rtol=1e-5)
-    np.testing.assert_allclose(masses["both"], posterior.marginal_cdf(box.low + 0.3 + 0.1 * box.width), rtol=1e-5)
+    np.testing.assert_allclose(
+        masses["both"], posterior.marginal_cdf(box.low + 0.3 + 0.1 * box.width), rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("tail", [0.0, 0.25, 1.0])
@@ -471,13 +518,15 @@ def test_reading_g_tail_weighs_the_mass_beyond_the_bound(tail):
 
 def test_reading_g_keeps_edge_working_when_the_mode_has_left_the_box():
     previous, posterior, feasible = example()
-    gone = GaussianMixture(posterior.logits, jnp.array([[-3.0, 4.0], [-3.5, 4.0]]), 0.1 * posterior.scale_tril)
+    gone = GaussianMixture(
+        posterior.logits, jnp.array([[-3.0, 4.0], [-3.5, 4.0]]), 0.1 * posterior.scale_tril
+    )
     with_tail, zone_alone = (Edge(tail=tail)(previous, gone, feasible)[0].support for tail in (1.0, 0.0))
     np.testing.assert_allclose(with_tail.low, [-0.8, 2.0], rtol=1e-6)
     np.testing.assert_array_equal(zone_alone.low, [0.0, 2.0])
 
 
-# ------------------------------------------------------------------------------------------------------- matching
+# -------------------------------------------------------------------------------------------- matching
 
 
 def apart(components: int, seed: int) -> GaussianMixture:
@@ -520,7 +569,7 @@ def test_matching_is_the_cheapest_assignment(seed):
     np.testing.assert_array_equal(jax.jit(match)(before, now, box), linear_sum_assignment(cost)[1])
 
 
-# --------------------------------------------------------------------------------------------------- the contract
+# ---------------------------------------------------------------------------------------- the contract
 
 
 @pytest.fixture(params=RULES)
@@ -545,7 +594,9 @@ def test_heuristics_are_heuristics(rule):
 
 def test_the_next_belief_holds_the_posterior(rule):
     previous, posterior, feasible = example()
-    belief, adaptation = apply(rule, Belief(previous.mixture, previous.support, jnp.asarray(False)), posterior, feasible)
+    belief, adaptation = apply(
+        rule, Belief(previous.mixture, previous.support, jnp.asarray(False)), posterior, feasible
+    )
     assert bool(belief.informed)
     chex.assert_trees_all_equal(belief.mixture, posterior)
     chex.assert_trees_all_equal_shapes_and_dtypes(belief, previous)
@@ -575,7 +626,9 @@ def test_vmap_over_hyperparameters_is_a_loop(rule):
     if not jax.tree.leaves(rule):
         pytest.skip("no hyperparameters")
     together = jax.jit(jax.vmap(lambda lane: lane(*example())))(stack(*lanes))
-    chex.assert_trees_all_close(together, stack(*(apply(lane, *example()) for lane in lanes)), rtol=1e-6, atol=1e-6)
+    chex.assert_trees_all_close(
+        together, stack(*(apply(lane, *example()) for lane in lanes)), rtol=1e-6, atol=1e-6
+    )
 
 
 def test_pytree_round_trip(rule):

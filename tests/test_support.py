@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
-from strategies import DIMS, boxes, keys, vectors
 
 from jaxlfi.support import Support, check_within
+from tests.strategies import DIMS, boxes, keys, vectors
 
 PHI = Support([-1.0, 0.0], [4.0, 10.0])
 
@@ -37,11 +37,15 @@ def test_bad_bounds_are_named(low, high, message):
 @pytest.mark.parametrize(
     ("low", "high", "message"),
     [
-        ([-1.5, 0.0], [4.0, 10.0], r"inside the feasible domain Phi; in dimension 0 it is \[-1.5, 4\] but Phi allows \[-1, 4\]"),
+        (
+            [-1.5, 0.0],
+            [4.0, 10.0],
+            r"inside the feasible domain Phi; in dimension 0 it is \[-1.5, 4\] but Phi allows \[-1, 4\]",
+        ),
         ([0.0, 1.0], [4.0, 11.0], r"in dimension 1 it is \[1, 11\] but Phi allows \[0, 10\]"),
         ([0.0, 1.0, 2.0], [1.0, 2.0, 3.0], r"expected bounds for 2 parameters, got 3"),
     ],
-)  # fmt: skip
+)
 def test_boxes_outside_phi_are_named(low, high, message):
     with pytest.raises(ValueError, match=f"^guess: .*{message}"):
         check_within(Support(low, high), PHI, "guess")
@@ -50,7 +54,7 @@ def test_boxes_outside_phi_are_named(low, high, message):
 @pytest.mark.parametrize("bad", [[2.0, 1.0], [np.nan, 1.0]])
 def test_arrays_are_checked_where_a_run_starts(bad):
     unchecked = Support(jnp.asarray(bad), jnp.asarray([1.5, 2.0]))
-    with pytest.raises(ValueError, match="^support: expected"):
+    with pytest.raises(ValueError, match=r"^support: expected"):
         check_within(unchecked, PHI)
 
 
@@ -101,7 +105,9 @@ def test_bounds_belong_to_the_box():
 
 
 def test_to_unit_takes_the_bounds_to_plus_and_minus_one():
-    np.testing.assert_allclose(PHI.to_unit(jnp.stack([PHI.low, PHI.high, PHI.centre])), [[-1, -1], [1, 1], [0, 0]])
+    np.testing.assert_allclose(
+        PHI.to_unit(jnp.stack([PHI.low, PHI.high, PHI.centre])), [[-1, -1], [1, 1], [0, 0]]
+    )
     np.testing.assert_allclose(PHI.to_unit(jnp.array([0.0, 2.5])), [-0.6, -0.5], rtol=1e-6)
 
 

@@ -29,7 +29,7 @@ def expand(low, high, phi_low, phi_high, go_left, go_right, eta):
 
 
 def edge(low, high, phi_low, phi_high, weights, means, scales, delta, tau, eta, zone_width=0.0, tail=1.0):
-    """Algorithm 2; `delta` is a fraction of the width, `zone_width` is added to the zone (reading F), G is `tail`.
+    """Algorithm 2; `delta` is a fraction of the width, `zone_width` is added to it (F), `tail` is G.
 
     Returns:
         theta_min, theta_max, M_L, M_R, each of shape [D].
