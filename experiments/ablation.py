@@ -82,22 +82,23 @@ def variants(base: Settings = QUICK) -> dict[str, Variant]:
 
     return {
         "quick": Variant("the preset itself", base),
-        "warm": estimator("warm start instead of a fresh network each round", warm_start=True),
-        "last-weights": estimator("last weights, no validation split", validation=0.0),
-        "zscore": estimator("plain z-score of the summaries", normaliser="zscore"),
+        "single": estimator("one network instead of four", members=1),
+        "wide": estimator("one network of 256 units a layer", members=1, hidden=(256, 256)),
         "relu": estimator("ReLU instead of tanh", activation="relu"),
-        "narrow": estimator("64 units a layer", hidden=(64,) * len(base.estimator.hidden)),
-        "slow-rate": estimator("learning rate 1e-4", learning_rate=1e-4),
+        "zscore": estimator("plain z-score of the summaries", normaliser="zscore"),
+        "warm": estimator("warm start instead of fresh networks each round", warm_start=True),
+        "last-weights": estimator("no validation split, last weights", validation=0.0),
+        "patience": estimator("early stopping after 4 passes (200 steps) without a better loss", patience=4),
+        "slow": estimator("learning rate 1e-4", learning_rate=1e-4),
         "decay": estimator("weight decay 0.1", weight_decay=0.1),
-        "ensemble": estimator("a mixture of three networks", members=3),
+        "paper-correction": run("posterior times the reference prior (reading A, paper)", correction="paper"),
+        "importance": run("importance-weighted loss (reading A, importance)", correction="importance"),
+        "reject": run("draws outside the support rejected (reading E)", restriction="reject"),
+        "defensive": run("a tenth of the proposals from the prior over the support", defensive=0.1),
         "zone-only": Variant("EDGE: mass in the zone only, no tail (reading G)", base, Edge(tail=0.0)),
         "zone-width": Variant(
             "EDGE: delta as an absolute width (reading F)", base, Edge(zone_fraction=0.0, zone_width=0.1)
         ),
-        "paper-correction": run("posterior times the reference prior (reading A, paper)", correction="paper"),
-        "importance": run("importance-weighted loss (reading A, importance)", correction="importance"),
-        "reject": run("draws outside the support rejected (reading E)", restriction="reject"),
-        "not-defensive": run("no defensive share of proposals", defensive=0.0),
     }
 
 

@@ -49,6 +49,8 @@ class Settings:
                 raise ValueError(f"{field}: expected one of {sorted(known)}, got {getattr(self, field)!r}")
         if self.rounds < 1 or self.additions < 1:
             raise ValueError(f"expected at least 1 round and 1 addition, got {self.rounds} and {self.additions}")
+        if isinstance(self.defensive, float | int) and not 0 <= self.defensive <= 1:
+            raise ValueError(f"defensive: expected a share in [0, 1], got {self.defensive}")
         if self.attempts < self.additions:
             raise ValueError(
                 f"attempts: expected at least the {self.additions} additions of a round, got {self.attempts}"
@@ -119,8 +121,8 @@ def init(key: jax.Array, task: Task, support: Support, settings: Settings, obser
 def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> Float[Array, "attempts dim"]:
     """Draw theta ~ p_i (line 11): the prior over Theta_0 in the first round, then the restricted posterior.
 
-    A defensive share of the draws stays with the prior over the *current* support. It sees the ground that the support has gained, and
-    frees a run whose posterior locked itself onto a place where it learns nothing more.
+    A defensive share of the draws stays with the prior over the *current* support: it sees the ground that the
+    support has gained, also where the posterior has locked itself onto a place where it learns nothing more.
     """
     key_prior, key_posterior, key_share = jax.random.split(key, 3)
     informed = RESTRICTIONS[settings.restriction](key_posterior, belief, settings.attempts)
@@ -155,7 +157,7 @@ def update(
     proposals = jax.tree.map(lambda all_, now: all_.at[round].set(now), state.proposals, state.belief)
     network = _started(settings.estimator, state, dataset)
     correction = CORRECTIONS[settings.correction]
-    weights = correction.row_weights(task, dataset, proposals, round)
+    weights = correction.row_weights(task, dataset, proposals, round, settings.defensive)
     expected = (round + 1) * settings.additions
     network, fit_info = fit(key, settings.estimator, network, dataset, weights, state.feasible, expected)
     q = condition(settings.estimator, network, observed, state.feasible)
@@ -174,10 +176,10 @@ def update(
 
 
 def _started(estimator: Estimator, state: State, dataset: Dataset) -> Network:
-    """A network that is trained on from round to round takes its normaliser from the first round's simulations."""
+    """A network that is trained on from round to round takes its normaliser from the first round that has simulations."""
     fresh = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid)
     normaliser = jax.tree.map(
-        lambda kept, new: jnp.where(state.belief.informed, kept, new), state.network.normaliser, fresh
+        lambda kept, new: jnp.where(state.dataset.size > 0, kept, new), state.network.normaliser, fresh
     )
     return Network(state.network.params, normaliser)
 

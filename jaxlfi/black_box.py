@@ -1,8 +1,9 @@
 """Black boxes: inference around a simulator in plain Python or NumPy, outside of the compiled program.
 
-What comes before the simulations of a round (drawing parameters) and after (fitting, adapting) is compiled; the
-simulator is called between, in waves: first for as many parameter vectors as additions are wanted, then for as many as
-failed, until the additions are reached or the attempts are spent. Nothing is simulated that is not needed.
+What comes before the simulations of a round (drawing parameters) and after (fitting, adapting) is compiled;
+the simulator is called between, in waves: first for as many parameter vectors as additions are wanted, then
+for as many as failed, until the additions are reached or the attempts are spent. Nothing is simulated that
+is not needed.
 """
 
 import functools
@@ -121,7 +122,9 @@ def simulate_within_budget(
     return within_budget(theta, x, failure, additions)
 
 
-def call(task: Task, rng: np.random.Generator, theta: np.ndarray, shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def call(
+    task: Task, rng: np.random.Generator, theta: np.ndarray, shape: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Call a black box and check what it gives: trajectories [N, T, C] and failure codes [N], 0 for success.
 
     Raises:

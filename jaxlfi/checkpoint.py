@@ -1,9 +1,9 @@
 """Checkpoint: what a run that was killed needs to go on, written as each round ends.
 
-A folder of .npz files, each replaced as a whole: `start.npz` with the observations, `round_000.npz` and so on with what each
-round did, and `state.npz` with the last state, which says how many rounds are done. Only the state is rewritten, so
-that a round costs the same early and late. A round that was written but that the state does not count yet is done
-again, to the same end.
+A folder of .npz files, each replaced as a whole: `start.npz` with the observations, `round_000.npz` and so on
+with what each round did, and `state.npz` with the last state, which says how many rounds are done. Only the
+state is rewritten, so that a round costs the same early and late. A round that was written but that the state
+does not count yet is done again, to the same end.
 """
 
 import shutil
@@ -33,7 +33,9 @@ class Checkpoint:
     def write_start(self, observed: np.ndarray, x: np.ndarray) -> None:
         """Keep the lanes' observations, shape [L, T, C], and their summaries, shape [L, S]."""
         self.folder.mkdir(parents=True)
-        atomic.write_arrays(self.folder / "start.npz", {"observed": observed, "x": x}, compress=False, durable=True)
+        atomic.write_arrays(
+            self.folder / "start.npz", {"observed": observed, "x": x}, compress=False, durable=True
+        )
 
     def read_start(self) -> tuple[np.ndarray, np.ndarray]:
         """The lanes' observations and summaries."""
@@ -41,11 +43,14 @@ class Checkpoint:
         return self._named(start, "start.npz", "observed"), self._named(start, "start.npz", "x")
 
     def write_round(self, index: int, state: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
-        """Keep a round's record and the state after it; of the trajectories, only the last round's are kept."""
+        """Keep a round's record and the state after it; of trajectories, only the last round's are kept."""
         rows = dict(rows)
         final_trajectory = rows.pop(_TRAJECTORY)
         atomic.write_arrays(
-            self.folder / _round_name(index), rows | {"seconds": np.asarray(seconds)}, compress=False, durable=True
+            self.folder / _round_name(index),
+            rows | {"seconds": np.asarray(seconds)},
+            compress=False,
+            durable=True,
         )
         leaves = {name: np.asarray(leaf) for name, leaf in _named_leaves(state).items()}
         extra = {_DONE: np.asarray(index + 1), _TRAJECTORY: final_trajectory}
@@ -79,8 +84,8 @@ class Checkpoint:
             array = self._named(arrays, "state.npz", name)
             if array.shape != leaf.shape or array.dtype != leaf.dtype:
                 raise CheckpointError(
-                    f"{self.folder / 'state.npz'}: expected {name} of shape {leaf.shape} and type {leaf.dtype}, "
-                    f"got {array.shape} and {array.dtype}"
+                    f"{self.folder / 'state.npz'}: expected {name} of shape {leaf.shape} and type "
+                    f"{leaf.dtype}, got {array.shape} and {array.dtype}"
                 )
         return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in names])
 

@@ -1,7 +1,7 @@
 """The command line: `jaxlfi tasks | infer | compare | report | resume`.
 
-This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set before
-jax starts can be set after the arguments are known.
+This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set
+before jax starts can be set after the arguments are known.
 """
 
 import argparse
@@ -44,15 +44,15 @@ Bad input ends with one line on stderr and exit status 2; nothing is ever overwr
 INFER_EXAMPLES = """\
 examples:
   jaxlfi infer lotka_volterra --support misspecified --heuristic edge --out runs/edge
-  jaxlfi infer lotka_volterra --heuristic edge --mass-threshold 0.01 --expansion 0.1 0.1 0.2 0.2 --out runs/gentle
-  jaxlfi infer my_package.spring:task --observation real.csv --support-low 1 0.1 --support-high 10 1 --out runs/spring
+  jaxlfi infer lotka_volterra --mass-threshold 0.01 --expansion 0.1 0.1 0.2 0.2 --out runs/gentle
+  jaxlfi infer spring:task --observation real.csv --support-low 1 0.1 --support-high 10 1 --out runs/spring
   jaxlfi infer lotka_volterra --preset paper --seeds 4 --out runs/paper
 
 """
 
 COMPARE_EXAMPLES = """\
-A configuration is SUPPORT (kept fixed) or SUPPORT+HEURISTIC. All configurations and seeds run side by side; the same
-seed means the same observation in all of them.
+A configuration is SUPPORT (kept fixed) or SUPPORT+HEURISTIC. All configurations and seeds run side by side;
+the same seed means the same observation in all of them.
 
 examples:
   jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
@@ -74,15 +74,19 @@ def parser() -> argparse.ArgumentParser:
     formatter = argparse.RawDescriptionHelpFormatter
     top = OneLineParser(
         prog="jaxlfi",
-        description="Likelihood-free inference of simulator parameters that notices a wrong support and moves it.",
+        description="Likelihood-free inference that notices when the prior's support is wrong, and moves it.",
         epilog=MAIN_EXAMPLES,
         formatter_class=formatter,
     )
     top.add_argument("--version", action="version", version=f"jaxlfi {jaxlfi.__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    tasks = commands.add_parser("tasks", help="list tasks, or describe one", description="List tasks, or describe one.")
-    tasks.add_argument("name", nargs="?", metavar="TASK", help="describe this one: parameters, units, supports, truth")
+    tasks = commands.add_parser(
+        "tasks", help="list tasks, or describe one", description="List tasks, or describe one."
+    )
+    tasks.add_argument(
+        "name", nargs="?", metavar="TASK", help="describe this one: parameters, units, supports, truth"
+    )
 
     infer = commands.add_parser(
         "infer",
@@ -91,16 +95,26 @@ def parser() -> argparse.ArgumentParser:
         epilog=INFER_EXAMPLES + GLOSSARY,
         formatter_class=formatter,
     )
-    infer.add_argument("--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)")
-    infer.add_argument("--support-low", nargs="+", type=float, metavar="X", help="your own support's lower bounds, one a parameter")
+    infer.add_argument(
+        "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
+    )
+    infer.add_argument(
+        "--support-low",
+        nargs="+",
+        type=float,
+        metavar="X",
+        help="your own support's lower bounds, one a parameter",
+    )
     infer.add_argument("--support-high", nargs="+", type=float, metavar="X", help="its upper bounds")
-    infer.add_argument("--heuristic", default="edge", metavar="NAME", help="none, edge, mode or centre (default: edge)")
+    infer.add_argument(
+        "--heuristic", default="edge", metavar="NAME", help="none, edge, mode or centre (default: edge)"
+    )
     _add_shared(infer, seeds=1)
 
     compare = commands.add_parser(
         "compare",
         help="run supports and heuristics side by side",
-        description="Run several supports and heuristics side by side, over several seeds, and tabulate their errors.",
+        description="Run supports and heuristics side by side, over several seeds, and tabulate the errors.",
         epilog=COMPARE_EXAMPLES + GLOSSARY,
         formatter_class=formatter,
     )
@@ -113,13 +127,17 @@ def parser() -> argparse.ArgumentParser:
     _add_shared(compare, seeds=4)
 
     resume = commands.add_parser(
-        "resume", help="go on with a run that was stopped", description="Go on with a run that was stopped or killed."
+        "resume",
+        help="go on with a run that was stopped",
+        description="Go on with a run that was stopped or killed.",
     )
     resume.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
     _add_machine(resume)
 
     report = commands.add_parser(
-        "report", help="draw the pictures of a run", description="Draw all pictures of a folder from its saved files."
+        "report",
+        help="draw the pictures of a run",
+        description="Draw all pictures of a folder from its saved files.",
     )
     report.add_argument("folder", type=Path, metavar="DIR", help="a folder that infer or compare wrote")
     return top
@@ -128,10 +146,18 @@ def parser() -> argparse.ArgumentParser:
 def _add_shared(command: argparse.ArgumentParser, seeds: int) -> None:
     """Arguments that `infer` and `compare` have in common."""
     command.add_argument("task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory")
-    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results")
-    command.add_argument("--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)")
-    command.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})")
-    command.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first run's seed (default: 0)")
+    command.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results"
+    )
+    command.add_argument(
+        "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"
+    )
+    command.add_argument(
+        "--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})"
+    )
+    command.add_argument(
+        "--first-seed", type=int, default=0, metavar="N", help="the first run's seed (default: 0)"
+    )
     command.add_argument(
         "--observation",
         type=Path,
@@ -140,30 +166,54 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int) -> None:
         "(default: the task's own, or one simulated at the known truth)",
     )
     _add_machine(command)
-    command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
+    command.add_argument(
+        "--keep-network", action="store_true", help="also save the trained networks (network.npz)"
+    )
 
     rounds = command.add_argument_group("rounds (default: the preset's)")
     rounds.add_argument("--rounds", type=int, metavar="N", help="inference rounds, N_LFI")
     rounds.add_argument("--additions", type=int, metavar="N", help="simulations added each round, at most")
-    rounds.add_argument("--attempts", type=int, metavar="N", help="simulations attempted each round, failures included")
-    rounds.add_argument("--correction", metavar="NAME", help="from the network to the posterior: none, paper, importance")
-    rounds.add_argument("--restriction", metavar="NAME", help="how draws are kept in the support: clip, reject")
+    rounds.add_argument(
+        "--attempts", type=int, metavar="N", help="simulations attempted each round, failures included"
+    )
+    rounds.add_argument(
+        "--correction", metavar="NAME", help="from the network to the posterior: none, paper, importance"
+    )
+    rounds.add_argument(
+        "--restriction", metavar="NAME", help="how draws are kept in the support: clip, reject"
+    )
+    rounds.add_argument(
+        "--defensive",
+        type=float,
+        metavar="X",
+        help="share of proposals drawn from the prior over the support",
+    )
 
     network = command.add_argument_group("network and training (default: the preset's)")
     network.add_argument("--hidden", type=int, nargs="+", metavar="N", help="units of each hidden layer")
     network.add_argument("--activation", metavar="NAME", help="relu, tanh or silu")
     network.add_argument("--components", type=int, metavar="K", help="Gaussians in each network's mixture")
     network.add_argument("--members", type=int, metavar="N", help="networks in the ensemble")
-    network.add_argument("--normaliser", metavar="NAME", help="what is done to summaries: zscore, asinh, none")
+    network.add_argument(
+        "--normaliser", metavar="NAME", help="what is done to summaries: zscore, asinh, none"
+    )
     network.add_argument("--epochs", type=int, metavar="N", help="full passes over the data each round")
-    network.add_argument("--steps", type=int, metavar="N", help="gradient steps each round, in place of --epochs")
+    network.add_argument(
+        "--steps", type=int, metavar="N", help="gradient steps each round, in place of --epochs"
+    )
     network.add_argument("--batch-size", type=int, metavar="N", help="simulations in a minibatch")
     network.add_argument("--learning-rate", type=float, metavar="X", help="Adam's step size")
     network.add_argument("--weight-decay", type=float, metavar="X", help="decoupled weight decay")
-    network.add_argument("--clip-norm", type=float, metavar="X", help="norm the gradients are clipped to (inf: not)")
+    network.add_argument(
+        "--clip-norm", type=float, metavar="X", help="norm the gradients are clipped to (inf: not)"
+    )
     network.add_argument("--schedule", metavar="NAME", help="of the learning rate: constant, cosine")
-    network.add_argument("--validation", type=float, metavar="X", help="fraction held out to choose the best weights by")
-    network.add_argument("--patience", type=int, metavar="N", help="passes without a better validation loss; 0: no limit")
+    network.add_argument(
+        "--validation", type=float, metavar="X", help="fraction held out to choose the best weights by"
+    )
+    network.add_argument(
+        "--patience", type=int, metavar="N", help="passes without a better validation loss; 0: no limit"
+    )
     network.add_argument(
         "--warm-start",
         action=argparse.BooleanOptionalAction,
@@ -188,19 +238,23 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int) -> None:
 def _add_machine(command: argparse.ArgumentParser) -> None:
     """Arguments about how, not what."""
     command.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
-    command.add_argument("--no-cache", action="store_true", help="compile anew, without the cache of compiled programs")
+    command.add_argument(
+        "--no-cache", action="store_true", help="compile anew, without the cache of compiled programs"
+    )
 
 
 def prepare_jax(arguments: argparse.Namespace) -> None:
     """Set what must be set before jax starts.
 
-    On CPU jax sees one device, and lanes of small networks do not fill it: with as many devices as cores, each takes
-    its share of the lanes. A single lane stays on one device, whose matrix products then use all cores.
+    On CPU jax sees one device, and lanes of small networks do not fill it: with as many devices as cores,
+    each takes its share of the lanes. A single lane stays on one device, whose matrix products then use all cores.
     """
     lanes = _lanes(arguments)
     flags = os.environ.get("XLA_FLAGS", "")
     if lanes > 1 and "xla_force_host_platform_device_count" not in flags:
-        devices = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, lanes)
+        devices = min(
+            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, lanes
+        )
         if recorded := _recorded(arguments).get("devices"):
             devices = recorded  # the same lanes on the same number of devices repeat bit for bit
         os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={devices}".strip()

@@ -1,11 +1,12 @@
 """A cache of compiled programs on disk, so that only the first run of a kind waits for the compiler.
 
-Measured with jax 0.9.2 on two CPU cores (one round of inference, `quick`): compiling took 8 s of processor time, loading
-from the cache 0.4 s; the file has half a megabyte.
+Measured with jax 0.9.2 on two CPU cores (one round of inference, `quick`): compiling took 8 s of processor
+time, loading from the cache 0.4 s; the file has half a megabyte.
 
-On every load XLA logs that "+prefer-no-gather" and the like are not features of the machine. They never are: they are
-the compiler's own preferences, listed as if they were features. The log is silenced before jax starts, and to keep
-programs from machines that really differ apart, the folder is named by a hash of the processor's model and features.
+On every load XLA logs that "+prefer-no-gather" and the like are not features of the machine. They never are:
+they are the compiler's own preferences, listed as if they were features. The log is silenced before jax
+starts, and to keep programs from machines that really differ apart, the folder is named by a hash of the
+processor's model and features.
 """
 
 import hashlib

@@ -38,15 +38,21 @@ class Correction:
     """A way from q_phi to p-hat: weights in the loss before the fit, and a change of the mixture after it.
 
     Attributes:
-        row_weights: (task, dataset, proposals, round) -> weight of each row in the loss, shape [C].
-        correct: (task, q, previous belief) -> (posterior, pairs not positive definite).
+        row_weights: (task, dataset, proposals, round, defensive share) -> weight of each row in the loss, shape [C].
+        change: (task, q, previous belief) -> (posterior, pairs not positive definite).
     """
 
-    row_weights: Callable[[Task, Dataset, Belief, Array], Array]
+    row_weights: Callable[[Task, Dataset, Belief, Array, Array], Array]
     change: Callable[[Task, GaussianMixture, Belief], tuple[GaussianMixture, Array]]
 
 
-def equal_weights(task: Task, dataset: Dataset, proposals: Belief, round: Int[Array, ""] | int) -> Array:
+def equal_weights(
+    task: Task,
+    dataset: Dataset,
+    proposals: Belief,
+    round: Int[Array, ""] | int,
+    defensive: Float[Array, ""] | float = 0.0,
+) -> Array:
     """Every simulation counts the same."""
     return dataset.valid.astype(jnp.float32)
 
@@ -65,18 +71,25 @@ def times_reference(task: Task, q: GaussianMixture, previous: Belief) -> tuple[G
     bad = jnp.asarray(0)
     if task.prior is not None:
         posterior, info = quotient(posterior, _as_mixture(task.prior), policy="skip")
-        bad = info.count
+        bad = info.not_positive_definite
     posterior = reduce(posterior, q.logits.shape[-1])
     posterior = jax.tree.map(lambda new, old: jnp.where(previous.informed, new, old), posterior, q)
     return posterior, jnp.where(previous.informed, bad, 0)
 
 
-def importance_weights(task: Task, dataset: Dataset, proposals: Belief, round: Int[Array, ""] | int) -> Array:
+def importance_weights(
+    task: Task,
+    dataset: Dataset,
+    proposals: Belief,
+    round: Int[Array, ""] | int,
+    defensive: Float[Array, ""] | float = 0.0,
+) -> Array:
     """w(theta) = p(theta) / p~(theta), with p~ the equally weighted mixture of all rounds' proposals.
 
     The balance heuristic of multiple importance sampling (Veach 1997): a simulation that any round was likely to draw
     has a bounded weight, as the first round drew from the prior itself. Weights are truncated at sqrt(n) times their
-    mean (Ionides 2008). Clipped proposals have atoms on the bounds, which a density leaves out.
+    mean (Ionides 2008). Clipped proposals have atoms on the bounds, which a density leaves out. The defensive share
+    of a round's proposals, drawn from the prior over its support, is part of its density.
     """
     rounds = proposals.informed.shape[0]
     used = jnp.arange(rounds) <= round
@@ -85,7 +98,9 @@ def importance_weights(task: Task, dataset: Dataset, proposals: Belief, round: I
         draws = proposal.mixture.sample(jax.random.key(0), MASS_DRAWS)
         inside = jnp.mean(proposal.support.contains(draws)) + 1.0 / MASS_DRAWS
         informed = proposal.mixture.log_prob(dataset.theta) - jnp.log(inside)
-        log_q = jnp.where(proposal.informed, informed, log_prior(task, proposal.support, dataset.theta))
+        prior = log_prior(task, proposal.support, dataset.theta)
+        mixed = jnp.logaddexp(jnp.log1p(-defensive) + informed, jnp.log(defensive) + prior)
+        log_q = jnp.where(proposal.informed, mixed, prior)
         return jnp.where(proposal.support.contains(dataset.theta), log_q, -jnp.inf)
 
     log_each = jnp.where(used[:, None], jax.vmap(log_density)(proposals), -jnp.inf)

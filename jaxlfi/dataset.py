@@ -40,12 +40,13 @@ def empty(capacity: int, dim: int, obs: int) -> Dataset:
 
 
 def augment(dataset: Dataset, attempts: Attempts, round: Int[Array, ""] | int) -> Dataset:
-    """Add the kept attempts behind the rows already filled (Algorithm 1, line 12)."""
+    """Add the kept attempts behind the rows already filled (Algorithm 1, line 12), as far as there is room."""
+    capacity = dataset.theta.shape[0]
     row = dataset.size + jnp.cumsum(attempts.kept) - 1
-    row = jnp.where(attempts.kept, row, dataset.theta.shape[0])  # past the end: dropped
+    row = jnp.where(attempts.kept, row, capacity)  # past the end: dropped
     return Dataset(
         theta=dataset.theta.at[row].set(attempts.theta, mode="drop"),
         x=dataset.x.at[row].set(attempts.x, mode="drop"),
         round=dataset.round.at[row].set(round, mode="drop"),
-        size=dataset.size + jnp.sum(attempts.kept, dtype=jnp.int32),
+        size=jnp.minimum(dataset.size + jnp.sum(attempts.kept, dtype=jnp.int32), capacity),
     )

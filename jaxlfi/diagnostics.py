@@ -92,10 +92,12 @@ def bound_warnings(task: Task, belief: Belief, threshold: float = 0.2) -> list[s
     limits = np.asarray(task.feasible.low), np.asarray(task.feasible.high)
     warnings = []
     for d, name in enumerate(task.coordinates):
-        for side, mass, bound, limit in zip(("lower", "upper"), (low, high), bounds, limits, strict=True):
+        for side, mass, bound, limit, outwards in zip(
+            ("lower", "upper"), (low, high), bounds, limits, (-1, 1), strict=True
+        ):
             if mass[d] <= threshold:
                 continue
-            at_limit = np.isclose(bound[d], limit[d])
+            at_limit = np.isclose(bound[d], limit[d]) or outwards * (bound[d] - limit[d]) > 0
             advice = (
                 "The bound is that of the feasible domain Phi: widen Phi if it can be."
                 if at_limit

@@ -37,7 +37,7 @@ class Estimator:
         components: Gaussians of each network's mixture, K.
         members: networks in the ensemble; the posterior is their equally weighted mixture, members * K components.
         epochs: full passes over the dataset each round (reading B); 0 where `steps` counts instead.
-        steps: gradient steps each round; 0 where `epochs` counts.
+        steps: gradient steps each round, rounded up to passes of equal length; 0 where `epochs` counts.
         batch_size: simulations in a minibatch, drawn from the filled rows only.
         schedule: "constant", or "cosine" to zero within the round.
         validation: fraction of the simulations held out to choose the best weights by; 0 keeps the last weights.

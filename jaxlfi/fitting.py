@@ -12,7 +12,7 @@ from jaxlfi.normalise import fit_normaliser, normalised
 from jaxlfi.support import Support
 
 STEPS_PER_PASS = 50
-"""Where gradient steps are counted, how many make a pass (after which the validation loss is looked at)."""
+"""Where gradient steps are counted, how many make a pass at most (after which the validation loss is looked at)."""
 
 
 @struct.dataclass
@@ -93,8 +93,8 @@ def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
     module = estimator.module(dim)
     adam = optax.adamw(estimator.learning_rate, weight_decay=estimator.weight_decay)
     optimiser = optax.chain(optax.clip_by_global_norm(estimator.clip_norm), adam)
-    passes = estimator.epochs or max(1, estimator.steps // STEPS_PER_PASS)
-    batches = -(-expected_size // estimator.batch_size) if estimator.epochs else STEPS_PER_PASS
+    passes = estimator.epochs or -(-estimator.steps // STEPS_PER_PASS)
+    batches = -(-expected_size // estimator.batch_size) if estimator.epochs else -(-estimator.steps // passes)
 
     key_split, key_passes = jax.random.split(key)
     rows = _shuffled(key_split, jnp.arange(capacity), size)
@@ -111,7 +111,7 @@ def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
 
     def gradient_step(rows, state, rate):
         loss, gradient = jax.value_and_grad(loss_of)(state.params, rows)
-        finite = jnp.isfinite(loss) & jnp.isfinite(optax.global_norm(gradient))
+        finite = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(gradient))
         gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
         updates, moments = optimiser.update(gradient, state.optimiser, state.params)
         # A step that is not finite moves nothing, also not by the momentum of the steps before.
@@ -119,10 +119,8 @@ def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
         params = optax.apply_updates(state.params, updates)
         return _Training(params, moments, state.nonfinite + ~finite), jnp.where(finite, loss, 0.0), finite
 
-    def one_pass(carry, inputs):
+    def one_pass(carry, index, order):
         state, best = carry
-        key, index = inputs
-        order = _shuffled(key, rows, training)
         rate = _rate(estimator.schedule, index / passes)
 
         def minibatch(b, loop):
@@ -137,23 +135,25 @@ def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
             return (state, _Best(state.params, jnp.inf, index)), (loss, jnp.nan)
         log_prob = module.apply(state.params, x[held_out_rows]).log_prob(theta[held_out_rows])
         validation = -jnp.sum(held_out_weights * jnp.where(held_out_weights > 0, log_prob, 0.0))
-        validation = validation / jnp.sum(held_out_weights)
-        better = validation < best.loss
+        held_out_weight = jnp.sum(held_out_weights)
+        validation = validation / held_out_weight
+        # With too few simulations to hold any out, the last weights are as good as any.
+        better = (validation < best.loss) | (held_out_weight == 0)
         best = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), _Best(state.params, validation, index), best
         )
         return (state, best), (loss, validation)
 
-    def guarded_pass(carry, inputs):
-        _, best = carry
-        stopped = inputs[1] - best.at > estimator.patience
-        return jax.lax.cond(stopped, lambda c, _: (c, (jnp.nan, jnp.nan)), one_pass, carry, inputs)
+    def body(carry, index):
+        order = _shuffled(jax.random.fold_in(key_passes, index), rows, training)
+        if not estimator.patience:
+            return one_pass(carry, index, order)
+        stopped = index - carry[1].at > estimator.patience
+        return jax.lax.cond(stopped, lambda c, *_: (c, (jnp.nan, jnp.nan)), one_pass, carry, index, order)
 
     state = _Training(params, optimiser.init(params), jnp.asarray(0))
     best = _Best(params, jnp.asarray(jnp.inf), jnp.asarray(0))
-    inputs = (jax.random.split(key_passes, passes), jnp.arange(passes))
-    body = guarded_pass if estimator.patience else one_pass
-    (state, best), (losses, validation_losses) = jax.lax.scan(body, (state, best), inputs)
+    (state, best), (losses, validation_losses) = jax.lax.scan(body, (state, best), jnp.arange(passes))
     info = FitInfo(losses, validation_losses, best.at, state.nonfinite)
     return best.params, info
 

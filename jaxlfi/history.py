@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.bayessim import Round
@@ -62,7 +61,9 @@ def own_evidence(row: Mapping[str, Any], place: int | None) -> dict[str, Any]:
     return kept | {EVIDENCE + name[len(own) :]: value for name, value in row.items() if name.startswith(own)}
 
 
-def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, ...], seconds: float) -> dict[str, Any]:
+def ledger_line(
+    index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, ...], seconds: float
+) -> dict[str, Any]:
     """What the ledger says of a round.
 
     Args:
@@ -77,7 +78,10 @@ def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, .
         "attempted": int(row["attempted"]),
         "succeeded": int(row["succeeded"]),
         "failed": {reason: int(count) for reason, count in zip(reasons, row["failed"], strict=True)},
-        **{name: row[name].tolist() for name in ("support_low", "support_high", "proposal_low", "proposal_high")},
+        **{
+            name: row[name].tolist()
+            for name in ("support_low", "support_high", "proposal_low", "proposal_high")
+        },
         "evidence": {
             name[len(EVIDENCE) :]: value.tolist() for name, value in row.items() if name.startswith(EVIDENCE)
         },
@@ -95,7 +99,7 @@ def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, .
 
 
 def theta_error(row: Mapping[str, np.ndarray]) -> float:
-    """|theta - theta_gt| summed over parameters, mean over the posterior samples; NaN without a known truth."""
+    """|theta - theta_gt| summed over parameters, mean over posterior samples; NaN without a known truth."""
     return float(np.mean(np.sum(row["sample_theta_error"], axis=-1)))
 
 
@@ -108,5 +112,3 @@ def trajectory_error(row: Mapping[str, np.ndarray]) -> float:
 def stacked_rounds(rows: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Records of successive rounds, stacked along a new leading axis."""
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-
-

@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from jaxlfi import bayessim, black_box, describe, run_store
+from jaxlfi import bayessim, black_box, run_store
 from jaxlfi import observation as observations
 from jaxlfi.bayessim import Round, Settings, State
 from jaxlfi.belief import Belief
@@ -135,20 +135,20 @@ def infer(
     observation: Any = None,
     *,
     support: str | Support | None = None,
-    heuristic: Heuristic = Edge(),  # noqa: B008 - immutable
+    heuristic: Heuristic = Edge(),
     settings: Settings = QUICK,
 ) -> Run:
     """Infer a task's parameters from one observed trajectory, adapting the support (Algorithm 1).
 
-    Compiled on first use for a task and the static part of `settings`; further calls reuse the program. Pure: it can be
-    jitted, and vmapped over keys, observations, supports, and the leaves of `heuristic` and `settings` (not for a
-    black box, which runs on the host).
+    Compiled on first use for a task and the static part of `settings`; further calls reuse the program. Pure:
+    it can be jitted, and vmapped over keys, observations, supports, and the leaves of `heuristic` and
+    `settings` (not for a black box, which runs on the host).
 
     Args:
         key: consumed.
         task: simulator, names and bounds.
-        observation: the real trajectory, in the shape the simulator produces. By default the task's own, or, where
-            the truth is known, a fresh simulation at the truth.
+        observation: the real trajectory, in the shape the simulator produces. By default the task's own, or,
+            where the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box in coordinates. By default the task's first.
         heuristic: how the support is adapted.
         settings: the numbers of the run; `jaxlfi.PAPER` are the paper's.
@@ -172,7 +172,9 @@ def infer(
     concrete = _is_concrete((key, observation, support, heuristic, settings))
     if task.black_box:
         if not concrete:
-            raise ValueError("infer: expected concrete arguments for a black box, which cannot be traced or vmapped")
+            raise ValueError(
+                "infer: expected concrete arguments for a black box, which cannot be traced or vmapped"
+            )
         run = _infer_black_box(key, task, observation, support, heuristic, settings)
     else:
         observed, x = observe(run_keys(key).observe, task, observation, concrete)
@@ -186,7 +188,9 @@ def infer(
     return run
 
 
-def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True) -> tuple[jax.Array, jax.Array]:
+def observe(
+    key: jax.Array, task: Task, observation: Any, concrete: bool = True
+) -> tuple[jax.Array, jax.Array]:
     """The observed trajectory, checked, and its summary.
 
     Args:
@@ -227,7 +231,8 @@ def check_heuristic(heuristic: Heuristic, task: Task) -> None:
     for leaf in jax.tree.leaves(heuristic):
         if np.shape(leaf) not in ((), (task.dim,)):
             raise ValueError(
-                f"heuristic: expected hyperparameters that are scalars or {task.dim} values, got shape {np.shape(leaf)}"
+                f"heuristic: expected hyperparameters that are scalars or {task.dim} values, "
+                f"got shape {np.shape(leaf)}"
             )
 
 

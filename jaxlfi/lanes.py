@@ -1,9 +1,10 @@
 """Lanes: many inference runs (configurations times seeds) stepped together as one compiled program.
 
-A lane is one run: a support, a heuristic, a seed and an observation. Lanes differ in leaves only, so one compiled
-`vmap` of `bayessim.step` serves them all, sharded over the local devices. Each lane has its own keys: what it gives
-does not depend on which other lanes run beside it, but for the rounding of differently batched arithmetic, which
-training amplifies from round to round. The same lanes on the same number of devices repeat bit for bit.
+A lane is one run: a support, a heuristic, a seed and an observation. Lanes differ in leaves only, so one
+compiled `vmap` of `bayessim.step` serves them all, sharded over the local devices. Each lane has its own
+keys: what it gives does not depend on which other lanes run beside it, but for the rounding of differently
+batched arithmetic, which training amplifies from round to round. The same lanes on the same number of
+devices repeat bit for bit.
 """
 
 import dataclasses
@@ -84,8 +85,8 @@ class Engine(Protocol):
 def stack_heuristics(rules: Sequence[Heuristic]) -> tuple[Heuristic, list[int | None]]:
     """Rules of several lanes as one stacked pytree.
 
-    Rules of the same structure differ in leaves only. Where there are more structures than one, each lane gets a
-    `Choice` of one rule of each structure and follows its own.
+    Rules of the same structure differ in leaves only. Where there are more structures than one, each lane
+    gets a `Choice` of one rule of each structure and follows its own.
 
     Returns:
         The stacked rule, and for each lane its place in the choice (None without a choice).
@@ -97,13 +98,17 @@ def stack_heuristics(rules: Sequence[Heuristic]) -> tuple[Heuristic, list[int | 
     places = [kinds.index(structure) for structure in structures]
     examples = [rules[structures.index(kind)] for kind in kinds]
     choices = [
-        Choice(index=place, rules=tuple(rule if place == slot else other for slot, other in enumerate(examples)))
+        Choice(
+            index=place, rules=tuple(rule if place == slot else other for slot, other in enumerate(examples))
+        )
         for rule, place in zip(rules, places, strict=True)
     ]
     return stack(choices), places
 
 
-def stack_inputs(lanes: Sequence[Lane], observed: np.ndarray, x: np.ndarray) -> tuple[Inputs, list[int | None]]:
+def stack_inputs(
+    lanes: Sequence[Lane], observed: np.ndarray, x: np.ndarray
+) -> tuple[Inputs, list[int | None]]:
     """Inputs of all lanes, and each lane's place in the choice of heuristics.
 
     Args:
@@ -189,8 +194,8 @@ class LaneEngine:
         return jax.tree.map(lambda leaf: jax.device_put(jnp.asarray(leaf)[rows], sharding), tree)
 
     def _program(self, one, in_axes: tuple[int | None, ...], donate: tuple[int, ...] = ()):
-        # The round's index is not batched: loops over minibatches then have one trip count for all lanes. And lanes
-        # are divided by shard_map, as while-loops must not get predicates that cross devices.
+        # The round's index is not batched: loops over minibatches then have one trip count for all lanes. And
+        # lanes are divided by shard_map, as while-loops must not get predicates that cross devices.
         many = jax.vmap(one, in_axes=in_axes)
         if self._mesh.size > 1:
             specs = tuple(PartitionSpec() if axis is None else PartitionSpec(AXIS) for axis in in_axes)
@@ -200,7 +205,9 @@ class LaneEngine:
         return jax.jit(many, donate_argnums=donate)
 
 
-def rounds(engine: Engine, state: State, first: int, last: int) -> Iterator[tuple[int, State, dict[str, np.ndarray]]]:
+def rounds(
+    engine: Engine, state: State, first: int, last: int
+) -> Iterator[tuple[int, State, dict[str, np.ndarray]]]:
     """Step the rounds from `first` up to but not including `last`, yielding each as it ends."""
     for index in range(first, last):
         state, rows = engine.round(state, index)

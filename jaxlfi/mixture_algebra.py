@@ -43,7 +43,7 @@ Policy = Callable[[Float[Array, "*pairs dim"]], tuple[Float[Array, "*pairs dim"]
 
 
 def drop(ratio: Float[Array, "*pairs dim"]) -> tuple[Float[Array, "*pairs dim"], bool]:
-    """Give the pair no weight (logit -inf)."""
+    """Give the pair no weight (logit -inf); its component is a's, to be had back if all are dropped."""
     return jnp.zeros_like(ratio), False
 
 
@@ -126,9 +126,7 @@ def quotient(
     ratio, keep = POLICIES[policy](pairs.ratio)
     dropped = pairs.absent | ~(definite | keep)
     fell_back = jnp.all(dropped)
-    plain, _ = skip(pairs.ratio)
-    ratio = jnp.where(fell_back, plain, jnp.where(definite[:, None], pairs.ratio, ratio))
-    mixture = _combined(pairs, ratio, -1.0)
+    mixture = _combined(pairs, jnp.where(definite[:, None], pairs.ratio, ratio), -1.0)
     logits = jnp.where(dropped & ~fell_back, -jnp.inf, mixture.logits)
     return (
         GaussianMixture(logits, mixture.means, mixture.scale_tril),

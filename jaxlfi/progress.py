@@ -4,7 +4,14 @@ import time
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 
 class RoundProgress:
@@ -67,4 +74,6 @@ class RoundProgress:
             return
         elapsed = time.monotonic() - self._began
         left = elapsed / (self._done - self._first) * (self._rounds - self._done)
-        self._console.print(f"round {self._done} of {self._rounds}, {elapsed:.0f} s elapsed, about {left:.0f} s left")
+        self._console.print(
+            f"round {self._done} of {self._rounds}, {elapsed:.0f} s elapsed, about {left:.0f} s left"
+        )

@@ -59,7 +59,7 @@ def environment() -> dict[str, Any]:
             "device": jax.devices()[0].device_kind,
             "cores": os.cpu_count(),
         },
-        "command_line": shlex.join(sys.argv),
+        "command_line": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
@@ -102,7 +102,9 @@ def create(folder: Path, config: Mapping[str, Any], fill) -> None:
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     except OSError as error:
-        raise StoreError(f"out: expected a folder that can be written, got {str(folder)!r}: {error}") from error
+        raise StoreError(
+            f"out: expected a folder that can be written, got {str(folder)!r}: {error}"
+        ) from error
     try:
         beside.chmod(0o755)
         fill(beside)
@@ -125,7 +127,9 @@ def read_config(folder: Path) -> dict[str, Any]:
     try:
         config = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise StoreError(f"expected a run folder, got {str(folder)!r} without a readable config.json") from error
+        raise StoreError(
+            f"expected a run folder, got {str(folder)!r} without a readable config.json"
+        ) from error
     kind = config.get("format") if isinstance(config, dict) else None
     if kind not in (RUN, RUNS, COMPARE):
         raise StoreError(f"expected a run folder, got {str(folder)!r} whose config.json is not of jaxlfi")
@@ -134,9 +138,13 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def write_ledger(folder: Path, rows: Sequence[Mapping[str, np.ndarray]], reasons: Sequence[str], seconds: Sequence[float]):
+def write_ledger(
+    folder: Path, rows: Sequence[Mapping[str, np.ndarray]], reasons: Sequence[str], seconds: Sequence[float]
+):
     """Write ledger.jsonl anew from the records of the rounds so far."""
-    lines = [ledger_line(i, row, tuple(reasons), s) for i, (row, s) in enumerate(zip(rows, seconds, strict=True))]
+    lines = [
+        ledger_line(i, row, tuple(reasons), s) for i, (row, s) in enumerate(zip(rows, seconds, strict=True))
+    ]
     atomic.write_json_lines(folder / "ledger.jsonl", lines)
 
 
@@ -206,7 +214,9 @@ def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     atomic.write_bytes(path, text.getvalue().encode())
 
 
-def lane_rows(rows: Sequence[Mapping[str, np.ndarray]], lane: int, place: int | None) -> list[dict[str, np.ndarray]]:
+def lane_rows(
+    rows: Sequence[Mapping[str, np.ndarray]], lane: int, place: int | None
+) -> list[dict[str, np.ndarray]]:
     """One lane's records out of those of all lanes."""
     return [own_evidence({name: value[lane] for name, value in row.items()}, place) for row in rows]
 
@@ -242,6 +252,8 @@ def run_config(
         "task": reference,
         "names": list(task.coordinates),
         "units": list(task.units),
+        "feasible_low": np.asarray(task.feasible.low).tolist(),
+        "feasible_high": np.asarray(task.feasible.high).tolist(),
         "configuration": configuration,
         "support": {"name": support_name} | describe.support_to_json(support),
         "heuristic": describe.heuristic_to_json(heuristic),
@@ -279,13 +291,18 @@ def read_ledger(folder: Path) -> list[dict[str, Any]]:
         lines = [json.loads(line) for line in path.read_text().splitlines()]
     except (OSError, ValueError) as error:
         raise StoreError(f"expected a ledger, got a missing or damaged {path}") from error
-    return [{name: float("nan") if value is None else value for name, value in line.items()} for line in lines]
+    return [
+        {name: float("nan") if value is None else value for name, value in line.items()} for line in lines
+    ]
 
 
 def read_table(path: Path) -> list[dict[str, Any]]:
     """The table of a comparison; what was unknown is NaN."""
     with path.open(newline="") as file:
         return [
-            {name: value if name == "configuration" else float(value or "nan") for name, value in line.items()}
+            {
+                name: value if name == "configuration" else float(value or "nan")
+                for name, value in line.items()
+            }
             for line in csv.DictReader(file)
         ]

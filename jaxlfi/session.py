@@ -64,7 +64,8 @@ def begin(folder: Path, plan: Plan, observation: Any = None) -> None:
     Args:
         folder: new or empty.
         plan: what to run.
-        observation: a trajectory for all lanes; by default the task's, or one simulated at the truth for each seed.
+        observation: a trajectory for all lanes; by default the task's, or one simulated at the truth for each
+            seed.
 
     Raises:
         ValueError: for anything that does not fit.
@@ -72,7 +73,9 @@ def begin(folder: Path, plan: Plan, observation: Any = None) -> None:
     run_store.refuse_occupied(folder)
     plan.settings.check()
     seeds = sorted({lane.seed for lane in plan.lanes})
-    by_seed = {seed: observe(run_keys(jax.random.key(seed)).observe, plan.task, observation) for seed in seeds}
+    by_seed = {
+        seed: observe(run_keys(jax.random.key(seed)).observe, plan.task, observation) for seed in seeds
+    }
     observed = np.stack([np.asarray(by_seed[lane.seed][0]) for lane in plan.lanes])
     x = np.stack([np.asarray(by_seed[lane.seed][1]) for lane in plan.lanes])
     config, lane_configs = _configs(plan)
@@ -137,7 +140,9 @@ def plan_of(config: dict[str, Any]) -> Plan:
             keep_network=config["keep_network"],
         )
     except (KeyError, TypeError) as error:
-        raise run_store.StoreError(f"config.json: expected a complete description of the run, got: {error!r}") from error
+        raise run_store.StoreError(
+            f"config.json: expected a complete description of the run, got: {error!r}"
+        ) from error
 
 
 def _lane_of(description: dict[str, Any]) -> Lane:
@@ -210,7 +215,14 @@ def _finish(folder, plan, state, rows, seconds, trajectory, places, observed, x)
         own = run_store.lane_rows(rows, lane, places[lane])
         lane_state = jax.tree.map(lambda leaf, lane=lane: leaf[lane], state)
         run_store.write_results(
-            folder / name, plan.task, own, seconds, trajectory[lane], lane_state.dataset, observed[lane], x[lane]
+            folder / name,
+            plan.task,
+            own,
+            seconds,
+            trajectory[lane],
+            lane_state.dataset,
+            observed[lane],
+            x[lane],
         )
         if plan.keep_network:
             leaves, _ = jax.tree_util.tree_flatten_with_path(lane_state.network)
@@ -229,8 +241,8 @@ def _finish(folder, plan, state, rows, seconds, trajectory, places, observed, x)
 def results(folder: Path, plan: Plan) -> list[dict[str, Any]]:
     """One line of `run_store.TABLE_COLUMNS` for each lane, from its ledger.
 
-    The errors are those of the last round, the success rate is over all rounds, and the seconds are the lane's share:
-    wall time without compiling, divided by the lanes that were stepped together.
+    The errors are those of the last round, the success rate is over all rounds, and the seconds are the
+    lane's share: wall time without compiling, divided by the lanes that were stepped together.
     """
     lines = []
     for lane, name in zip(plan.lanes, plan.folders(), strict=True):
@@ -260,7 +272,9 @@ def support_warnings(folder: Path, plan: Plan) -> Iterator[str]:
     for configuration in dict.fromkeys(lane.configuration for lane, _ in fixed):
         own = [belief for lane, belief in fixed if lane.configuration == configuration]
         if len(own) == 1:
-            yield from (f"{configuration}: {text}" for text in bound_warnings(plan.task, own[0], WARNING_MASS))
+            yield from (
+                f"{configuration}: {text}" for text in bound_warnings(plan.task, own[0], WARNING_MASS)
+            )
             continue
         masses = np.stack([np.stack(_edge_mass(belief)) for belief in own])  # [seed, side, D]
         bounds = own[0].support.low, own[0].support.high

@@ -46,8 +46,8 @@ class Task:
         name: what the task is called in files and figures.
 
     Raises:
-        ValueError: for numbers of names, units and bounds that do not agree, supports outside Phi, unknown names in
-            `log`, or bounds of a log parameter that are not positive.
+        ValueError: for numbers of names, units and bounds that do not agree, reversed bounds, unknown names in `log`,
+            or bounds or a truth of a log parameter that are not positive.
 
     Example:
         >>> spring = Task(lambda key, theta: theta[:1] / theta[1:], names=("force", "stiffness"), units=("N", "N/m"),
@@ -86,8 +86,6 @@ class Task:
             raise ValueError(f"names: expected distinct names, got {names}")
         if unknown := set(self.log) - set(names):
             raise ValueError(f"log: expected names among {names}, got {sorted(unknown)}")
-        if self.feasible.dim != len(names):
-            raise ValueError(f"feasible: expected bounds for {len(names)} parameters, got {self.feasible.dim}")
         if not self.supports:
             raise ValueError("supports: expected at least one named support, got none")
         store("feasible", self._box_to_coordinates(self.feasible, "feasible"))
@@ -99,7 +97,10 @@ class Task:
             },
         )
         if self.truth is not None:
-            store("truth", self.to_coordinates(_vector(self.truth, len(names), "truth")))
+            truth = _vector(self.truth, len(names), "truth")
+            if bool(np.any(np.asarray(truth)[self._is_log] <= 0)):
+                raise ValueError(f"truth: expected positive values of the log parameters {self.log}, got {truth}")
+            store("truth", self.to_coordinates(truth))
         if isinstance(self.summary, str):
             store("summary", summaries.named(self.summary))
 
@@ -145,9 +146,12 @@ class Task:
         return self.supports[choice]
 
     def _box_to_coordinates(self, box: Support, label: str) -> Support:
+        if box.dim != self.dim:
+            raise ValueError(f"{label}: expected bounds for {self.dim} parameters, got {box.dim}")
+        check_within(box, box, label)
         if not self.log:
             return box
-        if box.dim == self.dim and bool(np.any(np.asarray(box.low)[self._is_log] <= 0)):
+        if bool(np.any(np.asarray(box.low)[self._is_log] <= 0)):
             raise ValueError(f"{label}: expected positive bounds for the log parameters {self.log}, got {box.low}")
         return Support(self.to_coordinates(box.low), self.to_coordinates(box.high))
 

@@ -8,7 +8,7 @@ from importlib.metadata import entry_points
 from jaxlfi.task import Task
 
 GROUP = "jaxlfi.tasks"
-"""The entry-point group; a package adds a task with `[project.entry-points."jaxlfi.tasks"]` in its pyproject.toml."""
+"""The entry-point group; packages add tasks by `[project.entry-points."jaxlfi.tasks"]` in pyproject.toml."""
 
 
 def names() -> list[str]:
@@ -20,8 +20,8 @@ def load(reference: str) -> Task:
     """The task of that name.
 
     Args:
-        reference: a registered name, or "module:factory" for a callable without arguments that returns a `Task` (or
-            a `Task` itself) in a module that can be imported from the current folder.
+        reference: a registered name, or "module:factory" for a callable without arguments that returns a
+            `Task` (or a `Task` itself) in a module that can be imported from the current folder.
 
     Raises:
         ValueError: for unknown names, modules that cannot be imported, and things that are no tasks.

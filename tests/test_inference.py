@@ -31,25 +31,18 @@ def test_a_second_call_does_not_compile_again():
     assert inference._run._cache_size() == before
 
 
-def test_vmap_over_hyperparameters_equals_a_loop():
+def test_vmap_over_anything_equals_a_loop():
     edges = [Edge(mass_threshold=tau) for tau in (0.005, 0.2, 0.9)]
-    together = jax.vmap(lambda edge: infer(heuristic=edge))(jaxlfi.stack(edges))
+    observations = OBSERVED + np.array([[0.0], [0.5], [1.0]], np.float32)
+    low = np.array([[-3.0, -3.0], [-2.0, -2.0], [-1.0, -3.0]], np.float32)
+    high = jnp.array([0.0, 3.0])
+    together = jax.vmap(lambda h, o, low: infer(heuristic=h, observation=o, support=Support(low, high)))(
+        jaxlfi.stack(edges), jnp.asarray(observations), jnp.asarray(low)
+    )
     for i, edge in enumerate(edges):
-        alone = infer(heuristic=edge).belief
-        for a, b in zip(jax.tree.leaves(together.belief), jax.tree.leaves(alone), strict=True):
+        alone = infer(heuristic=edge, observation=observations[i], support=Support(low[i], np.asarray(high)))
+        for a, b in zip(jax.tree.leaves(together.belief), jax.tree.leaves(alone.belief), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=2e-3, atol=2e-3)
-    widths = together.belief.support.width
-    assert np.all(widths[0] >= widths[1]) and np.all(widths[1] >= widths[2])
-
-
-def test_it_can_be_traced_over_everything():
-    def total(key, observation, low):
-        support = Support(low, jnp.array([0.0, 3.0]))
-        return infer(observation=observation, support=support).mixture.mean.sum() + 0 * jax.random.uniform(key)
-
-    low = jnp.array([-3.0, -3.0])
-    value = jax.jit(total)(jax.random.key(0), jnp.asarray(OBSERVED), low)
-    np.testing.assert_allclose(value, infer().mixture.mean.sum(), rtol=2e-3, atol=2e-3)
 
 
 def test_the_command_line_and_the_library_agree(tmp_path):
@@ -63,7 +56,9 @@ def test_the_command_line_and_the_library_agree(tmp_path):
     assert files[0] == files[1]
     for name in ("posterior.npz", "dataset.npz", "history.npz", "observation.npz"):
         ours, same = (atomic.read_arrays(tmp_path / folder / name) for folder in ("library", "cli"))
-        assert {key: value.shape for key, value in ours.items()} == {key: value.shape for key, value in same.items()}
+        assert {key: value.shape for key, value in ours.items()} == {
+            key: value.shape for key, value in same.items()
+        }
     history, same = (atomic.read_arrays(tmp_path / folder / "history.npz") for folder in ("library", "cli"))
     np.testing.assert_allclose(history["sample_theta"], same["sample_theta"], rtol=5e-3, atol=5e-3)
     assert command("resume", tmp_path / "library") == 0  # complete: nothing to do
@@ -78,9 +73,10 @@ def test_draws_lie_in_the_support():
 
 
 def test_a_fixed_support_that_is_wrong_warns():
-    far = np.array([3.0, 0.0], np.float32)
-    with pytest.warns(jaxlfi.SupportWarning, match="first: .* upper bound 0"):
-        run = infer(observation=far, heuristic=Fixed())
+    # Hardly trained, the posterior is nearly as wide as Phi: far wider than this support.
+    narrow = Support([-0.2, -0.2], [0.2, 0.2])
+    with pytest.warns(jaxlfi.SupportWarning, match="first: .* upper bound 0.2"):
+        run = infer(support=narrow, heuristic=Fixed())
     assert any("widen the support" in text for text in run.warnings)
 
 
@@ -95,7 +91,10 @@ def test_without_an_observation_one_is_simulated_at_the_truth():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"observation": np.zeros(3)}, r"observation: expected the shape the simulator produces, \[2\], got \[3\]"),
+        (
+            {"observation": np.zeros(3)},
+            r"observation: expected the shape the simulator produces, \[2\], got \[3\]",
+        ),
         ({"observation": np.array([np.nan, 0])}, "observation: expected finite"),
         ({"support": "unknown"}, "support: expected one of"),
         ({"support": Support([0.0], [1.0])}, "support: expected bounds for 2 parameters, got 1"),
@@ -103,7 +102,10 @@ def test_without_an_observation_one_is_simulated_at_the_truth():
         ({"heuristic": "edge"}, "heuristic: expected one such as"),
         ({"heuristic": Edge(expansion=np.ones(3))}, r"scalars or 2 values, got shape \(3,\)"),
         ({"settings": settings(attempts=5)}, "attempts: expected at least"),
-        ({"task": dataclasses.replace(gaussian(), truth=None), "observation": None}, "observation: expected one"),
+        (
+            {"task": dataclasses.replace(gaussian(), truth=None), "observation": None},
+            "observation: expected one",
+        ),
     ],
 )
 def test_bad_input_is_named(arguments, message):
@@ -119,7 +121,6 @@ def test_bad_input_is_named(arguments, message):
         (lambda key, theta: (theta, theta, theta), r"expected one array"),
         (lambda key, theta: (theta, theta > 0), "expected a scalar outcome"),
         (lambda key, theta: (theta, False), r"got none \(failed: 25, non_finite: 0\)"),
-        (lambda key, theta: theta * jnp.nan, r"got none \(failed: 0, non_finite: 25\)"),
     ],
 )
 def test_a_simulator_that_breaks_its_contract_is_told(simulate, message):

@@ -14,8 +14,7 @@ from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
 from jaxlfi.history import own_evidence
 from jaxlfi.keys import run_keys
 from jaxlfi.lanes import Lane, LaneEngine, stack_heuristics, stack_inputs
-from jaxlfi.run_store import read_belief
-from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
+from tests.small import SETTINGS, gaussian, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
 
@@ -34,44 +33,55 @@ LANES = [
 ]
 
 
-@pytest.fixture(scope="module")
-def stepped():
+def step_lanes(devices=None):
     """The five lanes after two rounds, with every round's record."""
     observed = np.tile(OBSERVED, (len(LANES), 1))
     inputs, places = stack_inputs(LANES, observed, observed)
-    engine = LaneEngine(gaussian(), SETTINGS, inputs)
+    engine = LaneEngine(gaussian(), SETTINGS, inputs, devices)
     state, rows = engine.start(), []
     for index in range(SETTINGS.rounds):
         state, row = engine.round(state, index)
         rows.append(row)
-    return engine.fetch(state), rows, places
+    return engine.fetch(state), rows, places, inputs
+
+
+@pytest.fixture(scope="module")
+def stepped(whole_runs):  # noqa: F811 - the fixture
+    """As `step_lanes`, on one device."""
+    return step_lanes(jax.local_devices()[:1])
+
+
+@jax.jit
+def run_alone(key, heuristic, support):
+    """One lane by itself, as one program."""
+    state, _ = bayessim.run(key, gaussian(), SETTINGS, heuristic, jnp.asarray(OBSERVED), support)
+    return state
 
 
 @pytest.mark.parametrize("index", range(len(LANES)))
 def test_each_lane_is_the_pure_run_of_its_seed(stepped, index):
-    state, _, _ = stepped
+    state, _, _, inputs = stepped
     own = LANES[index]
-    key = run_keys(jax.random.key(own.seed)).run
-    alone, _ = _run(key, own.heuristic, own.support)
+    # Lane 1 by its own rule, the others by the choice of all rules, which is the same program for each.
+    heuristic = own.heuristic if index == 1 else jax.tree.map(lambda leaf: leaf[index], inputs.heuristic)
+    alone = run_alone(run_keys(jax.random.key(own.seed)).run, heuristic, own.support)
     for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(ours[index], theirs, rtol=2e-3, atol=2e-3)
 
 
-@jax.jit
-def _run(key, heuristic, support):
-    return bayessim.run(key, gaussian(), SETTINGS, heuristic, jnp.asarray(OBSERVED), support)
-
-
 def test_lanes_of_one_seed_share_their_first_draws(stepped):
-    _, rows, _ = stepped
+    _, rows, _, _ = stepped
     theta = rows[0]["theta"]
-    unit = [(t - np.asarray(x.support.low)) / np.asarray(x.support.width) for t, x in zip(theta, LANES, strict=True)]
+    unit = [
+        (t - np.asarray(x.support.low)) / np.asarray(x.support.width)
+        for t, x in zip(theta, LANES, strict=True)
+    ]
     np.testing.assert_allclose(unit[0], unit[1], atol=1e-5)
     assert not np.allclose(unit[1], unit[2], atol=1e-2)
 
 
 def test_evidence_is_the_lanes_own(stepped):
-    _, rows, places = stepped
+    _, rows, places, _ = stepped
     seen = [
         {name for name in own_evidence(rows[0], place) if name.startswith("evidence/")} for place in places
     ]
@@ -101,22 +111,25 @@ def test_inputs_are_padded_to_the_devices():
     assert engine.fetch(jnp.arange(4)).tolist() == [0, 1, 2]
 
 
-def test_two_devices_give_what_one_gives(tmp_path):
-    arguments = ["compare", TASK, "--configurations", "ok", "misspecified+edge", "misspecified+mode", *FLAGS, "--seeds", "1"]
-    assert command(*arguments, "--out", tmp_path / "one") == 0
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
-    subprocess.run(
-        [sys.executable, "-m", "jaxlfi", *arguments, "--out", str(tmp_path / "two")],
-        env=environment, check=True, capture_output=True,
-    )  # fmt: skip
-    from jaxlfi.run_store import read_config
+TWO_DEVICES = """
+import jax, numpy as np, sys
+from tests.test_lanes import step_lanes
+assert jax.local_device_count() == 2
+state, _, _, _ = step_lanes()
+np.savez(sys.argv[1], *map(np.asarray, jax.tree.leaves(state)))
+"""
 
-    assert read_config(tmp_path / "one")["devices"] == 1
-    assert read_config(tmp_path / "two")["devices"] == 2  # three lanes: one of them is padding
-    for configuration in ("ok", "misspecified+edge", "misspecified+mode"):
-        one, two = (read_belief(tmp_path / name / configuration / "seed_000") for name in ("one", "two"))
-        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
-            np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-3)
+
+def test_two_devices_give_what_one_gives(stepped, tmp_path):
+    """Five lanes on two devices: one of them is padding."""
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    command = [sys.executable, "-c", TWO_DEVICES, str(tmp_path / "two.npz")]
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    leaves = jax.tree.leaves(stepped[0])
+    two = np.load(tmp_path / "two.npz")
+    assert len(two.files) == len(leaves)
+    for i, leaf in enumerate(leaves):
+        np.testing.assert_allclose(two[f"arr_{i}"], leaf, rtol=2e-3, atol=2e-3)
 
 
 def test_stacking_makes_a_leading_axis():

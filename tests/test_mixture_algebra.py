@@ -221,7 +221,11 @@ def test_floor_leaves_a_fraction_of_as_precision():
 
 
 def test_equal_gaussians_are_not_positive_definite():
-    """Their precision difference is zero: rounding must not decide."""
+    """Nor are nearly equal ones, whose precision difference is zero but for rounding."""
+    first = jax.tree.map(lambda leaf: leaf[:1], A)
+    for wider, indefinite in ((2e-6, 1), (1e-3, 0)):
+        divisor = GaussianMixture(first.logits, first.means, (1 + wider) * first.scale_tril)
+        assert int(QUOTIENT(first, divisor, policy="drop")[1].not_positive_definite) == indefinite
     for policy in POLICIES:
         ratio, pairing = QUOTIENT(
             jax.tree.map(lambda leaf: leaf[:1], A), jax.tree.map(lambda leaf: leaf[:1], A), policy=policy
@@ -396,15 +400,19 @@ def test_reduction_is_runnalls(seed):
         np.testing.assert_allclose(reduced.covariances[k], covariance, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize(("present", "components"), [((0, 3, 4), 3), ((0, 3, 4), 2), ((2, 4), 3), ((1,), 2)])
+@pytest.mark.parametrize(
+    ("present", "components"), [((0, 3, 4), 3), ((0, 3, 4), 2), ((2, 4), 3), ((1,), 2), ((0, 1), 3)]
+)
 def test_reduction_drops_absent_components_first(present, components):
+    """Even before it merges equal ones, which costs nothing either: components 0 and 1 are equal."""
     draw = np.random.default_rng(1)
     logits = np.full(6, -np.inf)
     logits[list(present)] = draw.normal(size=len(present))
+    equal = [0, 0, 2, 3, 4, 5]
     mixture = GaussianMixture(
         jnp.asarray(logits, jnp.float32),
-        jnp.asarray(draw.normal(size=(6, 2)), jnp.float32),
-        jnp.asarray(draw.uniform(0.3, 1.0, (6, 1, 1)) * np.eye(2), jnp.float32),
+        jnp.asarray(draw.normal(size=(6, 2))[equal], jnp.float32),
+        jnp.asarray(draw.uniform(0.3, 1.0, (6, 1, 1))[equal] * np.eye(2), jnp.float32),
     )
     reduced = REDUCE(mixture, components=components)
     chex.assert_tree_all_finite((reduced.means, reduced.scale_tril))

@@ -78,7 +78,14 @@ def test_arrays_have_the_documented_shapes(folder):
             "evidence/mass_left": (ROUNDS, DIM),
             "evidence/mass_right": (ROUNDS, DIM),
         },
-        "observation.npz": {"trajectory": (2,), "x": (OBS,), "truth": (DIM,), "names": (DIM,), "channels": (1,), "times": (2,)},
+        "observation.npz": {
+            "trajectory": (2,),
+            "x": (OBS,),
+            "truth": (DIM,),
+            "names": (DIM,),
+            "channels": (1,),
+            "times": (2,),
+        },
     }
     for name, shapes in expected.items():
         arrays = atomic.read_arrays(folder / name)
@@ -91,11 +98,17 @@ def test_the_ledger_agrees_with_the_history(folder):
     history = atomic.read_arrays(folder / "history.npz")
     assert [line["round"] for line in ledger] == [0, 1]
     for i, line in enumerate(ledger):
-        assert line["attempted"] == history["counted"][i].sum() == line["succeeded"] + sum(line["failed"].values())
+        assert (
+            line["attempted"]
+            == history["counted"][i].sum()
+            == line["succeeded"] + sum(line["failed"].values())
+        )
         assert line["support_low"] == history["support_low"][i].tolist()
         assert line["proposal_high"] == history["proposal_high"][i].tolist()
         assert line["evidence"]["mass_right"] == history["evidence/mass_right"][i].tolist()
-        np.testing.assert_allclose(line["theta_error"], history["sample_theta_error"][i].sum(-1).mean(), rtol=1e-6)
+        np.testing.assert_allclose(
+            line["theta_error"], history["sample_theta_error"][i].sum(-1).mean(), rtol=1e-6
+        )
         assert np.isnan(line["validation_loss"])  # null in the file: there was nothing held out
     assert history["proposal_low"][0].tolist() == [-3, -3]
     np.testing.assert_array_equal(history["proposal_high"][1], history["support_high"][0])
@@ -119,12 +132,21 @@ def test_settings_survive_their_description(preset):
 
 
 @pytest.mark.parametrize(
-    "heuristic", [Fixed(), Edge(), Edge(expansion=np.array([0.1, 0.3], np.float32)), Matched(Mode(proximity=0.3)), Centre()]
+    "heuristic",
+    [
+        Fixed(),
+        Edge(),
+        Edge(expansion=np.array([0.1, 0.3], np.float32)),
+        Matched(Mode(proximity=0.3)),
+        Centre(),
+    ],
 )
 def test_heuristics_survive_their_description(heuristic):
     again = heuristic_from_json(json.loads(json.dumps(heuristic_to_json(heuristic))))
     assert jax.tree.structure(again) == jax.tree.structure(heuristic)
-    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(heuristic), strict=True))
+    assert all(
+        np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(heuristic), strict=True)
+    )
 
 
 class Killed(BaseException):
@@ -227,7 +249,7 @@ def test_a_state_of_another_shape_is_refused(tmp_path):
     checkpoint.write_start(np.zeros((1, 2)), np.zeros((1, 2)))
     checkpoint.write_round(0, {"a": np.zeros(3)}, {"final_trajectory": np.zeros((1, 20, 2))}, 0.1)
     assert checkpoint.read_state({"a": np.ones(3)})["a"].tolist() == [0, 0, 0]
-    with pytest.raises(CheckpointError, match="expected .* of shape"):
+    with pytest.raises(CheckpointError, match=r"expected .* of shape"):
         checkpoint.read_state({"a": np.zeros(4)})
 
 
@@ -237,7 +259,9 @@ def test_python_objects_are_never_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("content", [None, "{", "[]", '{"format": "other"}', '{"format": "jaxlfi-run", "version": 99}'])
+@pytest.mark.parametrize(
+    "content", [None, "{", "[]", '{"format": "other"}', '{"format": "jaxlfi-run", "version": 99}']
+)
 def test_foreign_folders_are_refused(tmp_path, content):
     if content is not None:
         (tmp_path / "config.json").write_text(content)

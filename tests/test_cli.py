@@ -1,0 +1,317 @@
+"""The command line: what it runs, what it refuses, and how it tells."""
+
+import csv
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+
+import jaxlfi
+from jaxlfi import atomic, cli, commands, observation, run_store, session, tasks
+from jaxlfi.bayessim import Settings
+from jaxlfi.estimator import Estimator
+from jaxlfi.heuristics import HEURISTICS
+from jaxlfi.presets import PRESETS
+from tests import test_black_box
+from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
+
+
+def error_line(capsys, *arguments) -> str:
+    """The one line that a refused command leaves on stderr."""
+    capsys.readouterr()
+    assert command(*arguments) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and message.endswith("\n") and "error: " in message
+    return message
+
+
+def test_help_teaches_and_does_not_wait_for_jax():
+    script = (
+        "import sys, jaxlfi.cli as c; c.main(['--help'] if len(sys.argv) < 2 else [sys.argv[1], '--help'])"
+    )
+    check = "import atexit, sys; atexit.register(lambda: print('jax' in sys.modules)); "
+    for name, wanted in (("infer", "delta"), ("compare", "SUPPORT[+HEURISTIC]")):
+        done = subprocess.run(
+            [sys.executable, "-c", check + script, name], capture_output=True, text=True, check=True
+        )
+        assert done.stdout.rstrip().endswith("False"), "jax was imported"
+        assert "examples:" in done.stdout and wanted in done.stdout
+
+
+def test_every_setting_and_hyperparameter_has_a_documented_flag():
+    choices = cli.parser()._subparsers._group_actions[0].choices
+    for name in ("infer", "compare"):
+        documented = {action.dest for action in choices[name]._actions if action.help}
+        fields = {field.name for kind in (Settings, Estimator) for field in dataclasses.fields(kind)} - {
+            "estimator"
+        }
+        assert fields | set(commands.hyperparameters()) <= documented
+
+
+def test_names_known_without_jax_are_the_real_ones():
+    assert set(cli.PRESETS) == set(PRESETS) and set(cli.HEURISTICS) == set(HEURISTICS)
+
+
+def test_version(capsys):
+    assert command("--version") == 0
+    assert capsys.readouterr().out == f"jaxlfi {jaxlfi.__version__}\n"
+
+
+BAD = {
+    "unknown task": (["infer", "nothing"], "task: expected one of"),
+    "no such module": (["infer", "no.such:task"], "cannot load 'no.such:task'"),
+    "no task": (["infer", "os:getcwd"], "expected 'os:getcwd' to give a jaxlfi.Task, got str"),
+    "unknown support": (["infer", TASK, "--support", "x"], "expected one of ['broad', 'misspecified', 'ok'], got 'x'"),  # noqa: E501
+    "unknown heuristic": (["infer", TASK, "--heuristic", "x"], "heuristic: expected one of"),
+    "unknown preset": (["infer", TASK, "--preset", "x"], "invalid choice: 'x'"),
+    "unknown flag": (["infer", TASK, "--nonsense"], "unrecognized arguments"),
+    "not a number": (["infer", TASK, "--rounds", "x"], "invalid int value: 'x'"),
+    "reversed": (["infer", TASK, "--support-low", "1", "1", "--support-high", "0", "2"], "low < high"),
+    "not finite": (["infer", TASK, "--support-low", "nan", "0", "--support-high", "1", "2"], "finite bounds"),
+    "outside Phi": (["infer", TASK, "--support-low", "-99", "0", "--support-high", "1", "2"], "feasible domain Phi"),  # noqa: E501
+    "dimensions": (["infer", TASK, "--support-low", "0", "--support-high", "1"], "bounds for 2 parameters, got 1"),  # noqa: E501
+    "half a box": (["infer", TASK, "--support-low", "0", "0"], "--support-low and --support-high together"),
+    "two supports": (
+        ["infer", TASK, "--support", "ok", "--support-low", "0", "0", "--support-high", "1", "1"],
+        "expected --support NAME, or",
+    ),
+    "no rounds": (["infer", TASK, "--rounds", "0"], "at least 1 round"),
+    "few attempts": (["infer", TASK, "--attempts", "5", "--additions", "9"], "attempts: expected at least the 9"),  # noqa: E501
+    "correction": (["infer", TASK, "--correction", "x"], "correction: expected one of"),
+    "activation": (["infer", TASK, "--activation", "x"], "activation: expected one of"),
+    "learning rate": (["infer", TASK, "--learning-rate", "nan"], "learning_rate: expected a number"),
+    "epochs and steps": (["infer", TASK, "--epochs", "5", "--steps", "5"], "epochs or steps"),
+    "seeds": (["infer", TASK, "--seeds", "0"], "seeds: expected at least 1"),
+    "hyperparameter length": (["infer", TASK, "--expansion", "1", "2", "3"], "expansion: expected one finite number or 2"),  # noqa: E501
+    "foreign hyperparameter": (["infer", TASK, "--proximity", "0.3"], "proximity: expected a hyperparameter of edge"),  # noqa: E501
+    "no file": (["infer", TASK, "--observation", "nothing.csv"], "cannot read 'nothing.csv'"),
+    "no format": (["infer", TASK, "--observation", "x.txt"], "expected a .csv or .npz"),
+    "configuration": (["compare", TASK, "--configurations", "ok+x"], "expected support+heuristic"),
+    "configurations": (["compare", TASK, "--configurations", "ok", "ok"], "expected distinct ones"),
+    "configured support": (["compare", TASK, "--configurations", "x+edge"], "support: expected one of"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line_and_writes_nothing(case, tmp_path, capsys):
+    arguments, expected = BAD[case]
+    assert expected in error_line(capsys, *arguments, "--out", tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["file", "folder"])
+def test_nothing_is_overwritten(name, tmp_path, capsys):
+    out = tmp_path / "out"
+    if name == "file":
+        out.write_text("mine")
+    else:
+        out.mkdir()
+        (out / "mine.txt").write_text("mine")
+    message = error_line(capsys, "infer", TASK, "--out", out)
+    assert "jaxlfi resume" in message and "another name" in message
+    assert (out if name == "file" else out / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("verb", ["resume", "report"])
+def test_foreign_folders_are_refused(verb, tmp_path, capsys):
+    (tmp_path / "file.txt").write_text("mine")
+    assert "expected a run folder" in error_line(capsys, verb, tmp_path)
+    assert "no folder" in error_line(capsys, verb, tmp_path / "nowhere")
+    (tmp_path / "config.json").write_text('{"format": "jaxlfi-run", "version": 1, "lanes": [{}]}')
+    if verb == "resume":
+        assert "complete description" in error_line(capsys, verb, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "file.txt"]
+
+
+@pytest.fixture(scope="module")
+def comparison(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
+    """A small comparison."""
+    out = tmp_path_factory.mktemp("compare") / "out"
+    configurations = ("ok", "misspecified", "misspecified+edge")
+    assert (
+        command("compare", TASK, "--configurations", *configurations, *FLAGS, "--seeds", "2", "--out", out)
+        == 0
+    )
+    return out
+
+
+def test_compare_writes_its_table(comparison):
+    with (comparison / "table.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert tuple(lines[0]) == run_store.TABLE_COLUMNS
+    assert [(line["configuration"], line["seed"]) for line in lines] == [
+        (configuration, str(seed))
+        for configuration in ("ok", "misspecified", "misspecified+edge")
+        for seed in (0, 1)
+    ]
+    for line in lines:
+        folder = comparison / line["configuration"] / f"seed_{int(line['seed']):03d}"
+        error = atomic.read_arrays(folder / "history.npz")["sample_theta_error"][-1]
+        assert float(line["theta_error"]) == pytest.approx(error.sum(-1).mean(), rel=1e-5)
+        assert float(line["success_rate"]) == 1.0 and float(line["seconds"]) > 0
+    assert run_store.read_table(comparison / "table.csv")[0]["configuration"] == "ok"
+
+
+def test_a_seed_has_one_observation_in_all_configurations(comparison):
+    seen = [
+        atomic.read_arrays(comparison / name / seed / "observation.npz")["trajectory"]
+        for seed in ("seed_000", "seed_001")
+        for name in ("ok", "misspecified+edge")
+    ]
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert not np.array_equal(seen[0], seen[2])
+
+
+def test_compare_tells_of_mass_on_the_bounds_of_fixed_supports(comparison):
+    plan = session.plan_of(run_store.read_config(comparison))
+    told = list(session.support_warnings(comparison, plan))
+    assert any(text.startswith("misspecified:") and "first upper 0 (2 of 2 seeds)" in text for text in told)
+    assert not any(text.startswith("misspecified+edge") for text in told)
+
+
+def test_resuming_what_is_complete_says_so(comparison, capsys):
+    for folder in (comparison, comparison / "ok" / "seed_000"):
+        assert command("resume", folder) == 0
+        assert "is complete" in capsys.readouterr().out
+
+
+def test_report_names_what_it_drew(comparison, monkeypatch, capsys):
+    from jaxlfi import figures
+
+    monkeypatch.setattr(figures, "report", lambda folder: [folder / "report.html"])
+    assert command("report", comparison) == 0
+    assert "report.html" in capsys.readouterr().out
+
+
+def test_an_observation_can_come_from_a_file(tmp_path):
+    (tmp_path / "real.csv").write_text("x\n0.8\n-0.6\n")
+    np.savez(tmp_path / "real.npz", trajectory=np.array([0.8, -0.6], np.float32))
+    for kind in ("csv", "npz"):
+        file = tmp_path / f"real.{kind}"
+        assert command("infer", TASK, *FLAGS, "--observation", file, "--out", tmp_path / kind) == 0
+    first, second = (atomic.read_arrays(tmp_path / kind / "posterior.npz") for kind in ("csv", "npz"))
+    np.testing.assert_array_equal(first["means"], second["means"])
+    seen = atomic.read_arrays(tmp_path / "csv" / "observation.npz")
+    np.testing.assert_allclose(seen["trajectory"], [0.8, -0.6], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("1,2\n3,4\n", [[1, 2], [3, 4]]),
+        ("hare,lynx\n1,2\n3,4\n", [[1, 2], [3, 4]]),
+        ("# a comment\nYear,hare,lynx\n1900,1,2\n1901,3,4\n", [[1, 2], [3, 4]]),
+        ("1\n2\n", [[1], [2]]),
+    ],
+)
+def test_csv_layouts(text, expected, tmp_path):
+    (tmp_path / "x.csv").write_text(text)
+    assert observation.read(tmp_path / "x.csv").tolist() == expected
+
+
+@pytest.mark.parametrize("text", ["", "a,b\n", "1,2\n3\n", "1,x\n", "1,2\nnan,1\n", "1,2,3\n"])
+def test_csv_files_that_cannot_be_an_observation(text, tmp_path, capsys):
+    (tmp_path / "x.csv").write_text(text)
+    arguments = ("infer", TASK, "--observation", tmp_path / "x.csv", "--out", tmp_path / "out")
+    assert "observation: " in error_line(capsys, *arguments)
+    assert not (tmp_path / "out").exists()
+
+
+def test_npz_files_that_cannot_be_an_observation(tmp_path, capsys):
+    np.savez(tmp_path / "two.npz", a=np.zeros(2), b=np.zeros(2))
+    np.savez(tmp_path / "pickled.npz", trajectory=np.array([{}, None]))
+    (tmp_path / "broken.npz").write_bytes(b"PK not really")
+    for name in ("two", "pickled", "broken"):
+        arguments = ("infer", TASK, "--observation", tmp_path / f"{name}.npz", "--out", tmp_path / "out")
+        assert "cannot read" in error_line(capsys, *arguments)
+
+
+def test_a_simulator_that_breaks_its_contract_leaves_nothing(tmp_path, capsys):
+    for name, expected in (("wrong_shape", "expected numbers of shape"), ("failing", "got none (failed: 25")):
+        task = f"tests.test_black_box:{name}"
+        assert expected in error_line(capsys, "infer", task, *FLAGS, "--out", tmp_path / name)
+        assert not list(tmp_path.iterdir())
+
+
+def slow():
+    """A task whose rounds take a while."""
+
+    def simulate(rng, theta):
+        time.sleep(0.7 if len(theta) == 20 else 0)
+        return test_black_box.numpy_simulate(rng, theta)
+
+    return test_black_box.boxed(simulate)
+
+
+def test_a_killed_process_resumes_to_the_same_bits(tmp_path):
+    arguments = ["infer", "tests.test_cli:slow", *FLAGS]
+    program = [sys.executable, "-m", "jaxlfi"]
+    process = subprocess.Popen(
+        [*program, *arguments, "--out", str(tmp_path / "killed")],
+        stdout=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 300
+    while not (tmp_path / "killed" / "checkpoint" / "state.npz").exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "killed" / "posterior.npz").exists()
+    again = [*program, "resume", str(tmp_path / "killed"), "--no-figures"]
+    done = subprocess.run(again, capture_output=True, text=True, check=True)
+    assert done.stderr == "" and "of 2 rounds to do" in done.stdout
+    assert command(*arguments, "--out", tmp_path / "whole") == 0
+    for name in ("posterior.npz", "dataset.npz"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_an_interrupt_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(session, "advance", interrupted)
+    assert command("infer", TASK, *FLAGS, "--out", tmp_path / "out") == 130
+    assert f"jaxlfi resume {tmp_path / 'out'}" in capsys.readouterr().err
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """One task that works and one whose package is broken."""
+    points = [
+        EntryPoint("linear", "envs.gaussian_linear:task", tasks.GROUP),
+        EntryPoint("broken", "no.such.module:task", tasks.GROUP),
+    ]
+    monkeypatch.setattr(tasks, "entry_points", lambda group: points)
+
+
+def test_tasks_are_listed_also_beside_a_broken_package(registered, capsys):
+    assert command("tasks") == 0
+    out = capsys.readouterr().out
+    assert "linear" in out and "first, second" in out and "cannot load 'broken'" in out
+
+
+def test_one_task_is_described(registered, capsys):
+    assert command("tasks", "linear") == 0
+    out = capsys.readouterr().out
+    assert "[-3, 0]" in out and "Phi" in out and "truth" in out
+    assert "cannot load 'broken'" in error_line(capsys, "tasks", "broken")
+    assert "expected one of ['broken', 'linear']" in error_line(capsys, "tasks", "other")
+
+
+def test_default_configurations_are_the_matrix_of_the_paper():
+    assert commands.default_configurations(gaussian()) == [
+        "ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre",
+    ]  # fmt: skip
+
+
+def test_bootstrap_interval_covers_the_mean():
+    values = np.random.default_rng(1).normal(3.0, 1.0, 50)
+    low, high = commands.bootstrap_interval(values)
+    assert low < values.mean() < high and high - low == pytest.approx(2 * 1.96 / np.sqrt(50), rel=0.3)

@@ -1,0 +1,57 @@
+"""Dataset: rows stay in order and compact, storage is never overrun."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxlfi.dataset import augment, empty
+from jaxlfi.simulation import within_budget
+
+CAPACITY, BUDGET = 8, 5
+augmented = jax.jit(augment)
+
+
+def attempts(failure, first: int, additions: int = 3):
+    """Attempts whose theta and x tell which one they are; failed ones carry numbers that must not be stored."""
+    place = jnp.arange(first, first + len(failure), dtype=jnp.float32)
+    return within_budget(
+        jnp.stack([place, -place], axis=1), 10 * place[:, None], jnp.asarray(failure), additions
+    )
+
+
+def test_an_empty_dataset_has_no_valid_rows():
+    dataset = empty(4, 2, 3)
+    assert dataset.theta.shape == (4, 2) and dataset.x.shape == (4, 3)
+    assert int(dataset.size) == 0 and not np.asarray(dataset.valid).any()
+
+
+@given(st.lists(st.lists(st.integers(0, 2), min_size=BUDGET, max_size=BUDGET), min_size=1, max_size=5))
+def test_rows_are_the_kept_ones_in_order(rounds):
+    """Against lists; five rounds of three ask for more than there is room for."""
+    dataset, expected = empty(CAPACITY, 2, 1), []
+    for round, failure in enumerate(rounds):
+        first = 1 + 100 * round
+        dataset = augmented(dataset, attempts(failure, first), round)
+        kept = [first + place for place, code in enumerate(failure) if code == 0][:3]
+        expected += [(place, round) for place in kept]
+    expected = expected[:CAPACITY]
+    size = int(dataset.size)
+    assert size == len(expected) <= CAPACITY
+    np.testing.assert_array_equal(dataset.valid, np.arange(CAPACITY) < size)
+    np.testing.assert_array_equal(dataset.theta[:size, 0], [place for place, _ in expected])
+    np.testing.assert_array_equal(dataset.theta[:size, 1], [-place for place, _ in expected])
+    np.testing.assert_array_equal(dataset.x[:size, 0], [10 * place for place, _ in expected])
+    np.testing.assert_array_equal(dataset.round[:size], [round for _, round in expected])
+    np.testing.assert_array_equal(dataset.theta[size:], 0.0)
+    np.testing.assert_array_equal(dataset.x[size:], 0.0)
+
+
+def test_lanes_fill_at_their_own_pace():
+    failures = jnp.array([[0, 1, 0, 0, 0], [1, 1, 1, 0, 1]])
+    place = jnp.arange(5.0)[:, None]
+    one = lambda failure: augment(empty(CAPACITY, 1, 1), within_budget(place, place, failure, 3), 0)
+    both = jax.vmap(one)(failures)
+    np.testing.assert_array_equal(both.size, [3, 1])
+    np.testing.assert_array_equal(both.theta[:, :4, 0], [[0, 2, 3, 0], [3, 0, 0, 0]])

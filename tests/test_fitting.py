@@ -1,0 +1,463 @@
+"""Fitting: what is learnt, from which rows, by how many steps, and what happens to numbers that are not finite."""
+
+import dataclasses
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlfi import dataset as datasets
+from jaxlfi.dataset import Dataset
+from jaxlfi.estimator import Estimator, Network, condition, initialise
+from jaxlfi.fitting import fit
+from jaxlfi.normalise import fit_normaliser
+from jaxlfi.support import Support
+
+SCALE = Support([-4.0, -6.0], [4.0, 2.0])
+CAPACITY, SIZE = 48, 40
+SMALL = Estimator(learning_rate=3e-3, hidden=(8,), components=2, epochs=6, batch_size=8)
+"""Five minibatches of eight an epoch. It trains on from the network it is given."""
+COLD = dataclasses.replace(SMALL, warm_start=False)
+VALIDATED = dataclasses.replace(
+    SMALL, learning_rate=2e-2, hidden=(16,), epochs=80, batch_size=10, validation=0.3, members=2
+)
+"""Two members that over-fit 28 rows."""
+PATIENT = dataclasses.replace(VALIDATED, patience=6)
+WHOLE = dataclasses.replace(SMALL, batch_size=60, epochs=12)
+"""Every minibatch of sixty is all of 10, 12 or 15 rows, several times over."""
+# Each of these is compiled once. The programs are small, and take less time to run than to optimise.
+QUICK_TO_COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+MIXING = np.array([[1.0, 0.4], [-0.2, 0.8]])
+NOISE = np.diag([0.3, 0.6])
+PRIOR_SD = np.array([1.2, 0.7])
+PRIOR_MEAN = np.array([0.3, -2.0])
+
+
+def change(estimator: Estimator, **changes) -> Estimator:
+    return dataclasses.replace(estimator, **changes)
+
+
+def toy(seed: int, size: int, capacity: int | None = None) -> Dataset:
+    """theta from a Gaussian, x = MIXING theta + noise: theta given x is Gaussian and known."""
+    capacity = capacity or size
+    draw = np.random.default_rng(seed)
+    theta, x = np.zeros((2, capacity, 2), np.float32)
+    theta[:size] = PRIOR_MEAN + PRIOR_SD * draw.normal(size=(size, 2))
+    x[:size] = theta[:size] @ MIXING.T + draw.normal(size=(size, 2)) @ NOISE
+    return Dataset(jnp.asarray(theta), jnp.asarray(x), jnp.zeros(capacity, jnp.int32), jnp.asarray(size, jnp.int32))
+
+
+DATA = toy(0, SIZE, CAPACITY)
+
+_initialise = jax.jit(initialise, static_argnames=("dim", "obs"), compiler_options=QUICK_TO_COMPILE)
+_normaliser = jax.jit(fit_normaliser, static_argnames="name")
+_condition = jax.jit(condition, compiler_options=QUICK_TO_COMPILE)
+
+
+def _train(key, estimator, network, dataset, weights, expected):
+    return fit(key, estimator, network, dataset, weights, SCALE, expected)
+
+
+_fit = jax.jit(_train, compiler_options=QUICK_TO_COMPILE)
+
+
+def start(estimator: Estimator, dataset: Dataset = DATA, seed: int = 5) -> Network:
+    """A network to be trained on, normalised by the dataset."""
+    params = _initialise(jax.random.key(seed), estimator, dim=2, obs=2)
+    return Network(params, _normaliser(estimator.normaliser, dataset.x, dataset.valid))
+
+
+def fitted(estimator=SMALL, dataset=DATA, seed=1, weights=None, network=None, expected=SIZE):
+    """Fit with a key of that seed: the network and what happened."""
+    weights = dataset.valid.astype(float) if weights is None else jnp.asarray(weights, jnp.float32)
+    network = start(estimator, dataset) if network is None else network
+    return jax.device_get(_fit(jax.random.key(seed), estimator, network, dataset, weights, expected))
+
+
+def distance(a, b) -> float:
+    return float(np.sqrt(sum(np.sum((x - y) ** 2) for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True))))
+
+
+# ------------------------------------------------------------------------------------------------- what is learnt
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    estimator = Estimator(
+        learning_rate=3e-3,
+        hidden=(32,),
+        components=1,
+        epochs=0,
+        steps=2000,
+        batch_size=100,
+        schedule="cosine",
+    )
+    return estimator, *fitted(estimator, toy(1, 4000), seed=2)
+
+
+@pytest.mark.parametrize("x", [(0.3, -1.6), (1.2, -1.0), (-1.5, -2.2)])
+def test_recovers_the_exact_conditional(learnt, x):
+    """The posterior under a Gaussian prior, within a fifth of its standard deviations and 15 % of its spreads."""
+    estimator, network, _ = learnt
+    noise = np.linalg.inv(NOISE @ NOISE)
+    covariance = np.linalg.inv(MIXING.T @ noise @ MIXING + np.diag(PRIOR_SD**-2.0))
+    mean = covariance @ (MIXING.T @ noise @ np.array(x) + PRIOR_MEAN / PRIOR_SD**2)
+    q = _condition(estimator, network, jnp.array(x), SCALE)
+    factor = np.linalg.inv(np.linalg.cholesky(covariance))
+    np.testing.assert_allclose(factor @ (np.asarray(q.mean) - mean), 0, atol=0.2)
+    # Whitened by the exact covariance, the learnt one is the identity: its axes and correlations are right too.
+    np.testing.assert_allclose(factor @ np.asarray(q.covariance) @ factor.T, np.eye(2), atol=0.3)
+
+
+def test_loss_reaches_the_entropy_of_the_conditional(learnt):
+    _, _, info = learnt
+    noise = np.linalg.inv(NOISE @ NOISE)
+    precision = MIXING.T @ noise @ MIXING + np.diag(PRIOR_SD**-2.0)
+    entropy = 1 + np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(precision)[1] - np.sum(np.log(SCALE.width / 2))
+    loss = info.loss[0]
+    assert loss[0] > loss[4] > entropy
+    # 500 draws: the mean of -log q has a standard error of 1 / sqrt(500) (half a chi-square of two degrees).
+    assert abs(loss[-10:].mean() - entropy) < 0.1
+
+
+# ------------------------------------------------------------------------------------------------- which rows count
+
+
+@pytest.mark.parametrize("junk", [1e6, np.nan])
+def test_rows_that_are_not_filled_change_nothing_bit_for_bit(junk):
+    dirty = dataclasses.replace(DATA, theta=DATA.theta.at[SIZE:].set(junk), x=DATA.x.at[SIZE:].set(junk))
+    chex.assert_trees_all_equal(fitted(VALIDATED, DATA), fitted(VALIDATED, dirty))
+
+
+def test_every_filled_row_matters():
+    last = dataclasses.replace(DATA, theta=DATA.theta.at[SIZE - 1].add(3.0))
+    assert distance(fitted(SMALL, DATA)[0].params, fitted(SMALL, last)[0].params) > 1e-4
+
+
+WHOLE_START = functools.cache(lambda: start(WHOLE))
+
+
+def whole(dataset: Dataset, weights):
+    """Training in which every step sees all rows, so that it is a function of the weighted data only."""
+    return fitted(WHOLE, dataset, weights=weights, network=WHOLE_START(), expected=60)
+
+
+def test_a_weight_of_two_is_a_row_twice():
+    once = toy(0, 12, 15)
+    twice = jax.tree.map(lambda leaf: leaf.at[12:].set(leaf[:3]) if leaf.ndim else leaf + 3, once)
+    weighted, seen = whole(once, [2.0] * 3 + [1.0] * 9 + [0.0] * 3)
+    repeated, expected = whole(twice, np.ones(15))
+    chex.assert_trees_all_close(weighted.params, repeated.params, atol=2e-5)
+    np.testing.assert_allclose(seen.loss, expected.loss, rtol=1e-4)
+    plain, _ = whole(once, np.ones(15))
+    assert distance(weighted.params, plain.params) > 1e-3
+
+
+def test_weights_are_relative():
+    data, weights = toy(0, 12, 15), np.linspace(0.2, 3, 15)
+    chex.assert_trees_all_close(whole(data, weights), whole(data, 64 * weights), atol=1e-6)
+
+
+def test_rows_of_no_weight_have_no_influence():
+    data = toy(0, 12, 15)
+    changed = dataclasses.replace(data, theta=data.theta.at[10:].set(3.0), x=data.x.at[10:].set(-7.0))
+    weights = np.where(np.arange(15) < 10, 1.0, 0.0)
+    chex.assert_trees_all_close(whole(data, weights), whole(changed, weights), atol=1e-6)
+    ten, _ = whole(dataclasses.replace(data, size=jnp.asarray(10)), np.ones(15))
+    chex.assert_trees_all_close(whole(data, weights)[0].params, ten.params, atol=2e-5)
+
+
+def test_an_empty_dataset_leaves_the_start():
+    """All simulations of the first round can fail."""
+    network = start(SMALL)
+    result, info = fitted(SMALL, datasets.empty(CAPACITY, 2, 2), network=network)
+    chex.assert_trees_all_equal(result.params, network.params)
+    assert info.nonfinite[0] == 0
+
+
+# --------------------------------------------------------------------------------------------------- how many steps
+
+
+@pytest.mark.parametrize(
+    ("estimator", "expected_size", "steps", "passes"),
+    [
+        (SMALL, 40, 30, 6),
+        (SMALL, 41, 36, 6),  # the last, short minibatch is filled up with rows from the start
+        (WHOLE, 40, 12, 12),
+        (change(SMALL, epochs=0, steps=20), 40, 20, 1),
+        (change(SMALL, epochs=0, steps=120), 40, 120, 3),
+    ],
+)
+def test_number_of_gradient_steps(estimator, expected_size, steps, passes):
+    """Rows that are all NaN turn the counter of steps that are not finite into one of all steps."""
+    nan = dataclasses.replace(DATA, x=jnp.full((CAPACITY, 2), jnp.nan))
+    _, info = fitted(estimator, nan, network=start(estimator), expected=expected_size)
+    assert info.nonfinite[0] == steps
+    assert info.loss.shape == (1, passes)
+    assert np.isnan(info.loss).all()
+
+
+def mean_loss(estimator: Estimator, network: Network, rows=slice(0, SIZE)) -> float:
+    """Mean negative log-density of some rows of DATA, in the scaled coordinates."""
+    q = jax.vmap(lambda x: condition(estimator, network, x, SCALE))(DATA.x[rows])
+    log_prob = jax.vmap(lambda mixture, theta: mixture.log_prob(theta))(q, DATA.theta[rows])
+    return float(-jnp.mean(log_prob) - jnp.sum(jnp.log(SCALE.width / 2)))
+
+
+def test_an_epoch_sees_every_row_once():
+    """Where nothing is learnt, each epoch's loss is the mean over all rows."""
+    network = start(SMALL)
+    _, info = fitted(change(SMALL, learning_rate=0.0), network=network)
+    np.testing.assert_allclose(info.loss, mean_loss(SMALL, network), rtol=1e-4)
+
+
+def test_the_cosine_schedule_slows_down():
+    """At so low a rate the gradient stays what it is; the mean of the factors at 0, 1/6, ..., 5/6 is 0.58."""
+    network, moved = start(SMALL), {}
+    for schedule in ("constant", "cosine"):
+        estimator = change(SMALL, schedule=schedule, learning_rate=1e-6)
+        moved[schedule] = distance(fitted(estimator, network=network)[0].params, network.params)
+    assert 0.5 < moved["cosine"] / moved["constant"] < 0.66
+
+
+# -------------------------------------------------------------------------------------------- validation and patience
+
+
+@pytest.fixture(scope="module")
+def overfitted():
+    network = start(VALIDATED)
+    return network, *fitted(VALIDATED, network=network)
+
+
+def test_the_weights_of_the_best_pass_are_taken(overfitted):
+    """The chosen pass is the argmin; looked at again on the same held-out rows, its weights have that loss."""
+    _, network, info = overfitted
+    chosen = info.chosen_pass
+    np.testing.assert_array_equal(chosen, info.validation_loss.argmin(axis=1))
+    assert (chosen > 0).all() and (chosen < VALIDATED.epochs - 1).all()
+    assert (info.loss[:, -1] < info.loss[[0, 1], chosen]).all()
+    _, again = fitted(change(VALIDATED, learning_rate=0.0), network=network)
+    np.testing.assert_allclose(again.validation_loss[:, 0], info.validation_loss.min(axis=1), rtol=1e-4)
+
+
+def test_patience_stops_after_so_many_passes_without_a_better_one(overfitted):
+    start_, _, everything = overfitted
+    network, info = fitted(PATIENT, network=start_)
+    _, again = fitted(change(VALIDATED, learning_rate=0.0), network=network)
+    for member, losses in enumerate(everything.validation_loss):
+        best = 0
+        for index, loss in enumerate(losses):
+            if loss < losses[best]:
+                best = index
+            if index - best == PATIENT.patience:
+                break
+        assert index < VALIDATED.epochs - 1
+        assert info.chosen_pass[member] == best
+        np.testing.assert_allclose(info.validation_loss[member, : index + 1], losses[: index + 1], rtol=1e-3)
+        assert np.isnan(info.validation_loss[member, index + 1 :]).all()
+        assert np.isnan(info.loss[member, index + 1 :]).all()
+        np.testing.assert_allclose(again.validation_loss[member, 0], losses[best], rtol=1e-3)
+
+
+def test_held_out_rows_are_not_trained_on(overfitted):
+    _, _, info = overfitted
+    assert (info.loss[:, -1] < info.validation_loss[:, -1] - 1).all()
+
+
+def test_validation_is_the_loss_of_the_held_out_share(overfitted):
+    """Where nothing is learnt, held-out and training rows together have the mean loss of all."""
+    network = overfitted[0]
+    # 28 rows to train on: seven minibatches of ten see each row two or three times, so ask for fourteen.
+    _, info = fitted(change(VALIDATED, learning_rate=0.0), network=network, expected=140)
+    together = 0.7 * info.loss[:, 0] + 0.3 * info.validation_loss[:, 0]
+    for member in range(2):
+        one = Network(jax.tree.map(lambda leaf: leaf[member : member + 1], network.params), network.normaliser)
+        np.testing.assert_allclose(together[member], mean_loss(change(VALIDATED, members=1), one), rtol=1e-4)
+
+
+def test_without_validation_the_last_weights_are_taken():
+    _, info = fitted()
+    assert info.chosen_pass[0] == SMALL.epochs - 1
+    assert np.isnan(info.validation_loss).all()
+
+
+def test_too_few_rows_to_hold_any_out_still_train(overfitted):
+    """Three tenths of three rows are none: the last weights are taken, not the untrained ones."""
+    network = overfitted[0]
+    result, info = fitted(VALIDATED, toy(0, 3, CAPACITY), network=network)
+    np.testing.assert_array_equal(info.chosen_pass, VALIDATED.epochs - 1)
+    assert distance(result.params, network.params) > 1e-2
+
+
+# ------------------------------------------------------------------------------------------------------- optimiser
+
+
+def test_clipping_bounds_what_an_outlier_does():
+    """Adam is blind to the gradients' common size, but not to one minibatch among many being clipped."""
+    outlier = dataclasses.replace(DATA, theta=DATA.theta.at[0].set(300.0))
+    network, moved = start(SMALL), {}
+    for norm in (np.inf, 0.1):
+        estimator = change(SMALL, clip_norm=norm)
+        results = [fitted(estimator, data, network=network)[0].params for data in (DATA, outlier)]
+        moved[norm] = distance(*results)
+    assert moved[0.1] < 0.7 * moved[np.inf]
+
+
+def test_weight_decay_shrinks_the_weights():
+    """To its letter: decoupled, so that after n steps a learning rate r and decay d leave (1 - r d)^n of the start.
+
+    Rows that all carry no weight have no gradient: decay is all that moves the weights.
+    """
+    network = start(SMALL)
+    decayed, _ = fitted(change(SMALL, weight_decay=2.0), weights=np.zeros(CAPACITY), network=network)
+    expected = jax.tree.map(lambda leaf: leaf * (1 - 3e-3 * 2.0) ** 30, network.params)
+    chex.assert_trees_all_close(decayed.params, expected, rtol=1e-4)
+
+
+def test_a_row_that_is_not_finite_is_counted_and_stepped_over():
+    """One NaN among the filled rows: one of the five minibatches of each epoch is lost, the weights stay finite."""
+    broken = dataclasses.replace(DATA, x=DATA.x.at[7, 1].set(jnp.nan))
+    network = start(SMALL)
+    result, info = fitted(SMALL, broken, network=network)
+    assert info.nonfinite[0] == SMALL.epochs
+    chex.assert_tree_all_finite(result.params)
+    assert np.isfinite(info.loss).all()
+    assert distance(result.params, network.params) > 1e-2
+
+
+def test_an_infinite_loss_moves_nothing():
+    """theta so far off that its density is zero in float32; with weight decay on, which would move weights too."""
+    far = dataclasses.replace(DATA, theta=jnp.full((CAPACITY, 2), 1e30))
+    network = start(SMALL)
+    result, info = fitted(change(SMALL, weight_decay=1.0), far, network=network)
+    assert info.nonfinite[0] == 30
+    chex.assert_trees_all_equal(result.params, jax.device_get(network.params))
+
+
+# ------------------------------------------------------------------------------------------- start, members, batching
+
+
+def test_a_warm_start_continues_and_a_cold_one_does_not():
+    fast = change(SMALL, learning_rate=2e-2)
+    first, trained = fitted(fast)
+    again, continued = fitted(fast, network=first, seed=9)
+    assert continued.loss[0, 0] < trained.loss[0, 0] - 0.5
+    assert abs(continued.loss[0, 0] - trained.loss[0, -1]) < 0.3
+    assert distance(again.params, first.params) > 1e-3
+    cold = change(COLD, learning_rate=2e-2)
+    _, anew = fitted(cold, network=first, seed=9)
+    assert anew.loss[0, 0] > continued.loss[0, 0] + 0.5
+    # What a cold start is given does not matter at all, and its normaliser is the data's.
+    other = jax.tree.map(lambda leaf: leaf + 1, first)
+    chex.assert_trees_all_equal(fitted(cold, network=first), fitted(cold, network=other))
+
+
+def test_a_warm_start_keeps_its_normaliser_and_a_cold_one_takes_the_datas():
+    network = start(SMALL)
+    shifted = dataclasses.replace(DATA, x=DATA.x + jnp.array([100.0, -50.0]))
+    kept = fitted(SMALL, shifted, network=network)[0].normaliser
+    chex.assert_trees_all_equal(kept, jax.device_get(network.normaliser))
+    anew = fitted(COLD, shifted, network=network)[0].normaliser
+    np.testing.assert_allclose(anew.mean - kept.mean, [100, -50], rtol=1e-3)
+
+
+def test_members_are_trained_apart_and_pooled(overfitted):
+    _, network, info = overfitted
+    kernels = network.params["params"]["Dense_0"]["kernel"]
+    assert kernels.shape == (2, 2, 16)
+    assert np.abs(kernels[0] - kernels[1]).max() > 1e-2
+    assert info.loss.shape == (2, VALIDATED.epochs) and info.loss[0, -1] != info.loss[1, -1]
+    x, theta = jnp.array([0.4, -1.0]), jnp.array([0.2, -1.5])
+    pooled = _condition(VALIDATED, network, x, SCALE)
+    assert pooled.logits.shape == (4,)
+    densities = []
+    for i in range(2):
+        member = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], network.params)
+        one = _condition(change(VALIDATED, members=1), Network(member, network.normaliser), x, SCALE)
+        densities.append(np.exp(one.log_prob(theta)))
+    np.testing.assert_allclose(np.exp(pooled.log_prob(theta)), np.mean(densities), rtol=1e-3)
+
+
+def test_conditioning_is_in_coordinates():
+    """A network of all zeros puts its mixture in the middle of Phi, a spread of e^-1 of half of its width."""
+    network = jax.tree.map(jnp.zeros_like, start(SMALL).params)
+    q = _condition(SMALL, Network(network, start(SMALL).normaliser), jnp.array([3.0, 4.0]), SCALE)
+    np.testing.assert_allclose(q.mean, SCALE.centre, atol=1e-6)
+    np.testing.assert_allclose(q.covariance, np.diag((np.exp(-1) * np.asarray(SCALE.width) / 2) ** 2), rtol=1e-5)
+
+
+def test_same_key_same_bits_other_key_other_weights():
+    first, second, other = fitted(seed=3), fitted(seed=3), fitted(seed=4)
+    chex.assert_trees_all_equal(first, second)
+    assert distance(first[0].params, other[0].params) > 1e-3
+
+
+def test_eager_agrees_with_jit():
+    network = start(SMALL)
+    eager, _ = _train(jax.random.key(1), SMALL, network, DATA, DATA.valid.astype(float), SIZE)
+    chex.assert_trees_all_close(jax.device_get(eager.params), fitted(SMALL, network=network)[0].params, atol=1e-4)
+
+
+def test_vmap_is_a_loop():
+    """Over keys, datasets that are filled to different heights, and a learning rate."""
+    data = [DATA, toy(4, 31, CAPACITY)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *data)
+    network, rates = start(SMALL), np.array([3e-3, 1e-2])
+    one = lambda seed, rate, data: _train(
+        jax.random.key(seed), change(SMALL, learning_rate=rate), network, data, data.valid.astype(float), SIZE
+    )
+    compiled = jax.jit(jax.vmap(one), compiler_options=QUICK_TO_COMPILE)
+    both, info = jax.device_get(compiled(jnp.array([1, 2]), jnp.asarray(rates), stacked))
+    for i in range(2):
+        alone, expected = fitted(change(SMALL, learning_rate=rates[i]), data[i], seed=i + 1, network=network)
+        chex.assert_trees_all_close(jax.tree.map(lambda leaf, i=i: leaf[i], both.params), alone.params, atol=1e-4)
+        np.testing.assert_allclose(info.loss[i], expected.loss, atol=1e-3)
+
+
+def test_leaves_do_not_recompile():
+    network = start(SMALL)
+    fitted(SMALL, network=network)
+    before = _fit._cache_size()
+    results = [
+        fitted(change(SMALL, learning_rate=rate, weight_decay=decay, clip_norm=norm), network=network)[0].params
+        for rate, decay, norm in ((1e-3, 0.0, np.inf), (1e-2, 0.1, 1.0))
+    ]
+    assert _fit._cache_size() == before
+    assert distance(*results) > 1e-2
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"activation": "gelu"}, r"^activation: expected one of \['relu', 'silu', 'tanh'\], got 'gelu'"),
+        ({"normaliser": "log"}, r"^normaliser: expected one of \['asinh', 'none', 'zscore'\], got 'log'"),
+        ({"schedule": "linear"}, r"^schedule: expected one of \['constant', 'cosine'\], got 'linear'"),
+        ({"components": 0}, r"^components: expected at least 1, got 0"),
+        ({"members": -1}, r"^members: expected at least 1, got -1"),
+        ({"batch_size": 0}, r"^batch_size: expected at least 1, got 0"),
+        ({"steps": 10}, r"^expected epochs or steps, one of them above 0, got 1000 and 10"),
+        ({"epochs": 0}, r"^expected epochs or steps, one of them above 0, got 0 and 0"),
+        ({"hidden": ()}, r"^hidden: expected at least one layer of at least one unit, got \(\)"),
+        ({"hidden": (8, 0)}, r"^hidden: .* got \(8, 0\)"),
+        ({"validation": 1.0}, r"^validation: expected a fraction in \[0, 1\), got 1.0"),
+        ({"patience": 3}, r"^patience: expected validation above 0 to stop by, got validation=0"),
+    ],
+)
+def test_settings_that_cannot_work_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Estimator(**changes).check()
+
+
+def test_the_defaults_are_the_papers():
+    paper = Estimator().check()
+    assert (paper.learning_rate, paper.epochs, paper.batch_size) == (1e-5, 1000, 100)
+    assert (paper.hidden, paper.components, paper.members) == ((1024,) * 3, 4, 1)
+    assert paper.warm_start and not paper.validation and paper.schedule == "constant"
+    assert set(paper.static_fields()) == {f.name for f in dataclasses.fields(paper)} - {
+        "learning_rate",
+        "weight_decay",
+        "clip_norm",
+    }
