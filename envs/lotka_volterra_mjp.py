@@ -386,7 +386,6 @@ def make_simulator(
         of predators and prey, and an int32 failure code, `SUCCESS` or `TOO_MANY_EVENTS`. After a
         failure the trajectory is finite and otherwise unspecified.
     """
-
     # Calls outside a jit of the caller's would compile the loops anew each time.
     work_off = jax.jit(functools.partial(_work_off, process, schedule))
 

@@ -25,8 +25,8 @@ def populations(
     """Predators X and prey Y at times 0, interval, 2 interval, ... (section III-A).
 
     dX/dt = theta_1 X Y - theta_2 X and dY/dt = theta_3 Y - theta_4 X Y, by the classical Runge-Kutta method in the
-    logarithms of the populations, which keeps them positive. Rates too fast for the step give non-finite numbers, which count as
-    failed simulations.
+    logarithms of the populations, which keeps them positive. Rates too fast for the step give non-finite numbers,
+    which count as failed simulations.
 
     Args:
         rates: theta_1..theta_4, 1 / time, shape [4].

@@ -176,7 +176,7 @@ def update(
 
 
 def _started(estimator: Estimator, state: State, dataset: Dataset) -> Network:
-    """A network that is trained on from round to round takes its normaliser from the first round that has simulations."""
+    """A network that is trained on takes its normaliser from the first round that has simulations."""
     fresh = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid)
     normaliser = jax.tree.map(
         lambda kept, new: jnp.where(state.dataset.size > 0, kept, new), state.network.normaliser, fresh

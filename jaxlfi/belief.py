@@ -50,8 +50,9 @@ def clipped(key: jax.Array, belief: Belief, n: int) -> Array:
 def rejected(key: jax.Array, belief: Belief, n: int, tries: int = 32) -> Array:
     """`n` draws of the mixture truncated to the support, by rejection with a bounded number of tries.
 
-    Every draw has its own `tries` candidates and takes the first inside the box. Where none is (a mixture almost wholly outside
-    its support), it is a uniform draw over the support, so that the time is bounded and the box is always respected.
+    Every draw has its own `tries` candidates and takes the first inside the box. Where none is (a mixture almost
+    wholly outside its support), it is a uniform draw over the support, so that the time is bounded and the box is
+    always respected.
     """
     key_candidates, key_fallback = jax.random.split(key)
     candidates = belief.mixture.sample(key_candidates, n * tries).reshape(n, tries, -1)

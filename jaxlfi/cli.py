@@ -247,7 +247,8 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
     """Set what must be set before jax starts.
 
     On CPU jax sees one device, and lanes of small networks do not fill it: with as many devices as cores,
-    each takes its share of the lanes. A single lane stays on one device, whose matrix products then use all cores.
+    each takes its share of the lanes. A single lane stays on one device, whose matrix products then use all
+    cores.
     """
     lanes = _lanes(arguments)
     flags = os.environ.get("XLA_FLAGS", "")

@@ -56,9 +56,9 @@ def discrepancy(
 def trajectory_distance(trajectory: Array, observed: Array) -> Float[Array, ""]:
     """Euclidean distance of two trajectories in units of the observed one's spread, per record.
 
-    Each channel is divided by its observed standard deviation, and the square root of the mean square is taken over records and
-    channels: a distance of 1 is as far as the observed trajectory is from its own mean. The paper's plain Euclidean
-    distance is this times a constant per channel; undivided, exp(-distance) would be zero for any pair of trajectories.
+    Each channel is divided by its observed standard deviation, and the square root of the mean square is taken over
+    records and channels: a distance of 1 is as far as the observed trajectory is from its own mean. The plain
+    Euclidean distance that the paper names would make exp(-distance) zero for any two trajectories of a population.
     """
     observed = observed.reshape(observed.shape[0], -1)
     spread = jnp.std(observed, axis=0)
@@ -104,6 +104,7 @@ def bound_warnings(task: Task, belief: Belief, threshold: float = 0.2) -> list[s
                 else "The true value may lie beyond it: widen the support there, or adapt it with --heuristic edge."
             )
             warnings.append(
-                f"{name}: {mass[d]:.2f} of the posterior mass lies at or beyond the {side} bound {bound[d]:.4g}. {advice}"
+                f"{name}: {mass[d]:.2f} of the posterior mass lies at or beyond the {side} bound {bound[d]:.4g}. "
+                f"{advice}"
             )
     return warnings

@@ -1,7 +1,5 @@
 """Estimator: the density estimator's architecture and how it is trained."""
 
-import dataclasses
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -43,8 +41,8 @@ class Estimator:
         validation: fraction of the simulations held out to choose the best weights by; 0 keeps the last weights.
         patience: stop after so many passes without a better validation loss; 0 runs all passes.
         warm_start: continue from the last round's weights, or start anew each round (reading C).
-        normaliser: "zscore", "asinh" or "none" (`jaxlfi.normalise.TRANSFORMS`). It belongs to the network: computed where the
-            network starts and kept while it is trained on.
+        normaliser: "zscore", "asinh" or "none" (`jaxlfi.normalise.TRANSFORMS`). It belongs to the network: computed
+            where the network starts and kept while it is trained on.
 
     Raises:
         ValueError: from `check` for settings that contradict each other.
@@ -88,10 +86,6 @@ class Estimator:
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one member for D parameters."""
         return MDN(self.components, dim, self.hidden, self.activation)
-
-    def static_fields(self) -> dict:
-        """The fields that are compiled in, by name."""
-        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if not f.metadata.get("pytree_node", True)}
 
 
 @struct.dataclass

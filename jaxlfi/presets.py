@@ -21,9 +21,9 @@ QUICK = Settings(
 )
 """An ensemble of four small networks that start anew every round: minutes on two cores.
 
-Chosen by the ablation in experiments/README.md. Where an observation is unlike everything simulated, as it is on a
-wrong support, one network extrapolates confidently to one place, and the next round learns nothing there. Four
-disagree, and explore.
+Chosen by the ablation in experiments/README.md. Where an observation is unlike everything simulated, as it
+is on a wrong support, one network extrapolates confidently to one place, and the next round learns nothing
+there. Four disagree, and explore.
 """
 
 PRESETS: dict[str, Settings] = {"quick": QUICK, "paper": PAPER}

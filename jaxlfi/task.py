@@ -18,18 +18,18 @@ Simulate = Callable[..., Any]
 class Task:
     """A likelihood-free inference problem.
 
-    Everything about parameters is declared in natural units. Inference works in *coordinates*: the natural logarithm for the
-    parameters named in `log`, the parameter itself otherwise. After construction `supports`, `feasible` and `truth`
-    are in coordinates, and so is every theta inside the library; `to_natural` leads back.
+    Everything about parameters is declared in natural units. Inference works in *coordinates*: the natural logarithm
+    for the parameters named in `log`, the parameter itself otherwise. After construction `supports`, `feasible` and
+    `truth` are in coordinates, and so is every theta inside the library; `to_natural` leads back.
 
     Attributes:
-        simulate: one simulation, `simulate(key, theta[D]) -> trajectory` or `-> (trajectory, outcome)`, in JAX and pure.
-            `outcome` is a boolean (true: valid) or an integer (0: valid, i: failed for the reason `failures[i - 1]`).
+        simulate: one simulation, `simulate(key, theta[D]) -> trajectory` or `-> (trajectory, outcome)`, in JAX and
+            pure. `outcome` is a boolean (true: valid) or an integer (0: valid, i: failed for the reason `failures[i - 1]`).
             For a black box, `simulate(rng, theta[N, D])` with a `numpy.random.Generator` and N parameter vectors,
             returning the same with a leading axis N.
         names: one name for each of the D parameters.
-        supports: boxes Theta_0 by name; the first is the default. One that is wider than Phi, like the paper's "broadest", is
-            allowed here and widens Phi for its own run.
+        supports: boxes Theta_0 by name; the first is the default. One that is wider than Phi, like the paper's
+            "broadest", is allowed here and widens Phi for its own run.
         feasible: Phi, the limits that no adapted support leaves.
         units: one unit for each parameter ("" for none).
         summary: what the network sees of a trajectory: the name of a summary (`jaxlfi.summaries.SUMMARIES`) or a

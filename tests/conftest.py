@@ -14,7 +14,7 @@ hypothesis.settings.register_profile(
     "jaxlfi",
     derandomize=True,
     deadline=None,
-    max_examples=30,
+    max_examples=25,
     database=None,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )

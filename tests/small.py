@@ -81,20 +81,22 @@ def whole_runs(tmp_path_factory):
     """What tests of whole runs need of jax; import this into their module.
 
     A cache of compiled programs, shared with processes that a test starts: compiling is nearly all that these
-        tests
-    wait for. And no key-reuse checker: it takes a vmapped scan over keys for a reuse (jax 0.9.2). Unbatched
-    runs are checked elsewhere.
+    tests wait for, and is done without most optimisations. And no key-reuse checker: it takes a vmapped scan
+    over keys for a reuse (jax 0.9.2). Unbatched runs are checked elsewhere.
     """
     folder = str(tmp_path_factory.getbasetemp() / "xla")
     with pytest.MonkeyPatch.context() as patch, jax.debug_key_reuse(False):
         patch.setenv("JAX_COMPILATION_CACHE_DIR", folder)
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
         patch.setenv("TF_CPP_MIN_LOG_LEVEL", "3")
         before = {name: getattr(jax.config, name) for name in CACHE_SETTINGS}
         for name, value in zip(CACHE_SETTINGS, (folder, 0.2), strict=True):
             jax.config.update(name, value)
+        jax.config.update("jax_disable_most_optimizations", True)
         compilation_cache.reset_cache()  # so that the new folder is looked at
         yield
         for name, value in before.items():
             jax.config.update(name, value)
+        jax.config.update("jax_disable_most_optimizations", False)
         compilation_cache.reset_cache()

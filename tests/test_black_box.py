@@ -120,7 +120,7 @@ def test_it_is_deterministic_and_leaves_the_same_files(tmp_path):
     [
         (lambda rng, theta: numpy_simulate(rng, theta)[1:], r"expected numbers of shape \[20, 2\]"),
         (lambda rng, theta: numpy_simulate(rng, theta)[:, :1], r"got float64 of shape \[20, 1\]"),
-        (lambda rng, theta: (numpy_simulate(rng, theta), np.ones(3, bool)), "expected an outcome for each of 20"),  # noqa: E501
+        (lambda rng, theta: (numpy_simulate(rng, theta), np.ones(3, bool)), "expected an outcome for each of 20"),
         (lambda rng, theta: (numpy_simulate(rng, theta), np.zeros(len(theta), bool)), r"got none \(failed: 25, non_finite: 0\)"),  # noqa: E501
         (lambda rng, theta: 1 / 0, "ZeroDivisionError"),
     ],

@@ -67,29 +67,29 @@ BAD = {
     "unknown task": (["infer", "nothing"], "task: expected one of"),
     "no such module": (["infer", "no.such:task"], "cannot load 'no.such:task'"),
     "no task": (["infer", "os:getcwd"], "expected 'os:getcwd' to give a jaxlfi.Task, got str"),
-    "unknown support": (["infer", TASK, "--support", "x"], "expected one of ['broad', 'misspecified', 'ok'], got 'x'"),  # noqa: E501
+    "unknown support": (["infer", TASK, "--support", "x"], "expected one of ['broad', 'misspecified', 'ok'], got 'x'"),
     "unknown heuristic": (["infer", TASK, "--heuristic", "x"], "heuristic: expected one of"),
     "unknown preset": (["infer", TASK, "--preset", "x"], "invalid choice: 'x'"),
     "unknown flag": (["infer", TASK, "--nonsense"], "unrecognized arguments"),
     "not a number": (["infer", TASK, "--rounds", "x"], "invalid int value: 'x'"),
     "reversed": (["infer", TASK, "--support-low", "1", "1", "--support-high", "0", "2"], "low < high"),
     "not finite": (["infer", TASK, "--support-low", "nan", "0", "--support-high", "1", "2"], "finite bounds"),
-    "outside Phi": (["infer", TASK, "--support-low", "-99", "0", "--support-high", "1", "2"], "feasible domain Phi"),  # noqa: E501
-    "dimensions": (["infer", TASK, "--support-low", "0", "--support-high", "1"], "bounds for 2 parameters, got 1"),  # noqa: E501
+    "outside Phi": (["infer", TASK, "--support-low", "-99", "0", "--support-high", "1", "2"], "feasible domain Phi"),
+    "dimensions": (["infer", TASK, "--support-low", "0", "--support-high", "1"], "bounds for 2 parameters, got 1"),
     "half a box": (["infer", TASK, "--support-low", "0", "0"], "--support-low and --support-high together"),
     "two supports": (
         ["infer", TASK, "--support", "ok", "--support-low", "0", "0", "--support-high", "1", "1"],
         "expected --support NAME, or",
     ),
     "no rounds": (["infer", TASK, "--rounds", "0"], "at least 1 round"),
-    "few attempts": (["infer", TASK, "--attempts", "5", "--additions", "9"], "attempts: expected at least the 9"),  # noqa: E501
+    "few attempts": (["infer", TASK, "--attempts", "5", "--additions", "9"], "attempts: expected at least the 9"),
     "correction": (["infer", TASK, "--correction", "x"], "correction: expected one of"),
     "activation": (["infer", TASK, "--activation", "x"], "activation: expected one of"),
     "learning rate": (["infer", TASK, "--learning-rate", "nan"], "learning_rate: expected a number"),
     "epochs and steps": (["infer", TASK, "--epochs", "5", "--steps", "5"], "epochs or steps"),
     "seeds": (["infer", TASK, "--seeds", "0"], "seeds: expected at least 1"),
     "hyperparameter length": (["infer", TASK, "--expansion", "1", "2", "3"], "expansion: expected one finite number or 2"),  # noqa: E501
-    "foreign hyperparameter": (["infer", TASK, "--proximity", "0.3"], "proximity: expected a hyperparameter of edge"),  # noqa: E501
+    "foreign hyperparameter": (["infer", TASK, "--proximity", "0.3"], "proximity: expected a hyperparameter of edge"),
     "no file": (["infer", TASK, "--observation", "nothing.csv"], "cannot read 'nothing.csv'"),
     "no format": (["infer", TASK, "--observation", "x.txt"], "expected a .csv or .npz"),
     "configuration": (["compare", TASK, "--configurations", "ok+x"], "expected support+heuristic"),

@@ -14,11 +14,9 @@ augmented = jax.jit(augment)
 
 
 def attempts(failure, first: int, additions: int = 3):
-    """Attempts whose theta and x tell which one they are; failed ones carry numbers that must not be stored."""
+    """Attempts whose theta and x tell which one they are; those of failures must not be stored."""
     place = jnp.arange(first, first + len(failure), dtype=jnp.float32)
-    return within_budget(
-        jnp.stack([place, -place], axis=1), 10 * place[:, None], jnp.asarray(failure), additions
-    )
+    return within_budget(jnp.stack([place, -place], axis=1), 10 * place[:, None], jnp.asarray(failure), additions)
 
 
 def test_an_empty_dataset_has_no_valid_rows():

@@ -1,4 +1,4 @@
-"""Fitting: what is learnt, from which rows, by how many steps, and what happens to numbers that are not finite."""
+"""Fitting: what is learnt, from which rows, by how many steps, and what numbers that are not finite do."""
 
 import dataclasses
 import functools
@@ -81,7 +81,7 @@ def distance(a, b) -> float:
     return float(np.sqrt(sum(np.sum((x - y) ** 2) for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True))))
 
 
-# ------------------------------------------------------------------------------------------------- what is learnt
+# ------------------------------------------------------------------------------------------- what is learnt
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def learnt():
 
 @pytest.mark.parametrize("x", [(0.3, -1.6), (1.2, -1.0), (-1.5, -2.2)])
 def test_recovers_the_exact_conditional(learnt, x):
-    """The posterior under a Gaussian prior, within a fifth of its standard deviations and 15 % of its spreads."""
+    """The posterior under a Gaussian prior: its mean to 0.2 standard deviations, its covariance to 0.3."""
     estimator, network, _ = learnt
     noise = np.linalg.inv(NOISE @ NOISE)
     covariance = np.linalg.inv(MIXING.T @ noise @ MIXING + np.diag(PRIOR_SD**-2.0))
@@ -108,7 +108,8 @@ def test_recovers_the_exact_conditional(learnt, x):
     q = _condition(estimator, network, jnp.array(x), SCALE)
     factor = np.linalg.inv(np.linalg.cholesky(covariance))
     np.testing.assert_allclose(factor @ (np.asarray(q.mean) - mean), 0, atol=0.2)
-    # Whitened by the exact covariance, the learnt one is the identity: its axes and correlations are right too.
+    # Whitened by the exact covariance, the learnt one is the identity: its axes and correlations are right
+    # too.
     np.testing.assert_allclose(factor @ np.asarray(q.covariance) @ factor.T, np.eye(2), atol=0.3)
 
 
@@ -123,7 +124,7 @@ def test_loss_reaches_the_entropy_of_the_conditional(learnt):
     assert abs(loss[-10:].mean() - entropy) < 0.1
 
 
-# ------------------------------------------------------------------------------------------------- which rows count
+# ----------------------------------------------------------------------------------------- which rows count
 
 
 @pytest.mark.parametrize("junk", [1e6, np.nan])
@@ -178,7 +179,7 @@ def test_an_empty_dataset_leaves_the_start():
     assert info.nonfinite[0] == 0
 
 
-# --------------------------------------------------------------------------------------------------- how many steps
+# ------------------------------------------------------------------------------------------- how many steps
 
 
 @pytest.mark.parametrize(
@@ -223,7 +224,7 @@ def test_the_cosine_schedule_slows_down():
     assert 0.5 < moved["cosine"] / moved["constant"] < 0.66
 
 
-# -------------------------------------------------------------------------------------------- validation and patience
+# ---------------------------------------------------------------------------------- validation and patience
 
 
 @pytest.fixture(scope="module")
@@ -233,7 +234,7 @@ def overfitted():
 
 
 def test_the_weights_of_the_best_pass_are_taken(overfitted):
-    """The chosen pass is the argmin; looked at again on the same held-out rows, its weights have that loss."""
+    """The chosen pass is the argmin; on the same held-out rows its weights have that loss again."""
     _, network, info = overfitted
     chosen = info.chosen_pass
     np.testing.assert_array_equal(chosen, info.validation_loss.argmin(axis=1))
@@ -256,10 +257,10 @@ def test_patience_stops_after_so_many_passes_without_a_better_one(overfitted):
                 break
         assert index < VALIDATED.epochs - 1
         assert info.chosen_pass[member] == best
-        np.testing.assert_allclose(info.validation_loss[member, : index + 1], losses[: index + 1], rtol=1e-3)
+        np.testing.assert_allclose(info.validation_loss[member, : index + 1], losses[: index + 1], atol=0.02)
         assert np.isnan(info.validation_loss[member, index + 1 :]).all()
         assert np.isnan(info.loss[member, index + 1 :]).all()
-        np.testing.assert_allclose(again.validation_loss[member, 0], losses[best], rtol=1e-3)
+        np.testing.assert_allclose(again.validation_loss[member, 0], losses[best], atol=0.02)
 
 
 def test_held_out_rows_are_not_trained_on(overfitted):
@@ -274,7 +275,8 @@ def test_validation_is_the_loss_of_the_held_out_share(overfitted):
     _, info = fitted(change(VALIDATED, learning_rate=0.0), network=network, expected=140)
     together = 0.7 * info.loss[:, 0] + 0.3 * info.validation_loss[:, 0]
     for member in range(2):
-        one = Network(jax.tree.map(lambda leaf: leaf[member : member + 1], network.params), network.normaliser)
+        params = jax.tree.map(lambda leaf, m=member: leaf[m : m + 1], network.params)
+        one = Network(params, network.normaliser)
         np.testing.assert_allclose(together[member], mean_loss(change(VALIDATED, members=1), one), rtol=1e-4)
 
 
@@ -292,7 +294,7 @@ def test_too_few_rows_to_hold_any_out_still_train(overfitted):
     assert distance(result.params, network.params) > 1e-2
 
 
-# ------------------------------------------------------------------------------------------------------- optimiser
+# ------------------------------------------------------------------------------------------------ optimiser
 
 
 def test_clipping_bounds_what_an_outlier_does():
@@ -307,7 +309,8 @@ def test_clipping_bounds_what_an_outlier_does():
 
 
 def test_weight_decay_shrinks_the_weights():
-    """To its letter: decoupled, so that after n steps a learning rate r and decay d leave (1 - r d)^n of the start.
+    """To its letter: decoupled, so that after n steps a learning rate r and decay d leave (1 - r d)^n of the
+    start.
 
     Rows that all carry no weight have no gradient: decay is all that moves the weights.
     """
@@ -318,7 +321,9 @@ def test_weight_decay_shrinks_the_weights():
 
 
 def test_a_row_that_is_not_finite_is_counted_and_stepped_over():
-    """One NaN among the filled rows: one of the five minibatches of each epoch is lost, the weights stay finite."""
+    """One NaN among the filled rows: one of the five minibatches of each epoch is lost, the weights stay
+    finite.
+    """
     broken = dataclasses.replace(DATA, x=DATA.x.at[7, 1].set(jnp.nan))
     network = start(SMALL)
     result, info = fitted(SMALL, broken, network=network)
@@ -329,7 +334,9 @@ def test_a_row_that_is_not_finite_is_counted_and_stepped_over():
 
 
 def test_an_infinite_loss_moves_nothing():
-    """theta so far off that its density is zero in float32; with weight decay on, which would move weights too."""
+    """theta so far off that its density is zero in float32; with weight decay on, which would move weights
+    too.
+    """
     far = dataclasses.replace(DATA, theta=jnp.full((CAPACITY, 2), 1e30))
     network = start(SMALL)
     result, info = fitted(change(SMALL, weight_decay=1.0), far, network=network)
@@ -337,7 +344,7 @@ def test_an_infinite_loss_moves_nothing():
     chex.assert_trees_all_equal(result.params, jax.device_get(network.params))
 
 
-# ------------------------------------------------------------------------------------------- start, members, batching
+# --------------------------------------------------------------------------------- start, members, batching
 
 
 def test_a_warm_start_continues_and_a_cold_one_does_not():

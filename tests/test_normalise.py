@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.strategies import vectors
 
 from jaxlfi.normalise import TRANSFORMS, Normaliser, fit_normaliser, normalised
+from tests.strategies import vectors
 
 NUMPY = {"zscore": lambda x: x, "asinh": np.arcsinh}
 
@@ -29,7 +29,8 @@ def test_against_numpy_over_valid_rows_only(name, x, size, junk):
         if scale[d] > 1e-3 * (1 + abs(mean[d])):
             np.testing.assert_allclose(normaliser.scale[d], scale[d], rtol=1e-2)
         elif scale[d] == 0:
-            # A constant summary is centred only (rounding of the mean may leave a residue, but no division by it).
+            # A constant summary is centred only (rounding of the mean may leave a residue, but no division by
+            # it).
             assert float(normaliser.scale[d]) == 1.0
     assert bool(jnp.all(normaliser.scale > 0))
 

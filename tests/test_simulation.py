@@ -54,9 +54,7 @@ def test_batched_attempts_are_counted_lane_by_lane():
 
 def task_of(simulator, summary="identity", failures=("slow", "fell")) -> Task:
     box = Support([0.5, -2.0], [20.0, 2.0])
-    return Task(
-        simulator, ("a", "b"), {"own": box}, box, summary=summary, failures=failures, log=("a",)
-    )
+    return Task(simulator, ("a", "b"), {"own": box}, box, summary=summary, failures=failures, log=("a",))
 
 
 def run(task, theta, key):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.strategies import vectors
 
 from jaxlfi import summaries
 from jaxlfi.bayessim import prior_draws
 from jaxlfi.support import Support
 from jaxlfi.task import Task
+from tests.strategies import vectors
 
 
 def simulate(key, theta):
@@ -78,9 +78,15 @@ def test_gradients_pass_through_coordinates_without_nan():
     ("changes", "message"),
     [
         ({"units": ("kg", "m")}, r"^units: expected one for each of the 3 parameters, got 2"),
-        ({"names": ("mass", "mass", "drag")}, r"^names: expected distinct names, got \('mass', 'mass', 'drag'\)"),
+        (
+            {"names": ("mass", "mass", "drag")},
+            r"^names: expected distinct names, got \('mass', 'mass', 'drag'\)",
+        ),
         ({"log": ("drag", "speed")}, r"^log: expected names among \('mass'.*got \['speed'\]"),
-        ({"feasible": Support([0.1, 1.0], [10.0, 5.0])}, r"^feasible: expected bounds for 3 parameters, got 2"),
+        (
+            {"feasible": Support([0.1, 1.0], [10.0, 5.0])},
+            r"^feasible: expected bounds for 3 parameters, got 2",
+        ),
         ({"supports": {}}, r"^supports: expected at least one named support, got none"),
         (
             {"supports": {"guess": Support([1.0], [4.0])}},
@@ -164,9 +170,7 @@ def test_draws_of_a_prior_are_kept_in_the_support(seed):
 def test_draws_of_a_prior_are_its_truncated_density(key):
     """Rejection, not clipping: no atoms on the bounds, and the mean of the truncated normal."""
     prior = distrax.MultivariateNormalDiag(jnp.zeros(1), jnp.ones(1))
-    task = Task(
-        simulate, ("a",), {"half": Support([0.0], [5.0])}, Support([-9.0], [9.0]), prior=prior
-    )
+    task = Task(simulate, ("a",), {"half": Support([0.0], [5.0])}, Support([-9.0], [9.0]), prior=prior)
     draws = np.asarray(prior_draws(key, task, task.support(), 4000))
     assert (draws > 0).all() and (draws < 5).all()
     assert abs(draws.mean() - np.sqrt(2 / np.pi)) < 5 * np.sqrt((1 - 2 / np.pi) / 4000)

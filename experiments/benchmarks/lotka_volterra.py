@@ -25,7 +25,6 @@ if "XLA_FLAGS" not in os.environ:  # read once, when jax starts
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
-import tyro  # noqa: E402
 
 from envs import lotka_volterra_mjp as lv  # noqa: E402
 
@@ -189,8 +188,8 @@ def textbook_numba(config: Config, setting: str) -> Run:
                 if events == max_events:
                     failure[i] = 1
                     break
-                time -= np.log(1.0 - np.random.random()) / total
-                level = np.random.random() * total
+                time -= np.log(1.0 - np.random.random()) / total  # noqa: NPY002 - numba's own generator
+                level = np.random.random() * total  # noqa: NPY002
                 if level < first:
                     x += 1.0
                 elif level < second:
@@ -253,4 +252,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(Config())

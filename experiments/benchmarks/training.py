@@ -2,9 +2,9 @@
 
 Prints
 
-* milliseconds a gradient step (batch of 100, four full-covariance Gaussians in four dimensions), for the network of each
-  preset, ours and PyTorch's (needs the `bench` extra), against the floor of its matrix products: their operations, divided by
-  the rate at which this machine multiplies large matrices;
+* milliseconds a gradient step (batch of 100, four full-covariance Gaussians in four dimensions), for the network of
+  each preset, ours and PyTorch's (needs the `bench` extra), against the floor of its matrix products: their
+  operations, divided by the rate at which this machine multiplies large matrices;
 * a whole inference run of `quick` compiled as one program, against its rounds called one by one, and against its
   parts (proposals, simulation, update) called one by one;
 * seconds of compilation, cold and from the cache on disk.
@@ -12,6 +12,7 @@ Prints
 Best and median of several calls are shown, since other programs may share the machine. One device, all its cores.
 """
 
+import itertools
 import os
 import statistics
 import subprocess
@@ -53,7 +54,7 @@ def products(estimator: Estimator) -> int:
     """Floating-point operations of a step's matrix products: forward, and twice that backward."""
     heads = estimator.components * (1 + DIM + DIM * (DIM + 1) // 2)
     layers = (OBS, *estimator.hidden, heads)
-    return 3 * 2 * BATCH * sum(a * b for a, b in zip(layers, layers[1:], strict=False))
+    return 3 * 2 * BATCH * sum(a * b for a, b in itertools.pairwise(layers))
 
 
 def matrix_rate() -> float:

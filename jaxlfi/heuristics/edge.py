@@ -24,7 +24,8 @@ class Edge:
         zone_width: an absolute width added to the zone: delta as Algorithm 2 writes it is
             `Edge(zone_fraction=0.0, zone_width=0.1)` (reading F).
         tail: the share of the mass *beyond* the bound that counts as lying in the zone. 1 counts it all, which is
-            where clipping puts it and what keeps EDGE working when the mode itself has left the box; 0 counts the zone alone (reading G).
+            where clipping puts it and what keeps EDGE working when the mode itself has left the box; 0 counts the zone
+            alone (reading G).
 
     Example:
         >>> Edge(mass_threshold=0.001).mass_threshold

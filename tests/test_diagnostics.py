@@ -1,0 +1,189 @@
+"""Diagnostics: masses against scipy, distances in closed form, warnings in words."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxlfi.belief import Belief
+from jaxlfi.diagnostics import bound_warnings, discrepancy, edge_mass, trajectory_distance
+from jaxlfi.mixture import GaussianMixture
+from jaxlfi.support import Support
+from jaxlfi.task import Task
+
+# Small programs: they take less time to run than to optimise.
+COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+see = jax.jit(discrepancy, static_argnames=("task", "restriction", "n"), compiler_options=COMPILE)
+BOX = Support([0.0, -2.0], [4.0, 6.0])
+PHI = Support([-10.0, -2.0], [10.0, 10.0])
+
+
+def belief(means=((1.0, 0.0), (3.5, 1.0)), scales=((0.5, 1.0), (0.4, 0.3)), logits=(0.0, 1.0), box=BOX) -> Belief:
+    mixture = GaussianMixture(jnp.array(logits), jnp.array(means), jax.vmap(jnp.diag)(jnp.array(scales)))
+    return Belief(mixture, box, jnp.asarray(True))
+
+
+def task(simulate=lambda key, theta: theta, **changes) -> Task:
+    arguments = {"names": ("mass", "drag"), "supports": {"guess": BOX}, "feasible": PHI, "truth": [1.0, 2.0]}
+    return Task(simulate, **(arguments | changes))
+
+
+@pytest.mark.parametrize("zone", [0.1, 0.25])
+def test_edge_mass_against_scipy(zone):
+    low, high = edge_mass(belief(), zone)
+    weights = np.exp([0.0, 1.0]) / np.exp([0.0, 1.0]).sum()
+    for d, (bottom, top) in enumerate([(0.0, 4.0), (-2.0, 6.0)]):
+        parts = [stats.norm(((1.0, 0.0), (3.5, 1.0))[k][d], ((0.5, 1.0), (0.4, 0.3))[k][d]) for k in range(2)]
+        width = zone * (top - bottom)
+        np.testing.assert_allclose(low[d], sum(weights[k] * parts[k].cdf(bottom + width) for k in range(2)), rtol=1e-4)
+        np.testing.assert_allclose(high[d], sum(weights[k] * parts[k].sf(top - width) for k in range(2)), rtol=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------ distances
+
+
+def test_trajectory_distance_in_closed_form():
+    """Channels of unlike spread: an offset of one spread in each is a distance of one."""
+    observed = jnp.array([[0.0, 100.0], [2.0, 300.0], [4.0, 500.0]])
+    spread = np.std(np.asarray(observed), axis=0)
+    assert float(trajectory_distance(observed, observed)) == 0
+    np.testing.assert_allclose(trajectory_distance(observed + spread, observed), 1, rtol=1e-6)
+    off = observed.at[1, 0].add(3.0).at[2, 1].add(-50.0)
+    expected = np.sqrt(((3 / spread[0]) ** 2 + (50 / spread[1]) ** 2) / 6)
+    np.testing.assert_allclose(trajectory_distance(off, observed), expected, rtol=1e-6)
+    # Units of measurement do not matter.
+    units = jnp.array([1000.0, 1e-3])
+    np.testing.assert_allclose(trajectory_distance(units * off, units * observed), expected, rtol=1e-5)
+
+
+def test_the_mean_of_the_observed_trajectory_is_one_away():
+    observed = jnp.asarray(np.random.default_rng(0).normal(5, 3, (20, 2)), jnp.float32)
+    mean = jnp.broadcast_to(observed.mean(0), observed.shape)
+    np.testing.assert_allclose(trajectory_distance(mean, observed), 1, rtol=1e-5)
+
+
+def test_a_constant_channel_is_not_divided_by_zero():
+    observed = jnp.stack([jnp.ones(4), jnp.arange(4.0)], axis=1)
+    np.testing.assert_allclose(trajectory_distance(observed.at[:, 0].add(2.0), observed), np.sqrt(2.0), rtol=1e-6)
+
+
+def test_trajectories_of_one_channel_may_be_vectors():
+    observed = jnp.array([1.0, 2.0, 4.0])
+    expected = trajectory_distance((observed + 1)[:, None], observed[:, None])
+    np.testing.assert_allclose(trajectory_distance(observed + 1, observed), expected)
+
+
+# -------------------------------------------------------------------------------------------- discrepancies
+
+
+def moving(key, theta):
+    """A trajectory of five records and two channels; it fails for small theta_1."""
+    return jnp.outer(jnp.arange(5.0), theta), theta[0] > 1.0
+
+
+def test_discrepancy_shapes_and_failures(key):
+    observed = jnp.outer(jnp.arange(5.0), jnp.array([1.0, 2.0]))
+    seen = see(key, task(moving), belief(), observed, n=50)
+    assert seen.theta.shape == (50, 2) and seen.trajectory.shape == (50, 5, 2)
+    assert bool(BOX.contains(seen.theta).all())
+    np.testing.assert_allclose(seen.theta_error, np.abs(np.asarray(seen.theta) - [1.0, 2.0]), rtol=1e-5, atol=1e-6)
+    failed = np.asarray(seen.theta[:, 0] <= 1.0)
+    assert 0 < failed.sum() < 50
+    np.testing.assert_array_equal(np.isnan(seen.trajectory_error), failed)
+    ok = int(np.flatnonzero(~failed)[0])
+    np.testing.assert_allclose(seen.trajectory_error[ok], trajectory_distance(seen.trajectory[ok], observed), rtol=1e-5)
+
+
+def test_trajectories_that_are_not_finite_have_no_distance(key):
+    broken = lambda key, theta: jnp.where(theta[0] > 1.0, jnp.nan, 1.0) * jnp.outer(jnp.arange(5.0), theta)
+    seen = see(key, task(broken), belief(), jnp.ones((5, 2)))
+    assert seen.theta.shape == (20, 2)  # section V: twenty posterior samples
+    np.testing.assert_array_equal(np.isnan(seen.trajectory_error), np.asarray(seen.theta[:, 0] > 1.0))
+    assert bool(jnp.isfinite(seen.theta_error).all())
+
+
+def test_without_a_truth_parameters_have_no_error(key):
+    seen = see(key, task(truth=None), belief(), jnp.array([1.0, 2.0]), n=3)
+    assert seen.theta_error.shape == (3, 2) and bool(jnp.isnan(seen.theta_error).all())
+    assert bool(jnp.isfinite(seen.trajectory_error).all())
+
+
+def test_errors_are_in_coordinates_and_trajectories_in_natural_units(key):
+    log_task = task(
+        log=("drag",),
+        supports={"guess": Support([0.0, 0.5], [4.0, 6.0])},
+        feasible=Support([-10.0, 0.1], [10.0, 10.0]),
+    )
+    seen = see(key, log_task, belief(box=log_task.support()), jnp.array([1.0, 2.0]), n=4)
+    np.testing.assert_allclose(seen.trajectory[:, 1], np.exp(seen.theta[:, 1]), rtol=1e-5)
+    np.testing.assert_allclose(seen.theta_error[:, 1], np.abs(seen.theta[:, 1] - np.log(2.0)), rtol=1e-4, atol=1e-6)
+
+
+def test_the_restriction_is_chosen_by_name(key):
+    """Far above the box, clipping puts all draws on the bound and rejection none."""
+    far = belief(means=((1.0, 20.0), (1.0, 20.0)))
+    again, problem, observed = jax.random.clone(key), task(), jnp.array([1.0, 2.0])
+    clipped = see(key, problem, far, observed, restriction="clip", n=10).theta
+    rejected = see(again, problem, far, observed, restriction="reject", n=10).theta
+    assert (np.asarray(clipped[:, 1]) == 6.0).all() and (np.asarray(rejected[:, 1]) < 6.0).all()
+
+
+# ------------------------------------------------------------------------------------------------- warnings
+
+
+def piled(d: int, at: float) -> Belief:
+    """A narrow Gaussian in the middle of the box, but for one parameter."""
+    mean = [2.0, 2.0]
+    mean[d] = at
+    return belief(means=(mean,), scales=((0.3, 0.3),), logits=(0.0,))
+
+
+def test_no_warning_in_the_middle():
+    assert bound_warnings(task(), piled(0, 2.0)) == []
+
+
+@pytest.mark.parametrize(
+    ("d", "at", "expected"),
+    [
+        (0, 4.0, "mass: 0.91 of the posterior mass lies at or beyond the upper bound 4. "),
+        (0, -1.0, "mass: 1.00 of the posterior mass lies at or beyond the lower bound 0. "),
+        (1, 5.2, "drag: 0.50 of the posterior mass lies at or beyond the upper bound 6. "),
+    ],
+)
+def test_warnings_name_parameter_side_amount_and_advice(d, at, expected):
+    advice = "The true value may lie beyond it: widen the support there, or adapt it with --heuristic edge."
+    assert bound_warnings(task(), piled(d, at)) == [expected + advice]
+
+
+def test_at_phis_own_bound_the_advice_is_another():
+    (warning,) = bound_warnings(task(), piled(1, -2.0))
+    assert warning.startswith("drag: 1.00 of the posterior mass lies at or beyond the lower bound -2. The bound is")
+    assert warning.endswith("that of the feasible domain Phi: widen Phi if it can be.")
+
+
+def test_a_bound_beyond_phi_is_limited_by_it_too():
+    """A named support may be wider than Phi, and widens it: no heuristic moves the bound further."""
+    wide = Belief(piled(1, -5.0).mixture, Support([0.0, -5.0], [4.0, 6.0]), jnp.asarray(True))
+    (warning,) = bound_warnings(task(), wide)
+    assert "widen Phi" in warning and "edge" not in warning
+
+
+def test_the_threshold_is_twice_what_a_uniform_marginal_has():
+    """A uniform marginal, as of many narrow components, has a tenth of its mass in each zone: no warning."""
+    centres = np.linspace(0.05, 0.95, 10)
+    means = np.stack([centres * 4.0, -2 + 8 * centres], axis=1)
+    uniform = belief(means=means, scales=np.full((10, 2), 0.02), logits=np.zeros(10))
+    np.testing.assert_allclose(edge_mass(uniform), 0.1, atol=1e-3)
+    assert bound_warnings(task(), uniform) == []
+    assert len(bound_warnings(task(), uniform, threshold=0.05)) == 4
+
+
+def test_log_parameters_are_named_as_what_they_are():
+    log_task = task(
+        log=("mass",),
+        supports={"guess": Support([1.0, -2.0], [54.6, 6.0])},
+        feasible=Support([0.1, -3.0], [99, 9]),
+    )
+    (warning,) = bound_warnings(log_task, piled(0, 4.0))
+    assert warning.startswith("ln mass: ")
