@@ -90,12 +90,12 @@ def variants(quick: Settings = QUICK) -> dict[str, Variant]:
     return {
         "quick": Variant("the preset: four networks", quick),
         "single": Variant("one network", base),
+        "no-prune": estimator("components of little weight kept", prune=0.0),
         "narrow": estimator("32 units a layer", hidden=(32, 32)),
         "relu": estimator("ReLU instead of tanh", activation="relu"),
         "zscore": estimator("plain z-score of the summaries", normaliser="zscore"),
         "warm": estimator("warm start instead of a fresh network each round (reading C)", warm_start=True),
         "last-weights": estimator("no validation split, last weights", validation=0.0),
-        "patience": estimator("early stopping after 200 steps without a better loss", patience=4),
         "slow": estimator("learning rate 1e-4", learning_rate=1e-4),
         "decay": estimator("weight decay 0.1", weight_decay=0.1),
         "paper-correction": run("posterior times the reference prior (reading A, paper)", correction="paper"),

@@ -193,6 +193,7 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int) -> None:
     network.add_argument("--hidden", type=int, nargs="+", metavar="N", help="units of each hidden layer")
     network.add_argument("--activation", metavar="NAME", help="relu, tanh or silu")
     network.add_argument("--components", type=int, metavar="K", help="Gaussians in each network's mixture")
+    network.add_argument("--prune", type=float, metavar="X", help="components of less weight than this are dropped")
     network.add_argument("--members", type=int, metavar="N", help="networks in the ensemble")
     network.add_argument(
         "--normaliser", metavar="NAME", help="what is done to summaries: zscore, asinh, none"

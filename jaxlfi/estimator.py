@@ -24,12 +24,15 @@ def static(default):
 class Estimator:
     """What q_phi is and how it is fitted each round. The defaults are the paper's (section III-C).
 
-    Learning rate, weight decay and clipping norm are leaves, so that a grid over them is one vmap; the rest is static.
+    Learning rate, weight decay, clipping norm and pruning are leaves, so that a grid over them is one vmap; the rest is static.
 
     Attributes:
         learning_rate: Adam's step size.
         weight_decay: decoupled weight decay (AdamW), per step and relative to the learning rate.
         clip_norm: global norm the gradients are clipped to.
+        prune: components of less weight than this are dropped from each network's mixture. Rarely used components are
+            hardly trained: they are wide and anywhere. BayesSim's first implementations prune at 0.005; the paper
+            does not say.
         hidden: units of each hidden layer.
         activation: "relu", "tanh" or "silu".
         components: Gaussians of each network's mixture, K.
@@ -51,6 +54,7 @@ class Estimator:
     learning_rate: Float[Array, "*batch"] | float = 1e-5
     weight_decay: Float[Array, "*batch"] | float = 0.0
     clip_norm: Float[Array, "*batch"] | float = jnp.inf
+    prune: Float[Array, "*batch"] | float = 0.0
     hidden: tuple[int, ...] = static((1024, 1024, 1024))
     activation: str = static("tanh")
     components: int = static(4)
@@ -120,5 +124,5 @@ def condition(
     """
     module = estimator.module(scale.dim)
     x = normalised(estimator.normaliser, network.normaliser, x)
-    members = jax.vmap(lambda params: module.apply(params, x).mixture())(network.params)
+    members = jax.vmap(lambda params: module.apply(params, x).mixture().prune(estimator.prune))(network.params)
     return pool(members).affine(0.5 * scale.width, scale.centre)

@@ -102,6 +102,11 @@ class GaussianMixture:
             scale_tril=scale[:, None] * self.scale_tril,
         )
 
+    def prune(self, least: Float[Array, ""] | float) -> "GaussianMixture":
+        """The mixture without its components of less weight than `least` (logit -inf); the heaviest always stays."""
+        kept = (self.weights >= least) | (self.weights == jnp.max(self.weights))
+        return GaussianMixture(jnp.where(kept, self.logits, -jnp.inf), self.means, self.scale_tril)
+
     def permute(self, order: Int[Array, " comp"]) -> "GaussianMixture":
         """The same mixture with its components in another order."""
         return GaussianMixture(self.logits[order], self.means[order], self.scale_tril[order])

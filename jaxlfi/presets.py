@@ -11,6 +11,7 @@ QUICK = Settings(
         hidden=(64, 64),
         activation="tanh",
         members=4,
+        prune=0.1,
         learning_rate=1e-3,
         epochs=0,
         steps=1000,
