@@ -20,7 +20,7 @@ def simulate(key: jax.Array, theta: jax.Array) -> jax.Array:
     return MIXING @ theta + NOISE * jax.random.normal(key, (DIM,))
 
 
-def posterior(x: jax.Array) -> GaussianMixture:
+def posterior(x: jax.Array | np.ndarray) -> GaussianMixture:
     """The exact posterior under a flat prior, one Gaussian; inside a box it is this, truncated.
 
     Args:

@@ -34,7 +34,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Key
 
-from jaxlfi import counter_rng
+from jaxlfi import counter_rng, summaries
 
 SUCCESS = 0
 TOO_MANY_EVENTS = 1
@@ -422,34 +422,14 @@ def make_simulator(
 
 
 def lotka_volterra_nine(trajectory: Float[Array, "records 2"]) -> Float[Array, "9"]:
-    """The nine summaries of Papamakarios and Murray (2016) of one trajectory.
+    """The nine summaries of Papamakarios and Murray (2016): `jaxlfi.summaries.series` of the two populations.
 
-    In this order: mean X, mean Y, log(var X + 1), log(var Y + 1), autocorrelations of X at lags 1
-    and 2, of Y at lags 1 and 2, and the correlation of X with Y. Variances are unbiased, with the
-    divisor T - 1; lagged products of the standardised series are summed and divided by T - 1 too.
+    In this order: mean X, mean Y, log(var X + 1), log(var Y + 1), autocorrelations of X at lags 1 and 2, of Y at
+    lags 1 and 2, and the correlation of X with Y.
 
-    Departure: a series that never changes has variance zero and undefined correlations, NaN in the
-    original. They are 0 here: such a series says nothing about the other one or its own future, and
-    the simulation is a valid one (nothing happened) that inference must be able to use.
+    Departure: correlations of a constant series are undefined, NaN in the original, and 0 here.
 
     Args:
-        trajectory: [T, 2], T >= 3.
-
-    Returns:
-        Summaries, [9] float32.
+        trajectory: predators and prey at every record, shape [T, 2], T >= 3.
     """
-    count = trajectory.shape[0]
-    mean = jnp.mean(trajectory, axis=0)
-    centred = trajectory - mean
-    variance = jnp.sum(centred**2, axis=0) / (count - 1)
-    constant = jnp.all(trajectory == trajectory[0], axis=0)
-    variance = jnp.where(constant, 0.0, variance)
-    standardised = centred * jnp.where(constant, 0.0, lax.rsqrt(jnp.where(constant, 1.0, variance)))
-
-    def correlation(first, second):
-        return jnp.sum(first * second, axis=0) / (count - 1)
-
-    lag1 = correlation(standardised[:-1], standardised[1:])
-    lag2 = correlation(standardised[:-2], standardised[2:])
-    cross = correlation(standardised[:, 0], standardised[:, 1])
-    return jnp.stack([*mean, *jnp.log1p(variance), lag1[0], lag2[0], lag1[1], lag2[1], cross])
+    return summaries.series(trajectory)

@@ -1,5 +1,6 @@
 """Iterative BayesSim with support adaptation: Algorithm 1, lines 9-20, as init / step / run."""
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -102,6 +103,8 @@ class Round:
 
 def init(key: jax.Array, task: Task, support: Support, settings: Settings, observed: Float[Array, " obs"]) -> State:
     """The state before the first round: no data, and nothing believed but the support."""
+    chex.assert_rank(observed, 1)
+    chex.assert_shape([support.low, support.high], (task.dim,))
     components = settings.estimator.members * settings.estimator.components
     belief = uninformed(support, components)
     obs = observed.shape[-1]

@@ -24,7 +24,8 @@ def static(default):
 class Estimator:
     """What q_phi is and how it is fitted each round. The defaults are the paper's (section III-C).
 
-    Learning rate, weight decay, clipping norm and pruning are leaves, so that a grid over them is one vmap; the rest is static.
+    Learning rate, weight decay, clipping norm and pruning are leaves, so that a grid over them is one vmap; the rest
+    is static.
 
     Attributes:
         learning_rate: Adam's step size.

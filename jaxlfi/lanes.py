@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -70,6 +70,7 @@ class Inputs:
     x: Float[Array, "*batch obs"]
 
 
+@runtime_checkable
 class Engine(Protocol):
     """Steps all lanes by one round. Arrays that leave it have a leading axis of one entry a lane."""
 

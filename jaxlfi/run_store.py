@@ -216,7 +216,7 @@ def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
 
 def lane_rows(
     rows: Sequence[Mapping[str, np.ndarray]], lane: int, place: int | None
-) -> list[dict[str, np.ndarray]]:
+) -> list[dict[str, Any]]:
     """One lane's records out of those of all lanes."""
     return [own_evidence({name: value[lane] for name, value in row.items()}, place) for row in rows]
 

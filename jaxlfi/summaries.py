@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Summary = Callable[[Array], Array]
@@ -13,7 +15,33 @@ def identity(trajectory: Float[Array, "..."]) -> Float[Array, " obs"]:
     return jnp.ravel(trajectory)
 
 
-SUMMARIES: dict[str, Summary] = {"identity": identity}
+def series(trajectory: Float[Array, "time channels"]) -> Float[Array, " obs"]:
+    """Level, spread, memory and coupling of a time series, shape [4 C + C (C - 1) / 2]; of two channels, nine numbers.
+
+    In this order: the means; log(variance + 1), the variances with divisor T - 1; for each channel its autocorrelations
+    at lags 1 and 2; the correlations of each pair of channels. Lagged products of the standardised series are summed
+    and divided by T - 1. These are the summaries that Papamakarios and Murray (2016) use for predators and prey.
+
+    A channel that never changes has undefined correlations. They are 0: it says nothing about the others or its own
+    future, and the simulation is a valid one that inference must be able to use.
+
+    Args:
+        trajectory: shape [T, C], T >= 3.
+    """
+    count, channels = trajectory.shape
+    mean = jnp.mean(trajectory, axis=0)
+    centred = trajectory - mean
+    variance = jnp.sum(centred**2, axis=0) / (count - 1)
+    constant = jnp.all(trajectory == trajectory[0], axis=0)
+    variance = jnp.where(constant, 0.0, variance)
+    standardised = centred * jnp.where(constant, 0.0, jax.lax.rsqrt(jnp.where(constant, 1.0, variance)))
+    memory = [jnp.sum(standardised[lag:] * standardised[:-lag], axis=0) / (count - 1) for lag in (1, 2)]
+    first, second = np.triu_indices(channels, 1)
+    coupling = jnp.sum(standardised[:, first] * standardised[:, second], axis=0) / (count - 1)
+    return jnp.concatenate([mean, jnp.log1p(variance), jnp.stack(memory, axis=-1).ravel(), coupling])
+
+
+SUMMARIES: dict[str, Summary] = {"identity": identity, "series": series}
 """Summaries by name; each maps one trajectory to a vector [S]."""
 
 

@@ -1,0 +1,37 @@
+"""Keep a finished run in the project: its table, pictures and configuration, without the bulky arrays.
+
+    python -m experiments.keep runs/demo experiments/results/demo
+
+A single run keeps its ledger and posterior too.
+"""
+
+import argparse
+import shutil
+from pathlib import Path
+
+KEPT = ("config.json", "table.csv", "ledger.jsonl", "posterior.npz")
+"""Files kept where they are there, beside the pictures."""
+
+
+def keep(source: Path, target: Path) -> list[Path]:
+    """Copy what is worth keeping; returns the copies."""
+    target.mkdir(parents=True, exist_ok=True)
+    files = [source / name for name in KEPT if (source / name).exists()]
+    files += sorted((source / "figures").glob("*.png"))
+    return [Path(shutil.copy2(file, target / file.name)) for file in files]
+
+
+def main() -> None:
+    """Copy and say what was copied."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", type=Path)
+    parser.add_argument("target", type=Path)
+    arguments = parser.parse_args()
+    if not (arguments.source / "config.json").exists():
+        parser.error(f"expected a run folder, got {arguments.source}")
+    for path in keep(arguments.source, arguments.target):
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

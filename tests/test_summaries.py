@@ -1,0 +1,45 @@
+"""Named summaries against plain NumPy."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlfi import summaries
+
+
+def plain_series(trajectory):
+    """The definition, in float64 and loops."""
+    count, channels = trajectory.shape
+    mean, variance = trajectory.mean(0), trajectory.var(0, ddof=1)
+    z = (trajectory - mean) / np.sqrt(variance)
+    memory = [np.sum(z[lag:, c] * z[:-lag, c]) / (count - 1) for c in range(channels) for lag in (1, 2)]
+    pairs = [(a, b) for a in range(channels) for b in range(a + 1, channels)]
+    coupling = [np.sum(z[:, a] * z[:, b]) / (count - 1) for a, b in pairs]
+    return np.concatenate([mean, np.log(variance + 1), memory, coupling])
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3])
+def test_series_matches_its_definition(channels):
+    rng = np.random.default_rng(channels)
+    trajectory = np.cumsum(rng.normal(size=(40, channels)) * (1 + np.arange(channels)), axis=0)
+    ours = np.asarray(summaries.series(jnp.asarray(trajectory, jnp.float32)))
+    assert ours.shape == (4 * channels + channels * (channels - 1) // 2,)
+    np.testing.assert_allclose(ours, plain_series(trajectory), rtol=2e-4, atol=2e-4)
+
+
+def test_series_of_a_constant_channel_has_no_correlations():
+    rng = np.random.default_rng(0)
+    trajectory = np.stack([np.full(20, 3.0), rng.normal(size=20)], axis=-1).astype(np.float32)
+    ours = np.asarray(summaries.series(jnp.asarray(trajectory))
+    np.testing.assert_array_equal(ours[[2, 4, 5, 8]], 0.0)
+    np.testing.assert_allclose(ours[[1, 3, 6, 7]], plain_series(trajectory[:, 1:]), rtol=1e-3, atol=1e-4)
+
+
+def test_identity_flattens():
+    trajectory = jnp.arange(6.0).reshape(3, 2)
+    np.testing.assert_array_equal(summaries.named("identity")(trajectory), [0, 1, 2, 3, 4, 5])
+
+
+def test_unknown_name_lists_the_known():
+    with pytest.raises(ValueError, match=r"summary: expected one of \['identity', 'series'\], got 'nine'"):
+        summaries.named("nine")
