@@ -30,7 +30,7 @@ def test_series_matches_its_definition(channels):
 def test_series_of_a_constant_channel_has_no_correlations():
     rng = np.random.default_rng(0)
     trajectory = np.stack([np.full(20, 3.0), rng.normal(size=20)], axis=-1).astype(np.float32)
-    ours = np.asarray(summaries.series(jnp.asarray(trajectory))
+    ours = np.asarray(summaries.series(jnp.asarray(trajectory)))
     np.testing.assert_array_equal(ours[[2, 4, 5, 8]], 0.0)
     np.testing.assert_allclose(ours[[1, 3, 6, 7]], plain_series(trajectory[:, 1:]), rtol=1e-3, atol=1e-4)
 
