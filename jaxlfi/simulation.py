@@ -76,7 +76,12 @@ def simulate(
     return jax.vmap(one)(jax.random.split(key, theta.shape[0]), theta)
 
 
-def within_budget(theta: Array, x: Array, failure: Array, additions: int) -> Attempts:
+def within_budget(
+    theta: Float[Array, "attempts dim"],
+    x: Float[Array, "attempts obs"],
+    failure: Int[Array, " attempts"],
+    additions: Int[Array, ""] | int,
+) -> Attempts:
     """Keep the first `additions` successes; what was drawn after the last one needed does not count as attempted.
 
     Args:

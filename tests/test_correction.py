@@ -69,7 +69,7 @@ def test_some_corrections_leave_the_mixture_as_it_is(name):
 
 @pytest.mark.parametrize("name", ["none", "paper"])
 def test_some_corrections_weigh_all_filled_rows_the_same(name):
-    weights = CORRECTIONS[name].row_weights(task(), data(np.ones((3, 2)), 5), None, 0, 0.0)
+    weights = CORRECTIONS[name].row_weights(task(), data(np.ones((3, 2)), 5), INFORMED, 0, 0.0)
     np.testing.assert_array_equal(weights, [1, 1, 1, 0, 0])
 
 
