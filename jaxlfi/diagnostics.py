@@ -68,13 +68,16 @@ def trajectory_distance(trajectory: Array, observed: Array) -> Float[Array, ""]:
 
 def edge_mass(belief: Belief, zone_fraction: float = 0.1) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
     """Marginal posterior mass in or beyond the zone along each lower and each upper bound, shape [D] each."""
-    box = belief.support
+    box = jax.tree.map(jnp.asarray, belief.support)
     zone = zone_fraction * box.width
     infinite = jnp.full_like(box.low, jnp.inf)
     return (
         belief.mixture.interval_mass(-infinite, box.low + zone),
         belief.mixture.interval_mass(box.high - zone, infinite),
     )
+
+
+_edge_mass = jax.jit(edge_mass)
 
 
 def bound_warnings(task: Task, belief: Belief, threshold: float = 0.2) -> list[str]:
@@ -87,7 +90,7 @@ def bound_warnings(task: Task, belief: Belief, threshold: float = 0.2) -> list[s
         belief: one belief, concrete.
         threshold: mass above which a bound is named.
     """
-    low, high = (np.asarray(side) for side in edge_mass(belief))
+    low, high = (np.asarray(side) for side in _edge_mass(belief))
     bounds = np.asarray(belief.support.low), np.asarray(belief.support.high)
     limits = np.asarray(task.feasible.low), np.asarray(task.feasible.high)
     warnings = []

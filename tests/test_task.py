@@ -110,7 +110,7 @@ def test_gradients_pass_through_coordinates_without_nan():
         ),
         ({"truth": [1.0, 2.0]}, r"^truth: expected 3 numbers, got shape \(2,\)"),
         ({"truth": [1.0, 2.0, 0.0]}, r"^truth: expected positive values of the log parameters"),
-        ({"summary": "nine"}, r"^summary: expected one of \['identity'\], got 'nine'"),
+        ({"summary": "nine"}, r"^summary: expected one of \['identity', 'series'\], got 'nine'"),
     ],
 )
 def test_bad_declarations_are_named(changes, message):
