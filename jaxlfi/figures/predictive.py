@@ -65,6 +65,7 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
             draw_channel(axes[channel, column], history, channel, own)
             axes[channel, column].grid(True)
         axes[-1, column].set_xlabel(_time_label(history))
+        axes[-1, column].locator_params(axis="x", nbins=5)
     for channel, name in enumerate(first.channels):
         axes[channel, 0].set_ylabel(plain(name))
         _robust_limits(axes[channel, 0], histories, channel)
