@@ -216,8 +216,15 @@ def stopped(tmp_path_factory):
     return out
 
 
-@pytest.mark.parametrize("file", ["state.npz", "round_000.npz", "start.npz"])
-@pytest.mark.parametrize("damage", ["truncated", "flipped", "missing", "foreign"])
+@pytest.mark.parametrize(
+    ("damage", "file"),
+    [
+        (damage, file)
+        for damage in ("truncated", "flipped", "missing", "foreign")
+        for file in ("state.npz", "round_000.npz", "start.npz")
+        if (damage, file) != ("missing", "state.npz")  # without a state a run begins with its first round
+    ],
+)
 def test_a_damaged_checkpoint_is_refused_and_left_alone(stopped, tmp_path, capsys, file, damage):
     import shutil
 
@@ -234,8 +241,6 @@ def test_a_damaged_checkpoint_is_refused_and_left_alone(stopped, tmp_path, capsy
         path.unlink()
     else:
         np.savez(path, something=np.zeros(3))
-    if file == "state.npz" and damage == "missing":
-        pytest.skip("without a state a run begins with its first round")
     before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
     capsys.readouterr()
     assert command("resume", out, "--no-figures") == 2
