@@ -12,7 +12,8 @@ from jaxlfi.mixture_algebra import pool
 from jaxlfi.normalise import TRANSFORMS, Normaliser, normalised
 from jaxlfi.support import Support
 
-SCHEDULES = ("constant", "cosine")
+SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jnp.cos(jnp.pi * progress))}
+"""The learning rate's factor at a point of progress through the round's fitting, by name."""
 
 
 def static(default):

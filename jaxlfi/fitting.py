@@ -7,7 +7,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.dataset import Dataset
-from jaxlfi.estimator import Estimator, Network, initialise
+from jaxlfi.estimator import SCHEDULES, Estimator, Network, initialise
 from jaxlfi.normalise import fit_normaliser, normalised
 from jaxlfi.support import Support
 
@@ -35,7 +35,7 @@ class FitInfo:
 @struct.dataclass
 class _Training:
     params: dict
-    optimiser: optax.OptState
+    moments: optax.OptState
     nonfinite: Int[Array, ""]
 
 
@@ -91,10 +91,13 @@ def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
     """One member's training: a scan over passes, each a loop over minibatches."""
     capacity, dim = theta.shape
     module = estimator.module(dim)
-    adam = optax.adamw(estimator.learning_rate, weight_decay=estimator.weight_decay)
-    optimiser = optax.chain(optax.clip_by_global_norm(estimator.clip_norm), adam)
     passes = estimator.epochs or -(-estimator.steps // STEPS_PER_PASS)
     batches = -(-expected_size // estimator.batch_size) if estimator.epochs else -(-estimator.steps // passes)
+
+    def rate(count):
+        return estimator.learning_rate * SCHEDULES[estimator.schedule](count / (passes * batches))
+
+    adam = optax.adamw(rate, weight_decay=estimator.weight_decay)
 
     key_split, key_passes = jax.random.split(key)
     rows = _shuffled(key_split, jnp.arange(capacity), size)
@@ -109,40 +112,39 @@ def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
     def loss_of(params, rows):
         return -jnp.mean(weights[rows] * module.apply(params, x[rows]).log_prob(theta[rows]))
 
-    def gradient_step(rows, state, rate):
+    def gradient_step(state, rows):
         loss, gradient = jax.value_and_grad(loss_of)(state.params, rows)
-        finite = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(gradient))
-        gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
-        updates, moments = optimiser.update(gradient, state.optimiser, state.params)
+        norm = optax.tree.norm(gradient)
+        finite = jnp.isfinite(loss) & jnp.isfinite(norm)
+        # A factor, where optax divides each entry: one pass fewer over the gradient.
+        factor = jnp.minimum(1.0, estimator.clip_norm / norm)
+        gradient = jax.tree.map(lambda g: jnp.where(finite, factor * g, 0.0), gradient)
+        updates, moments = adam.update(gradient, state.moments, state.params)
         # A step that is not finite moves nothing, also not by the momentum of the steps before.
-        updates = jax.tree.map(lambda u: jnp.where(finite, rate, 0.0) * u, updates)
+        updates = jax.tree.map(lambda u: jnp.where(finite, u, 0.0), updates)
         params = optax.apply_updates(state.params, updates)
         return _Training(params, moments, state.nonfinite + ~finite), jnp.where(finite, loss, 0.0), finite
 
     def one_pass(carry, index, order):
         state, best = carry
-        rate = _rate(estimator.schedule, index / passes)
 
         def minibatch(b, loop):
             state, total, count = loop
             chosen = order[(b * estimator.batch_size + jnp.arange(estimator.batch_size)) % training]
-            state, loss, finite = gradient_step(chosen, state, rate)
+            state, loss, finite = gradient_step(state, chosen)
             return state, total + loss, count + finite
 
         state, total, count = jax.lax.fori_loop(0, batches, minibatch, (state, 0.0, 0))
         loss = total / count  # NaN where no step of the pass was finite
         if not estimator.validation:
-            return (state, _Best(state.params, jnp.inf, index)), (loss, jnp.nan)
+            return (state, best), (loss, jnp.nan)
         log_prob = module.apply(state.params, x[held_out_rows]).log_prob(theta[held_out_rows])
         validation = -jnp.sum(held_out_weights * jnp.where(held_out_weights > 0, log_prob, 0.0))
         held_out_weight = jnp.sum(held_out_weights)
         validation = validation / held_out_weight
         # With too few simulations to hold any out, the last weights are as good as any.
         better = (validation < best.loss) | (held_out_weight == 0)
-        best = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old), _Best(state.params, validation, index), best
-        )
-        return (state, best), (loss, validation)
+        return (state, _where(better, _Best(state.params, validation, index), best)), (loss, validation)
 
     def body(carry, index):
         order = _shuffled(jax.random.fold_in(key_passes, index), rows, training)
@@ -151,21 +153,20 @@ def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
         stopped = index - carry[1].at > estimator.patience
         return jax.lax.cond(stopped, lambda c, *_: (c, (jnp.nan, jnp.nan)), one_pass, carry, index, order)
 
-    state = _Training(params, optimiser.init(params), jnp.asarray(0))
-    best = _Best(params, jnp.asarray(jnp.inf), jnp.asarray(0))
+    state = _Training(params, adam.init(params), jnp.asarray(0))
+    best = _Best(params, jnp.asarray(jnp.inf), jnp.asarray(0)) if estimator.validation else None
     (state, best), (losses, validation_losses) = jax.lax.scan(body, (state, best), jnp.arange(passes))
-    info = FitInfo(losses, validation_losses, best.at, state.nonfinite)
-    return best.params, info
+    if best is None:
+        best = _Best(state.params, jnp.asarray(jnp.inf), jnp.asarray(passes - 1))
+    return best.params, FitInfo(losses, validation_losses, best.at, state.nonfinite)
+
+
+def _where(condition, new, old):
+    """One of two pytrees."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
 def _shuffled(key: jax.Array, rows: Int[Array, " cap"], count: Int[Array, ""]) -> Int[Array, " cap"]:
     """The first `count` rows in random order, the others behind them."""
     rank = jnp.where(jnp.arange(rows.shape[0]) < count, jax.random.uniform(key, rows.shape), 2.0)
     return rows[jnp.argsort(rank)]
-
-
-def _rate(schedule: str, progress: Array) -> Array:
-    """The learning rate's factor at a point of progress through the round."""
-    if schedule == "cosine":
-        return 0.5 * (1 + jnp.cos(jnp.pi * progress))
-    return jnp.ones_like(progress)

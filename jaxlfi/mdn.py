@@ -50,6 +50,28 @@ class MixtureHead:
         return GaussianMixture(self.logits, self.means, jnp.tril(scale_tril))
 
 
+class Dense(nn.Module):
+    """An affine layer whose kernel lies [out, in].
+
+    The gradient of such a kernel is a product that comes out as the kernel lies, also under vmap. That of a kernel
+    [in, out] (Flax's own layer) is transposed after the product, entry by entry, once for each of Adam's passes over
+    it: on CPU that took three quarters of a step of 3 x 1024 units.
+
+    Attributes:
+        units: length of the output.
+    """
+
+    units: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
+        """The product of x and the transposed kernel, plus the bias."""
+        initial = nn.initializers.lecun_normal(in_axis=-1, out_axis=-2)
+        kernel = self.param("kernel", initial, (self.units, x.shape[-1]))
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.units,))
+        return jax.lax.dot_general(x, kernel, (((x.ndim - 1,), (1,)), ((), ()))) + bias
+
+
 class MDN(nn.Module):
     """A multilayer perceptron from normalised summaries to a mixture over theta scaled to [-1, 1]^D.
 
@@ -70,10 +92,10 @@ class MDN(nn.Module):
         """The mixture for each summary vector."""
         activation = ACTIVATIONS[self.activation]
         for units in self.hidden:
-            x = activation(nn.Dense(units)(x))
+            x = activation(Dense(units)(x))
         components, dim = self.components, self.dim
         below = dim * (dim - 1) // 2
-        out = nn.Dense(components * (1 + 2 * dim + below))(x)
+        out = Dense(components * (1 + 2 * dim + below))(x)
         logits, means, log_diagonal, lower = jnp.split(
             out, np.cumsum([components, components * dim, components * dim]), axis=-1
         )

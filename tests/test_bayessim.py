@@ -124,7 +124,7 @@ def test_importance_weights_keep_later_rounds_exact():
 @pytest.fixture(scope="module")
 def sequential():
     """The paper's p-hat = q over five rounds of 100: the wrong support kept, and adapted; and the right one."""
-    estimator = dataclasses.replace(MODEST, steps=300, batch_size=100)
+    estimator = dataclasses.replace(MODEST, steps=450, batch_size=100)
     return infer(Settings(estimator=estimator, rounds=5), ("misspecified", "misspecified", "ok"), (0, 1, 0), 1)
 
 

@@ -374,7 +374,7 @@ def test_a_warm_start_keeps_its_normaliser_and_a_cold_one_takes_the_datas():
 def test_members_are_trained_apart_and_pooled(overfitted):
     _, network, info = overfitted
     kernels = network.params["params"]["Dense_0"]["kernel"]
-    assert kernels.shape == (2, 2, 16)
+    assert kernels.shape == (2, 16, 2)
     assert np.abs(kernels[0] - kernels[1]).max() > 1e-2
     assert info.loss.shape == (2, VALIDATED.epochs) and info.loss[0, -1] != info.loss[1, -1]
     x, theta = jnp.array([0.4, -1.0]), jnp.array([0.2, -1.5])
