@@ -12,6 +12,7 @@ Prints
 Best and median of several calls are shown, since other programs may share the machine. One device, all its cores.
 """
 
+import importlib.util
 import itertools
 import os
 import statistics
@@ -39,15 +40,16 @@ ROWS = 1000
 REPEATS = 5
 
 
-def measure(call: Callable[[], object], repeats: int = REPEATS) -> tuple[float, float]:
-    """Best and median seconds of a call, after one that warms it up."""
-    call()
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - start)
-    return min(seconds), statistics.median(seconds)
+def measure(calls: dict[str, Callable[[], object]], repeats: int = REPEATS) -> dict[str, tuple[float, float]]:
+    """Best and median seconds of calls, made in turn so that they share the machine's moods, after one to warm up."""
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for repeat in range(repeats + 1):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            if repeat:
+                seconds[name].append(time.perf_counter() - start)
+    return {name: (min(of), statistics.median(of)) for name, of in seconds.items()}
 
 
 def products(estimator: Estimator) -> int:
@@ -61,12 +63,13 @@ def matrix_rate() -> float:
     """Operations a second of a large float32 matrix product."""
     a = jnp.ones((2048, 2048))
     multiply = jax.jit(jnp.matmul)
-    best, _ = measure(lambda: jax.block_until_ready(multiply(a, a)))
+    ((best, _),) = measure({"": lambda: jax.block_until_ready(multiply(a, a))}).values()
     return 2 * 2048**3 / best
 
 
-def our_step(estimator: Estimator, passes: int) -> tuple[float, float]:
-    """Best and median seconds of one of our gradient steps, in a fit of many."""
+def our_steps(estimator: Estimator, steps: int) -> Callable[[], object]:
+    """A call of so many of our gradient steps, a fit."""
+    passes = steps * BATCH // ROWS
     estimator = estimator.replace(epochs=passes, steps=0, members=1)
     task = lotka_volterra()
     key = jax.random.key(0)
@@ -82,16 +85,13 @@ def our_step(estimator: Estimator, passes: int) -> tuple[float, float]:
     run = jax.jit(
         lambda key: fit(key, estimator, network, data, jnp.ones(ROWS), task.feasible, ROWS)[1].loss
     )
-    steps = passes * ROWS // BATCH
-    return tuple(seconds / steps for seconds in measure(lambda: jax.block_until_ready(run(key))))
+    return lambda: jax.block_until_ready(run(key))
 
 
-def torch_step(estimator: Estimator, steps: int) -> tuple[float, float] | None:
-    """The same step as a PyTorch user writes it; None where PyTorch is not installed."""
-    try:
-        import torch
-    except ImportError:
-        return None
+def torch_steps(estimator: Estimator, steps: int, fused: bool) -> Callable[[], object]:
+    """The same steps as a PyTorch user writes them, with Adam as it comes or by its fused kernel."""
+    import torch
+
     components, below = estimator.components, DIM * (DIM - 1) // 2
     activation = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.SiLU}[estimator.activation]
     layers: list[torch.nn.Module] = []
@@ -100,7 +100,7 @@ def torch_step(estimator: Estimator, steps: int) -> tuple[float, float] | None:
         layers += [torch.nn.Linear(width, units), activation()]
         width = units
     network = torch.nn.Sequential(*layers, torch.nn.Linear(width, components * (1 + 2 * DIM + below)))
-    optimiser = torch.optim.Adam(network.parameters(), lr=float(estimator.learning_rate))
+    optimiser = torch.optim.Adam(network.parameters(), lr=float(estimator.learning_rate), fused=fused)
     x, theta = torch.randn(ROWS, OBS), torch.rand(ROWS, DIM) * 2 - 1
     row, column = torch.tril_indices(DIM, DIM, -1)
 
@@ -124,24 +124,26 @@ def torch_step(estimator: Estimator, steps: int) -> tuple[float, float] | None:
             loss_of(x[rows], theta[rows]).backward()
             optimiser.step()
 
-    return tuple(seconds / steps for seconds in measure(train, repeats=3))
+    return train
 
 
 def step_table() -> None:
     """Milliseconds a gradient step."""
     rate = matrix_rate()
     print(f"Large matrix products run at {rate / 1e9:.0f} GFLOP/s here.\n")
-    print(f"{'gradient step':<24}{'ours, ms':>12}{'(median)':>10}{'PyTorch, ms':>13}{'(median)':>10}{'floor, ms':>11}")
-    for preset, passes, steps in (("quick", 100, 300), ("paper", 4, 20)):
+    torch_is_here = importlib.util.find_spec("torch") is not None
+    print(f"{'gradient step, ms':<24}{'best':>12}{'median':>10}")
+    for preset, steps in (("quick", 500), ("paper", 40)):
         estimator = PRESETS[preset].estimator
-        best, median = our_step(estimator, passes)
-        other = torch_step(estimator, steps)
-        layers = "x".join(map(str, estimator.hidden))
-        torch_cells = f"{other[0] * 1e3:>13.2f}{other[1] * 1e3:>10.2f}" if other else f"{'not installed':>23}"
-        print(
-            f"{preset + ' ' + layers:<24}{best * 1e3:>12.3f}{median * 1e3:>10.3f}{torch_cells}"
-            f"{products(estimator) / rate * 1e3:>11.3f}"
-        )
+        calls = {"ours": our_steps(estimator, steps)}
+        if torch_is_here:
+            calls["PyTorch"] = torch_steps(estimator, steps, fused=False)
+            calls["PyTorch, fused Adam"] = torch_steps(estimator, steps, fused=True)
+        print(f"{preset}, {'x'.join(map(str, estimator.hidden))}; floor {products(estimator) / rate * 1e3:.3f}")
+        for name, (best, median) in measure(calls).items():
+            print(f"  {name:<22}{best / steps * 1e3:>12.3f}{median / steps * 1e3:>10.3f}")
+    if not torch_is_here:
+        print("PyTorch is not installed: pip install 'jaxlfi[bench]'")
     print()
 
 
@@ -189,12 +191,12 @@ def run_table() -> None:
             state, _ = timed("update", update, key_update, state, i, theta, x, failure)
 
     print(f"{'a whole run of quick, one lane':<40}{'best, s':>10}{'median, s':>11}")
-    for name, call in (
-        ("one compiled program", lambda: jax.block_until_ready(whole(key))),
-        ("its rounds, one call each", stepwise),
-        ("its parts, one call each", by_parts),
-    ):
-        best, median = measure(call)
+    calls = {
+        "one compiled program": lambda: jax.block_until_ready(whole(key)),
+        "its rounds, one call each": stepwise,
+        "its parts, one call each": by_parts,
+    }
+    for name, (best, median) in measure(calls).items():
         print(f"{name:<40}{best:>10.2f}{median:>11.2f}")
     print("parts of the last: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in spent.items()) + "\n")
 
