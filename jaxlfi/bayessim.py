@@ -10,10 +10,10 @@ from jaxlfi import dataset as datasets
 from jaxlfi.belief import RESTRICTIONS, Belief, uninformed
 from jaxlfi.correction import CORRECTIONS, CorrectionInfo, effective_size
 from jaxlfi.dataset import Dataset
-from jaxlfi.estimator import Estimator, Network, condition, initialise, static
+from jaxlfi.estimator import Estimator, Network, initialise, normalisers, static
 from jaxlfi.fitting import FitInfo, fit
 from jaxlfi.heuristics import Adaptation, Heuristic
-from jaxlfi.normalise import fit_normaliser
+from jaxlfi.posterior import posterior
 from jaxlfi.simulation import Attempts, simulate, within_budget
 from jaxlfi.support import Support
 from jaxlfi.task import Task
@@ -108,16 +108,16 @@ def init(key: jax.Array, task: Task, support: Support, settings: Settings, obser
     components = settings.estimator.members * settings.estimator.components
     belief = uninformed(support, components)
     obs = observed.shape[-1]
+    feasible = task.feasible.hull(support)
     nothing = datasets.empty(settings.rounds * settings.additions, task.dim, obs)
     return State(
         belief=belief,
         proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.rounds, *leaf.shape)), belief),
         dataset=nothing,
         network=Network(
-            params=initialise(key, settings.estimator, task.dim, obs),
-            normaliser=fit_normaliser(settings.estimator.normaliser, nothing.x, nothing.valid),
+            initialise(key, settings.estimator, task.dim, obs), *normalisers(settings.estimator, nothing, feasible)
         ),
-        feasible=task.feasible.hull(support),
+        feasible=feasible,
     )
 
 
@@ -162,29 +162,31 @@ def update(
     correction = CORRECTIONS[settings.correction]
     weights = correction.row_weights(task, dataset, proposals, round, settings.defensive)
     expected = (round + 1) * settings.additions
-    network, fit_info = fit(key, settings.estimator, network, dataset, weights, state.feasible, expected)
-    q = condition(settings.estimator, network, observed, state.feasible)
-    posterior, not_positive_definite = correction.change(task, q, state.belief)
-    belief, adaptation = heuristic(state.belief, posterior, state.feasible)
+    # An MDN is read off, a flow is drawn from.
+    key_fit, key_draw = jax.random.split(key) if settings.estimator.is_flow else (key, None)
+    log_prior = None if task.prior is None else task.prior.log_prob(dataset.theta)
+    network, fit_info = fit(
+        key_fit, settings.estimator, network, dataset, weights, state.feasible, expected, log_prior
+    )
+    q, inside = posterior(key_draw, settings.estimator, network, observed, state.feasible, state.belief.support)
+    mixture, not_positive_definite = correction.change(task, q, state.belief)
+    belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     info = Round(
         attempts=attempts,
         failed=attempts.failed(len(task.reasons)),
         proposal=state.belief,
         belief=belief,
         adaptation=adaptation,
-        correction=CorrectionInfo(effective_size(weights), not_positive_definite),
+        correction=CorrectionInfo(effective_size(weights), not_positive_definite, inside),
         fit=fit_info,
     )
     return State(belief, proposals, dataset, network, state.feasible), info
 
 
 def _started(estimator: Estimator, state: State, dataset: Dataset) -> Network:
-    """A network that is trained on takes its normaliser from the first round that has simulations."""
-    fresh = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid)
-    normaliser = jax.tree.map(
-        lambda kept, new: jnp.where(state.dataset.size > 0, kept, new), state.network.normaliser, fresh
-    )
-    return Network(state.network.params, normaliser)
+    """A network that is trained on takes its normalisers from the first round that has simulations."""
+    fresh = Network(state.network.params, *normalisers(estimator, dataset, state.feasible))
+    return jax.tree.map(lambda kept, new: jnp.where(state.dataset.size > 0, kept, new), state.network, fresh)
 
 
 def step(

@@ -1,4 +1,4 @@
-"""The command line: `jaxlfi tasks | infer | compare | report | resume`.
+"""The command line: `jaxlfi tasks | infer | compare | grid | report | resume`.
 
 This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set
 before jax starts can be set after the arguments are known.
@@ -6,6 +6,7 @@ before jax starts can be set after the arguments are known.
 
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from typing import NoReturn
 import jaxlfi
 
 PRESETS = ("quick", "paper")
+METHODS = ("bayessim", "apt", "npe")
 FILE_WIDTH = 120
 """Characters a line where the output is no terminal."""
 HEURISTICS = ("none", "edge", "mode", "centre")
@@ -35,6 +37,7 @@ examples:
   jaxlfi tasks                                   what there is to infer
   jaxlfi infer lotka_volterra --support misspecified --heuristic edge --out runs/edge
   jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
+  jaxlfi grid lotka_volterra --vary expansion=0.1,0.2,0.4 --out runs/grid
   jaxlfi resume runs/comparison                  go on after a crash, to the same result bit for bit
   jaxlfi report runs/comparison                  draw the pictures again
 
@@ -57,6 +60,18 @@ the same seed means the same observation in all of them.
 examples:
   jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
   jaxlfi compare lotka_volterra --configurations ok broad broad+centre --seeds 20 --out runs/broad
+
+"""
+
+
+GRID_EXAMPLES = """\
+Every combination of values is run with every seed, side by side in chunks that fit the memory; the same seed means
+the same observation in all of them. Hyperparameters on no axis keep the paper's values, or those of their flags.
+
+examples:
+  jaxlfi grid lotka_volterra --support misspecified --out runs/edge-grid \\
+      --vary zone_fraction=0.05,0.1,0.2 mass_threshold=0.001,0.005,0.05 expansion=0.1,0.2,0.4
+  jaxlfi grid lotka_volterra --heuristic mode --vary proximity=0.2,0.4 --vary expansion=0.1,0.2 --out runs/mode-grid
 
 """
 
@@ -126,6 +141,33 @@ def parser() -> argparse.ArgumentParser:
     )
     _add_shared(compare, seeds=4)
 
+    grid = commands.add_parser(
+        "grid",
+        help="run a heuristic over a grid of its hyperparameters",
+        description="Run a heuristic over a grid of its hyperparameters, to see how sensitive it is to them.",
+        epilog=GRID_EXAMPLES + GLOSSARY,
+        formatter_class=formatter,
+    )
+    grid.add_argument(
+        "--vary",
+        nargs="+",
+        action="extend",
+        required=True,
+        metavar="NAME=V,V,...",
+        help="a hyperparameter and its values, as in expansion=0.1,0.2,0.4; several, or the flag again",
+    )
+    grid.add_argument(
+        "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
+    )
+    grid.add_argument("--heuristic", default="edge", metavar="NAME", help="edge or mode (default: edge)")
+    grid.add_argument(
+        "--lanes-per-chunk",
+        type=int,
+        metavar="N",
+        help="runs computed and saved together (default: as many as there is memory for)",
+    )
+    _add_shared(grid, seeds=4, networks=False)
+
     resume = commands.add_parser(
         "resume",
         help="go on with a run that was stopped",
@@ -134,20 +176,38 @@ def parser() -> argparse.ArgumentParser:
     resume.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
     _add_machine(resume)
 
+    sample = commands.add_parser(
+        "sample",
+        help="draw from the posterior of a run",
+        description="Draw parameters from the posterior of a finished run, in natural units.",
+    )
+    sample.add_argument("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
+    sample.add_argument("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
+    sample.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the draws (default: 0)")
+    sample.add_argument(
+        "--out", type=Path, metavar="FILE", help="a new .csv or .npz file (default: samples.csv in the folder)"
+    )
+
     report = commands.add_parser(
         "report",
         help="draw the pictures of a run",
         description="Draw all pictures of a folder from its saved files.",
     )
-    report.add_argument("folder", type=Path, metavar="DIR", help="a folder that infer or compare wrote")
+    report.add_argument("folder", type=Path, metavar="DIR", help="a folder that infer, compare or grid wrote")
     return top
 
 
-def _add_shared(command: argparse.ArgumentParser, seeds: int) -> None:
-    """Arguments that `infer` and `compare` have in common."""
+def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = True) -> None:
+    """Arguments that `infer`, `compare` and `grid` have in common; `grid` saves no networks."""
     command.add_argument("task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory")
     command.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results"
+    )
+    command.add_argument(
+        "--method",
+        choices=METHODS,
+        default="bayessim",
+        help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: a flow, one round (default: bayessim)",
     )
     command.add_argument(
         "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"
@@ -166,9 +226,10 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int) -> None:
         "(default: the task's own, or one simulated at the known truth)",
     )
     _add_machine(command)
-    command.add_argument(
-        "--keep-network", action="store_true", help="also save the trained networks (network.npz)"
-    )
+    if networks:
+        command.add_argument(
+            "--keep-network", action="store_true", help="also save the trained networks (network.npz)"
+        )
 
     rounds = command.add_argument_group("rounds (default: the preset's)")
     rounds.add_argument("--rounds", type=int, metavar="N", help="inference rounds, N_LFI")
@@ -190,6 +251,9 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int) -> None:
     )
 
     network = command.add_argument_group("network and training (default: the preset's)")
+    network.add_argument("--family", metavar="NAME", help="mdn, or a normalizing flow: maf, nsf")
+    network.add_argument("--loss", metavar="NAME", help="likelihood, or atomic, which needs no correction")
+    network.add_argument("--transforms", type=int, metavar="N", help="transforms of a flow")
     network.add_argument("--hidden", type=int, nargs="+", metavar="N", help="units of each hidden layer")
     network.add_argument("--activation", metavar="NAME", help="relu, tanh or silu")
     network.add_argument("--components", type=int, metavar="K", help="Gaussians in each network's mixture")
@@ -269,9 +333,12 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
 def _lanes(arguments: argparse.Namespace) -> int:
     """How many lanes a command is going to have, as far as its arguments tell."""
     if arguments.command == "resume":
-        return len(_recorded(arguments).get("lanes", ()))
+        recorded = _recorded(arguments)
+        return len(recorded.get("lanes") or ()) + bool(recorded.get("axes")) * 2  # a grid does not list its lanes
     if arguments.command == "compare":
         return arguments.seeds * len(arguments.configurations or "default")
+    if arguments.command == "grid":
+        return arguments.seeds * math.prod(axis.count(",") + 1 for axis in arguments.vary)
     return getattr(arguments, "seeds", 1)
 
 

@@ -3,15 +3,16 @@
 import argparse
 import dataclasses
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from jaxlfi import atomic, run_store, session, sweep
 from jaxlfi import observation as observations
-from jaxlfi import run_store, session
 from jaxlfi import tasks as task_lookup
 from jaxlfi.bayessim import Settings
 from jaxlfi.checkpoint import CheckpointError
@@ -20,14 +21,18 @@ from jaxlfi.heuristics import HEURISTICS, Heuristic, Matched, Mode
 from jaxlfi.inference import check_heuristic, simulator_shapes
 from jaxlfi.lanes import Lane
 from jaxlfi.observation import SimulatorError
-from jaxlfi.presets import PRESETS
+from jaxlfi.presets import METHODS, PRESETS
+from jaxlfi.sampling import posterior_samples
 from jaxlfi.session import Plan
 from jaxlfi.support import Support
+from jaxlfi.sweep import Work
 from jaxlfi.task import Task
 
-Prepared = tuple[Path, Plan]
+Prepared = tuple[Path, Plan | Work]
 EXPECTED = (SimulatorError, CheckpointError, run_store.StoreError)
 """Errors of a run that are the input's, and told in one line."""
+LEAKAGE = 0.01
+"""Share of the posterior inside its support below which draws from it are warned of."""
 BOOTSTRAP = 2000
 """Resamples of an interval."""
 
@@ -113,12 +118,41 @@ def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
     return arguments.out, plan
 
 
+def grid(arguments: argparse.Namespace, console: Console) -> Prepared:
+    """Prepare `jaxlfi grid`."""
+    task = task_lookup.load(arguments.task)
+    settings = build_settings(arguments)
+    axes = sweep.parse_axes(arguments.vary)
+    _refuse_foreign_hyperparameters(arguments, [arguments.heuristic])
+    for axis in axes:
+        if getattr(arguments, axis.name, None) is not None:
+            raise ValueError(f"{axis.name}: expected it on an axis or as a flag of its own, got both")
+    name = arguments.support or next(iter(task.supports))
+    plan = sweep.Grid(
+        task=task,
+        support=task.support(name),
+        rule=build_heuristic(arguments, arguments.heuristic, settings, task),
+        axes=axes,
+        seeds=tuple(_seeds(arguments)),
+        settings=settings,
+        reference=arguments.task,
+        preset=arguments.preset,
+        support_name=name,
+    )
+    observation = _observation(arguments, task)
+    run_store.refuse_occupied(arguments.out)
+    console.print(f"{task.name}: compiling for {plan.size} runs")
+    return arguments.out, sweep.begin(arguments.out, plan, observation, arguments.lanes_per_chunk)
+
+
 def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     """Prepare `jaxlfi resume`: nothing is left to do where the run is complete."""
     folder = arguments.folder
+    if sweep.is_grid(folder):
+        return _resume_grid(folder, console)
     config = run_store.read_config(folder)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
-        console.print(f"{folder} is complete: nothing to resume. Its pictures: jaxlfi report {folder}")
+        console.print(_COMPLETE.format(folder=folder))
         return None
     if "lanes" not in config:
         raise run_store.StoreError(
@@ -127,14 +161,56 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     return folder, session.plan_of(config)
 
 
+_COMPLETE = "{folder} is complete: nothing to resume. Its pictures: jaxlfi report {folder}"
+
+
+def _resume_grid(folder: Path, console: Console) -> Prepared | None:
+    config = sweep.read_config(folder)
+    if config.get("status") == "finished":
+        console.print(_COMPLETE.format(folder=folder))
+        return None
+    if config.get("devices") != (here := jax.local_device_count()):
+        console.print(
+            f"warning: begun on {config.get('devices')} devices and resumed on {here}: results differ by rounding",
+            style="yellow",
+            soft_wrap=True,
+            highlight=False,
+        )
+    return folder, sweep.reopen(folder)
+
+
 def report(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi report`."""
-    run_store.read_config(arguments.folder)
+    (sweep if sweep.is_grid(arguments.folder) else run_store).read_config(arguments.folder)
     draw(arguments.folder, console)
 
 
-def run(folder: Path, plan: Plan, arguments: argparse.Namespace, console: Console) -> None:
-    """Run what `infer`, `compare` or `resume` prepared, and tell what came of it."""
+def sample(arguments: argparse.Namespace, console: Console) -> None:
+    """`jaxlfi sample DIR`."""
+    out = arguments.out or arguments.folder / "samples.csv"
+    if out.suffix not in (".csv", ".npz"):
+        raise ValueError(f"out: expected a name that ends in .csv or .npz, got {out}")
+    if out.exists():
+        raise ValueError(f"out: expected a new file, got {out}, which exists")
+    draws, names, inside = posterior_samples(arguments.folder, arguments.number, arguments.seed)
+    if out.suffix == ".npz":
+        atomic.write_arrays(out, {"theta": draws, "names": np.asarray(names)})
+    else:
+        rows = [",".join(names), *(",".join(f"{value:.8g}" for value in row) for row in draws)]
+        atomic.write_bytes(out, ("\n".join(rows) + "\n").encode())
+    console.print(f"samples: {out}", soft_wrap=True, highlight=False)
+    if inside < LEAKAGE:
+        console.print(
+            f"warning: only {inside:.2g} of the posterior lies in the support it was truncated to; it may be wrong.",
+            style="yellow", soft_wrap=True, highlight=False,
+        )
+
+
+def run(folder: Path, plan: Plan | Work, arguments: argparse.Namespace, console: Console) -> None:
+    """Run what `infer`, `compare`, `grid` or `resume` prepared, and tell what came of it."""
+    if isinstance(plan, Work):
+        _run_grid(folder, plan, arguments, console)
+        return
     try:
         session.advance(folder, plan, console)
     except SimulatorError:
@@ -150,6 +226,45 @@ def run(folder: Path, plan: Plan, arguments: argparse.Namespace, console: Consol
         console.print(f"results: {folder}", soft_wrap=True, highlight=False)
     if not arguments.no_figures:
         draw(folder, console)
+
+
+def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: Console) -> None:
+    try:
+        arrays = sweep.advance(folder, work, console)
+    except SimulatorError:
+        if arguments.command != "resume":
+            shutil.rmtree(folder)  # raised in the first chunk only: there is nothing in it to go on from
+        raise
+    console.print(marginal_table(work.grid, arrays))
+    console.print(f"table: {folder / 'table.csv'}", soft_wrap=True, highlight=False)
+    if not arguments.no_figures:
+        draw(folder, console)
+
+
+def marginal_table(grid: sweep.Grid, arrays: Mapping[str, np.ndarray]) -> Table:
+    """One line a value of each hyperparameter, over the seeds and the other hyperparameters."""
+    table = Table("hyperparameter", "value", "runs", "theta error", "traj. error", "success")
+    for place, axis in enumerate(grid.axes):
+        for index, value in enumerate(axis.values):
+            theta, trajectory, success = (
+                np.ravel(np.take(arrays[name], index, axis=place))
+                for name in ("theta_error", "trajectory_error", "success_rate")
+            )
+            table.add_row(
+                axis.name,
+                f"{value:g}",
+                str(len(theta)),
+                _mean_and_sd(theta),
+                _mean_and_sd(trajectory),
+                f"{np.mean(success):.0%}",
+            )
+    return table
+
+
+def _mean_and_sd(values: np.ndarray) -> str:
+    """Of those that are known."""
+    values = values[np.isfinite(values)]
+    return f"{np.mean(values):.2f} ± {np.std(values, ddof=min(1, values.size - 1)):.2f}" if values.size else "-"
 
 
 def draw(folder: Path, console: Console) -> None:
@@ -172,7 +287,7 @@ def default_configurations(task: Task) -> list[str]:
 
 def build_settings(arguments: argparse.Namespace) -> Settings:
     """The preset with the settings that were given in its place."""
-    preset = PRESETS[arguments.preset]
+    preset = METHODS[arguments.method](PRESETS[arguments.preset])
     given = {name: value for name, value in vars(arguments).items() if value is not None}
     if "steps" in given and "epochs" not in given:
         given["epochs"] = 0

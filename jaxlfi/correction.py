@@ -27,10 +27,12 @@ class CorrectionInfo:
     Attributes:
         effective_size: effective number of simulations under the loss weights, (sum w)^2 / sum w^2, shape [].
         not_positive_definite: component pairs whose quotient had no positive definite covariance, shape [].
+        inside: share of q_phi's mass inside the support, before any correction; the rest has leaked, shape [].
     """
 
     effective_size: Float[Array, "*batch"]
     not_positive_definite: Int[Array, "*batch"]
+    inside: Float[Array, "*batch"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Fitting q_phi to a masked dataset by Adam, as one scan over passes."""
+"""Fitting q_phi to a masked dataset by Adam, as one loop over passes."""
 
 import jax
 import jax.numpy as jnp
@@ -7,8 +7,9 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.dataset import Dataset
-from jaxlfi.estimator import SCHEDULES, Estimator, Network, initialise
-from jaxlfi.normalise import fit_normaliser, normalised
+from jaxlfi.estimator import SCHEDULES, Estimator, Network, initialise, normalisers
+from jaxlfi.losses import LOSSES, Rows
+from jaxlfi.normalise import normalised
 from jaxlfi.support import Support
 
 STEPS_PER_PASS = 50
@@ -54,6 +55,7 @@ def fit(
     weights: Float[Array, " cap"],
     scale: Support,
     expected_size: Int[Array, ""] | int,
+    log_prior: Float[Array, " cap"] | None = None,
 ) -> tuple[Network, FitInfo]:
     """Train q_phi over the dataset (Algorithm 1, line 13).
 
@@ -67,6 +69,8 @@ def fit(
         scale: the box that is scaled to [-1, 1]^D (Phi).
         expected_size: filled rows if no simulation had failed. It sets the number of minibatches of an epoch and,
             unlike the size itself, is the same for all lanes of a vmap, which then step together.
+        log_prior: log-density of the prior at each row, up to a constant, shape [C]; None for a uniform one. Only
+            the atomic losses ask for it.
 
     Returns:
         The trained network and what happened.
@@ -74,23 +78,24 @@ def fit(
     key_init, key_fit = jax.random.split(key)
     if not estimator.warm_start:
         network = Network(
-            params=initialise(key_init, estimator, scale.dim, dataset.x.shape[-1]),
-            normaliser=fit_normaliser(estimator.normaliser, dataset.x, dataset.valid),
+            initialise(key_init, estimator, scale.dim, dataset.x.shape[-1]), *normalisers(estimator, dataset, scale)
         )
     x = normalised(estimator.normaliser, network.normaliser, dataset.x)
-    theta = scale.to_unit(dataset.theta)
+    theta = network.to_network(scale.to_unit(dataset.theta))
+    log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
 
     def one(key, params):
-        return _fit_member(key, estimator, params, theta, x, weights, dataset.size, expected_size)
+        return _fit_member(key, estimator, params, Rows(theta, x, weights, log_prior), dataset.size, expected_size)
 
     params, info = jax.vmap(one)(jax.random.split(key_fit, estimator.members), network.params)
-    return Network(params, network.normaliser), info
+    return network.replace(params=params), info
 
 
-def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
-    """One member's training: a scan over passes, each a loop over minibatches."""
-    capacity, dim = theta.shape
+def _fit_member(key, estimator, params, data, size, expected_size):
+    """One member's training: passes over the data, each a loop over minibatches."""
+    capacity, dim = data.theta.shape
     module = estimator.module(dim)
+    objective = LOSSES[estimator.loss]
     passes = estimator.epochs or -(-estimator.steps // STEPS_PER_PASS)
     batches = -(-expected_size // estimator.batch_size) if estimator.epochs else -(-estimator.steps // passes)
 
@@ -103,17 +108,22 @@ def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
     rows = _shuffled(key_split, jnp.arange(capacity), size)
     held_out = jnp.floor(estimator.validation * size).astype(jnp.int32)
     training = jnp.maximum(size - held_out, 1)
-    held_out_places = jnp.arange(max(1, int(estimator.validation * capacity)))
+    held_out_places = jnp.arange(max(2, int(estimator.validation * capacity)))
     held_out_rows = jnp.take(rows, training + held_out_places, mode="clip")
-    held_out_weights = jnp.where(held_out_places < held_out, weights[held_out_rows], 0.0)
-    mean_weight = jnp.sum(jnp.where(jnp.arange(capacity) < size, weights, 0.0)) / jnp.maximum(size, 1)
-    weights = weights / jnp.maximum(mean_weight, 1e-30)
+    mean_weight = jnp.sum(jnp.where(jnp.arange(capacity) < size, data.weights, 0.0)) / jnp.maximum(size, 1)
+    data = data.replace(weights=data.weights / jnp.maximum(mean_weight, 1e-30))
+    held_out_data = data.take(held_out_rows)
+    held_out_data = held_out_data.replace(
+        weights=jnp.where(held_out_places < held_out, held_out_data.weights, 0.0)
+    )
 
-    def loss_of(params, rows):
-        return -jnp.mean(weights[rows] * module.apply(params, x[rows]).log_prob(theta[rows]))
+    key_loss, key_held_out = jax.random.fold_in(key_passes, passes), jax.random.fold_in(key_passes, passes + 1)
 
-    def gradient_step(state, rows):
-        loss, gradient = jax.value_and_grad(loss_of)(state.params, rows)
+    def loss_of(params, key, batch):
+        return objective.training(key, module.apply(params, batch.x), batch)
+
+    def gradient_step(key, state, batch):
+        loss, gradient = jax.value_and_grad(loss_of)(state.params, key, batch)
         norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(loss) & jnp.isfinite(norm)
         # A factor, where optax divides each entry: one pass fewer over the gradient.
@@ -130,35 +140,43 @@ def _fit_member(key, estimator, params, theta, x, weights, size, expected_size):
 
         def minibatch(b, loop):
             state, total, count = loop
-            chosen = order[(b * estimator.batch_size + jnp.arange(estimator.batch_size)) % training]
-            state, loss, finite = gradient_step(state, chosen)
+            batch = data.take(order[(b * estimator.batch_size + jnp.arange(estimator.batch_size)) % training])
+            key = jax.random.fold_in(key_loss, index * batches + b)
+            state, loss, finite = gradient_step(key, state, batch)
             return state, total + loss, count + finite
 
         state, total, count = jax.lax.fori_loop(0, batches, minibatch, (state, 0.0, 0))
         loss = total / count  # NaN where no step of the pass was finite
         if not estimator.validation:
             return (state, best), (loss, jnp.nan)
-        log_prob = module.apply(state.params, x[held_out_rows]).log_prob(theta[held_out_rows])
-        validation = -jnp.sum(held_out_weights * jnp.where(held_out_weights > 0, log_prob, 0.0))
-        held_out_weight = jnp.sum(held_out_weights)
-        validation = validation / held_out_weight
+        nothing_held_out = jnp.sum(held_out_data.weights) == 0
+        # The same key for all passes: their losses are compared.
+        q = module.apply(state.params, held_out_data.x)
+        validation = objective.held_out(jax.random.clone(key_held_out), q, held_out_data)
+        validation = jnp.where(nothing_held_out, jnp.nan, validation)
         # With too few simulations to hold any out, the last weights are as good as any.
-        better = (validation < best.loss) | (held_out_weight == 0)
+        better = (validation < best.loss) | nothing_held_out
         return (state, _where(better, _Best(state.params, validation, index), best)), (loss, validation)
 
-    def body(carry, index):
+    def running(carry):
+        index, (_, best), _ = carry
+        unfinished = index < passes
+        return unfinished & (index - best.at <= estimator.patience) if estimator.patience else unfinished
+
+    def body(carry):
+        index, training_state, curves = carry
         order = _shuffled(jax.random.fold_in(key_passes, index), rows, training)
-        if not estimator.patience:
-            return one_pass(carry, index, order)
-        stopped = index - carry[1].at > estimator.patience
-        return jax.lax.cond(stopped, lambda c, *_: (c, (jnp.nan, jnp.nan)), one_pass, carry, index, order)
+        training_state, seen = one_pass(training_state, index, order)
+        return index + 1, training_state, jax.tree.map(lambda curve, now: curve.at[index].set(now), curves, seen)
 
     state = _Training(params, adam.init(params), jnp.asarray(0))
     best = _Best(params, jnp.asarray(jnp.inf), jnp.asarray(0)) if estimator.validation else None
-    (state, best), (losses, validation_losses) = jax.lax.scan(body, (state, best), jnp.arange(passes))
+    unseen = jnp.full(passes, jnp.nan)
+    start = jnp.asarray(0), (state, best), (unseen, unseen)
+    _, (state, best), (training_losses, validation_losses) = jax.lax.while_loop(running, body, start)
     if best is None:
         best = _Best(state.params, jnp.asarray(jnp.inf), jnp.asarray(passes - 1))
-    return best.params, FitInfo(losses, validation_losses, best.at, state.nonfinite)
+    return best.params, FitInfo(training_losses, validation_losses, best.at, state.nonfinite)
 
 
 def _where(condition, new, old):

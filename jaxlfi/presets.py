@@ -1,5 +1,7 @@
 """Presets: named settings of a run."""
 
+from collections.abc import Callable
+
 from jaxlfi.bayessim import Settings
 from jaxlfi.estimator import Estimator
 
@@ -29,3 +31,40 @@ there. Four disagree, and explore.
 
 PRESETS: dict[str, Settings] = {"quick": QUICK, "paper": PAPER}
 """Presets by the name the command line gives them."""
+
+FLOW = Estimator(
+    family="nsf",
+    loss="atomic",
+    hidden=(50, 50),
+    activation="relu",
+    components=4,
+    learning_rate=5e-4,
+    clip_norm=5.0,
+    epochs=500,
+    batch_size=50,
+    validation=0.1,
+    patience=20,
+    warm_start=True,
+    normaliser="zscore",
+)
+"""Sequential neural posterior estimation as it is commonly set up (Greenberg et al. 2019; the paper's appendix A)."""
+
+
+def apt(settings: Settings) -> Settings:
+    """Automatic posterior transformation, SNPE-C: a flow, the atomic loss, truncated proposals."""
+    return settings.replace(estimator=FLOW, restriction="reject")
+
+
+def npe(settings: Settings) -> Settings:
+    """Neural posterior estimation: all simulations in a single round, from the prior."""
+    return settings.replace(
+        estimator=FLOW.replace(loss="likelihood"),
+        restriction="reject",
+        rounds=1,
+        additions=settings.rounds * settings.additions,
+        attempts=settings.rounds * settings.attempts,
+    )
+
+
+METHODS: dict[str, Callable[[Settings], Settings]] = {"bayessim": lambda settings: settings, "apt": apt, "npe": npe}
+"""What a method makes of a preset, by the name the command line gives it. All are Algorithm 1 with other parts."""

@@ -20,6 +20,7 @@ from jaxlfi.inference import observe, refuse_hopeless
 from jaxlfi.keys import run_keys
 from jaxlfi.lanes import Lane, LaneEngine, stack_inputs
 from jaxlfi.progress import RoundProgress
+from jaxlfi.sampling import network_arrays
 from jaxlfi.task import Task
 
 WARNING_MASS = 0.2
@@ -224,11 +225,9 @@ def _finish(folder, plan, state, rows, seconds, trajectory, places, observed, x)
             observed[lane],
             x[lane],
         )
-        if plan.keep_network:
-            leaves, _ = jax.tree_util.tree_flatten_with_path(lane_state.network)
-            atomic.write_arrays(
-                folder / name / "network.npz", {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
-            )
+        # Draws of a flow's posterior are the flow's, not those of the mixture fitted to it.
+        if plan.keep_network or plan.settings.estimator.is_flow:
+            atomic.write_arrays(folder / name / "network.npz", network_arrays(lane_state.network))
     if plan.kind == run_store.COMPARE:
         lines = results(folder, plan)
         order = list(dict.fromkeys(line["configuration"] for line in lines))

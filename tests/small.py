@@ -25,7 +25,7 @@ SETTINGS = Settings(
 )
 FLAGS = (
     "--hidden 16 --activation tanh --normaliser zscore --learning-rate 1e-3 --steps 100 --batch-size 20 "
-    "--validation 0 --patience 0 --members 1 --components 4 --weight-decay 0 --clip-norm inf "
+    "--validation 0 --patience 0 --members 1 --components 4 --prune 0 --weight-decay 0 --clip-norm inf "
     "--schedule constant --no-warm-start --correction none --restriction clip "
     "--rounds 2 --additions 20 --attempts 25 --no-figures"
 ).split()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import atomic, cli, commands, observation, run_store, session, tasks
+from jaxlfi import atomic, cli, commands, observation, run_store, session, sweep, tasks
 from jaxlfi.bayessim import Settings
 from jaxlfi.estimator import Estimator
 from jaxlfi.heuristics import HEURISTICS
@@ -36,7 +36,7 @@ def test_help_teaches_and_does_not_wait_for_jax():
         "import sys, jaxlfi.cli as c; c.main(['--help'] if len(sys.argv) < 2 else [sys.argv[1], '--help'])"
     )
     check = "import atexit, sys; atexit.register(lambda: print('jax' in sys.modules)); "
-    for name, wanted in (("infer", "delta"), ("compare", "SUPPORT[+HEURISTIC]")):
+    for name, wanted in (("infer", "delta"), ("compare", "SUPPORT[+HEURISTIC]"), ("grid", "NAME=V,V,...")):
         done = subprocess.run(
             [sys.executable, "-c", check + script, name], capture_output=True, text=True, check=True
         )
@@ -46,7 +46,7 @@ def test_help_teaches_and_does_not_wait_for_jax():
 
 def test_every_setting_and_hyperparameter_has_a_documented_flag():
     choices = cli.parser()._subparsers._group_actions[0].choices
-    for name in ("infer", "compare"):
+    for name in ("infer", "compare", "grid"):
         documented = {action.dest for action in choices[name]._actions if action.help}
         fields = {field.name for kind in (Settings, Estimator) for field in dataclasses.fields(kind)} - {
             "estimator"
@@ -95,6 +95,22 @@ BAD = {
     "configuration": (["compare", TASK, "--configurations", "ok+x"], "expected support+heuristic"),
     "configurations": (["compare", TASK, "--configurations", "ok", "ok"], "expected distinct ones"),
     "configured support": (["compare", TASK, "--configurations", "x+edge"], "support: expected one of"),
+    "nothing to vary": (["grid", TASK], "arguments are required: --vary"),
+    "no axis": (["grid", TASK, "--vary"], "expected at least one argument"),
+    "no values": (["grid", TASK, "--vary", "tail="], "vary: expected NAME=V,V,... with numbers, got 'tail='"),
+    "no numbers": (["grid", TASK, "--vary", "tail=a,b"], "vary: expected NAME=V,V,... with numbers, got 'tail=a,b'"),
+    "joined axes": (["grid", TASK, "--vary", "tail=0,1,expansion=2"], "vary: expected NAME=V,V,..."),
+    "unknown axis": (["grid", TASK, "--vary", "x=1"], "(zone_fraction, mass_threshold, expansion, zone_width, tail), got 'x'"),  # noqa: E501
+    "another's axis": (["grid", TASK, "--heuristic", "mode", "--vary", "tail=1"], "vary: expected a hyperparameter"),
+    "no hyperparameters": (["grid", TASK, "--heuristic", "centre", "--vary", "tail=1"], "it has none"),
+    "axis twice": (["grid", TASK, "--vary", "tail=0,1", "--vary", "tail=0.5"], "each once, got tail, tail"),
+    "value twice": (["grid", TASK, "--vary", "tail=0.5,0.50"], "tail: expected at least one value, each once"),
+    "out of range": (["grid", TASK, "--vary", "tail=0.5,1.5"], "tail: expected finite numbers in [0, 1], got 0.5,1.5"),
+    "axis and flag": (["grid", TASK, "--vary", "tail=0,1", "--tail", "1"], "on an axis or as a flag of its own"),
+    "grid's support": (["grid", TASK, "--vary", "tail=0,1", "--support", "x"], "support: expected one of"),
+    "grid's seeds": (["grid", TASK, "--vary", "tail=0,1", "--seeds", "0"], "seeds: expected at least 1"),
+    "no lanes": (["grid", TASK, "--vary", "tail=0,1", "--lanes-per-chunk", "0"], "lanes_per_chunk: expected at least 1"),  # noqa: E501
+    "black box": (["grid", "tests.test_black_box:failing", "--vary", "tail=0,1"], "simulator is in JAX"),
 }  # fmt: skip
 
 
@@ -103,6 +119,28 @@ def test_bad_input_is_one_line_and_writes_nothing(case, tmp_path, capsys):
     arguments, expected = BAD[case]
     assert expected in error_line(capsys, *arguments, "--out", tmp_path / "out")
     assert not list(tmp_path.iterdir())
+
+
+def test_more_lanes_than_memory_are_refused_before_anything_is_written(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sweep, "free_memory", lambda devices: 2e4)
+    arguments = ("grid", TASK, *FLAGS, "--vary", "tail=0,0.5,1", "--lanes-per-chunk", "9", "--out", tmp_path / "out")
+    assert "lanes_per_chunk: expected fewer lanes than fill the memory: 9 need" in error_line(capsys, *arguments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_grid_has_as_many_devices_as_it_was_begun_with(tmp_path, monkeypatch):
+    vary = ["--vary", "tail=0,1", "expansion=1,2,3"]
+    begun = cli.parser().parse_args(["grid", TASK, *vary, "--vary", "zone_width=0", "--seeds", "4", "--out", "x"])
+    assert cli._lanes(begun) == 24
+    atomic.write_json(tmp_path / "config.json", {"format": sweep.GRID, "axes": [{}], "devices": 7})
+    monkeypatch.setenv("XLA_FLAGS", "")
+    cli.prepare_jax(cli.parser().parse_args(["resume", str(tmp_path), "--no-cache"]))
+    assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=7"
+
+
+def test_report_refuses_a_grid_that_is_not_finished(tmp_path, capsys):
+    atomic.write_json(tmp_path / "config.json", {"format": sweep.GRID, "version": run_store.VERSION})
+    assert "expected a finished grid, found no grid.npz" in error_line(capsys, "report", tmp_path)
 
 
 @pytest.mark.parametrize("name", ["file", "folder"])

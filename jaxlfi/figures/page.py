@@ -4,7 +4,7 @@ import base64
 import dataclasses
 import html
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,23 +86,52 @@ def render(collection: Collection, pictures: Sequence[Picture]) -> str:
     first = next(iter(collection.runs.values()))[0]
     task = _short(config.get("task") or first.config.get("task") or collection.folder.name)
     title = f"{task}: {len(collection.table)} run{'s' if len(collection.table) != 1 else ''} of jaxlfi"
+    return _document(
+        title,
+        [_facts(collection), _notes(collection), f"<h2>Results</h2>{_table(collection)}"],
+        pictures,
+        config,
+    )
+
+
+def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
+    """The page of a sensitivity grid as text.
+
+    Args:
+        config: the grid's config.json.
+        pictures: in the order to show them.
+    """
+    heuristic = config["heuristic"]["name"]
+    title = f"{_short(config['task'])}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
+    varied = [f"{axis['name']}: {', '.join(f'{v:g}' for v in axis['values'])}" for axis in config["axes"]]
+    facts = {
+        "Hyperparameters": "; ".join(varied),
+        "Support": config["support"]["name"],
+        "Rounds": config["settings"]["rounds"],
+        "Seeds": len(config["seeds"]),
+        **_provenance(config.get),
+    }
+    note = "<p>Every run is a line of table.csv; grid.npz has the same and more as arrays.</p>"
+    return _document(title, [_definitions(facts), note], pictures, config)
+
+
+def _document(title: str, parts: Sequence[str], pictures: Sequence[Picture], config: Mapping[str, Any]) -> str:
+    """A whole page: a heading, its first parts, the pictures with links to them, and config.json."""
     shown = [(f"picture-{i}", picture) for i, picture in enumerate(pictures, 1)]
     links = "".join(f'<a href="#{name}">{html.escape(picture.title)}</a>' for name, picture in shown)
-    parts = [
+    every = [
         "<!DOCTYPE html>",
         '<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<title>{html.escape(title)}</title><style>{_CSS}</style></head><body><main>",
         f"<h1>{html.escape(title)}</h1>",
-        _facts(collection),
-        _notes(collection),
-        f"<h2>Results</h2>{_table(collection)}",
+        *parts,
         f"<nav>{links}</nav>",
         *(_figure(name, picture) for name, picture in shown),
         f"<h2>Configuration</h2><details><summary>config.json</summary><pre>{_json(config)}</pre></details>",
         "</main></body></html>",
     ]
-    return "\n".join(parts) + "\n"
+    return "\n".join(every) + "\n"
 
 
 def _facts(collection: Collection) -> str:
@@ -119,12 +148,24 @@ def _facts(collection: Collection) -> str:
         ),
         "Rounds": first.rounds,
         "Seeds": max(len(histories) for histories in collection.runs.values()),
+        **_provenance(get),
+    }
+    return _definitions(facts)
+
+
+def _provenance(get: Callable[..., Any]) -> dict[str, Any]:
+    """What a run was made with, looked up by one of the names it may go by in config.json."""
+    return {
         "Preset": get("preset"),
-        "Command": get("command_line", "command"),
+        "Command": get("command_line") or get("command"),
         "Versions": get("versions"),
         "Platform": get("platform"),
         "Started": get("started"),
     }
+
+
+def _definitions(facts: Mapping[str, Any]) -> str:
+    """Names and what is known by them, without those of which nothing is."""
     lines = []
     for name, value in facts.items():
         if value in (None, "", {}):

@@ -1,6 +1,6 @@
 """Report: all pictures of a run folder, and a page with them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,12 @@ from jaxlfi.figures import (
     predictive,
     samples,
     seeds,
+    sensitivity,
     style,
     supports,
 )
 from jaxlfi.figures.collection import Collection, Runs, open_collection, representative
-from jaxlfi.figures.history import History
+from jaxlfi.figures.history import History, read_config
 from jaxlfi.figures.page import Picture
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
 
@@ -31,7 +32,7 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
     """Draw all pictures that apply to a run folder and write a page that shows them.
 
     Args:
-        folder: of one run, of several seeds, or of a comparison.
+        folder: of one run, of several seeds, of a comparison, or of a sensitivity grid.
         dpi: resolution of the pictures, which are as wide as a paper's column or text.
 
     Returns:
@@ -40,18 +41,27 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
     Raises:
         ValueError: for a folder that is missing, of another kind or damaged; nothing is written then.
     """
+    folder = Path(folder)
+    if sensitivity.is_grid(folder):
+        grid, config = sensitivity.load(folder), read_config(folder)
+        return _written(folder, GRID_PICTURES, grid, lambda pictures: page.render_grid(config, pictures), dpi)
     collection = open_collection(folder)
+    return _written(folder, PICTURES, collection, lambda pictures: page.render(collection, pictures), dpi)
+
+
+def _written(folder: Path, makers: Mapping[str, Callable], loaded, render: Callable, dpi: float) -> list[Path]:
+    """Draw what there is to draw of what was loaded, and write the page."""
     pictures: list[Picture] = []
     with style.context():
-        for name, make in PICTURES.items():
-            made = make(collection)
+        for name, make in makers.items():
+            made = make(loaded)
             if made is None:
                 continue
             figure, title, caption = made
-            path = style.save(figure, collection.folder / "figures" / f"{name}.png", dpi)
+            path = style.save(figure, folder / "figures" / f"{name}.png", dpi)
             pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
-    text = page.render(collection, pictures)
-    index = collection.folder / "report.html"
+    text = render(pictures)
+    index = folder / "report.html"
     index.write_text(text, encoding="utf-8")
     return [index, *(picture.path for picture in pictures)]
 
@@ -190,6 +200,35 @@ PICTURES: dict[str, Callable[[Collection], Made]] = {
     "seeds": _seeds,
 }
 """What makes each picture, by the name of its file."""
+
+
+def _sensitivity(grid: sensitivity.Grid) -> Made:
+    figure = style.new_figure(*sensitivity.size(grid, bars=2))
+    sensitivity.draw(figure, grid)
+    caption = (
+        "Discrepancy after the last iteration for every pair of hyperparameters: of simulated trajectories above "
+        "the diagonal, of parameters below it; on the diagonal, for each hyperparameter alone. Means over seeds and "
+        "the other hyperparameters, ± their standard deviations. The colours are reversed, as smaller is better. "
+        "The heuristic's own values are bold."
+    )
+    return figure, "Sensitivity to hyperparameters", caption
+
+
+def _feasibility(grid: sensitivity.Grid) -> Made:
+    figure = style.new_figure(*sensitivity.size(grid, bars=1))
+    sensitivity.draw_success(figure, grid)
+    caption = (
+        "Share of all attempted simulations that succeeded, for every pair of hyperparameters; on the diagonal, for "
+        "each alone. Means over seeds and the other hyperparameters, ± their standard deviations."
+    )
+    return figure, "Simulation success", caption
+
+
+GRID_PICTURES: dict[str, Callable[[sensitivity.Grid], Made]] = {
+    "sensitivity": _sensitivity,
+    "feasibility": _feasibility,
+}
+"""The pictures of a sensitivity grid, by the name of the file."""
 
 
 def _which_seed(runs: Runs) -> str:

@@ -1,0 +1,241 @@
+"""The losses of APT against plain loops and a posterior known in closed form; densities kept in a box."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from scipy import stats
+
+from jaxlfi.npe.atomic import acceptance, atomic, contrast, log_prob_truncated, nll, sample_within
+
+FAST = {"xla_backend_optimization_level": 0}
+
+
+def test_nll_is_the_weighted_mean():
+    log_prob = jnp.array([-1.0, 2.0, jnp.nan, 0.5])
+    assert nll(log_prob, jnp.array([1.0, 3.0, 0.0, 2.0])) == pytest.approx(-(-1 + 6 + 1) / 6)
+    assert nll(log_prob, jnp.zeros(4)) == 0
+
+
+def test_contrasts_are_distinct_other_rows_of_positive_weight_and_all_sets_are_as_likely():
+    weights = jnp.array([1.0, 0.0, 2.0, 1.0, 0.5, 0.0, 1.0, 3.0])
+    usable = np.flatnonzero(weights)
+    keys = jax.random.split(jax.random.key(0), 2500)
+    drawn = jax.jit(jax.vmap(lambda key: contrast(key, weights, 3)))(keys)
+    rows, present = np.asarray(drawn.rows), np.asarray(drawn.present)
+    assert rows.shape == (2500, 2, 8)
+    np.testing.assert_array_equal(present, np.broadcast_to(weights > 0, present.shape))
+    for b in usable:
+        pairs = np.sort(rows[:, :, b], axis=1)
+        assert (pairs[:, 0] != pairs[:, 1]).all()
+        assert set(pairs.ravel()) == set(usable) - {b}
+        _, counts = np.unique(pairs @ [8, 1], return_counts=True)
+        assert counts.size == 10
+        assert stats.chisquare(counts).pvalue > 1e-3
+
+
+def test_contrasts_that_are_not_there_are_absent():
+    """Three rows of weight: two contrasts each, whatever the number of atoms."""
+    drawn = contrast(jax.random.key(1), jnp.array([1.0, 0.0, 1.0, 0.0, 1.0]), 5)
+    for b, others in {0: {2, 4}, 2: {0, 4}, 4: {0, 2}}.items():
+        there = np.asarray(drawn.present[:, b])
+        assert there.sum() == 2
+        assert set(np.asarray(drawn.rows[:, b])[there].tolist()) == others
+
+
+@pytest.mark.parametrize("atoms", [1, 6])
+def test_contrasts_refuse_numbers_of_atoms_that_do_not_fit(atoms):
+    with pytest.raises(ValueError, match=f"atoms: expected 2 up to the 5 rows of a minibatch, got {atoms}"):
+        contrast(jax.random.key(0), jnp.ones(5), atoms)
+
+
+def squares(theta):
+    """Some log q(theta | x) for five rows, with x in it, and no density."""
+    x = jnp.array([0.3, -1.0, 2.0, 0.0, 0.7])
+    return -jnp.sum((theta - x[:, None]) ** 2, axis=-1) + 0.2 * theta[..., 0] * x
+
+
+def test_atomic_is_what_a_plain_loop_says():
+    draw = np.random.default_rng(0)
+    theta = draw.normal(size=(5, 2)).astype(np.float32)
+    log_prior = draw.normal(size=5).astype(np.float32)
+    weights = np.array([1.0, 2.0, 0.0, 0.5, 1.5], np.float32)
+    combined = np.array([1.0, 0.0, 1.0, 2.0, 0.0], np.float32)
+    key = jax.random.key(4)
+    drawn = contrast(key, jnp.asarray(weights), 3)
+    log_q = np.asarray(squares(jnp.broadcast_to(theta[:, None], (5, 5, 2))))
+    total = 0.0
+    for b in np.flatnonzero(weights):
+        atoms = [b, *np.asarray(drawn.rows[:, b])]
+        ratios = [np.exp(log_q[j, b]) / np.exp(log_prior[j]) for j in atoms]
+        total -= weights[b] * (np.log(ratios[0] / np.sum(ratios)) + combined[b] * log_q[b, b])
+    given = [jnp.asarray(part) for part in (theta, log_prior, weights)]
+    loss = atomic(jax.random.clone(key), squares, *given, 3, jnp.asarray(combined))
+    assert loss == pytest.approx(total / weights.sum(), rel=1e-5)
+
+
+def test_equal_atoms_under_a_uniform_prior_are_told_apart_by_chance():
+    theta = jnp.full((5, 2), 0.7)
+    loss = atomic(jax.random.key(0), squares, theta, jnp.zeros(5), jnp.ones(5), 4)
+    assert loss == pytest.approx(np.log(4), rel=1e-6)
+
+
+def test_rows_without_weight_contribute_nothing_whatever_they_hold():
+    weights = jnp.array([1.0, 0.0, 1.0, 1.0, 0.0])
+    theta = jnp.arange(10.0).reshape(5, 2) / 7
+    dirty = theta.at[1].set(jnp.nan).at[4].set(1e30)
+    log_prior = jnp.array([0.1, jnp.nan, 0.2, 0.4, -jnp.inf])
+
+    def loss(scale, theta, log_prior):
+        return atomic(jax.random.key(2), lambda t: scale * squares(t), theta, log_prior, weights, 3)
+
+    clean = jax.value_and_grad(loss)(1.5, theta, jnp.where(weights > 0, log_prior, 0.0))
+    unclean = jax.value_and_grad(loss)(1.5, dirty, log_prior)
+    assert np.isfinite(clean).all()
+    np.testing.assert_array_equal(unclean, clean)
+    assert atomic(jax.random.key(2), squares, dirty, log_prior, jnp.zeros(5), 3) == 0
+
+
+# x ~ N(theta, 1), proposed from N(1.5, 0.7^2). The posterior is N(gain x + offset, exp(2 log_scale)) under any Gaussian
+# prior, and so is what a plain fit to the proposals finds, which is the posterior under the proposal as a prior.
+PROPOSAL = (1.5, 0.7)
+
+
+def posterior(prior_mean, prior_scale):
+    """Gain, offset and log-scale in closed form."""
+    precision = prior_scale**-2 + 1
+    return np.array([1 / precision, prior_mean * prior_scale**-2 / precision, -0.5 * np.log(precision)])
+
+
+PRIORS = {"normal": (0.5, 2.0), "uniform": (0.0, np.inf)}
+
+
+def minibatch(key, n):
+    key_theta, key_x = jax.random.split(key)
+    theta = PROPOSAL[0] + PROPOSAL[1] * jax.random.normal(key_theta, (n, 1))
+    return theta, theta + jax.random.normal(key_x, (n, 1))
+
+
+def log_density(params, x):
+    gain, offset, log_scale = params
+    return lambda theta: jax.scipy.stats.norm.logpdf(theta - gain * x - offset, 0, jnp.exp(log_scale))[..., 0]
+
+
+def atomic_of(params, key, prior, n=500):
+    key_batch, key_atoms = jax.random.split(key)
+    theta, x = minibatch(key_batch, n)
+    mean, scale = PRIORS[prior]
+    log_prior = jnp.zeros(n) if np.isinf(scale) else jax.scipy.stats.norm.logpdf(theta[:, 0], mean, scale)
+    return atomic(key_atoms, log_density(params, x), theta, log_prior, jnp.ones(n))
+
+
+def plain_of(params, key, prior, n=500):
+    theta, x = minibatch(key, n)
+    return nll(log_density(params, x)(theta), jnp.ones(n))
+
+
+@pytest.mark.parametrize("prior", PRIORS)
+def test_the_expected_gradient_is_zero_at_the_posterior_whatever_the_proposal(prior):
+    truth = jnp.asarray(posterior(*PRIORS[prior]))
+
+    def errors(loss, seed):
+        """The mean gradient in standard errors."""
+        gradient = jax.vmap(lambda key: jax.grad(loss)(truth, key, prior))
+        drawn = np.asarray(jax.jit(gradient, compiler_options=FAST)(jax.random.split(jax.random.key(seed), 200)))
+        return drawn.mean(0) / (drawn.std(0) / np.sqrt(200))
+
+    assert np.abs(errors(atomic_of, 5)).max() < 4
+    assert np.abs(errors(plain_of, 6)).max() > 30
+
+
+@pytest.mark.parametrize("prior", PRIORS)
+def test_the_least_loss_is_that_of_the_posterior_not_of_the_proposal(prior):
+    steps = 500
+    adam = optax.adam(optax.cosine_decay_schedule(4e-2, steps))
+
+    def fitted(loss):
+        def step(i, carry):
+            params, moments = carry
+            gradient = jax.grad(loss)(params, jax.random.fold_in(jax.random.key(6), i), prior, 300)
+            updates, moments = adam.update(gradient, moments)
+            return optax.apply_updates(params, updates), moments
+
+        start = jnp.array([0.2, -0.5, 0.3])
+        return np.asarray(jax.jit(lambda: jax.lax.fori_loop(0, steps, step, (start, adam.init(start)))[0])())
+
+    truth, proposal = posterior(*PRIORS[prior]), posterior(*PROPOSAL)
+    assert np.abs(truth - proposal).max() > 0.4
+    np.testing.assert_allclose(fitted(plain_of), proposal, atol=0.05)
+    np.testing.assert_allclose(fitted(atomic_of), truth, atol=0.08)
+
+
+def normal_draws(key, n):
+    return jax.random.normal(key, (n, 2))
+
+
+LOW, HIGH = jnp.array([0.5, -1.0]), jnp.array([2.0, 1.5])
+MASS = np.prod(stats.norm.cdf(HIGH) - stats.norm.cdf(LOW))
+
+
+def test_draws_within_a_box_have_the_truncated_density():
+    drawn = jax.jit(lambda key: sample_within(key, normal_draws, LOW, HIGH, 2000, 16))(jax.random.key(3))
+    theta = np.asarray(drawn.theta)
+    assert drawn.missing == 0
+    assert ((theta > LOW) & (theta < HIGH)).all()
+    assert np.unique(theta, axis=0).shape == (2000, 2)
+    for d in (0, 1):
+        assert stats.kstest(theta[:, d], stats.truncnorm(LOW[d], HIGH[d]).cdf).pvalue > 1e-3
+    assert drawn.acceptance == pytest.approx(MASS, abs=4 * np.sqrt(MASS / 32000))
+
+
+def test_draws_that_are_not_found_are_clipped_and_counted():
+    drawn = jax.jit(lambda key: sample_within(key, normal_draws, LOW, HIGH, 1000, 2))(jax.random.key(3))
+    found = 1000 - int(drawn.missing)
+    assert found == pytest.approx(2000 * MASS, abs=4 * np.sqrt(2000 * MASS))
+    assert drawn.acceptance == pytest.approx(found / 2000)
+    theta = np.asarray(drawn.theta)
+    strictly = ((theta > LOW) & (theta < HIGH)).all(1)
+    assert ((theta >= LOW) & (theta <= HIGH)).all()
+    np.testing.assert_array_equal(strictly, np.arange(1000) < found)
+    assert np.unique(theta[:found], axis=0).shape == (found, 2)
+
+
+def test_draws_within_boxes_can_be_mapped():
+    """A box that all draws fall into, and one that none does."""
+    low = jnp.array([[-9.0, -9.0], [20.0, 20.0]])
+    keys = jax.random.split(jax.random.key(3), 2)
+    drawn = jax.vmap(lambda key, low: sample_within(key, normal_draws, low, low + 18, 20, 3))(keys, low)
+    np.testing.assert_array_equal(drawn.missing, [0, 20])
+    np.testing.assert_array_equal(drawn.acceptance, [1, 0])
+    np.testing.assert_array_equal(drawn.theta[1], np.full((20, 2), 20.0))
+
+
+def test_a_box_far_from_all_draws_leaves_all_missing():
+    drawn = sample_within(jax.random.key(3), normal_draws, LOW + 50, HIGH + 50, 20, 3)
+    assert drawn.missing == 20 and drawn.acceptance == 0
+    np.testing.assert_array_equal(drawn.theta, np.broadcast_to(LOW + 50, (20, 2)))
+
+
+@pytest.mark.parametrize("n, tries", [(0, 3), (4, 0)])
+def test_draws_within_a_box_refuse_counts_below_one(n, tries):
+    with pytest.raises(ValueError, match=f"expected at least 1 of each, got {n} and {tries}"):
+        sample_within(jax.random.key(3), normal_draws, LOW, HIGH, n, tries)
+
+
+def test_acceptance_is_the_mass_in_the_box():
+    share = acceptance(jax.random.key(9), normal_draws, LOW, HIGH, 40000)
+    assert share == pytest.approx(MASS, abs=4 * np.sqrt(MASS * (1 - MASS) / 40000))
+
+
+def test_truncated_density_is_one_in_all_inside_and_nothing_outside():
+    axis = np.linspace(-4, 4, 801, dtype=np.float32)
+    theta = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+    log_q = stats.norm.logpdf(theta).sum(-1).astype(np.float32)
+    log_prob = log_prob_truncated(jnp.asarray(log_q), jnp.asarray(theta), LOW, HIGH, jnp.float32(MASS))
+    # The box's faces lie on the grid: half a cell too much at either end, 1.5 % of the mass.
+    assert np.exp(log_prob).sum() * 0.01**2 == pytest.approx(1, abs=0.02)
+    inside = ((theta >= LOW) & (theta <= HIGH)).all(-1)
+    assert (np.isneginf(log_prob) == ~inside).all()
+    np.testing.assert_allclose(log_prob[inside], log_q[inside] - np.log(MASS), rtol=1e-5)
+    assert np.isfinite(log_prob_truncated(jnp.float32(-3.0), LOW, LOW, HIGH, jnp.float32(0.0)))
