@@ -252,7 +252,7 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
 
     network = command.add_argument_group("network and training (default: the preset's)")
     network.add_argument("--family", metavar="NAME", help="mdn, or a normalizing flow: maf, nsf")
-    network.add_argument("--loss", metavar="NAME", help="likelihood, or atomic, which needs no correction")
+    network.add_argument("--loss", metavar="NAME", help="likelihood; atomic, combined: no correction needed")
     network.add_argument("--transforms", type=int, metavar="N", help="transforms of a flow")
     network.add_argument("--hidden", type=int, nargs="+", metavar="N", help="units of each hidden layer")
     network.add_argument("--activation", metavar="NAME", help="relu, tanh or silu")

@@ -56,7 +56,8 @@ class Estimator:
             "nsf" (`jaxlfi.npe.flows`), whose posterior is seen by the heuristics as a mixture of K Gaussians fitted to
             its draws.
         transforms: of a flow.
-        loss: "likelihood", or "atomic", which needs no correction for the proposals (`jaxlfi.losses.LOSSES`).
+        loss: "likelihood", or "atomic" or "combined", which need no correction for the proposals
+            (`jaxlfi.losses.LOSSES`).
         normaliser: "zscore", "asinh" or "none" (`jaxlfi.normalise.TRANSFORMS`). It belongs to the network: computed
             where the network starts and kept while it is trained on.
 

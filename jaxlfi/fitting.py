@@ -83,9 +83,10 @@ def fit(
     x = normalised(estimator.normaliser, network.normaliser, dataset.x)
     theta = network.to_network(scale.to_unit(dataset.theta))
     log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
+    data = Rows(theta, x, weights, log_prior, from_prior=(dataset.round == 0).astype(weights.dtype))
 
     def one(key, params):
-        return _fit_member(key, estimator, params, Rows(theta, x, weights, log_prior), dataset.size, expected_size)
+        return _fit_member(key, estimator, params, data, dataset.size, expected_size)
 
     params, info = jax.vmap(one)(jax.random.split(key_fit, estimator.members), network.params)
     return network.replace(params=params), info

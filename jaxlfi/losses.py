@@ -24,12 +24,14 @@ class Rows:
         x: normalised summaries, shape [N, S].
         weights: weight of each in the loss, shape [N].
         log_prior: log-density of the prior, up to a constant, shape [N].
+        from_prior: 1 for those drawn from the prior itself, in the first round, 0 for others, shape [N].
     """
 
     theta: Float[Array, "n dim"]
     x: Float[Array, "n obs"]
     weights: Float[Array, " n"]
     log_prior: Float[Array, " n"]
+    from_prior: Float[Array, " n"]
 
     def take(self, rows: Int[Array, " m"]) -> "Rows":
         """Some of them."""
@@ -64,8 +66,15 @@ def contrastive(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
     return atomic(key, q.log_prob, rows.theta, rows.log_prior, rows.weights, min(ATOMS, rows.theta.shape[0]))
 
 
+def combined(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
+    """The atomic loss, and -log q of the rows drawn from the prior: they hold q down where no proposal is made."""
+    atoms = min(ATOMS, rows.theta.shape[0])
+    return atomic(key, q.log_prob, rows.theta, rows.log_prior, rows.weights, atoms, rows.from_prior)
+
+
 LOSSES: dict[str, Loss] = {
     "likelihood": Loss(likelihood, held_out_likelihood),
     "atomic": Loss(contrastive, contrastive),
+    "combined": Loss(combined, combined),
 }
 """Losses by name."""

@@ -155,7 +155,7 @@ def test_members_take_turns():
 
 def test_methods_keep_the_budget():
     apt, npe = METHODS["apt"](QUICK), METHODS["npe"](QUICK)
-    assert (apt.rounds, apt.additions) == (QUICK.rounds, QUICK.additions) and apt.estimator.loss == "atomic"
+    assert (apt.rounds, apt.additions) == (QUICK.rounds, QUICK.additions) and apt.estimator.loss == "combined"
     assert npe.rounds == 1 and npe.additions == QUICK.rounds * QUICK.additions and npe.estimator.loss == "likelihood"
     for settings in (apt, npe):
         assert settings.check().estimator.is_flow

@@ -19,7 +19,10 @@ FORBIDDEN = {
     "experiments": set(),
 }
 """Strictly downward: experiments -> envs -> jaxlfi."""
-NETWORKS = {f"jaxlfi.{name}" for name in ("mdn", "estimator", "fitting", "normalise", "bayessim", "correction")}
+NETWORKS = {
+    f"jaxlfi.{name}"
+    for name in "mdn estimator fitting losses normalise posterior npe bayessim correction".split()
+}
 
 
 def files(*packages: str) -> list[pathlib.Path]:
