@@ -52,6 +52,8 @@ def trajectory_and_outcome(task: Task, key: jax.Array, theta: Float[Array, " dim
 def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, Int[Array, ""]]:
     """Turn what a simulator says of one trajectory into a failure code; non-finite numbers are a failure too."""
     failure = jnp.where(outcome, 0, 1) if outcome.dtype == bool else outcome
+    # A code that stands for no reason is still a failure, and must be counted as one.
+    failure = jnp.where((failure < 0) | (failure > len(task.failures)), 1, failure)
     finite = jnp.all(jnp.isfinite(trajectory))
     failure = jnp.where((failure == 0) & ~finite, len(task.reasons), failure).astype(jnp.int32)
     return trajectory.astype(jnp.float32), failure

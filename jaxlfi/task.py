@@ -25,7 +25,7 @@ class Task:
     Attributes:
         simulate: one simulation, `simulate(key, theta[D]) -> trajectory` or `-> (trajectory, outcome)`, in JAX and
             pure. `outcome` is a boolean (true: valid) or an integer (0: valid, i: failed for the reason
-            `failures[i - 1]`).
+            `failures[i - 1]`; any other integer counts as the first of them).
             For a black box, `simulate(rng, theta[N, D])` with a `numpy.random.Generator` and N parameter vectors,
             returning the same with a leading axis N.
         names: one name for each of the D parameters.

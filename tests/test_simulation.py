@@ -86,6 +86,13 @@ def test_an_integer_outcome_is_the_reason(key):
     np.testing.assert_array_equal(x[1:], 0.0)
 
 
+@pytest.mark.parametrize("code", [-1, 3, 99])
+def test_an_integer_that_is_no_reason_counts_as_the_first(code, key):
+    """3 would be "non_finite", which is not the simulator's to tell; none may get lost between the reasons."""
+    _, failure = run(task_of(lambda key, theta: (theta, jnp.where(theta[1] < 0.0, code, 0))), THETA, key)
+    np.testing.assert_array_equal(failure, [0, 1, 0])
+
+
 @pytest.mark.parametrize("bad", [jnp.nan, jnp.inf, -jnp.inf])
 def test_non_finite_trajectories_are_a_failure(bad, key):
     """Also where the simulator says that all is well; its own reason goes first where it has one."""
