@@ -15,6 +15,7 @@ _HOMES = {
     "Estimator": "jaxlfi.estimator",
     "Fixed": "jaxlfi.heuristics",
     "GaussianMixture": "jaxlfi.mixture",
+    "METHODS": "jaxlfi.presets",
     "Matched": "jaxlfi.heuristics",
     "Mode": "jaxlfi.heuristics",
     "PAPER": "jaxlfi.presets",

@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from jaxlfi import bayessim, black_box, run_store
+from jaxlfi import atomic, bayessim, black_box, run_store
 from jaxlfi import observation as observations
 from jaxlfi.bayessim import Round, Settings, State
 from jaxlfi.belief import Belief
@@ -24,7 +24,9 @@ from jaxlfi.keys import run_keys
 from jaxlfi.lanes import Inputs
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.observation import SimulatorError
+from jaxlfi.posterior import draws_within
 from jaxlfi.presets import QUICK
+from jaxlfi.sampling import network_arrays
 from jaxlfi.support import Support
 from jaxlfi.task import Task
 
@@ -72,7 +74,14 @@ class Run:
         return bound_warnings(self.task, self.belief)
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
-        """`n` draws of the posterior inside the support, in coordinates (`task.to_natural` leads back)."""
+        """`n` draws of the posterior inside the support, in coordinates (`task.to_natural` leads back).
+
+        A flow's posterior is drawn from itself, not from the mixture fitted to it.
+        """
+        estimator = self.settings.estimator
+        if estimator.is_flow:
+            scale = self.task.feasible.hull(self._first_support())
+            return draws_within(key, estimator, self.network, self.x, scale, self.belief.support, n)[0]
         return bayessim.RESTRICTIONS[self.settings.restriction](key, self.belief, n)
 
     def save(self, path: str | Path) -> Path:
@@ -111,17 +120,21 @@ class Run:
                 np.asarray(self.observed),
                 np.asarray(self.x),
             )
+            if self.settings.estimator.is_flow:
+                atomic.write_arrays(beside / "network.npz", network_arrays(jax.device_get(self.network)))
 
         run_store.create(folder, self._config(), fill)
         return folder
 
+    def _first_support(self) -> Support:
+        return jax.tree.map(lambda leaf: leaf[0], self.info.proposal.support)
+
     def _config(self) -> dict[str, Any]:
-        first = jax.tree.map(lambda leaf: leaf[0], self.info.proposal.support)
         return run_store.run_config(
             task=self.task,
             reference=self.task.name,
             support_name="own",
-            support=first,
+            support=self._first_support(),
             heuristic=self.heuristic,
             preset=None,
             settings=self.settings,

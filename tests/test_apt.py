@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import ks_2samp
 from test_bayessim import EXACT, MODEST, TASK, X, infer, lane, whitened
 
+import jaxlfi
 from envs import gaussian_linear
 from jaxlfi import bayessim, cli, run_store
 from jaxlfi.bayessim import Settings
@@ -188,6 +189,16 @@ def test_a_run_can_be_sampled(folder, tmp_path):
     first, _, _ = posterior_samples(folder, 50, seed=0)
     other, _, _ = posterior_samples(folder, 50, seed=1)
     assert np.abs(first - other).max() > 1e-3
+
+
+def test_a_library_run_draws_from_the_flow_and_saves_it(tmp_path):
+    settings = Settings(estimator=FLOW, rounds=2, additions=30, attempts=30, restriction="reject")
+    run = jaxlfi.infer(jax.random.key(0), TASK, X, support="ok", heuristic=jaxlfi.Edge(), settings=settings)
+    draws = np.asarray(run.sample(jax.random.key(0), 300))
+    run.save(tmp_path / "run")
+    saved, names, inside = posterior_samples(tmp_path / "run", 300, seed=0)
+    np.testing.assert_allclose(saved, draws, rtol=1e-5, atol=1e-5)
+    assert names == ["first", "second"] and 0 < inside <= 1
 
 
 def test_the_ledger_tells_how_much_of_the_posterior_is_inside(folder):
