@@ -17,7 +17,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(VENV)/.installed  ## the main job: supports and heuristics compared on Lotka-Volterra
-	$(BIN)/jaxlfi compare lotka_volterra --preset quick --seeds 8 --out $(OUT)
+	$(BIN)/jaxlfi compare lotka_volterra --preset quick --seeds 6 --out $(OUT)
 
 test: $(VENV)/.installed  ## all tests
 	$(BIN)/python -m pytest -n $(WORKERS)
