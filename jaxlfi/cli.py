@@ -1,4 +1,4 @@
-"""The command line: `jaxlfi tasks | infer | compare | grid | report | resume`.
+"""The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | report`.
 
 This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set
 before jax starts can be set after the arguments are known.
@@ -39,6 +39,7 @@ examples:
   jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
   jaxlfi grid lotka_volterra --vary expansion=0.1,0.2,0.4 --out runs/grid
   jaxlfi resume runs/comparison                  go on after a crash, to the same result bit for bit
+  jaxlfi sample runs/edge -n 1000                draws from the posterior, in natural units
   jaxlfi report runs/comparison                  draw the pictures again
 
 Bad input ends with one line on stderr and exit status 2; nothing is ever overwritten.

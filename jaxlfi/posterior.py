@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxlfi.estimator import Estimator, Network, condition, draw
 from jaxlfi.mixture import GaussianMixture
+from jaxlfi.npe.atomic import sample_within
 from jaxlfi.npe.mixture_fit import fit_mixture
 from jaxlfi.support import Support
 
@@ -61,16 +62,12 @@ def draws_within(
     n: int,
     tries: int = 20,
 ) -> tuple[Float[Array, "n dim"], Float[Array, ""]]:
-    """`n` draws of a flow's posterior truncated to the support, in bounded time.
-
-    Of n * tries candidates those inside are kept in order; where they are fewer than n they are repeated, and where
-    there is none the candidates are clipped.
+    """`n` draws of a flow's posterior truncated to the support, in bounded time (`jaxlfi.npe.sample_within`).
 
     Returns:
-        The draws, and the share of candidates that were inside.
+        The draws, and the share of n * tries candidates that were inside.
     """
-    candidates = draw(key, estimator, network, x, scale, n * tries)
-    inside = support.contains(candidates)
-    found = jnp.maximum(jnp.sum(inside), 1)
-    first = jnp.argsort(~inside, stable=True)[jnp.arange(n) % found]
-    return support.clip(candidates[first]), jnp.mean(inside)
+    kept = sample_within(
+        key, lambda key, n: draw(key, estimator, network, x, scale, n), support.low, support.high, n, tries
+    )
+    return kept.theta, kept.acceptance
