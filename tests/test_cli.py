@@ -122,7 +122,7 @@ def test_bad_input_is_one_line_and_writes_nothing(case, tmp_path, capsys):
 
 
 def test_more_lanes_than_memory_are_refused_before_anything_is_written(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sweep, "free_memory", lambda devices: 2e4)
+    monkeypatch.setattr(sweep.chunks, "free_memory", lambda devices: 2e4)
     arguments = ("grid", TASK, *FLAGS, "--vary", "tail=0,0.5,1", "--lanes-per-chunk", "9", "--out", tmp_path / "out")
     assert "lanes_per_chunk: expected fewer lanes than fill the memory: 9 need" in error_line(capsys, *arguments)
     assert not list(tmp_path.iterdir())

@@ -22,7 +22,9 @@ from jaxlfi.heuristics import Centre, Edge, Matched, Mode
 from jaxlfi.keys import run_keys
 from jaxlfi.observation import SimulatorError
 from jaxlfi.run_store import StoreError
-from jaxlfi.sweep import Axis, Grid
+from jaxlfi.sweep import Axis, Grid, chunks
+from jaxlfi.sweep import folder as store
+from jaxlfi.sweep.grid import observations
 from tests.small import FLAGS, SETTINGS, command, whole_runs  # noqa: F401 - a fixture
 
 REFERENCE = "tests.test_sweep:task"
@@ -163,7 +165,7 @@ def interrupted(folder, work, monkeypatch, after: int) -> None:
         return original(work, index, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(sweep, "run_chunk", stop)
+        patch.setattr(store, "run_chunk", stop)
         with pytest.raises(KeyboardInterrupt):
             sweep.advance(folder, work, QUIET)
 
@@ -178,7 +180,7 @@ def test_a_resumed_grid_computes_what_is_missing_to_the_same_bits(finished, tmp_
     assert not (broken / "grid.npz").exists()
     computed, original = [], sweep.run_chunk
     monkeypatch.setattr(
-        sweep, "run_chunk", lambda work, index, *rest: computed.append(index) or original(work, index, *rest)
+        store, "run_chunk", lambda work, index, *rest: computed.append(index) or original(work, index, *rest)
     )
     assert command("resume", broken, "--no-figures") == 0
     assert computed == [0, 2] and (broken / "chunks" / "001.npz").read_bytes() == kept
@@ -257,7 +259,7 @@ def test_a_changed_or_damaged_grid_is_not_resumed(case, finished, tmp_path, caps
 
 def test_a_task_that_has_changed_is_not_resumed(finished, monkeypatch):
     changed = dataclasses.replace(TASK, truth=np.array([1.0, 0.5]))
-    monkeypatch.setattr(sweep.tasks, "load", lambda reference: changed)
+    monkeypatch.setattr(store.tasks, "load", lambda reference: changed)
     with pytest.raises(StoreError, match="the task as they were"):
         sweep.reopen(finished[0])
 
@@ -295,23 +297,23 @@ def test_chunks_are_cut_to_the_memory(monkeypatch):
         tried.append(work.length)
         return work, each * work.length
 
-    monkeypatch.setattr(sweep, "compiled", compiled)
-    lane = sweep.lane_bytes(sweep.Work(make_grid(), *sweep.observations(make_grid()), 1))
-    monkeypatch.setattr(sweep, "free_memory", lambda devices: 1e12)
+    monkeypatch.setattr(chunks, "compiled", compiled)
+    lane = chunks.lane_bytes(sweep.Work(make_grid(), *observations(make_grid()), 1))
+    monkeypatch.setattr(chunks, "free_memory", lambda devices: 1e12)
     assert sweep.prepare(make_grid()).length == 12
     assert sweep.prepare(make_grid(), lanes_per_chunk=100).length == 12
-    monkeypatch.setattr(sweep, "free_memory", lambda devices: 7.5 * sweep.PROGRAM_PER_STATE * lane / sweep.SHARE)
+    monkeypatch.setattr(chunks, "free_memory", lambda devices: 7.5 * chunks.PROGRAM_PER_STATE * lane / chunks.SHARE)
     assert sweep.prepare(make_grid(), lanes_per_chunk=3).length == 3
     assert sweep.prepare(make_grid()).length == 6  # 7 fit, and two chunks of 6 need no padding
     # The program turns out to need four times what was estimated: 1.9 lanes fit.
-    each = 4 * sweep.PROGRAM_PER_STATE * lane
+    each = 4 * chunks.PROGRAM_PER_STATE * lane
     tried.clear()
     assert sweep.prepare(make_grid()).length == 1 and tried == [6, 1]
     with pytest.raises(ValueError, match="lanes_per_chunk: expected fewer lanes"):
         sweep.prepare(make_grid(), lanes_per_chunk=12)
     # Not even the states fit: refused without compiling.
     tried.clear()
-    monkeypatch.setattr(sweep, "free_memory", lambda devices: lane)
+    monkeypatch.setattr(chunks, "free_memory", lambda devices: lane)
     for given in (None, 2):
         with pytest.raises(ValueError, match="fill the memory"):
             sweep.prepare(make_grid(), lanes_per_chunk=given)
@@ -320,7 +322,7 @@ def test_chunks_are_cut_to_the_memory(monkeypatch):
 
 def test_free_memory_is_shared_by_the_devices_of_a_cpu():
     (device,) = jax.local_devices()[:1]
-    one, two = sweep.free_memory([device]), sweep.free_memory([device] * 2)
+    one, two = chunks.free_memory([device]), chunks.free_memory([device] * 2)
     assert 2**20 < one < os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     assert two == pytest.approx(one / 2, rel=0.2)
 
@@ -329,7 +331,7 @@ def test_free_memory_is_shared_by_the_devices_of_a_cpu():
 def test_even_lengths_are_the_fewest_equal_chunks(devices):
     for size in range(1, 40):
         for most in range(1, 45):
-            length = sweep.even_length(size, most, devices)
+            length = chunks.even_length(size, most, devices)
             step = devices if most >= devices else 1
             assert 1 <= length <= min(most, size)
             assert -(-size // length) == -(-size // min(size, most // step * step))
