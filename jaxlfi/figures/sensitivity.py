@@ -296,7 +296,7 @@ def _chosen(grid: Grid, place: int) -> np.ndarray:
 
 
 def _number(value: float) -> str:
-    """Three characters or so."""
+    """Four characters or so."""
     if not np.isfinite(value) or value == 0:
         return "0" if value == 0 else "–"
-    return f"{value:.0f}" if abs(value) >= 9.95 else f"{value:.1f}" if abs(value) >= 0.995 else f"{value:.2f}"
+    return f"{value:.0f}" if abs(value) >= 99.5 else f"{value:.1f}" if abs(value) >= 9.95 else f"{value:.2f}"
