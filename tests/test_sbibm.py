@@ -46,3 +46,24 @@ def test_the_classifier_sees_what_can_be_seen():
     first, same, shifted = rng.normal(3, 2, (1500, 1)), rng.normal(3, 2, (1500, 1)), rng.normal(7, 2, (1500, 1))
     assert c2st(first, same) == pytest.approx(0.5, abs=0.05)
     assert c2st(first, shifted) == pytest.approx(stats.norm.cdf(1), abs=0.03)
+
+
+def test_exact_references_are_posteriors():
+    """The mean rank of the truth among the reference's draws, over many observations, is one half."""
+    for name in ("gaussian_linear_uniform", "gaussian_mixture"):
+        task, ranks = TASKS[name](), []
+        for number in range(1, 61):
+            theta = task.support().sample(jax.random.split(jax.random.key(number))[0], 1)[0]
+            ranks.append((reference(name, number) < np.asarray(theta)).mean(0))
+        assert stats.kstest(np.concatenate(ranks), "uniform").pvalue > 1e-3
+
+
+def test_the_needle_is_there():
+    """Half of the mixture's posterior is ten times as narrow as the other half."""
+    draws, x = reference("gaussian_mixture", 1), observation("gaussian_mixture", 1)
+    assert np.mean(np.linalg.norm(draws - x, axis=1) < 0.3) == pytest.approx(0.5 + 0.5 * 0.044, abs=0.03)
+    simulated = jax.vmap(TASKS["gaussian_mixture"]().simulate)(
+        jax.random.split(jax.random.key(0), 4000), jnp.zeros((4000, 2))
+    )
+    expected = lambda z: 0.5 * stats.norm.cdf(z) + 0.5 * stats.norm.cdf(z, scale=0.1)
+    assert stats.kstest(np.asarray(simulated)[:, 0], expected).pvalue > 1e-3
