@@ -9,7 +9,7 @@ import argparse
 import shutil
 from pathlib import Path
 
-KEPT = ("config.json", "table.csv", "ledger.jsonl", "posterior.npz")
+KEPT = ("config.json", "table.csv", "grid.npz", "ledger.jsonl", "posterior.npz")
 """Files kept where they are there, beside the pictures."""
 
 
