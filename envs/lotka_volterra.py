@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from envs.lotka_volterra_mjp import JumpProcess, lotka_volterra_nine, make_simulator
+from envs.lotka_volterra_mjp import SUMMARY_NAMES, JumpProcess, lotka_volterra_nine, make_simulator
 from jaxlfi.support import Support
 from jaxlfi.task import Task
 
@@ -49,6 +49,7 @@ def task(process: JumpProcess = JumpProcess()) -> Task:
         summary=lotka_volterra_nine,
         truth=TRUTH,
         failures=("too_many_events",),
+        summary_names=SUMMARY_NAMES,
         channels=("predators", "prey"),
         times=np.arange(process.intervals + 1) * process.interval,
     )

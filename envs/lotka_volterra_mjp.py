@@ -421,6 +421,20 @@ def make_simulator(
     return simulate
 
 
+SUMMARY_NAMES = (
+    "mean X",
+    "mean Y",
+    "log var X",
+    "log var Y",
+    "X lag 1",
+    "X lag 2",
+    "Y lag 1",
+    "Y lag 2",
+    "X with Y",
+)
+"""Names of the nine summaries: levels, spreads, autocorrelations at a lag, and the correlation of X with Y."""
+
+
 def lotka_volterra_nine(trajectory: Float[Array, "records 2"]) -> Float[Array, "9"]:
     """The nine summaries of Papamakarios and Murray (2016): `jaxlfi.summaries.series` of the two populations.
 

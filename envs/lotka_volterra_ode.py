@@ -1,5 +1,6 @@
 """The Lotka-Volterra equations, solved deterministically and seen through noise."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -9,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from envs.lotka_volterra_mjp import lotka_volterra_nine
+from envs.lotka_volterra_mjp import SUMMARY_NAMES, lotka_volterra_nine
 from jaxlfi.support import Support
 from jaxlfi.task import Task
 
@@ -77,7 +78,8 @@ def task(noise: str = "gaussian", duration: float = 200.0, interval: float = 0.1
 
     Args:
         noise: "gaussian" or "lognormal".
-        duration: simulated time; 200 is the tutorial's that the appendix follows.
+        duration: simulated time; 200 is the tutorial's that the appendix follows (`short` is the appendix to the
+            letter).
         interval: time between records.
 
     Raises:
@@ -105,6 +107,18 @@ def task(noise: str = "gaussian", duration: float = 200.0, interval: float = 0.1
         feasible=Support([0.001, 0.001, 0.01, 0.001], [0.1, 0.5, 0.5, 0.1]),
         summary=lotka_volterra_nine,
         truth=np.array([0.01, 0.1, 0.1, 0.02]),
+        summary_names=SUMMARY_NAMES,
         channels=("predators", "prey"),
         times=np.arange(records) * interval,
     )
+
+
+def short(noise: str = "gaussian") -> Task:
+    """The appendix to the letter: 200 steps of 0.1, a duration of 20, a quarter of a cycle at the truth.
+
+    The tutorial that it follows simulates a duration of 200 in steps of 0.1, which is what `task` does.
+
+    Args:
+        noise: "gaussian" or "lognormal".
+    """
+    return dataclasses.replace(task(noise, duration=20.0), name="lotka_volterra_ode_short")

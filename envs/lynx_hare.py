@@ -72,6 +72,14 @@ def growth(trajectory: Float[Array, "years 2"]) -> Float[Array, "12"]:
     return jnp.concatenate([slope, intercept, mean, jnp.log(sd), *memory])
 
 
+SUMMARY_NAMES = tuple(
+    f"{name} {species}"
+    for name in ("slope", "intercept", "mean", "log sd", "lag 1", "lag 3")
+    for species in ("lynx", "hare")
+)
+"""Names of the summaries of `growth`."""
+
+
 def task(nuisance: Nuisance = Nuisance()) -> Task:
     """Infer the four log-rates (1/year) of the Lotka-Volterra equations from 21 years of pelts.
 
@@ -98,6 +106,7 @@ def task(nuisance: Nuisance = Nuisance()) -> Task:
         },
         feasible=Support([-7.0, -3.0, -3.0, -7.0], [0.0, 2.0, 2.0, 0.0]),
         summary=growth,
+        summary_names=SUMMARY_NAMES,
         observation=pelts,
         channels=("lynx (thousands of pelts)", "hare (thousands of pelts)"),
         times=years,

@@ -22,9 +22,10 @@ SUPPORTS = {
     "ok": Support([0.0, 0.0, 0.0], [10.0, 10.0, 0.35]),
     "misspecified": Support([3.0, 0.0, 0.0], [10.0, 7.0, 0.35]),
     "broad": Support([0.0, 0.0, 0.0], [20.0, 20.0, 0.5]),
+    "unmirrored": Support([3.0, 2.0, 0.0], [10.0, 7.0, 0.35]),
 }
 """The named supports of the paper's appendix on M/G/1. "misspecified" excludes the truth in theta_1, but not its mirror
-image (5, 1, 0.2), which is the same queue (see `task`)."""
+image (5, 1, 0.2), which is the same queue (see `task`); "unmirrored", which is ours, excludes both."""
 
 FEASIBLE = SUPPORTS["broad"]
 """Phi: the broad support, as for Lotka-Volterra. No rate in it is negative."""
@@ -269,8 +270,16 @@ def task(
         feasible=FEASIBLE,
         summary=summary,
         truth=np.array([1.0, 5.0, 0.2]),
+        summary_names=_summary_names(percentiles, whiten),
         channels=("inter-departure time",),
+        record_label="rank" if order == "sorted" else "job",
     )
+
+
+def _summary_names(percentiles: tuple[float, ...], whiten: str | None) -> tuple[str, ...]:
+    if whiten == "pca":
+        return tuple(f"component {i + 1}" for i in range(len(percentiles)))
+    return tuple(f"percentile {p:g}" for p in percentiles)
 
 
 def _check(jobs: int, percentiles: tuple[float, ...], whiten: str | None, order: str, floor: float) -> None:

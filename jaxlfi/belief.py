@@ -16,8 +16,10 @@ class Belief:
     Attributes:
         mixture: the posterior as a mixture of Gaussians (unbounded).
         support: the box Theta its draws are kept in.
-        informed: false before the first round, when there is a prior over the box but no posterior yet. The mixture
-            is then a stand-in of the right shape. Heuristics that compare two posteriors (MODE) need to know.
+        informed: whether the next proposals are drawn from the mixture, or else from the prior over the support. False
+            before the first round, when there is no posterior yet and the mixture is a stand-in of the right shape,
+            and under a heuristic that always proposes from the prior (`Truncate`), whose mixture is the posterior.
+            Heuristics that compare two posteriors (MODE) do so only where it is true.
     """
 
     mixture: GaussianMixture

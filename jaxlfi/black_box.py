@@ -178,7 +178,9 @@ def discrepancies(keys: jax.Array, task: Task, beliefs, observed: jax.Array, res
     finite = jnp.all(jnp.isfinite(trajectory.reshape(*trajectory.shape[:2], -1)), axis=-1)
     error = jnp.where((outcome == 0) & finite, distance(trajectory, observed), jnp.nan)
     truth = jnp.full(task.dim, jnp.nan) if task.truth is None else task.truth
-    return Discrepancy(theta, jnp.abs(theta - truth), error, trajectory)
+    x, failure = jax.vmap(functools.partial(_summaries, task))(trajectory, outcome)
+    x = jnp.where((failure == 0)[..., None], x, jnp.nan)
+    return Discrepancy(theta, jnp.abs(theta - truth), error, trajectory, x)
 
 
 def _draw(restriction: str, key: jax.Array, belief) -> tuple[jax.Array, jax.Array]:

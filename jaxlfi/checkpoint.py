@@ -14,9 +14,10 @@ import jax
 import numpy as np
 
 from jaxlfi import atomic
+from jaxlfi.history import FINAL, apart
 
 FOLDER = "checkpoint"
-_DONE, _TRAJECTORY = "rounds_done", "final_trajectory"
+_DONE = "rounds_done"
 
 
 class CheckpointError(ValueError):
@@ -43,9 +44,8 @@ class Checkpoint:
         return self._named(start, "start.npz", "observed"), self._named(start, "start.npz", "x")
 
     def write_round(self, index: int, state: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
-        """Keep a round's record and the state after it; of trajectories, only the last round's are kept."""
-        rows = dict(rows)
-        final_trajectory = rows.pop(_TRAJECTORY)
+        """Keep a round's record and the state after it; of some arrays, only the last round's (`history.apart`)."""
+        rows, final = apart(rows)
         atomic.write_arrays(
             self.folder / _round_name(index),
             rows | {"seconds": np.asarray(seconds)},
@@ -53,8 +53,8 @@ class Checkpoint:
             durable=True,
         )
         leaves = {name: np.asarray(leaf) for name, leaf in _named_leaves(state).items()}
-        extra = {_DONE: np.asarray(index + 1), _TRAJECTORY: final_trajectory}
-        atomic.write_arrays(self.folder / "state.npz", leaves | extra, compress=False, durable=True)
+        done = {_DONE: np.asarray(index + 1)}
+        atomic.write_arrays(self.folder / "state.npz", leaves | done | final, compress=False, durable=True)
 
     def rounds_done(self) -> int:
         """How many rounds the state has behind it."""
@@ -62,15 +62,15 @@ class Checkpoint:
             return 0
         return int(self._named(self._read("state.npz"), "state.npz", _DONE))
 
-    def read_rounds(self, count: int) -> tuple[list[dict[str, np.ndarray]], list[float], np.ndarray | None]:
-        """Records of the first rounds, their seconds, and the last round's trajectories."""
+    def read_rounds(self, count: int) -> tuple[list[dict[str, np.ndarray]], list[float], dict[str, np.ndarray]]:
+        """Records of the first rounds, their seconds, and what is kept of the last round only."""
         rows, seconds = [], []
         for index in range(count):
             arrays = self._read(_round_name(index))
             seconds.append(float(self._named(arrays, _round_name(index), "seconds")))
             rows.append({name: value for name, value in arrays.items() if name != "seconds"})
-        trajectory = self._named(self._read("state.npz"), "state.npz", _TRAJECTORY) if count else None
-        return rows, seconds, trajectory
+        state = self._read("state.npz") if count else {}
+        return rows, seconds, {name: value for name, value in state.items() if name.startswith(FINAL)}
 
     def read_state(self, template: Any) -> Any:
         """The last state.

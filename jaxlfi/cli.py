@@ -1,4 +1,4 @@
-"""The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | report`.
+"""The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | diagnose | report`.
 
 This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set
 before jax starts can be set after the arguments are known.
@@ -19,7 +19,7 @@ PRESETS = ("quick", "paper")
 METHODS = ("bayessim", "apt", "npe")
 FILE_WIDTH = 120
 """Characters a line where the output is no terminal."""
-HEURISTICS = ("none", "edge", "mode", "centre")
+HEURISTICS = ("none", "edge", "mode", "centre", "truncate")
 
 GLOSSARY = """\
 names and symbols:
@@ -40,6 +40,7 @@ examples:
   jaxlfi grid lotka_volterra --vary expansion=0.1,0.2,0.4 --out runs/grid
   jaxlfi resume runs/comparison                  go on after a crash, to the same result bit for bit
   jaxlfi sample runs/edge -n 1000                draws from the posterior, in natural units
+  jaxlfi diagnose runs/edge                      whether the posterior can be believed
   jaxlfi report runs/comparison                  draw the pictures again
 
 Bad input ends with one line on stderr and exit status 2; nothing is ever overwritten.
@@ -73,6 +74,28 @@ examples:
   jaxlfi grid lotka_volterra --support misspecified --out runs/edge-grid \\
       --vary zone_fraction=0.05,0.1,0.2 mass_threshold=0.001,0.005,0.05 expansion=0.1,0.2,0.4
   jaxlfi grid lotka_volterra --heuristic mode --vary proximity=0.2,0.4 --vary expansion=0.1,0.2 --out runs/mode-grid
+
+"""
+
+DIAGNOSE_EXAMPLES = """\
+Truths are drawn from the prior over a support and simulated, and the run's method is asked for the posterior of each:
+by its network, where the run had one round and kept it (--method npe, or --rounds 1 --keep-network), else by repeating
+the whole inference side by side, in chunks that are saved as they end. A command that was stopped goes on when it is
+given again. It takes about as long as that many runs; the exit status is 0 whatever comes out.
+
+checks:
+  rank          of each truth among its draws, by parameter (simulation-based calibration)
+  coverage      how often the densest region of a level holds the truth; around random points (TARP)
+  classifier    accuracy at telling truths from draws, given the simulation
+  predictive    whether the run's own observation looks like simulations of its own posterior
+verdicts:
+  over-confident, under-confident: posteriors are too narrow, too wide; biased low, high: they lie below, above
+  the truths. A check fails at p up to 0.01, corrected for the number of parameters.
+
+examples:
+  jaxlfi diagnose runs/npe
+  jaxlfi diagnose runs/edge --reference ok --truths 200
+  jaxlfi diagnose runs/gaussian --against reference.csv
 
 """
 
@@ -123,7 +146,7 @@ def parser() -> argparse.ArgumentParser:
     )
     infer.add_argument("--support-high", nargs="+", type=float, metavar="X", help="its upper bounds")
     infer.add_argument(
-        "--heuristic", default="edge", metavar="NAME", help="none, edge, mode or centre (default: edge)"
+        "--heuristic", default="edge", metavar="NAME", help="none, edge, mode, centre or truncate (default: edge)"
     )
     _add_shared(infer, seeds=1)
 
@@ -160,7 +183,7 @@ def parser() -> argparse.ArgumentParser:
     grid.add_argument(
         "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
     )
-    grid.add_argument("--heuristic", default="edge", metavar="NAME", help="edge or mode (default: edge)")
+    grid.add_argument("--heuristic", default="edge", metavar="NAME", help="edge, mode or truncate (default: edge)")
     grid.add_argument(
         "--lanes-per-chunk",
         type=int,
@@ -186,8 +209,39 @@ def parser() -> argparse.ArgumentParser:
     sample.add_argument("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
     sample.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the draws (default: 0)")
     sample.add_argument(
-        "--out", type=Path, metavar="FILE", help="a new .csv or .npz file (default: samples.csv in the folder)"
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="a new .csv or .npz file, or .nc for ArviZ's InferenceData (default: samples.csv in the folder)",
     )
+
+    diagnose = commands.add_parser(
+        "diagnose",
+        help="check whether the posterior of a run can be believed",
+        description="Check whether the posteriors of a run's method are calibrated, and whether its own fits.",
+        epilog=DIAGNOSE_EXAMPLES,
+        formatter_class=formatter,
+    )
+    diagnose.add_argument("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
+    diagnose.add_argument(
+        "--reference", metavar="NAME", help="the support that truths are drawn over (default: the task's first)"
+    )
+    diagnose.add_argument("--truths", type=int, default=100, metavar="N", help="simulated truths (default: 100)")
+    diagnose.add_argument(
+        "--draws", type=int, default=200, metavar="L", help="draws from the posterior of each (default: 200)"
+    )
+    diagnose.add_argument("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
+    diagnose.add_argument(
+        "--against",
+        type=Path,
+        metavar="FILE",
+        help="samples to compare the run's posterior with, in natural units: a .csv with the parameters' names as "
+        'headings, or an .npz with an array "theta"',
+    )
+    diagnose.add_argument(
+        "--out", type=Path, metavar="DIR", help="a new folder for the results (default: diagnostics in the run's)"
+    )
+    _add_machine(diagnose)
 
     report = commands.add_parser(
         "report",
@@ -296,6 +350,7 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
         ("expansion", "eta", "edge, mode: how far a bound moves, as a fraction of the width"),
         ("shift-threshold", "nu_TH", "mode: how far a mode must have moved"),
         ("proximity", "rho", "mode: how near a bound a mode must be, as a fraction of the width"),
+        ("quantile", "", "truncate: posterior mass given up beyond each bound, 0 to 0.5"),
     ):
         shown = f"{text} ({symbol})" if symbol else text
         hyper.add_argument(f"--{flag}", type=float, nargs="+", metavar="X", help=shown)
@@ -340,15 +395,21 @@ def _lanes(arguments: argparse.Namespace) -> int:
         return arguments.seeds * len(arguments.configurations or "default")
     if arguments.command == "grid":
         return arguments.seeds * math.prod(axis.count(",") + 1 for axis in arguments.vary)
+    if arguments.command == "diagnose":
+        return arguments.truths
     return getattr(arguments, "seeds", 1)
 
 
 def _recorded(arguments: argparse.Namespace) -> dict:
-    """The config.json of the run to resume, where there is one; whether it is sound is checked later."""
-    if arguments.command != "resume":
+    """What the work to go on with says of itself, where there is some; whether it is sound is checked later."""
+    if arguments.command == "resume":
+        path = arguments.folder / "config.json"
+    elif arguments.command == "diagnose":
+        path = (arguments.out or arguments.folder / "diagnostics") / "plan.json"
+    else:
         return {}
     try:
-        config = json.loads((arguments.folder / "config.json").read_text())
+        config = json.loads(path.read_text())
     except (OSError, ValueError):
         return {}
     return config if isinstance(config, dict) else {}
@@ -380,6 +441,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return _refuse(error)
     except KeyboardInterrupt:
         advice = f"; continue with: jaxlfi resume {prepared[0]}" if prepared else ""
+        if arguments.command == "diagnose":
+            advice = "; the same command goes on from here"
         print(f"jaxlfi: interrupted{advice}", file=sys.stderr)
         return 130
     return 0

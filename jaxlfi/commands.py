@@ -11,7 +11,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from jaxlfi import atomic, run_store, session, sweep
+from jaxlfi import atomic, diagnostics, export, run_store, session, sweep
+from jaxlfi import diagnose as diagnosis
 from jaxlfi import observation as observations
 from jaxlfi import tasks as task_lookup
 from jaxlfi.bayessim import Settings
@@ -188,10 +189,14 @@ def report(arguments: argparse.Namespace, console: Console) -> None:
 def sample(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi sample DIR`."""
     out = arguments.out or arguments.folder / "samples.csv"
-    if out.suffix not in (".csv", ".npz"):
-        raise ValueError(f"out: expected a name that ends in .csv or .npz, got {out}")
+    if out.suffix not in (".csv", ".npz", ".nc"):
+        raise ValueError(f"out: expected a name that ends in .csv or .npz, or .nc for ArviZ, got {out}")
     if out.exists():
         raise ValueError(f"out: expected a new file, got {out}, which exists")
+    if out.suffix == ".nc":
+        export.write_netcdf(out, arguments.folder, arguments.number, arguments.seed)
+        console.print(f"samples: {out}", soft_wrap=True, highlight=False)
+        return
     draws, names, inside = posterior_samples(arguments.folder, arguments.number, arguments.seed)
     if out.suffix == ".npz":
         atomic.write_arrays(out, {"theta": draws, "names": np.asarray(names)})
@@ -204,6 +209,35 @@ def sample(arguments: argparse.Namespace, console: Console) -> None:
             f"warning: only {inside:.2g} of the posterior lies in the support it was truncated to; it may be wrong.",
             style="yellow", soft_wrap=True, highlight=False,
         )
+
+
+def diagnose(arguments: argparse.Namespace, console: Console) -> None:
+    """`jaxlfi diagnose DIR`."""
+    subject = diagnosis.read_subject(arguments.folder)
+    name = arguments.reference or next(iter(subject.task.supports))
+    if name not in subject.task.supports:
+        raise ValueError(f"reference: expected one of {sorted(subject.task.supports)}, got {name!r}")
+    plan = diagnosis.Plan(name, arguments.truths, arguments.draws, arguments.seed)
+    reference = None
+    if arguments.against is not None:
+        reference = arguments.against.name, diagnosis.read_reference(arguments.against, subject.task)
+    out = arguments.out or arguments.folder / "diagnostics"
+    checks = diagnosis.run(out, subject, plan, console, reference)
+    console.print(checks_table(checks))
+    console.print(f"diagnostics: {out}", soft_wrap=True, highlight=False)
+    if not arguments.no_figures:
+        for path in _figures().checks.report(out):
+            console.print(f"picture: {path}", soft_wrap=True, highlight=False)
+
+
+def checks_table(checks: Sequence[diagnosis.Check]) -> Table:
+    """One line a check."""
+    table = Table("check", "statistic", "expected", "p-value", "verdict")
+    for check in checks:
+        p_value = "" if np.isnan(check.p_value) else f"{check.p_value:.2g}"
+        colour = {"": "", diagnostics.OK: "green"}.get(check.verdict, "red")
+        table.add_row(check.name, check.statistic, check.expected, p_value, check.verdict, style=colour)
+    return table
 
 
 def run(folder: Path, plan: Plan | Work, arguments: argparse.Namespace, console: Console) -> None:
@@ -269,12 +303,17 @@ def _mean_and_sd(values: np.ndarray) -> str:
 
 def draw(folder: Path, console: Console) -> None:
     """Draw all pictures of a folder from its saved files, and name them."""
+    for path in _figures().report(folder):
+        console.print(f"picture: {path}", soft_wrap=True, highlight=False)
+
+
+def _figures():
+    """The package of figures: matplotlib is needed for pictures only."""
     try:
-        from jaxlfi import figures  # matplotlib is needed for pictures only
+        import jaxlfi.figures.checks
     except ImportError as error:
         raise run_store.StoreError(f"pictures: expected matplotlib to be installed, got: {error}") from error
-    for path in figures.report(folder):
-        console.print(f"picture: {path}", soft_wrap=True, highlight=False)
+    return jaxlfi.figures
 
 
 def default_configurations(task: Task) -> list[str]:

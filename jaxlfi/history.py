@@ -5,12 +5,21 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
-from jaxlfi.bayessim import Round
+from jaxlfi.bayessim import Round, Settings
+from jaxlfi.belief import RESTRICTIONS, Belief
 from jaxlfi.diagnostics import Discrepancy
+from jaxlfi.estimator import Network
+from jaxlfi.posterior import draws_within
+from jaxlfi.support import Support
 
 EVIDENCE = "evidence/"
 """Prefix of the heuristic's evidence among the named arrays."""
+FINAL = "final_"
+"""Prefix of the named arrays of which only the last round's are kept."""
+DRAWS = 1000
+"""Draws of the last posterior that are saved."""
 
 
 def record(info: Round, seen: Discrepancy) -> dict[str, jax.Array]:
@@ -44,8 +53,40 @@ def record(info: Round, seen: Discrepancy) -> dict[str, jax.Array]:
         "sample_theta": seen.theta,
         "sample_theta_error": seen.theta_error,
         "sample_trajectory_error": seen.trajectory_error,
-        "final_trajectory": seen.trajectory,
+        FINAL + "trajectory": seen.trajectory,
+        FINAL + "x": seen.x,
     }
+
+
+def apart(row: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A record in two: what is kept of every round, and what is kept of the last one only."""
+    final = {name: value for name, value in row.items() if name.startswith(FINAL)}
+    return {name: value for name, value in row.items() if name not in final}, final
+
+
+def posterior_draws(
+    key: jax.Array,
+    settings: Settings,
+    network: Network,
+    x: Float[Array, " obs"],
+    scale: Support,
+    belief: Belief,
+    n: int = DRAWS,
+) -> Float[Array, "n dim"]:
+    """`n` draws of a run's last posterior, in coordinates: a flow's own, or the mixture's as rounds draw them.
+
+    Args:
+        key: consumed.
+        settings: of the run.
+        network: trained weights.
+        x: the observed summary, shape [S].
+        scale: the box the network's [-1, 1]^D stands for (Phi).
+        belief: the posterior and the support that draws are kept in.
+        n: number of draws.
+    """
+    if settings.estimator.is_flow:
+        return draws_within(key, settings.estimator, network, x, scale, belief.support, n)[0]
+    return RESTRICTIONS[settings.restriction](key, belief, n)
 
 
 def own_evidence(row: Mapping[str, Any], place: int | None) -> dict[str, Any]:

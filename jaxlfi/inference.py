@@ -19,12 +19,12 @@ from jaxlfi.dataset import Dataset
 from jaxlfi.diagnostics import bound_warnings, discrepancy
 from jaxlfi.estimator import Network
 from jaxlfi.heuristics import Edge, Fixed, Heuristic
-from jaxlfi.history import record
+from jaxlfi.history import DRAWS, apart, posterior_draws, record
 from jaxlfi.keys import run_keys
 from jaxlfi.lanes import Inputs
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.observation import SimulatorError
-from jaxlfi.posterior import draws_within
+from jaxlfi.posterior import truncated_log_prob
 from jaxlfi.presets import QUICK
 from jaxlfi.sampling import network_arrays
 from jaxlfi.support import Support
@@ -78,11 +78,17 @@ class Run:
 
         A flow's posterior is drawn from itself, not from the mixture fitted to it.
         """
-        estimator = self.settings.estimator
-        if estimator.is_flow:
-            scale = self.task.feasible.hull(self._first_support())
-            return draws_within(key, estimator, self.network, self.x, scale, self.belief.support, n)[0]
-        return bayessim.RESTRICTIONS[self.settings.restriction](key, self.belief, n)
+        scale = self.task.feasible.hull(self._first_support())
+        return posterior_draws(key, self.settings, self.network, self.x, scale, self.belief, n)
+
+    def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
+        """Log-density of the posterior truncated to the support it ended with, at coordinates theta [..., D].
+
+        -inf outside. A flow's is its own, not that of the mixture fitted to it. The mass it is divided by is
+        estimated from draws (`jaxlfi.posterior.MASS_DRAWS`), the same each time.
+        """
+        scale = self.task.feasible.hull(self._first_support())
+        return truncated_log_prob(self.settings.estimator, self.network, self.x, scale, self.belief, theta)
 
     def save(self, path: str | Path) -> Path:
         """Write a run folder (`jaxlfi.run_store`), which `jaxlfi report` can draw.
@@ -105,17 +111,18 @@ class Run:
         measure = black_box.discrepancies if self.task.black_box else _discrepancies
         seen = measure(keys, self.task, self.info.belief, observed, self.settings.restriction)
         stacked = jax.device_get(record(self.info, seen))
-        rows = [{name: value[i] for name, value in stacked.items()} for i in range(rounds)]
-        trajectories = [row.pop("final_trajectory") for row in rows]
+        parts = [apart({name: value[i] for name, value in stacked.items()}) for i in range(rounds)]
+        draws = self.sample(jax.random.fold_in(run_keys(self.key).diagnose, rounds), DRAWS)
 
         def fill(beside: Path) -> None:
             seconds = [float("nan")] * rounds
             run_store.write_results(
                 beside,
                 self.task,
-                rows,
+                [row for row, _ in parts],
                 seconds,
-                trajectories[-1],
+                parts[-1][1],
+                np.asarray(draws),
                 jax.device_get(self.dataset),
                 np.asarray(self.observed),
                 np.asarray(self.x),
@@ -226,6 +233,7 @@ def observe(
     x = jnp.asarray(task.summary(observed), jnp.float32)
     if not isinstance(x, jax.core.Tracer) and not np.isfinite(np.asarray(x)).all():
         raise ValueError(f"observation: expected a finite summary, got {np.asarray(x).tolist()}")
+    task.named_summaries(x.shape[-1])  # refuses names that are not the summary's
     return observed, x
 
 

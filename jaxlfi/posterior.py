@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxlfi.belief import Belief, rejected
 from jaxlfi.estimator import Estimator, Network, condition, draw
 from jaxlfi.mixture import GaussianMixture
-from jaxlfi.npe.atomic import sample_within
+from jaxlfi.normalise import normalised
+from jaxlfi.npe.atomic import log_prob_truncated, sample_within
 from jaxlfi.npe.mixture_fit import fit_mixture
 from jaxlfi.support import Support
 
@@ -14,6 +16,8 @@ FLOW_DRAWS = 1000
 """Draws of a flow to which its mixture is fitted."""
 LEAK_DRAWS = 512
 """Draws by which the mass of a mixture inside the support is estimated."""
+MASS_DRAWS = 10_000
+"""Draws by which it is where a density is divided by it: to 1 % of itself where it is a half."""
 
 
 def posterior(
@@ -71,3 +75,90 @@ def draws_within(
         key, lambda key, n: draw(key, estimator, network, x, scale, n), support.low, support.high, n, tries
     )
     return kept.theta, kept.acceptance
+
+
+def truncated_draws(
+    key: jax.Array,
+    estimator: Estimator,
+    network: Network | None,
+    x: Float[Array, " obs"],
+    scale: Support,
+    belief: Belief,
+    n: int,
+) -> tuple[Float[Array, "n dim"], Float[Array, ""]]:
+    """`n` draws of a posterior truncated to its support: a mixture's by rejection, a flow's from the flow itself.
+
+    Args:
+        key: consumed.
+        estimator: the settings the network was made with.
+        network: trained weights; a mixture needs none.
+        x: the observed summary, shape [S].
+        scale: the box the network's [-1, 1]^D stands for.
+        belief: the mixture, and the support.
+        n: number of draws.
+
+    Returns:
+        The draws, and the share of the untruncated posterior that lies in the support.
+    """
+    if estimator.is_flow:
+        return draws_within(key, estimator, network, x, scale, belief.support, n)
+    return rejected(key, belief, n), mixture_mass(belief)
+
+
+def truncated_log_prob(
+    estimator: Estimator,
+    network: Network | None,
+    x: Float[Array, " obs"],
+    scale: Support,
+    belief: Belief,
+    theta: Float[Array, "*n dim"],
+    inside: Float[Array, ""] | None = None,
+) -> Float[Array, "*n"]:
+    """Log-density of what `truncated_draws` draws from, -inf outside the support.
+
+    Args:
+        estimator: the settings the network was made with.
+        network: trained weights; a mixture needs none.
+        x: the observed summary, shape [S].
+        scale: the box the network's [-1, 1]^D stands for.
+        belief: the mixture, and the support.
+        theta: in coordinates, shape [..., D].
+        inside: the posterior's mass in the support; by default estimated from `MASS_DRAWS` draws, always the same.
+    """
+    box = belief.support
+    if estimator.is_flow:
+        log_prob = flow_log_prob(estimator, network, x, scale, theta)
+        if inside is None:
+            draws = draw(jax.random.key(0), estimator, network, x, scale, MASS_DRAWS)
+            inside = jnp.mean(box.contains(draws))
+    else:
+        log_prob = belief.mixture.log_prob(theta)
+        inside = mixture_mass(belief) if inside is None else inside
+    return log_prob_truncated(log_prob, theta, box.low, box.high, inside)
+
+
+def mixture_mass(belief: Belief) -> Float[Array, ""]:
+    """Mass of a belief's mixture in its support, estimated from `MASS_DRAWS` draws that are always the same."""
+    return jnp.mean(belief.support.contains(belief.mixture.sample(jax.random.key(0), MASS_DRAWS)))
+
+
+def flow_log_prob(
+    estimator: Estimator, network: Network, x: Float[Array, " obs"], scale: Support, theta: Float[Array, "*n dim"]
+) -> Float[Array, "*n"]:
+    """Log-density of a flow's q_phi(theta | x) in coordinates, not truncated: the mean density of all members.
+
+    Args:
+        estimator: the settings the network was made with.
+        network: trained weights.
+        x: the observed summary, shape [S].
+        scale: the box the network's [-1, 1]^D stands for.
+        theta: in coordinates, shape [..., D].
+    """
+    module = estimator.module(scale.dim)
+    x = normalised(estimator.normaliser, network.normaliser, x)
+    inner = network.to_network(scale.to_unit(theta))
+    members = jax.vmap(lambda params: module.apply(params, x).log_prob(inner))(network.params)
+    # Both maps from theta to what the network sees are affine, dimension by dimension.
+    width = 0.5 * scale.width
+    width = width if network.theta_normaliser is None else width * network.theta_normaliser.scale
+    return jax.nn.logsumexp(members, axis=0) - jnp.log(estimator.members) - jnp.sum(jnp.log(width))

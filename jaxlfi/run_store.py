@@ -132,7 +132,9 @@ def read_config(folder: Path) -> dict[str, Any]:
         ) from error
     kind = config.get("format") if isinstance(config, dict) else None
     if kind not in (RUN, RUNS, COMPARE):
-        raise StoreError(f"expected a run folder, got {str(folder)!r} whose config.json is not of jaxlfi")
+        known = isinstance(kind, str) and kind.startswith("jaxlfi-")
+        told = f"is of format {kind!r}" if known else "is not of jaxlfi"
+        raise StoreError(f"expected a run folder, got {str(folder)!r} whose config.json {told}")
     if config.get("version") != VERSION:
         raise StoreError(f"{path}: expected version {VERSION} of the format, got {config.get('version')}")
     return config
@@ -153,7 +155,8 @@ def write_results(
     task: Task,
     rows: Sequence[Mapping[str, np.ndarray]],
     seconds: Sequence[float],
-    final_trajectory: np.ndarray,
+    final: Mapping[str, np.ndarray],
+    draws: np.ndarray,
     dataset: Any,
     observed: np.ndarray,
     x: np.ndarray,
@@ -165,7 +168,9 @@ def write_results(
         task: for names and times.
         rows: the rounds' records of this one lane.
         seconds: of each round.
-        final_trajectory: the simulations of the last round's posterior samples, shape [N, T, C].
+        final: what is kept of the last round only (`jaxlfi.history.apart`): the simulations of its posterior samples,
+            shape [N, T, C], and their summaries, shape [N, S].
+        draws: of the last posterior, shape [n, D].
         dataset: `jaxlfi.dataset.Dataset` of this one lane.
         observed: the observed trajectory.
         x: its summary.
@@ -174,7 +179,7 @@ def write_results(
     write_ledger(folder, rows, task.reasons, seconds)
     last = rows[-1]
     belief = {name: last[name] for name in ("logits", "means", "scale_tril", "support_low", "support_high")}
-    atomic.write_arrays(folder / "posterior.npz", belief | {"names": names})
+    atomic.write_arrays(folder / "posterior.npz", belief | {"draws": draws, "names": names})
     size = int(dataset.size)
     atomic.write_arrays(
         folder / "dataset.npz",
@@ -187,8 +192,8 @@ def write_results(
             "reasons": np.asarray(task.reasons),
             "names": names,
             "seconds": np.asarray(seconds, np.float64),
-            "final_trajectory": final_trajectory,
-        },
+        }
+        | dict(final),
     )
     unknown = np.full(task.dim, np.nan, np.float32)
     atomic.write_arrays(
@@ -198,8 +203,10 @@ def write_results(
             "x": x,
             "truth": unknown if task.truth is None else task.truth,
             "names": names,
+            "summaries": np.asarray(task.named_summaries(len(x)), dtype=str),
             "channels": np.asarray(task.channels, dtype=str),
             "times": np.arange(len(observed)) if task.times is None else task.times,
+            "record_label": np.asarray(task.record_label or ("record" if task.times is None else "time")),
         },
     )
 

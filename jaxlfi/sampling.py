@@ -1,5 +1,7 @@
 """Draws from the posterior of a finished run folder, in the parameters' natural units."""
 
+import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi import atomic, describe, run_store
-from jaxlfi.belief import rejected
+from jaxlfi.bayessim import Settings
+from jaxlfi.belief import Belief
 from jaxlfi.dataset import empty
 from jaxlfi.estimator import Network, initialise, normalisers
-from jaxlfi.posterior import draws_within
+from jaxlfi.posterior import truncated_draws
 from jaxlfi.support import Support
 
 LOG = "ln "
@@ -38,29 +41,82 @@ def posterior_samples(folder: Path, n: int, seed: int = 0) -> tuple[np.ndarray, 
     """
     if n < 1:
         raise ValueError(f"n: expected at least 1, got {n}")
-    config = run_store.read_config(folder)
-    if config.get("format") != run_store.RUN:
-        raise run_store.StoreError(f"{folder}: expected the folder of one run, such as {folder / 'seed_000'}")
-    belief = run_store.read_belief(folder)
-    key = jax.random.key(seed)
-    settings = describe.settings_from_json(config["settings"])
-    if settings.estimator.is_flow:
-        scale = Support(config["feasible_low"], config["feasible_high"]).hull(
-            describe.support_from_json(config["support"])
-        )
-        x = jnp.asarray(atomic.read_arrays(folder / "observation.npz")["x"])
-        network = read_network(folder / "network.npz", settings.estimator, scale, x.shape[0])
-        draws, inside = draws_within(key, settings.estimator, network, x, scale, belief.support, n)
-    else:
-        draws = rejected(key, belief, n)
-        inside = jnp.mean(belief.support.contains(belief.mixture.sample(key, n)))
+    run = read_run(folder)
+    draws, inside = run.draws(jax.random.key(seed), n)
     natural = np.array(draws, np.float64)
     names = []
-    for d, name in enumerate(config["names"]):
+    for d, name in enumerate(run.config["names"]):
         if name.startswith(LOG):
             natural[:, d] = np.exp(natural[:, d])
         names.append(name.removeprefix(LOG))
     return natural, names, float(inside)
+
+
+@dataclasses.dataclass(frozen=True)
+class Finished:
+    """A finished run as its folder tells of it.
+
+    Attributes:
+        folder: where it was read from.
+        config: config.json.
+        settings: the numbers of the run.
+        support: Theta_0.
+        scale: the box the network's [-1, 1]^D stands for: Phi, widened by Theta_0.
+        belief: the posterior and the support it ended with.
+        observed: the observed trajectory, shape [T, C] or [T].
+        x: its summary, shape [S].
+    """
+
+    folder: Path
+    config: dict[str, Any]
+    settings: Settings
+    support: Support
+    scale: Support
+    belief: Belief
+    observed: jax.Array
+    x: jax.Array
+
+    @functools.cached_property
+    def network(self) -> Network | None:
+        """Trained weights; None for an MDN's that were not kept.
+
+        Raises:
+            StoreError: where they are damaged, or a flow's are missing.
+        """
+        path = self.folder / "network.npz"
+        if not self.settings.estimator.is_flow and not path.exists():
+            return None
+        return read_network(path, self.settings.estimator, self.scale, self.x.shape[0])
+
+    def draws(self, key: jax.Array, n: int) -> tuple[jax.Array, jax.Array]:
+        """`n` draws of the posterior in coordinates, truncated to its support, and its share in there."""
+        estimator = self.settings.estimator
+        network = self.network if estimator.is_flow else None
+        return truncated_draws(key, estimator, network, self.x, self.scale, self.belief, n)
+
+
+def read_run(folder: Path) -> Finished:
+    """What `infer` left in a folder.
+
+    Raises:
+        StoreError: for a folder that holds no finished run, or a damaged one.
+    """
+    config = run_store.read_config(folder)
+    if config.get("format") != run_store.RUN:
+        one = next((lane["folder"] for lane in config.get("lanes", ())), "seed_000")
+        raise run_store.StoreError(f"{folder}: expected the folder of one run, such as {folder / one}")
+    if config.get("status", "finished") != "finished" or not (folder / "posterior.npz").exists():
+        raise run_store.StoreError(f"{folder}: expected a finished run; go on with it by 'jaxlfi resume'")
+    belief = run_store.read_belief(folder)
+    settings = describe.settings_from_json(config["settings"])
+    support = describe.support_from_json(config["support"])
+    scale = Support(config["feasible_low"], config["feasible_high"]).hull(support)
+    try:
+        seen = atomic.read_arrays(folder / "observation.npz")
+        observed, x = jnp.asarray(seen["trajectory"]), jnp.asarray(seen["x"])
+    except (ValueError, KeyError) as error:
+        raise run_store.StoreError(f"{folder / 'observation.npz'}: expected a whole observation: {error}") from error
+    return Finished(folder, config, settings, support, scale, belief, observed, x)
 
 
 def network_arrays(network: Network) -> dict[str, Any]:
@@ -88,4 +144,5 @@ def read_network(path: Path, estimator: Any, scale: Support, obs: int) -> Networ
             raise run_store.StoreError(
                 f"{path}: expected shape {leaf.shape} at {jax.tree_util.keystr(place)}, got {array.shape}"
             )
-    return jax.tree.unflatten(structure, [jnp.asarray(array) for array in found])
+    with jax.ensure_compile_time_eval():  # so that it can be read, and kept, while a function is traced
+        return jax.tree.unflatten(structure, [jnp.asarray(array) for array in found])

@@ -16,9 +16,10 @@ from jaxlfi.black_box import BlackBoxEngine
 from jaxlfi.checkpoint import Checkpoint
 from jaxlfi.diagnostics import bound_warnings, edge_mass
 from jaxlfi.heuristics import Fixed
+from jaxlfi.history import apart, posterior_draws
 from jaxlfi.inference import observe, refuse_hopeless
 from jaxlfi.keys import run_keys
-from jaxlfi.lanes import Lane, LaneEngine, stack_inputs
+from jaxlfi.lanes import Inputs, Lane, LaneEngine, diagnose_key, stack_inputs
 from jaxlfi.progress import RoundProgress
 from jaxlfi.sampling import network_arrays
 from jaxlfi.task import Task
@@ -178,7 +179,7 @@ def advance(folder: Path, plan: Plan, console: Console) -> None:
     inputs, places = stack_inputs(plan.lanes, observed, x)
     engine = (BlackBoxEngine if plan.task.black_box else LaneEngine)(plan.task, plan.settings, inputs)
     done = checkpoint.rounds_done()
-    rows, seconds, trajectory = checkpoint.read_rounds(done)
+    rows, seconds, final = checkpoint.read_rounds(done)
     lanes = len(plan.lanes)
     label = f"{plan.task.name}: {lanes} {'run' if lanes == 1 else 'runs side by side'}"
     state = _state(engine, checkpoint, done)
@@ -194,13 +195,15 @@ def advance(folder: Path, plan: Plan, console: Console) -> None:
             if index == 0:
                 refuse_hopeless(row["succeeded"], row["failed"], plan.task)
             checkpoint.write_round(index, engine.fetch(state), row, seconds[-1])
-            trajectory = row.pop("final_trajectory")
+            row, final = apart(row)
             rows.append(row)
             for lane, name in enumerate(plan.folders()):
                 own = run_store.lane_rows(rows, lane, places[lane])
                 run_store.write_ledger(folder / name, own, plan.task.reasons, seconds)
             progress.advance()
-    _finish(folder, plan, engine.fetch(state), rows, seconds, trajectory, places, observed, x)
+    state = engine.fetch(state)
+    draws = jax.device_get(_draws(inputs, plan.settings, state))
+    _finish(folder, plan, state, rows, seconds, final, draws, places, observed, x)
     checkpoint.remove()
 
 
@@ -210,7 +213,18 @@ def _state(engine: LaneEngine | BlackBoxEngine, checkpoint: Checkpoint, done: in
     return engine.place(checkpoint.read_state(engine.fetch(state))) if done else state
 
 
-def _finish(folder, plan, state, rows, seconds, trajectory, places, observed, x) -> None:
+@jax.jit
+def _draws(inputs: Inputs, settings: Settings, state: State) -> jax.Array:
+    """Draws of every lane's last posterior, shape [L, n, D]."""
+
+    def one(lane: Inputs, state: State) -> jax.Array:
+        key = diagnose_key(lane, settings.rounds)  # the rounds have those before
+        return posterior_draws(key, settings, state.network, lane.x, state.feasible, state.belief)
+
+    return jax.vmap(one)(inputs, state)
+
+
+def _finish(folder, plan, state, rows, seconds, final, draws, places, observed, x) -> None:
     """Write every lane's results and the comparison's table, and then that the run is complete."""
     for lane, name in enumerate(plan.folders()):
         own = run_store.lane_rows(rows, lane, places[lane])
@@ -220,7 +234,8 @@ def _finish(folder, plan, state, rows, seconds, trajectory, places, observed, x)
             plan.task,
             own,
             seconds,
-            trajectory[lane],
+            {name: value[lane] for name, value in final.items()},
+            draws[lane],
             lane_state.dataset,
             observed[lane],
             x[lane],

@@ -42,8 +42,11 @@ class Task:
             the support; its draws are kept in the support like all others.
         failures: names of the reasons for which a simulation can fail.
         black_box: true for a Python or NumPy simulator that JAX cannot trace.
+        summary_names: names of the summary's numbers, for plots; by default x_1 to x_S.
         channels: names of the columns of a trajectory, for plots.
         times: times of the rows of a trajectory, shape [T], for plots.
+        record_label: what the rows of a trajectory are counted by, for plots; by default "time" where there are
+            `times`, else "record".
         name: what the task is called in files and figures.
 
     Raises:
@@ -70,8 +73,10 @@ class Task:
     prior: Any = None
     failures: Sequence[str] = ("failed",)
     black_box: bool = False
+    summary_names: Sequence[str] = ()
     channels: Sequence[str] = ()
     times: Any = None
+    record_label: str | None = None
     name: str = "task"
 
     def __post_init__(self):
@@ -81,6 +86,7 @@ class Task:
         store("units", tuple(self.units) if self.units is not None else ("",) * len(names))
         store("failures", tuple(self.failures))
         store("log", tuple(self.log))
+        store("summary_names", tuple(self.summary_names))
         if len(self.units) != len(names):
             raise ValueError(f"units: expected one for each of the {len(names)} parameters, got {len(self.units)}")
         if len(set(names)) != len(names):
@@ -119,6 +125,18 @@ class Task:
     def reasons(self) -> tuple[str, ...]:
         """All reasons of failure, in the order of their codes from 1: the task's own, then "non_finite"."""
         return (*self.failures, "non_finite")
+
+    def named_summaries(self, count: int) -> tuple[str, ...]:
+        """Names of the summary's `count` numbers.
+
+        Raises:
+            ValueError: if the task names another number of them.
+        """
+        if self.summary_names and len(self.summary_names) != count:
+            raise ValueError(
+                f"summary_names: expected one for each of the summary's {count} numbers, got {len(self.summary_names)}"
+            )
+        return self.summary_names or tuple(f"x_{i + 1}" for i in range(count))
 
     @property
     def _is_log(self) -> np.ndarray:

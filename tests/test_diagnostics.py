@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from jaxlfi import black_box
 from jaxlfi.belief import Belief
 from jaxlfi.diagnostics import bound_warnings, discrepancy, edge_mass, trajectory_distance
 from jaxlfi.mixture import GaussianMixture
@@ -93,6 +94,34 @@ def test_discrepancy_shapes_and_failures(key):
     np.testing.assert_array_equal(np.isnan(seen.trajectory_error), failed)
     ok = int(np.flatnonzero(~failed)[0])
     np.testing.assert_allclose(seen.trajectory_error[ok], trajectory_distance(seen.trajectory[ok], observed), rtol=1e-5)
+
+
+def test_summaries_are_those_of_the_trajectories_and_nan_where_there_are_none(key):
+    """The first that fail have a trajectory too, and one that is finite can have a summary that is not."""
+
+    def total(trajectory):
+        return jnp.append(jnp.sum(trajectory, axis=0), jnp.where(trajectory[1, 0] > 3.0, jnp.inf, 7.0))
+
+    seen = see(key, task(moving, summary=total), belief(), jnp.zeros((5, 2)), n=50)
+    usable = np.asarray((seen.theta[:, 0] > 1.0) & (seen.theta[:, 0] <= 3.0))
+    assert 0 < usable.sum() < np.sum(seen.theta[:, 0] > 1.0) < 50
+    expected = np.column_stack([10 * np.asarray(seen.theta), np.full(50, 7.0)])
+    np.testing.assert_allclose(seen.x[usable], expected[usable], rtol=1e-5)
+    assert bool(jnp.isnan(seen.x[~usable]).all()) and seen.x.shape == (50, 3)
+
+
+def test_summaries_of_a_black_box(key, monkeypatch):
+    def simulate(rng, theta):
+        return np.arange(5.0)[:, None] * theta[:, None], theta[:, 0] > 1.0
+
+    problem = task(simulate, black_box=True, summary=lambda trajectory: jnp.sum(trajectory, axis=0))
+    drawn = jnp.asarray(np.random.default_rng(0).uniform(0, 3, (2, 20, 2)), jnp.float32)
+    monkeypatch.setattr(black_box, "_draw", lambda restriction, key, place: (drawn[place], key))
+    seen = black_box.discrepancies(jax.random.split(key, 2), problem, jnp.arange(2), jnp.zeros((2, 5, 2)), "clip")
+    failed = np.asarray(drawn[..., 0] <= 1.0)
+    assert seen.x.shape == (2, 20, 2) and 0 < failed.sum() < 40
+    np.testing.assert_allclose(seen.x[~failed], 10 * seen.theta[~failed], rtol=1e-5)
+    assert bool(jnp.isnan(seen.x[failed]).all()) and bool(jnp.isnan(seen.trajectory_error[failed]).all())
 
 
 def test_trajectories_that_are_not_finite_have_no_distance(key):

@@ -22,6 +22,8 @@ from jaxlfi.figures import (
     load,
     losses,
     open_collection,
+    pairs,
+    polars,
     predictive,
     report,
     representative,
@@ -31,6 +33,7 @@ from jaxlfi.figures import (
     style,
     supports,
 )
+from jaxlfi.figures.history import spread_of
 
 COMPARED = ("ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre")
 TRUTH = np.log([0.01, 0.5, 1.0, 0.01])
@@ -143,19 +146,37 @@ def write_run(
 
     spread = stacked["sample_theta_error"][-1].mean() if truth else 0.4
     predicted = np.stack([wave(0.5 * spread * rng.normal()) * np.exp(0.15 * rng.normal()) for _ in range(20)])
+    summaries = ("mean X", "mean Y", "log var X", "log var Y", "X with Y")
+    x_of = lambda theta: theta[:, :1] * np.arange(1, 6) + theta[:, -1:] ** 2
+    x = x_of(target[None])[0]
+    final_x = x_of(draws) + 0.1 * rng.normal(size=(20, 5))
+    final_x[np.isnan(stacked["sample_trajectory_error"][-1])] = np.nan
     folder.mkdir(parents=True)
+    last = {name: stacked[name][-1] for name in ("logits", "means", "scale_tril", "support_low", "support_high")}
+    many = (mean + scale * rng.normal(size=(1000, dim))).clip(low, high)
+    np.savez(folder / "posterior.npz", **last, draws=many)
+    dataset = [stacked["theta"][i][stacked["kept"][i]] for i in range(rounds)]
+    np.savez(
+        folder / "dataset.npz",
+        theta=np.concatenate(dataset),
+        x=np.concatenate([x_of(theta) for theta in dataset]),
+        round=np.repeat(np.arange(rounds), [len(theta) for theta in dataset]),
+    )
     np.savez(
         folder / "history.npz",
         **stacked,
         reasons=np.array(["too_many_events", "non_finite"]),
         seconds=rng.uniform(1, 2, rounds),
         final_trajectory=predicted,
+        final_x=final_x,
     )
     names = np.array([NAMES[d % 4] + ("" if d < 4 else f" {d}") for d in range(dim)])
     np.savez(
         folder / "observation.npz",
         trajectory=wave(0.0) * rng.lognormal(0, 0.1, (records, len(channels))),
-        x=np.zeros(9),
+        x=x,
+        summaries=np.array(summaries),
+        record_label="month",
         truth=target if truth else np.full(dim, np.nan),
         names=names,
         channels=np.array(channels, dtype=str),
@@ -450,6 +471,127 @@ def test_predictive_shows_few_records_as_points(tmp_path):
     assert (observed.get_marker(), observed.get_linestyle()) == ("o", "None")
 
 
+def test_predictive_counts_records_by_their_label(tmp_path):
+    folder = write_run(tmp_path / "run", records=21)
+    label = lambda: drawn(predictive.draw, [load(folder)]).axes[-1].get_xlabel()
+    assert label() == "month"
+    change(folder, "observation.npz", lambda a: a.pop("record_label"))
+    assert label() == "time"
+    change(folder, "observation.npz", lambda a: a.update(times=np.arange(21)))
+    assert label() == "record"
+
+
+def correlated(rng, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Normal draws of two parameters and their covariance."""
+    covariance = np.array([[0.5, 0.42], [0.42, 0.9]])
+    return rng.multivariate_normal([1.0, -2.0], covariance, n), covariance
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8, 0.95])
+def test_contours_of_normal_draws_are_their_ellipses(share):
+    draws, covariance = correlated(np.random.default_rng(0), 40_000)
+    x, y, density_ = pairs.smoothed(draws, np.array([[-50.0, -50.0], [50.0, 50.0]]))
+    assert density_.sum() == pytest.approx(1)
+    np.testing.assert_allclose([density_.sum(0) @ x, density_.sum(1) @ y], [1.0, -2.0], atol=0.03)
+    inside = density_ >= pairs.levels(density_, [share])[0]
+    area = inside.sum() * (x[1] - x[0]) * (y[1] - y[0])
+    ellipse = np.pi * stats.chi2(2).ppf(share) * np.sqrt(np.linalg.det(covariance))
+    assert area == pytest.approx(ellipse, rel=0.2)  # the kernel widens, by a quarter of a standard deviation
+    # The ellipse leans to the right: the first axis is horizontal.
+    assert inside[y > -1.5][:, x > 1.5].sum() > 3 * inside[y > -1.5][:, x < 0.5].sum()
+
+
+def test_a_density_does_not_fade_at_the_support():
+    """Draws that are uniform in a box have one density up to its bounds, and none beyond."""
+    box = np.array([[0.0, 10.0], [1.0, 14.0]])
+    draws = np.random.default_rng(1).uniform(*box, (100_000, 2))
+    x, y, share = pairs.smoothed(draws, box)
+    assert x.min() > 0 and x.max() < 1 and y.min() > 10 and y.max() < 14
+    np.testing.assert_allclose(share, share.mean(), rtol=0.15)
+
+
+def test_draws_all_in_one_place_have_a_density():
+    for draws in (np.zeros((50, 2)), np.column_stack([np.zeros(50), np.linspace(0, 1, 50)])):
+        _, _, share = pairs.smoothed(draws, np.array([[0.0, 0.0], [1.0, 1.0]]))
+        assert np.isfinite(share).all() and share.sum() == pytest.approx(1)
+
+
+def test_pairs_shows_all_draws_with_support_and_truth(compared):
+    histories = [representative(compared.runs[name]) for name in ("misspecified", "misspecified+edge")]
+    figure = drawn(pairs.draw, histories)
+    panels = [axes for axes in figure.axes if axes.axison]
+    assert len(panels) == 2 * 10
+    for place, history in enumerate(histories):
+        marginal, pair = panels[10 * place], panels[10 * place + 1]
+        (outline,) = marked(marginal, "marginal")
+        corners = outline.get_xy()
+        assert corners[:, 0].min() == pytest.approx(history.draws[:, 0].min())
+        assert corners[:, 0].max() == pytest.approx(history.draws[:, 0].max())
+        assert marked(marginal, "truth")[0].get_xdata()[0] == pytest.approx(TRUTH[0])
+        np.testing.assert_allclose(marked(pair, "truth")[0].get_xydata(), TRUTH[None, :2])
+        boxes = [[*box.get_xy(), box.get_width(), box.get_height()] for box in pair.patches]
+        low, high = history.supports
+        expected = [np.concatenate([low[i, :2], (high - low)[i, :2]]) for i in ((-1, 0) if place else (-1,))]
+        np.testing.assert_allclose(boxes, expected)
+        inside = (history.draws[:, :2] >= [pair.get_xlim()[0], pair.get_ylim()[0]]) & (
+            history.draws[:, :2] <= [pair.get_xlim()[1], pair.get_ylim()[1]]
+        )
+        assert inside.all(1).mean() > 0.97
+    assert panels[1].get_xlim() == panels[11].get_xlim()
+
+
+def test_pairs_are_arranged_by_how_many_fit(tmp_path):
+    assert pairs.arrangement(3, 4) == (1, 3)
+    assert pairs.arrangement(4, 4) == (2, 2)
+    assert pairs.arrangement(4, 2) == (1, 4)
+    assert pairs.arrangement(1, 6) == (1, 1)
+    assert not pairs.drawable(load(write_run(tmp_path / "seven", dim=7, rounds=1)))
+
+
+def test_polars_measure_all_in_the_units_of_ok(compared):
+    """Widths of its first support, and the spread of its first round's summaries."""
+    chosen = [compared.runs[name][0] for name in ("misspecified", "ok")]
+    bare, ok = chosen
+    figure = drawn(polars.draw, chosen)
+    circles = [axes for axes in figure.axes if axes.axison]
+    assert len(circles) == 4
+    with np.load(ok.folder / "dataset.npz") as dataset:
+        first = dataset["x"][dataset["round"] == 0]
+    spread = (np.percentile(first, 84, axis=0) - np.percentile(first, 16, axis=0)) / 2
+    for column, history in enumerate(chosen):
+        width = ok.proposal_high[0] - ok.proposal_low[0]
+        np.testing.assert_allclose(width, 7.0)
+        expected = [history.theta_error[-1] / width, np.abs(history.final_x - history.x) / spread]
+        for axes, errors in zip(circles[column::2], expected, strict=True):
+            (mean,) = marked(axes, "mean")
+            np.testing.assert_allclose(mean.get_ydata()[:-1], np.nanmean(errors, axis=0))
+            assert mean.get_ydata()[0] == mean.get_ydata()[-1]
+            assert axes.get_ylim()[1] > np.nanmean(errors, axis=0).max()
+    assert circles[0].get_ylim() == circles[1].get_ylim()
+    assert [label.get_text() for label in circles[2].get_xticklabels()][2] == "log var X"
+    assert polars.reference([bare]) is bare
+
+
+def test_polars_leave_out_what_has_no_unit_or_no_value(tmp_path):
+    folder = write_run(tmp_path / "run")
+    constant = lambda a: a["x"].__setitem__((slice(None), 1), 3.0)
+    change(folder, "dataset.npz", constant)
+    history = load(folder)
+    mean = marked(drawn(polars.draw, [history]).axes[-1], "mean")[0]
+    assert len(mean.get_xdata()) == 4 + 1
+    change(folder, "history.npz", lambda a: a["final_x"].fill(np.nan))
+    failed = load(folder)
+    assert set(polars.panels([failed])) == {"parameters"}
+    both = drawn(polars.draw, [history, failed])
+    assert [text.get_text() for text in both.axes[-1].texts] == ["none"]
+
+
+def test_the_spread_of_normal_numbers_is_their_standard_deviation():
+    x = np.random.default_rng(2).normal(5.0, [0.3, 20.0], (40_000, 2))
+    x[:100] = 1e6  # but for a few
+    np.testing.assert_allclose(spread_of(x), [0.3, 20.0], rtol=0.03)
+
+
 def test_seeds_marks_mean_and_median(compared):
     values = compared.values("theta_error")
     figure = drawn(seeds.draw, values, "error")
@@ -537,7 +679,8 @@ def names_of(paths: list[Path]) -> list[str]:
     return [path.name for path in paths]
 
 
-EVERYTHING = ["samples", "efficiency", "curves", "discrepancy", "support", "losses", "predictive", "seeds"]
+EVERYTHING = ["samples", "efficiency", "curves", "discrepancy", "support", "losses"]
+EVERYTHING += ["predictive", "pairs", "polars", "seeds"]
 
 
 def test_report_of_a_comparison(compared):
@@ -613,7 +756,8 @@ def test_report_of_a_run_with_nothing_but_what_is_required(tmp_path):
     ]
     needed += ["logits", "means", "scale_tril"]
     change(folder, "history.npz", lambda a: [a.pop(name) for name in list(a) if name not in needed])
-    (folder / "observation.npz").unlink()
+    for file in ("observation.npz", "posterior.npz", "dataset.npz"):
+        (folder / file).unlink()
     (folder / "config.json").write_text(json.dumps({"format": "jaxlfi-run"}))
     assert names_of(report(folder, dpi=30)) == ["report.html", "samples.png", "efficiency.png", "support.png"]
     history = load(folder)
@@ -621,9 +765,22 @@ def test_report_of_a_run_with_nothing_but_what_is_required(tmp_path):
     np.testing.assert_array_equal(history.failed, (history.counted & (history.failure > 0)).sum(1))
 
 
+def test_an_older_folder_leaves_out_what_was_not_saved(tmp_path):
+    folder = write_run(tmp_path / "run")
+    change(folder, "posterior.npz", lambda a: a.pop("draws"))
+    change(folder, "history.npz", lambda a: a.pop("final_x"))
+    change(folder, "observation.npz", lambda a: [a.pop(name) for name in ("summaries", "record_label")])
+    history = load(folder)
+    assert not pairs.drawable(history)
+    assert set(polars.panels([history])) == {"parameters"}
+    assert history.summaries == ("x_1", "x_2", "x_3", "x_4", "x_5")
+
+
 def test_report_survives_a_posterior_that_is_not_finite(tmp_path):
     folder = write_run(tmp_path / "run", rounds=3)
     change(folder, "history.npz", lambda a: [a[name].__setitem__(-1, np.nan) for name in ("logits", "means")])
+    change(folder, "posterior.npz", lambda a: a["draws"].fill(np.nan))
+    assert not pairs.drawable(load(folder))
     figure = drawn(samples.draw, [load(folder)])
     assert any("not finite" in text.get_text() for text in figure.axes[1].texts)
 
@@ -688,6 +845,9 @@ def test_missing_and_empty_folders_are_refused(tmp_path):
         report(tmp_path)
     with pytest.raises(ValueError, match="found a file"):
         report(tmp_path / "config.json")
+    (tmp_path / "config.json").write_text('{"format": "jaxlfi-grid"}')
+    with pytest.raises(ValueError, match="a sensitivity grid: `report` draws it"):
+        open_collection(tmp_path)
 
 
 def test_a_damaged_table_and_unlike_runs_are_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""EDGE, MODE and CENTRE: against the paper's pseudocode, their laws, and the contract all heuristics keep."""
+"""EDGE, MODE, CENTRE and truncation: against pseudocode, their laws, and the contract all heuristics keep."""
 
 import chex
 import jax
@@ -7,13 +7,18 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from scipy.optimize import linear_sum_assignment
+from scipy import stats
+from scipy.optimize import brentq, linear_sum_assignment
+from scipy.special import ndtr
 
+from jaxlfi.bayessim import Settings, propose
 from jaxlfi.belief import Belief
-from jaxlfi.heuristics import HEURISTICS, Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, stretch
+from jaxlfi.heuristics import HEURISTICS, Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate, stretch
 from jaxlfi.heuristics.matching import match
+from jaxlfi.heuristics.truncate import LEAST_WIDTH
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.support import Support
+from jaxlfi.task import Task
 from tests.oracles import heuristics as oracle
 from tests.strategies import floats, problems, vectors
 
@@ -36,13 +41,18 @@ def modes() -> st.SearchStrategy[Mode]:
     return st.builds(Mode, floats(0.0, 0.6), floats(0.1, 1.2), floats(0.0, 0.6), floats(0.01, 1.5))
 
 
+def truncations() -> st.SearchStrategy[Truncate]:
+    """Truncate with quantiles from hardly anything to most of the mass."""
+    return st.builds(Truncate, floats(1e-4, 0.4))
+
+
 def any_rule() -> st.SearchStrategy[Heuristic]:
-    """One of the paper's heuristics."""
-    return st.one_of(edges(), modes(), st.just(Centre()))
+    """One of the rules that move a bound."""
+    return st.one_of(edges(), modes(), st.just(Centre()), truncations())
 
 
 def decided(rule, previous, posterior, feasible, margin: float = 1e-3) -> bool:
-    """Whether every comparison the rule makes is decided by more than rounding."""
+    """Whether every comparison the rule makes is decided by more than rounding, and no quantile lies in a gap."""
     evidence = {
         name: np.asarray(seen)
         for name, seen in apply(rule, *(previous, posterior, feasible))[1].evidence.items()
@@ -56,6 +66,10 @@ def decided(rule, previous, posterior, feasible, margin: float = 1e-3) -> bool:
         gaps += [np.abs(evidence["mode_shift"]) - rule.shift_threshold]
         gaps += [np.abs(z) - rule.proximity, np.abs(1 - z) - rule.proximity]
         gaps += [evidence[side] - rule.mass_threshold for side in ("weight_left", "weight_right")]
+    if isinstance(rule, Truncate):
+        for end in ("interval_low", "interval_high"):
+            densities = stats.norm.pdf(evidence[end], posterior.means, posterior.marginal_scales)
+            gaps += [np.maximum(np.asarray(posterior.weights) @ densities / rule.quantile - 0.1, 0)]
     return min(np.abs(gap).min() for gap in gaps) > margin
 
 
@@ -262,6 +276,50 @@ def test_centre_by_hand():
     np.testing.assert_allclose(belief.support.high, [3.24, 5.44], rtol=1e-6)
 
 
+def truncated(box, phi, weights, means, scales, quantile):
+    """Bounds and interval of `Truncate` in float64: roots of each marginal's CDF, and one case after the other."""
+
+    def root(d, sign):
+        return brentq(lambda x: weights @ ndtr(sign * (x - means[:, d]) / scales[:, d]) - quantile, -100, 100)
+
+    interval_low, interval_high = (np.array([root(d, sign) for d in range(len(box.low))]) for sign in (1, -1))
+    low, high = np.clip(interval_low, box.low, box.high), np.clip(interval_high, box.low, box.high)
+    for d in range(len(low)):
+        least = min(LEAST_WIDTH * (phi.high[d] - phi.low[d]), box.high[d] - box.low[d])
+        if high[d] - low[d] < least:
+            middle = np.clip((low[d] + high[d]) / 2, box.low[d] + least / 2, box.high[d] - least / 2)
+            low[d], high[d] = middle - least / 2, middle + least / 2
+    return low, high, interval_low, interval_high
+
+
+@pytest.mark.parametrize(("quantile", "seed"), [(1e-3, 30), (0.3, 31)], ids=["default", "strict"])
+def test_truncate_is_the_intersection_with_the_posteriors_interval(quantile, seed):
+    def expected(box, phi, weights, now, before):
+        return truncated(box, phi, weights, now.means, np.sqrt((now.scale_tril**2).sum(-1)), quantile)
+
+    cases = random_cases(seed, n=200)
+    low_shift, high_shift = against_oracle(
+        Truncate(quantile), cases, expected, ("interval_low", "interval_high"), 0.0, 0.0
+    )
+    width = cases[0].support.width + high_shift - low_shift
+    sliver = np.isclose(width, LEAST_WIDTH * np.asarray(cases[2].width), rtol=1e-2)
+    for shift in (low_shift, -high_shift):
+        assert 40 < ((shift > 0) & ~sliver).sum() < 560
+    if quantile == 0.3:
+        assert (sliver & (low_shift == 0)).sum() > 5 < (sliver & (high_shift == 0)).sum()
+
+
+def test_truncate_by_hand():
+    """Of N(1, 1), a tenth lies below -0.28 and a tenth above 2.28, of N(2, 10) more than that beyond the box."""
+    box, feasible = Support([-1.0, 0.0], [3.0, 4.0]), Support([-10.0, -10.0], [10.0, 10.0])
+    posterior = GaussianMixture(jnp.zeros(1), jnp.array([[1.0, 2.0]]), jnp.diag(jnp.array([1.0, 10.0]))[None])
+    belief, adaptation = apply(Truncate(0.1), Belief(posterior, box, jnp.asarray(True)), posterior, feasible)
+    np.testing.assert_allclose(adaptation.evidence["interval_low"], [1 - 1.2815516, 2 - 12.815516], rtol=1e-5)
+    np.testing.assert_allclose(belief.support.low, [1 - 1.2815516, 0.0], rtol=1e-5)
+    np.testing.assert_allclose(belief.support.high, [1 + 1.2815516, 4.0], rtol=1e-5)
+    assert float(belief.support.low[1]) == 0.0 and float(adaptation.high_shift[1]) == 0.0
+
+
 def test_stretch_moves_only_the_chosen_bounds_and_not_beyond_phi():
     box, feasible = Support([0.0, 0.0, 0.0], [1.0, 2.0, 1.0]), Support([-0.1, -9.0, 0.0], [5.0, 9.0, 1.2])
     left, right = jnp.array([True, False, True]), jnp.array([False, True, True])
@@ -297,6 +355,60 @@ def test_centre_keeps_the_width_and_is_centred_where_phi_lets_it(problem):
     mean, half = np.asarray(posterior.mean), 0.5 * np.asarray(previous.support.width)
     fits = (mean - half >= np.asarray(feasible.low)) & (mean + half <= np.asarray(feasible.high))
     np.testing.assert_allclose(np.asarray(new.centre)[fits], mean[fits], atol=1e-5)
+
+
+@given(truncations(), problems())
+def test_truncate_only_shrinks_and_keeps_its_least_width(rule, problem):
+    old, feasible = jax.device_get((problem[0].support, problem[2]))
+    new = jax.device_get(apply(rule, *problem)[0].support)
+    assert (new.low >= old.low).all() and (new.high <= old.high).all()
+    least = np.minimum(LEAST_WIDTH * feasible.width, old.width)
+    assert (new.width >= least - 1e-6).all()
+
+
+def test_truncating_a_truncated_box_again_changes_nothing():
+    for problem in variants():
+        once, _ = apply(Truncate(0.05), *problem)
+        twice, adaptation = apply(Truncate(0.05), once, *problem[1:])
+        chex.assert_trees_all_equal(once, twice)
+        assert not bool(jnp.any(adaptation.low_shift)) and not bool(jnp.any(adaptation.high_shift))
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_truncate_keeps_a_sliver_at_the_bound_the_posterior_has_left_by(side):
+    """However far it is gone, and however often: nothing is left to shrink to, and the box stays a box."""
+    belief, _, feasible = example()
+    box = belief.support
+    gone = GaussianMixture(jnp.zeros(1), jnp.array([[2.0 + side * 1e6, 4.0]]), 0.1 * jnp.eye(2)[None])
+    for _ in range(3):
+        belief, _ = apply(Truncate(), belief, gone, feasible)
+        bound = box.high if side > 0 else box.low
+        kept = belief.support.high if side > 0 else belief.support.low
+        assert float(kept[0]) == float(bound[0])
+        np.testing.assert_allclose(belief.support.width[0], 1e-3 * 5.5, rtol=1e-3)
+
+
+def test_after_truncation_proposals_are_uniform_over_the_support(key):
+    """Neither from the posterior nor over the support of before."""
+    task = Task(lambda key, theta: theta, ("a", "b"), {"guess": example()[0].support}, example()[2])
+    belief, adaptation = apply(Truncate(0.1), *example())
+    assert float(adaptation.high_shift[0]) < 0 < float(adaptation.low_shift[1])
+    settings = Settings(additions=2000, attempts=2000)
+    draws = np.asarray(jax.jit(propose, static_argnums=1)(key, task, settings, belief))
+    for d in range(2):
+        uniform = stats.uniform(belief.support.low[d], belief.support.width[d])
+        assert stats.kstest(draws[:, d], uniform.cdf).pvalue > 1e-3
+
+
+def test_truncating_nothing_keeps_the_support():
+    belief, _ = apply(Truncate(0.0), *example())
+    chex.assert_trees_all_equal(belief.support, example()[0].support)
+
+
+@pytest.mark.parametrize("quantile", [-1e-3, 0.5, float("nan")])
+def test_a_quantile_that_is_no_tail_is_refused(quantile):
+    with pytest.raises(ValueError, match=r"^quantile: expected a mass in \[0, 0.5\), got"):
+        Truncate(quantile)
 
 
 def test_centre_of_a_box_wider_than_phi_is_phi():
@@ -337,9 +449,11 @@ def test_reflection_swaps_left_and_right(rule, problem):
         "mass_right": "mass_left",
         "weight_left": "weight_right",
         "weight_right": "weight_left",
+        "interval_low": "interval_high",
+        "interval_high": "interval_low",
     }
     for name, value in adaptation.evidence.items():
-        sign = 1.0 if name in swapped else -1.0
+        sign = 1.0 if name.endswith(("left", "right")) else -1.0
         np.testing.assert_allclose(seen.evidence[swapped.get(name, name)], sign * value, atol=1e-5)
 
 
@@ -367,7 +481,7 @@ def test_translation_and_scaling_are_followed(rule, problem, data):
 
 @given(any_rule(), problems(components=4), st.permutations(range(4)))
 def test_the_order_of_components_does_not_matter(rule, problem, order):
-    """To EDGE and CENTRE; to MODE if both beliefs are reordered alike."""
+    """To EDGE, CENTRE and truncation; to MODE if both beliefs are reordered alike."""
     assume(decided(rule, *problem, margin=1e-5))
     previous, posterior, feasible = problem
     order = jnp.asarray(order)
@@ -379,7 +493,7 @@ def test_the_order_of_components_does_not_matter(rule, problem, order):
     np.testing.assert_allclose(permuted.support.high, belief.support.high, atol=1e-5)
 
 
-@given(st.one_of(edges(), modes(), st.just(Centre())), problems(), st.data())
+@given(any_rule(), problems(), st.data())
 def test_the_order_of_dimensions_does_not_matter(rule, problem, data):
     dim = problem[0].support.dim
     order = np.asarray(data.draw(st.permutations(range(dim))))
@@ -410,7 +524,7 @@ def test_the_order_of_dimensions_does_not_matter(rule, problem, data):
     np.testing.assert_allclose(reordered.support.high, np.asarray(belief.support.high)[order], atol=1e-4)
 
 
-@given(st.one_of(edges(), modes()), problems())
+@given(st.one_of(edges(), modes(), truncations()), problems())
 def test_a_scalar_hyperparameter_is_a_constant_vector(rule, problem):
     dim = problem[0].support.dim
     as_vectors = jax.tree.map(lambda value: jnp.asarray(np.full(dim, value, np.float32)), rule)
@@ -445,11 +559,11 @@ def test_mode_does_nothing_after_the_first_round(problem, shift_threshold, mass_
 
 @given(problems(components=4))
 def test_choice_is_the_rule_it_chooses(problem):
-    rules = (Edge(), Mode(), Centre(), Fixed())
+    rules = (Edge(), Mode(), Centre(), Fixed(), Truncate())
     for index, rule in enumerate(rules):
         belief, adaptation = apply(Choice(index, rules), *problem)
         expected, alone = apply(rule, *problem)
-        chex.assert_trees_all_close(belief, expected, rtol=1e-6)
+        chex.assert_trees_all_close(belief, expected, rtol=1e-6, atol=1e-6)
         chex.assert_trees_all_close(adaptation.low_shift, alone.low_shift, atol=1e-6)
         for name, value in alone.evidence.items():
             np.testing.assert_allclose(adaptation.evidence[f"{index}/{name}"], value, atol=1e-6)
@@ -486,6 +600,14 @@ def test_hyperparameters_act_on_their_own_dimension(rule, hyperparameter):
     vector = rule.replace(**{name: jnp.array(value) for name, value in hyperparameter.items()})
     held = apply(vector, *problem)[0].support
     np.testing.assert_allclose(held.low, [free.low[0], problem[0].support.low[1]], rtol=1e-6)
+
+
+def test_a_quantile_of_zero_spares_its_dimension():
+    box = example()[0].support
+    free, held = (apply(Truncate(quantile), *example())[0].support for quantile in (0.3, jnp.array([0.3, 0.0])))
+    assert bool(jnp.all((free.low > box.low) & (free.high < box.high)))
+    np.testing.assert_array_equal(held.low, [free.low[0], box.low[1]])
+    np.testing.assert_array_equal(held.high, [free.high[0], box.high[1]])
 
 
 def test_reading_f_zone_width_is_absolute_and_zone_fraction_relative():
@@ -599,7 +721,8 @@ def test_the_next_belief_holds_the_posterior(rule):
     belief, adaptation = apply(
         rule, Belief(previous.mixture, previous.support, jnp.asarray(False)), posterior, feasible
     )
-    assert bool(belief.informed)
+    # Truncation alone goes on to draw from the prior.
+    assert bool(belief.informed) != isinstance(rule, Truncate)
     chex.assert_trees_all_equal(belief.mixture, posterior)
     chex.assert_trees_all_equal_shapes_and_dtypes(belief, previous)
     assert adaptation.low_shift.shape == adaptation.high_shift.shape == (2,)

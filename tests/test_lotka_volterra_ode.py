@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 from envs.lotka_volterra_mjp import lotka_volterra_nine
 from envs.lotka_volterra_ode import NOISES, gaussian_noise, lognormal_noise, populations, task
+from jaxlfi import tasks
 from jaxlfi.simulation import simulate
 
 RATES = [(0.01, 0.1, 0.1, 0.02), (0.03, 0.15, 0.12, 0.011), (0.004, 0.31, 0.22, 0.006)]
@@ -124,6 +125,39 @@ def test_the_task_is_appendix_a():
     assert not bool(problem.support("misspecified").contains(problem.truth))
     for box in problem.supports.values():
         assert bool(problem.feasible.contains(box.low)) and bool(problem.feasible.contains(box.high))
+
+
+def test_the_appendix_to_the_letter_is_its_first_tenth(key):
+    """200 steps of 0.1; everything else is the same."""
+    problem, whole = tasks.load("envs.lotka_volterra_ode:short"), task()
+    np.testing.assert_allclose(problem.times, whole.times[:201], atol=1e-6)
+    assert problem.times[-1] == 20.0 and problem.name == "lotka_volterra_ode_short"
+    again = jax.random.clone(key)
+    trajectory = problem.simulate(key, problem.truth)
+    assert trajectory.shape == (201, 2)
+    off = np.asarray(trajectory) - oracle(RATES[0], duration=20.0, records=201)
+    assert abs(off.std() - 1) < 5 / np.sqrt(2 * off.size)
+    for name, box in whole.supports.items():
+        np.testing.assert_array_equal(problem.support(name).low, box.low)
+        np.testing.assert_array_equal(problem.support(name).high, box.high)
+    np.testing.assert_array_equal(problem.truth, whole.truth)
+    positive = np.asarray(tasks.load("envs.lotka_volterra_ode:short").simulate(again, problem.truth))
+    np.testing.assert_array_equal(positive, trajectory)
+
+
+def test_summaries_are_named_in_their_order():
+    """A trajectory whose nine statistics are all unlike."""
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(5, 2, 400).cumsum() / 30, rng.normal(40, 9, 400)
+    got = dict(zip(task().summary_names, np.asarray(lotka_volterra_nine(jnp.stack([x, y], 1))), strict=True))
+    lag = lambda series, k: np.corrcoef(series[k:], series[:-k])[0, 1]
+    expected = {"mean X": x.mean(), "mean Y": y.mean()}
+    expected |= {"log var X": np.log(x.var(ddof=1) + 1), "log var Y": np.log(y.var(ddof=1) + 1)}
+    expected |= {f"{name} lag {k}": lag(series, k) for name, series in {"X": x, "Y": y}.items() for k in (1, 2)}
+    expected |= {"X with Y": np.corrcoef(x, y)[0, 1]}
+    assert list(got) == list(expected)
+    for name, value in expected.items():
+        assert got[name] == pytest.approx(value, abs=0.02), name
 
 
 def test_rates_too_fast_for_the_step_count_as_failures(key):

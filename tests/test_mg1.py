@@ -338,6 +338,7 @@ def test_the_task_is_the_papers():
         "ok": ([0, 0, 0], [10, 10, 0.35]),
         "misspecified": ([3, 0, 0], [10, 7, 0.35]),
         "broad": ([0, 0, 0], [20, 20, 0.5]),
+        "unmirrored": ([3, 2, 0], [10, 7, 0.35]),
     }
     assert list(problem.supports) == list(boxes) and problem.name == "mg1"
     for name, (low, high) in boxes.items():
@@ -347,7 +348,9 @@ def test_the_task_is_the_papers():
     np.testing.assert_allclose(problem.feasible.high, boxes["broad"][1])
     assert bool(problem.support("ok").contains(problem.truth))
     assert not bool(problem.support("misspecified").contains(problem.truth))
-    assert bool(problem.support("misspecified").contains(problem.truth[jnp.array([1, 0, 2])]))  # as the text says
+    mirrored = problem.truth[jnp.array([1, 0, 2])]
+    assert bool(problem.support("misspecified").contains(mirrored))  # as the text says
+    assert not bool(problem.support("unmirrored").contains(jnp.stack([jnp.asarray(problem.truth), mirrored])).any())
     assert float(problem.feasible.low[2]) >= 0  # no negative rates
     assert (problem.names, problem.units) == (
         ("service min", "service max", "arrival rate"),

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
+from scipy.optimize import brentq
 from scipy.special import logsumexp, ndtr
 
 from jaxlfi.mixture import GaussianMixture, component_log_prob, systematic
@@ -32,6 +33,7 @@ MOMENTS = jax.jit(lambda mixture: (mixture.mean, mixture.covariance))
 LOG_PROB = jax.jit(GaussianMixture.log_prob)
 INTERVAL_MASS = jax.jit(GaussianMixture.interval_mass)
 MARGINAL_CDF = jax.jit(GaussianMixture.marginal_cdf)
+MARGINAL_QUANTILE = jax.jit(GaussianMixture.marginal_quantile)
 
 
 def reference(mixture: GaussianMixture):
@@ -122,6 +124,78 @@ def test_tail_masses_by_hand():
     ):
         bounds = np.array([[low], [high]], np.float32)
         np.testing.assert_allclose(INTERVAL_MASS(mixture, *bounds), [mass], rtol=1e-5)
+
+
+def reference_quantile(mixture: GaussianMixture, level: float, d: int) -> float:
+    """A root of the marginal CDF by SciPy."""
+    weights, means, covariances = reference(mixture)
+    cdf = lambda x: weights @ ndtr((x - means[:, d]) / np.sqrt(covariances[:, d, d]))
+    return brentq(lambda x: cdf(x) - level, -1e3, 1e3, xtol=1e-13)
+
+
+@pytest.mark.parametrize("level", [1e-12, 1e-5, 1e-3, 0.1, 0.4999, 0.9])
+def test_marginal_quantiles_are_scipys_roots(level):
+    expected = [reference_quantile(EXAMPLE, level, d) for d in range(2)]
+    np.testing.assert_allclose(MARGINAL_QUANTILE(EXAMPLE, level), expected, rtol=2e-6)
+
+
+@given(shapes().flatmap(lambda kd: mixtures(*kd)), floats(1e-6, 0.999))
+def test_the_quantile_of_a_level_has_that_mass_below(mixture, level):
+    """Also in a gap between components, where the quantile itself is anywhere."""
+    quantile = np.asarray(MARGINAL_QUANTILE(mixture, level))
+    below = reference_mass(mixture, np.full_like(quantile, -np.inf), quantile)
+    np.testing.assert_allclose(below, level, rtol=2e-5)
+
+
+def test_quantiles_at_the_corners():
+    levels = np.array([0.0, 1.0], np.float32)
+    np.testing.assert_array_equal(MARGINAL_QUANTILE(EXAMPLE, levels), [-np.inf, np.inf])
+    far = GaussianMixture(jnp.array([0.0, -jnp.inf]), jnp.array([[3.0], [1e30]]), jnp.array([[[2.0]], [[1e20]]]))
+    for level in (1e-3, 0.5, 0.99):
+        np.testing.assert_allclose(MARGINAL_QUANTILE(far, level), stats.norm(3, 2).ppf(level), rtol=2e-6)
+
+
+def test_quantiles_from_above_are_those_of_the_mirrored_mixture():
+    """In the upper tail 1 - level is no float32 any more."""
+    mirrored = GaussianMixture(EXAMPLE.logits, -EXAMPLE.means, EXAMPLE.scale_tril)
+    chex.assert_trees_all_equal(EXAMPLE.mirror(), mirrored)
+    expected = [reference_quantile(mirrored, 1e-9, d) for d in range(2)]
+    np.testing.assert_allclose(MARGINAL_QUANTILE(EXAMPLE.mirror(), 1e-9), expected, rtol=2e-6)
+    theta = np.array([[0.3, -2.0], [1.0, 1.0]], np.float32)
+    np.testing.assert_allclose(LOG_PROB(EXAMPLE.mirror(), -theta), LOG_PROB(EXAMPLE, theta), rtol=1e-6)
+
+
+def test_quantiles_of_vectors_and_batches_are_those_of_each_one():
+    levels = np.array([[0.1, 0.2], [0.3, 0.01]], np.float32)
+    together = jax.jit(jax.vmap(EXAMPLE.marginal_quantile))(levels)
+    for i, d in np.ndindex(2, 2):
+        np.testing.assert_allclose(together[i, d], MARGINAL_QUANTILE(EXAMPLE, levels[i, d])[d], rtol=1e-6)
+
+
+def test_derivatives_of_quantiles_are_those_of_the_implicit_function():
+    """Central differences of SciPy's roots, in a mean, a factor, a logit and the level."""
+    one = jax.jit(jax.grad(lambda mixture, level: mixture.marginal_quantile(level)[1], argnums=(0, 1)))
+    gradient, slope = one(EXAMPLE, 0.05)
+
+    def difference(changed, step=1e-4):
+        ends = [reference_quantile(*changed(sign * step), 1) for sign in (1, -1)]
+        return (ends[0] - ends[1]) / (2 * step)
+
+    def moved(field, place):
+        old = np.asarray(getattr(EXAMPLE, field), np.float64)
+
+        def changed(step):
+            new = old.copy()
+            new[place] += step
+            return EXAMPLE.replace(**{field: new}), 0.05
+
+        return changed
+
+    np.testing.assert_allclose(slope, difference(lambda step: (EXAMPLE, 0.05 + step)), rtol=1e-3)
+    for field, place in (("means", (1, 1)), ("scale_tril", (0, 1, 0)), ("logits", (2,))):
+        expected = difference(moved(field, place))
+        assert abs(expected) > 0.01
+        np.testing.assert_allclose(getattr(gradient, field)[place], expected, rtol=1e-3)
 
 
 def test_moments_are_those_of_its_draws(key):

@@ -1,17 +1,25 @@
 """Run folders: every file and shape, whole at any moment, and never anything else's."""
 
+import dataclasses
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi import atomic, run_store
+from envs import lotka_volterra, lynx_hare, mg1
+from jaxlfi import atomic, bayessim, run_store
 from jaxlfi.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.describe import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json
 from jaxlfi.heuristics import Centre, Edge, Fixed, Matched, Mode
-from jaxlfi.presets import PRESETS
-from tests.small import FLAGS, TASK, command, share_engine, whole_runs  # noqa: F401 - a fixture
+from jaxlfi.history import posterior_draws
+from jaxlfi.inference import observe
+from jaxlfi.posterior import draws_within
+from jaxlfi.presets import METHODS, PRESETS
+from jaxlfi.simulation import trajectory_and_outcome
+from jaxlfi.support import Support
+from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, share_engine, whole_runs  # noqa: F401 - a fixture
 
 ROUNDS, ADDITIONS, ATTEMPTS, DIM, COMPONENTS, OBS, SAMPLES = 2, 20, 25, 2, 4, 2, 20
 
@@ -44,6 +52,7 @@ def test_arrays_have_the_documented_shapes(folder):
             "scale_tril": (COMPONENTS, DIM, DIM),
             "support_low": (DIM,),
             "support_high": (DIM,),
+            "draws": (1000, DIM),
             "names": (DIM,),
         },
         "dataset.npz": {
@@ -75,6 +84,7 @@ def test_arrays_have_the_documented_shapes(folder):
             "reasons": (2,),
             "seconds": (ROUNDS,),
             "final_trajectory": (SAMPLES, 2),
+            "final_x": (SAMPLES, OBS),
             "evidence/mass_left": (ROUNDS, DIM),
             "evidence/mass_right": (ROUNDS, DIM),
         },
@@ -83,14 +93,67 @@ def test_arrays_have_the_documented_shapes(folder):
             "x": (OBS,),
             "truth": (DIM,),
             "names": (DIM,),
+            "summaries": (OBS,),
             "channels": (1,),
             "times": (2,),
+            "record_label": (),
         },
     }
     for name, shapes in expected.items():
         arrays = atomic.read_arrays(folder / name)
         assert {key: arrays[key].shape for key in shapes} == shapes
         assert not any(value.dtype.hasobject for value in arrays.values())
+
+
+def test_summaries_and_draws_are_those_of_the_last_posterior(folder):
+    history, posterior, observation = (
+        atomic.read_arrays(folder / f"{name}.npz") for name in ("history", "posterior", "observation")
+    )
+    np.testing.assert_array_equal(history["final_x"], history["final_trajectory"])  # this task's summary
+    assert observation["summaries"].tolist() == ["x_1", "x_2"] and str(observation["record_label"]) == "record"
+    rng = np.random.default_rng(0)
+    weight = np.exp(posterior["logits"] - posterior["logits"].max())
+    component = rng.choice(COMPONENTS, 100_000, p=weight / weight.sum())
+    noise = rng.normal(size=(100_000, DIM))
+    mixture = posterior["means"][component] + np.einsum("nij,nj->ni", posterior["scale_tril"][component], noise)
+    low, high = posterior["support_low"], posterior["support_high"]
+    clipped = np.clip(mixture, low, high)
+    draws = posterior["draws"]
+    assert ((draws >= low) & (draws <= high)).all()
+    np.testing.assert_allclose(draws.mean(0), clipped.mean(0), atol=5 * clipped.std(0).max() / np.sqrt(1000))
+    np.testing.assert_allclose(draws.std(0), clipped.std(0), rtol=0.15)
+
+
+def test_draws_of_a_flow_are_its_own():
+    """Not those of the mixture that stands for it."""
+    task, settings = gaussian(), METHODS["apt"](SETTINGS)
+    settings = settings.replace(estimator=settings.estimator.replace(hidden=(8, 8), transforms=1))
+    state = bayessim.init(jax.random.key(0), task, task.support("ok"), settings, jnp.zeros(OBS))
+    x, box = jnp.array([0.8, -0.6]), Support(jnp.array([-1.0, 0.0]), jnp.array([2.0, 1.5]))
+    belief = state.belief.replace(support=box)
+    got = posterior_draws(jax.random.key(1), settings, state.network, x, state.feasible, belief, 50)
+    own, _ = draws_within(jax.random.key(1), settings.estimator, state.network, x, state.feasible, box, 50)
+    np.testing.assert_array_equal(got, own)
+    far = belief.replace(mixture=belief.mixture.replace(means=belief.mixture.means + 100))
+    again = posterior_draws(jax.random.key(1), settings, state.network, x, state.feasible, far, 50)
+    np.testing.assert_array_equal(got, again)
+
+
+def test_names_of_summaries_are_refused_before_anything_runs():
+    named = dataclasses.replace(gaussian(), summary_names=("a", "b"))
+    assert named.named_summaries(2) == ("a", "b") and gaussian().named_summaries(3) == ("x_1", "x_2", "x_3")
+    three = dataclasses.replace(gaussian(), summary_names=("a", "b", "c"))
+    with pytest.raises(ValueError, match=r"^summary_names: expected one for each of the summary's 2 numbers, got 3"):
+        observe(jax.random.key(0), three, np.array([0.8, -0.6], np.float32))
+
+
+@pytest.mark.parametrize("module", [lotka_volterra, lynx_hare, mg1])
+def test_tasks_name_as_many_summaries_as_they_have(module):
+    task = module.task()
+    summary = lambda key, theta: task.summary(trajectory_and_outcome(task, key, theta)[0])
+    seen = jax.eval_shape(summary, jax.random.key(0), task.feasible.low)
+    assert len(set(task.named_summaries(*seen.shape))) == seen.size
+    assert "x_1" not in task.named_summaries(*seen.shape)
 
 
 def test_the_ledger_agrees_with_the_history(folder):
@@ -252,7 +315,9 @@ def test_a_damaged_checkpoint_is_refused_and_left_alone(stopped, tmp_path, capsy
 def test_a_state_of_another_shape_is_refused(tmp_path):
     checkpoint = Checkpoint(tmp_path)
     checkpoint.write_start(np.zeros((1, 2)), np.zeros((1, 2)))
-    checkpoint.write_round(0, {"a": np.zeros(3)}, {"final_trajectory": np.zeros((1, 20, 2))}, 0.1)
+    checkpoint.write_round(0, {"a": np.zeros(3)}, {"b": np.ones(2), "final_x": np.zeros((1, 20, 2))}, 0.1)
+    rows, seconds, final = checkpoint.read_rounds(1)
+    assert [list(row) for row in rows] == [["b"]] and seconds == [0.1] and list(final) == ["final_x"]
     assert checkpoint.read_state({"a": np.ones(3)})["a"].tolist() == [0, 0, 0]
     with pytest.raises(CheckpointError, match=r"expected .* of shape"):
         checkpoint.read_state({"a": np.zeros(4)})
@@ -271,6 +336,12 @@ def test_foreign_folders_are_refused(tmp_path, content):
     if content is not None:
         (tmp_path / "config.json").write_text(content)
     with pytest.raises(run_store.StoreError, match="expected"):
+        run_store.read_config(tmp_path)
+
+
+def test_a_grid_is_named_where_a_run_is_expected(tmp_path):
+    (tmp_path / "config.json").write_text('{"format": "jaxlfi-grid", "version": 1}')
+    with pytest.raises(run_store.StoreError, match=r"expected a run folder, got .* is of format 'jaxlfi-grid'"):
         run_store.read_config(tmp_path)
 
 

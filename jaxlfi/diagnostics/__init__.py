@@ -1,5 +1,20 @@
 """Diagnostics: how far a posterior is from the truth, whether it is calibrated, and where it piles up on a bound."""
 
+from jaxlfi.diagnostics.c2st import c2st
+from jaxlfi.diagnostics.calibration import (
+    OK,
+    SIGNIFICANCE,
+    Histogram,
+    Uniformity,
+    coverage_verdict,
+    density_ranks,
+    distance_ranks,
+    distance_verdict,
+    histogram,
+    ranks,
+    ranks_verdict,
+    uniformity,
+)
 from jaxlfi.diagnostics.discrepancy import (
     POSTERIOR_SAMPLES,
     Discrepancy,
@@ -8,12 +23,28 @@ from jaxlfi.diagnostics.discrepancy import (
     edge_mass,
     trajectory_distance,
 )
+from jaxlfi.diagnostics.predictive import PredictiveCheck, predictive_check
 
 __all__ = [
+    "OK",
     "POSTERIOR_SAMPLES",
+    "SIGNIFICANCE",
     "Discrepancy",
+    "Histogram",
+    "PredictiveCheck",
+    "Uniformity",
     "bound_warnings",
+    "c2st",
+    "coverage_verdict",
+    "density_ranks",
     "discrepancy",
+    "distance_ranks",
+    "distance_verdict",
     "edge_mass",
+    "histogram",
+    "predictive_check",
+    "ranks",
+    "ranks_verdict",
     "trajectory_distance",
+    "uniformity",
 ]

@@ -1,5 +1,7 @@
 """Discrepancies of a posterior from the truth, and the warning of mass piled on a bound."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from jaxlfi.belief import RESTRICTIONS, Belief
-from jaxlfi.simulation import trajectory_and_outcome
+from jaxlfi.simulation import summarised, trajectory_and_outcome
 from jaxlfi.task import Task
 
 POSTERIOR_SAMPLES = 20
@@ -23,18 +25,23 @@ class Discrepancy:
         theta_error: |theta - theta_gt| for each draw and parameter, shape [N, D]; NaN where the truth is unknown.
         trajectory_error: distance of each draw's trajectory from the observed one, shape [N]; NaN where it failed.
         trajectory: the simulated trajectories, shape [N, T, C].
+        x: their summaries, shape [N, S]; NaN where the simulation failed or its summary is not finite.
     """
 
     theta: Float[Array, "*batch samples dim"]
     theta_error: Float[Array, "*batch samples dim"]
     trajectory_error: Float[Array, "*batch samples"]
     trajectory: Float[Array, "*shape"]
+    x: Float[Array, "*batch samples obs"]
 
 
 def discrepancy(
     key: jax.Array, task: Task, belief: Belief, observed: Array, restriction: str = "clip", n: int = POSTERIOR_SAMPLES
 ) -> Discrepancy:
     """Draw from a belief, simulate, and compare (section V).
+
+    Where the posterior is a flow, the belief is the mixture fitted to it (`jaxlfi.posterior.posterior`), and so are the
+    draws.
 
     Args:
         key: consumed.
@@ -48,9 +55,11 @@ def discrepancy(
     theta = RESTRICTIONS[restriction](key_draw, belief, n)
     simulate = jax.vmap(lambda key, theta: trajectory_and_outcome(task, key, theta))
     trajectory, failure = simulate(jax.random.split(key_simulate, n), theta)
+    x, unusable = jax.vmap(functools.partial(summarised, task))(trajectory, failure)
     truth = jnp.full(task.dim, jnp.nan) if task.truth is None else task.truth
     error = jnp.where(failure == 0, jax.vmap(lambda t: trajectory_distance(t, observed))(trajectory), jnp.nan)
-    return Discrepancy(theta, jnp.abs(theta - truth), error, trajectory)
+    x = jnp.where((unusable == 0)[:, None], x, jnp.nan)
+    return Discrepancy(theta, jnp.abs(theta - truth), error, trajectory, x)
 
 
 def trajectory_distance(trajectory: Array, observed: Array) -> Float[Array, ""]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxlfi.figures.history import History, load, read_config
+from jaxlfi.figures.sensitivity import FORMAT as GRID
 from jaxlfi.figures.style import HEURISTIC_COLOURS, SUPPORT_COLOURS
 
 Runs = Mapping[str, Sequence[History]]
@@ -83,8 +84,9 @@ def open_collection(folder: Path | str) -> Collection:
         raise ValueError(f"{folder}: expected a run folder, found {'a file' if folder.exists() else 'none'}")
     config = read_config(folder)
     if config["format"] not in FORMATS:
+        hint = ", a sensitivity grid: `report` draws it" if config["format"] == GRID else ""
         raise ValueError(
-            f"{folder}: expected config.json of format {' or '.join(FORMATS)}, got {config['format']!r}"
+            f"{folder}: expected config.json of format {' or '.join(FORMATS)}, got {config['format']!r}{hint}"
         )
     unfinished: list[str] = []
     if config["format"] == "jaxlfi-run":

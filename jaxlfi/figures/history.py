@@ -59,9 +59,15 @@ class History:
         failed: failures of each round, shape [R].
         seconds: time of each round, shape [R].
         final_trajectory: simulations of the last posterior's samples, shape [N, T, C], or None.
+        final_x: their summaries, shape [N, S], NaN: failed; or None.
+        draws: of the last posterior, shape [n, D], or None.
         observed: the observed trajectory, shape [T, C], or None.
+        x: its summary, shape [S], or None.
+        x_scale: spread of the first round's summaries, shape [S], or None (`spread_of`).
+        summaries: names of the summary's numbers.
         truth: theta_gt, shape [D], NaN where unknown.
         times: shape [T], or None.
+        record_label: what the trajectory's rows are counted by, "time".
         channels: names of the trajectory's columns.
         feasible_low: lower limits Phi, shape [D], or None.
         feasible_high: upper limits Phi, or None.
@@ -92,9 +98,15 @@ class History:
     failed: np.ndarray
     seconds: np.ndarray
     final_trajectory: np.ndarray | None
+    final_x: np.ndarray | None
+    draws: np.ndarray | None
     observed: np.ndarray | None
+    x: np.ndarray | None
+    x_scale: np.ndarray | None
+    summaries: tuple[str, ...]
     truth: np.ndarray
     times: np.ndarray | None
+    record_label: str
     channels: tuple[str, ...]
     feasible_low: np.ndarray | None
     feasible_high: np.ndarray | None
@@ -168,7 +180,8 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     """Read one run's folder.
 
     Args:
-        folder: holds config.json of format "jaxlfi-run", history.npz and, mostly, observation.npz.
+        folder: holds config.json of format "jaxlfi-run", history.npz and, mostly, observation.npz, posterior.npz and
+            dataset.npz.
         configuration: what to call the run; by default as config.json does, or by support and heuristic.
 
     Raises:
@@ -179,10 +192,13 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     if config["format"] != "jaxlfi-run":
         raise ValueError(f"{folder}: expected config.json of format 'jaxlfi-run', got {config['format']!r}")
     arrays = read_arrays(folder / "history.npz", REQUIRED)
-    observation = read_arrays(folder / "observation.npz") if (folder / "observation.npz").exists() else {}
+    observation = _arrays_if_there(folder / "observation.npz")
     _check_shapes(folder / "history.npz", arrays)
     rounds, _attempts, dim = arrays["theta"].shape
     trajectory = _trajectory(observation.get("trajectory"))
+    times = _times(observation.get("times"), trajectory)
+    x = observation.get("x")
+    obs = 0 if x is None else len(x)
     counted, failure = arrays["counted"].astype(bool), arrays["failure"]
     return History(
         folder=folder,
@@ -204,9 +220,15 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
         failed=_failed(arrays, counted, failure),
         seconds=np.broadcast_to(np.asarray(arrays.get("seconds", np.nan), float), (rounds,)),
         final_trajectory=_samples(_optional(arrays, "final_trajectory")),
+        final_x=_rows(_optional(arrays, "final_x"), obs),
+        draws=_rows(_arrays_if_there(folder / "posterior.npz").get("draws"), dim),
         observed=trajectory,
+        x=x,
+        x_scale=_x_scale(_arrays_if_there(folder / "dataset.npz"), obs),
+        summaries=_texts(observation.get("summaries"), None, obs, "x_{}"),
         truth=_vector(observation.get("truth"), dim),
-        times=_times(observation.get("times"), trajectory),
+        times=times,
+        record_label=_record_label(observation, times),
         channels=_texts(
             observation.get("channels"),
             config.get("channels"),
@@ -257,6 +279,20 @@ def read_arrays(path: Path, required: tuple[str, ...] = ()) -> dict[str, np.ndar
     if missing := [name for name in required if name not in arrays]:
         raise ValueError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
     return arrays
+
+
+def spread_of(x: np.ndarray) -> np.ndarray:
+    """Half the distance from the 16th to the 84th percentile of each column: a normal's standard deviation.
+
+    Args:
+        x: shape [N, S], N >= 1.
+    """
+    low, high = np.quantile(x, [0.16, 0.84], axis=0)
+    return (high - low) / 2
+
+
+def _arrays_if_there(path: Path) -> dict[str, np.ndarray]:
+    return read_arrays(path) if path.exists() else {}
 
 
 def _one_line(error: Exception) -> str:
@@ -312,6 +348,25 @@ def _trajectory(array: np.ndarray | None) -> np.ndarray | None:
 def _samples(array: np.ndarray | None) -> np.ndarray | None:
     """Trajectories as [N, T, C]."""
     return None if array is None or array.ndim < 2 else array.reshape(*array.shape[:2], -1)
+
+
+def _rows(array: np.ndarray | None, columns: int) -> np.ndarray | None:
+    """Vectors as [N, columns], or None."""
+    return array if array is not None and array.ndim == 2 and array.shape[1] == columns and len(array) else None
+
+
+def _x_scale(dataset: Mapping[str, np.ndarray], obs: int) -> np.ndarray | None:
+    """Spread of the summaries of the first round that has any."""
+    if not {"x", "round"} <= dataset.keys() or not len(dataset["x"]) or dataset["x"].shape[1:] != (obs,):
+        return None
+    return spread_of(dataset["x"][dataset["round"] == dataset["round"].min()])
+
+
+def _record_label(observation: Mapping[str, np.ndarray], times: np.ndarray | None) -> str:
+    """As saved; else "record" where there are no times but numbers."""
+    if "record_label" in observation:
+        return str(observation["record_label"])
+    return "record" if times is None or np.array_equal(times, np.arange(len(times))) else "time"
 
 
 def _vector(array: np.ndarray | None, dim: int) -> np.ndarray:

@@ -64,7 +64,7 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
         for channel in range(len(first.channels)):
             draw_channel(axes[channel, column], history, channel, own)
             axes[channel, column].grid(True)
-        axes[-1, column].set_xlabel(_time_label(history))
+        axes[-1, column].set_xlabel(plain(history.record_label))
         axes[-1, column].locator_params(axis="x", nbins=5)
     for channel, name in enumerate(first.channels):
         axes[channel, 0].set_ylabel(plain(name))
@@ -78,11 +78,6 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
     ]
     wide = figure.get_size_inches()[0] > 5
     figure.legend(handles=handles, loc="outside lower center", ncols=4 if wide else 2)
-
-
-def _time_label(history: History) -> str:
-    """Tasks without times are given the numbers of their records."""
-    return "record" if np.array_equal(history.times, np.arange(len(history.times))) else "time"
 
 
 def _few(history: History) -> bool:

@@ -12,6 +12,8 @@ from jaxlfi.figures import (
     efficiency,
     losses,
     page,
+    pairs,
+    polars,
     predictive,
     samples,
     seeds,
@@ -160,10 +162,7 @@ def _losses(collection: Collection) -> Made:
 
 
 def _predictive(collection: Collection) -> Made:
-    runs = {
-        name: [h for h in histories if predictive.drawable(h)] for name, histories in collection.runs.items()
-    }
-    runs = {name: histories for name, histories in runs.items() if histories}
+    runs = _those(collection.runs, predictive.drawable)
     if not runs:
         return None
     histories, titles = columns(runs)
@@ -174,6 +173,45 @@ def _predictive(collection: Collection) -> Made:
         runs
     )
     return figure, "Posterior predictive", caption
+
+
+def _pairs(collection: Collection) -> Made:
+    runs = _those(collection.runs, pairs.drawable)
+    if not runs:
+        return None
+    histories, titles = columns(runs)
+    dim = histories[0].dim
+    rows, across = pairs.arrangement(len(histories), dim)
+    width = TEXT_WIDTH if across * dim > 4 else COLUMN_WIDTH
+    figure = style.new_figure(width, 1.0 + rows * (0.3 + width * dim / (across * dim + 0.6)))
+    pairs.draw(figure, histories, titles)
+    caption = (
+        "Draws of the last posterior, kept in its support: each parameter on the diagonal, each pair of parameters "
+        "below it, with contours that enclose half, four fifths and 95 % of the draws." + _which_seed(runs)
+    )
+    return figure, "Posterior by pairs of parameters", caption
+
+
+def _polars(collection: Collection) -> Made:
+    histories, titles = columns(collection.runs)
+    rows = polars.panels(histories)
+    if not rows:
+        return None
+    width = TEXT_WIDTH if len(histories) > 1 else COLUMN_WIDTH
+    figure = style.new_figure(width, 0.9 + min(1.9, 0.88 * width / len(histories)) * len(rows))
+    polars.draw(figure, histories, titles)
+    unit = style.configuration_label(polars.reference(histories).configuration)
+    units = {
+        "parameters": f"of the parameters from the true ones, in widths of the first support of {unit}",
+        "summaries": "of their simulations' summaries from the observed ones, in standard deviations of the first "
+        f"iteration's simulations of {unit} (half the distance of their 16th and 84th percentiles)",
+    }
+    caption = (
+        "Absolute discrepancy of posterior samples after the last iteration: "
+        + "; ".join(units[name] for name in rows)
+        + ". A flow's samples are those of the mixture that is fitted to it." + _which_seed(collection.runs)
+    )
+    return figure, "Discrepancy by parameter and summary", caption
 
 
 def _seeds(collection: Collection) -> Made:
@@ -197,9 +235,14 @@ PICTURES: dict[str, Callable[[Collection], Made]] = {
     "support": _supports,
     "losses": _losses,
     "predictive": _predictive,
+    "pairs": _pairs,
+    "polars": _polars,
     "seeds": _seeds,
 }
 """What makes each picture, by the name of its file."""
+
+
+_OVER = "Means over seeds and the other hyperparameters, ± their standard deviations."
 
 
 def _sensitivity(grid: sensitivity.Grid) -> Made:
@@ -207,9 +250,8 @@ def _sensitivity(grid: sensitivity.Grid) -> Made:
     sensitivity.draw(figure, grid)
     caption = (
         "Discrepancy after the last iteration for every pair of hyperparameters: of simulated trajectories above "
-        "the diagonal, of parameters below it; on the diagonal, for each hyperparameter alone. Means over seeds and "
-        "the other hyperparameters, ± their standard deviations. The colours are reversed, as smaller is better. "
-        "The heuristic's own values are bold."
+        f"the diagonal, of parameters below it; on the diagonal, for each hyperparameter alone. {_OVER} "
+        "The colours are reversed, as smaller is better. The heuristic's own values are bold."
     )
     return figure, "Sensitivity to hyperparameters", caption
 
@@ -219,7 +261,7 @@ def _feasibility(grid: sensitivity.Grid) -> Made:
     sensitivity.draw_success(figure, grid)
     caption = (
         "Share of all attempted simulations that succeeded, for every pair of hyperparameters; on the diagonal, for "
-        "each alone. Means over seeds and the other hyperparameters, ± their standard deviations."
+        f"each alone. {_OVER}"
     )
     return figure, "Simulation success", caption
 
@@ -229,6 +271,12 @@ GRID_PICTURES: dict[str, Callable[[sensitivity.Grid], Made]] = {
     "feasibility": _feasibility,
 }
 """The pictures of a sensitivity grid, by the name of the file."""
+
+
+def _those(runs: Runs, drawable: Callable[[History], bool]) -> Runs:
+    """The runs of which there is something to draw."""
+    chosen = {name: [h for h in histories if drawable(h)] for name, histories in runs.items()}
+    return {name: histories for name, histories in chosen.items() if histories}
 
 
 def _which_seed(runs: Runs) -> str:

@@ -70,7 +70,7 @@ SUPPORT_COLOURS = {
 }
 """Fixed supports: the hues the paper underlines them with, saturated."""
 
-HEURISTIC_COLOURS = {"edge": "#F5A025", "mode": "#025358", "centre": "#45200E"}
+HEURISTIC_COLOURS = {"edge": "#F5A025", "mode": "#025358", "centre": "#45200E", "truncate": "#3C46FF"}
 """Adapted supports. With the five above, any two stay apart (CIELAB 22) in each kind of colour blindness."""
 
 OTHER_COLOURS = ("#7F7F7F", "#C2578F", "#8A8A1F", "#4F7CAC", "#B0713B", "#2E2E2E")
@@ -85,6 +85,7 @@ _MARKERS = {
     "edge": ("^", "-"),
     "mode": ("v", (0, (6, 1, 1, 1))),
     "centre": ("P", (0, (3, 1, 1, 1, 1, 1))),
+    "truncate": ("H", (0, (2, 1))),
 }
 _OTHER_MARKERS = ("<", ">", "h", "d", "8", "*")
 _SHADES = {"ok": 0.45, "broad": -0.35, "broader": 0.25, "broadest": -0.2}

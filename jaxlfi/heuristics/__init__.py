@@ -7,9 +7,10 @@ from jaxlfi.heuristics.edge import Edge
 from jaxlfi.heuristics.fixed import Fixed
 from jaxlfi.heuristics.matching import Matched
 from jaxlfi.heuristics.mode import Mode
+from jaxlfi.heuristics.truncate import Truncate
 
-HEURISTICS: dict[str, type] = {"none": Fixed, "edge": Edge, "mode": Mode, "centre": Centre}
-"""Heuristics by the name the command line gives them, each with the defaults of section V."""
+HEURISTICS: dict[str, type] = {"none": Fixed, "edge": Edge, "mode": Mode, "centre": Centre, "truncate": Truncate}
+"""Heuristics by the name the command line gives them; the paper's with the defaults of section V."""
 
 __all__ = [
     "HEURISTICS",
@@ -21,5 +22,6 @@ __all__ = [
     "Heuristic",
     "Matched",
     "Mode",
+    "Truncate",
     "stretch",
 ]

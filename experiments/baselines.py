@@ -1,0 +1,231 @@
+"""What others do about a wrong support, beside EDGE: truncation and tailed priors, on Lotka-Volterra.
+
+    python -m experiments.baselines --seeds 20 --out experiments/results/baselines
+
+Every row has the same budget of simulations, the same seeds and, for each seed, the same observation. The seeds of a
+row are lanes of one program, sharded over the processor's cores. A row whose array file exists is not run again; table
+and figure are drawn from the saved arrays. `--seeds 2 --rounds 2 --steps 20` is a trial.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from jaxlfi import compile_cache
+
+if __name__ == "__main__":  # before jax starts
+    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={os.cpu_count() or 1}")
+    compile_cache.enable()
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from envs.lotka_volterra import task as lotka_volterra
+from jaxlfi import atomic
+from jaxlfi.bayessim import Settings
+from jaxlfi.commands import bootstrap_interval
+from jaxlfi.describe import heuristic_to_json, settings_to_json
+from jaxlfi.figures import seeds as strips
+from jaxlfi.figures import style
+from jaxlfi.heuristics import Edge, Fixed, Heuristic, Truncate
+from jaxlfi.history import theta_error, trajectory_error
+from jaxlfi.keys import run_keys
+from jaxlfi.lanes import Lane, LaneEngine, rounds, stack_inputs
+from jaxlfi.observation import simulate_observation
+from jaxlfi.presets import QUICK
+from jaxlfi.progress import RoundProgress
+from jaxlfi.run_store import environment
+from jaxlfi.tailed import with_tails
+from jaxlfi.task import Task
+
+REFERENCE = "misspecified+edge"
+"""The row that all others are compared with, seed by seed."""
+
+
+def in_one_round(settings: Settings) -> Settings:
+    """All simulations, and all attempts, in a single round; the training of a round stays what it is."""
+    return settings.replace(
+        rounds=1, additions=settings.rounds * settings.additions, attempts=settings.rounds * settings.attempts
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One row of the table.
+
+    Attributes:
+        what: what it is, in words.
+        support: the support to begin with, by its name in the changed task.
+        heuristic: how it is adapted.
+        task: what becomes of the task.
+        settings: what becomes of the settings.
+    """
+
+    what: str
+    support: str
+    heuristic: Heuristic = Fixed()
+    task: Callable[[Task], Task] = lambda task: task
+    settings: Callable[[Settings], Settings] = lambda settings: settings
+
+
+def tailed(tail: float) -> Callable[[Task], Task]:
+    """Tails around the misspecified support, of a scale of so many of its widths."""
+    return lambda task: with_tails(task, "misspecified", tail)
+
+
+TAILS = (0.1, 0.2, 0.3)
+
+ROWS: dict[str, Row] = {
+    "ok": Row("holds the truth, kept", "ok"),
+    "misspecified": Row("excludes it in theta_1 and theta_2, kept", "misspecified"),
+    "broad": Row("as wide as Phi, kept", "broad"),
+    "broadest": Row("wider than Phi, kept", "broadest"),
+    REFERENCE: Row("misspecified, moved by EDGE", "misspecified", Edge()),
+    "misspecified+truncate": Row("misspecified, truncated: proposals from the prior", "misspecified", Truncate()),
+    **{
+        f"tails-{tail:g}-static": Row(
+            f"misspecified with tails of {tail:g}, one round", "tailed", task=tailed(tail), settings=in_one_round
+        )
+        for tail in TAILS
+    },
+    **{
+        f"tails-{tail:g}": Row(f"misspecified with tails of {tail:g}, the first round", "tailed", task=tailed(tail))
+        for tail in TAILS
+    },
+}
+"""The rows by name, in the table's order."""
+
+
+def run_row(row: Row, task: Task, settings: Settings, seeds: int) -> dict[str, np.ndarray]:
+    """All seeds of one row.
+
+    Args:
+        row: which.
+        task: the task as it is; its observations are those of all rows.
+        settings: the numbers of a sequential run.
+        seeds: how many, from 0.
+
+    Returns:
+        Arrays with a leading axis of seeds: theta_error, theta_error_by_parameter, trajectory_error, attempted and
+        succeeded (a round each, trailing axis), support_low and support_high at the end; and the seconds of all seeds
+        together.
+    """
+    observed = np.stack([simulate_observation(run_keys(jax.random.key(seed)).observe, task) for seed in range(seeds)])
+    x = np.asarray(jax.vmap(task.summary)(observed))
+    task, settings = row.task(task), row.settings(settings)
+    lanes = [Lane(row.support, row.support, task.support(row.support), row.heuristic, seed) for seed in range(seeds)]
+    inputs, _ = stack_inputs(lanes, observed, x)
+    engine = LaneEngine(task, settings, inputs)
+    state = engine.start()
+    engine.compile(state)
+    started = time.perf_counter()
+    seen = []
+    with RoundProgress(Console(), settings.rounds, 0, f"{seeds} seeds") as progress:
+        for _, _, line in rounds(engine, state, 0, settings.rounds):
+            seen.append(line)
+            progress.advance()
+    seconds = time.perf_counter() - started
+    last = [{name: value[seed] for name, value in seen[-1].items()} for seed in range(seeds)]
+    return {
+        "theta_error": np.array([theta_error(line) for line in last]),
+        "theta_error_by_parameter": np.stack([line["sample_theta_error"].mean(axis=0) for line in last]),
+        "trajectory_error": np.array([trajectory_error(line) for line in last]),
+        "attempted": np.stack([line["attempted"] for line in seen], axis=1),
+        "succeeded": np.stack([line["succeeded"] for line in seen], axis=1),
+        "support_low": seen[-1]["support_low"],
+        "support_high": seen[-1]["support_high"],
+        "seconds": np.asarray(seconds),
+    }
+
+
+def saved(folder: Path) -> dict[str, dict[str, np.ndarray]]:
+    """The arrays of the rows that are there, in the table's order."""
+    return {name: atomic.read_arrays(path) for name in ROWS if (path := folder / f"{name}.npz").exists()}
+
+
+def table(rows: Mapping[str, Mapping[str, np.ndarray]]) -> str:
+    """The comparison as Markdown: means with 95 % bootstrap intervals over seeds, medians in parentheses."""
+    reference = rows.get(REFERENCE)
+    dim = max(arrays["theta_error_by_parameter"].shape[1] for arrays in rows.values())
+    by_parameter = [f"theta_{d + 1}" for d in range(dim)]
+    header = ["row", "what it is", "summed error", f"paired difference to {REFERENCE}", *by_parameter]
+    header += ["trajectory error", "success", "seconds a run"]
+    lines = [header, ["---"] * len(header)]
+    for name, arrays in rows.items():
+        errors = arrays["theta_error"]
+        paired = reference is not None and name != REFERENCE
+        lines.append(
+            [
+                f"`{name}`",
+                ROWS[name].what,
+                f"{_with_interval(errors)} ({np.median(errors):.2f})",
+                _with_interval(errors - reference["theta_error"]) if paired else "",
+                *(f"{mean:.2f}" for mean in arrays["theta_error_by_parameter"].mean(axis=0)),
+                f"{np.nanmean(arrays['trajectory_error']):.2f}",
+                f"{np.mean(arrays['succeeded'].sum(axis=1) / arrays['attempted'].sum(axis=1)):.0%}",
+                f"{arrays['seconds'] / len(errors):.1f}",
+            ]
+        )
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _with_interval(values: np.ndarray) -> str:
+    low, high = bootstrap_interval(values)
+    return f"{values.mean():.2f} [{low:.2f}, {high:.2f}]"
+
+
+def draw(rows: Mapping[str, Mapping[str, np.ndarray]], path: Path) -> None:
+    """The summed errors as a strip a row."""
+    with style.context():
+        figure = style.new_figure(style.TEXT_WIDTH, 3.0)
+        strips.draw(figure, {name: arrays["theta_error"] for name, arrays in rows.items()}, "summed error of theta")
+        style.save(figure, path, dpi=200)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the rows that are missing, and write table and figure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), metavar="ROW")
+    parser.add_argument("--rounds", type=int, default=QUICK.rounds)
+    parser.add_argument("--steps", type=int, default=QUICK.estimator.steps, help="gradient steps each round")
+    parser.add_argument("--out", type=Path, default=Path("experiments/results/baselines"))
+    arguments = parser.parse_args(argv)
+    settings = QUICK.replace(rounds=arguments.rounds, estimator=QUICK.estimator.replace(steps=arguments.steps)).check()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    configs = {
+        name: {
+            "what": row.what,
+            "seeds": arguments.seeds,
+            "settings": settings_to_json(row.settings(settings)),
+            "heuristic": heuristic_to_json(row.heuristic),
+        }
+        for name, row in ROWS.items()
+    }
+    for name in saved(arguments.out):  # before anything is run
+        there = json.loads((arguments.out / f"{name}.json").read_text())
+        if different := [field for field, value in configs[name].items() if there.get(field) != value]:
+            parser.error(f"{name}: expected a row of the same {' and '.join(different)}; choose another --out")
+    for name in arguments.rows:
+        path = arguments.out / f"{name}.npz"
+        if path.exists():
+            print(f"{name}: {path} is there already")
+            continue
+        print(f"{name}: {ROWS[name].what}", flush=True)
+        arrays = run_row(ROWS[name], lotka_volterra(), settings, arguments.seeds)
+        atomic.write_json(path.with_suffix(".json"), configs[name] | environment())
+        atomic.write_arrays(path, arrays)
+    rows = saved(arguments.out)
+    (arguments.out / "table.md").write_text(table(rows))
+    draw(rows, arguments.out / "seeds.png")
+    print(f"wrote {arguments.out / 'table.md'} and {arguments.out / 'seeds.png'}")
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,257 @@
+"""Calibration: whether truths fall among posterior draws as often as the posteriors say, over many observations.
+
+Every check here turns a truth into its rank among L draws from its posterior: of the parameter itself, of the
+density, or of the distance from a random point. Of a calibrated posterior, the truth and the draws are draws of the
+same distribution, and each rank from 0 to L is equally likely.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+SIGNIFICANCE = 0.01
+"""p-value below which a check fails: of five checks of a calibrated posterior, one fails in one run out of twenty."""
+POINTWISE = 0.95
+"""Probability that one point of a calibrated curve, or one bar of its histogram, lies in its pointwise band."""
+POINTS = 50
+"""Most points at which a curve is looked at."""
+NULL_DRAWS = 10_000
+"""Simulated calibrated curves, from which the simultaneous band and the p-value come."""
+OK = "ok"
+OVER, UNDER = "miscalibrated: over-confident", "miscalibrated: under-confident"
+LOW, HIGH = "miscalibrated: biased low", "miscalibrated: biased high"
+
+
+@dataclasses.dataclass(frozen=True)
+class Uniformity:
+    """Whether ranks are uniform; K points, bands as [2, K] of lower and upper ends.
+
+    Attributes:
+        level: shares of the ranks looked at, shape [K].
+        share: of the truths whose rank lies in them; of a calibrated posterior the level itself, shape [K].
+        pointwise: band that a calibrated curve leaves at one given point with probability 1 - `POINTWISE`, binomial.
+        simultaneous: band that it leaves anywhere with probability `SIGNIFICANCE` at most.
+        worst: the level at which the curve strays most.
+        p_value: probability that a calibrated curve strays as far, `SIGNIFICANCE` or less where it leaves that band.
+        shift: how far the mean rank is off, in standard errors: negative where truths are below their draws.
+        spread: how much farther than they should the ranks are from the middle one, in standard errors: positive
+            where truths are at either end of their draws.
+    """
+
+    level: Float[np.ndarray, " points"]
+    share: Float[np.ndarray, " points"]
+    pointwise: Float[np.ndarray, "2 points"]
+    simultaneous: Float[np.ndarray, "2 points"]
+    worst: float
+    p_value: float
+    shift: float
+    spread: float
+
+    def share_at(self, level: float) -> float:
+        """Share of the truths at a level, between the points."""
+        return float(np.interp(level, [0.0, *self.level, 1.0], [0.0, *self.share, 1.0]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Histogram:
+    """Ranks in B bins of as nearly equal widths as whole ranks allow.
+
+    Attributes:
+        edges: first rank of each bin and one past the last, shape [B + 1].
+        count: truths in each bin, shape [B].
+        expected: of a calibrated posterior, shape [B].
+        band: lower and upper ends of the binomial band of each bin by itself (`POINTWISE`), shape [2, B].
+    """
+
+    edges: Int[np.ndarray, " edges"]
+    count: Int[np.ndarray, " bins"]
+    expected: Float[np.ndarray, " bins"]
+    band: Float[np.ndarray, "2 bins"]
+
+
+def ranks(
+    key: jax.Array, truths: Float[Array | np.ndarray, "n dim"], draws: Float[Array | np.ndarray, "n draws dim"]
+) -> Int[Array, "n dim"]:
+    """How many of L draws are below the truth, for each parameter: simulation-based calibration (Talts et al. 2018).
+
+    Draws equal to the truth, as clipping to a bound makes them, are put below it or above it at random: the rank of a
+    calibrated posterior stays uniform then, which that of the middle of the ties would not.
+
+    Args:
+        key: consumed.
+        truths: parameters that an observation was simulated at, in coordinates, shape [N, D].
+        draws: from the posterior of each observation, shape [N, L, D].
+
+    Returns:
+        Ranks from 0 to L.
+
+    Raises:
+        ValueError: for shapes that do not fit.
+    """
+    if draws.ndim != 3 or truths.shape != (draws.shape[0], draws.shape[2]):
+        raise ValueError(
+            f"truths, draws: expected shapes [N, D] and [N, L, D], got {list(truths.shape)} and {list(draws.shape)}"
+        )
+    below = jnp.sum(draws < truths[:, None], axis=1)
+    equal = jnp.sum(draws == truths[:, None], axis=1)
+    return below + jax.random.randint(key, below.shape, 0, equal + 1)
+
+
+def density_ranks(
+    key: jax.Array, truth_log_prob: Float[Array | np.ndarray, " n"], log_prob: Float[Array | np.ndarray, "n draws"]
+) -> Int[Array, " n"]:
+    """How many of L draws have a higher posterior density than the truth: expected coverage (Hermans et al. 2022).
+
+    The truth lies in the highest-density region of level c where its rank is below c (L + 1), so the share of truths
+    of such ranks is the coverage of these regions.
+
+    Args:
+        key: consumed, for ties.
+        truth_log_prob: log-density of each truth, up to a constant of its observation; -inf outside the support.
+        log_prob: of the draws, shape [N, L].
+    """
+    return ranks(key, -truth_log_prob[:, None], -log_prob[..., None])[:, 0]
+
+
+def distance_ranks(
+    key: jax.Array,
+    truths: Float[Array | np.ndarray, "n dim"],
+    draws: Float[Array | np.ndarray, "n draws dim"],
+    low: Float[Array | np.ndarray, " dim"],
+    high: Float[Array | np.ndarray, " dim"],
+) -> Int[Array, " n"]:
+    """How many of L draws are nearer to a random point than the truth is: TARP (Lemos et al. 2023).
+
+    Each truth has a point of its own, uniform over the prior's box, and distances are Euclidean in units of the box.
+
+    Args:
+        key: consumed.
+        truths: shape [N, D].
+        draws: shape [N, L, D].
+        low: lower bounds of the prior's box, shape [D].
+        high: upper bounds, shape [D].
+    """
+    key_point, key_ties = jax.random.split(key)
+    point = low + (high - low) * jax.random.uniform(key_point, truths.shape)
+    distance = lambda theta, point: jnp.linalg.norm((theta - point) / (high - low), axis=-1)
+    return ranks(key_ties, distance(truths, point)[:, None], distance(draws, point[:, None])[..., None])[:, 0]
+
+
+def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) -> Uniformity:
+    """Test whether ranks from 0 to L are uniform, by their cumulative distribution.
+
+    At each of up to `POINTS` levels the number of truths of lower rank is binomial. The statistic is the least
+    two-sided binomial tail probability over the levels; its distribution for calibrated posteriors is simulated, and
+    so is the simultaneous band, which is as hard to leave at every level (Säilynoja, Bürkner and Vehtari 2022). Unlike
+    the band of Kolmogorov and Smirnov it narrows towards both ends, where ranks pile up if a posterior is too narrow.
+
+    Args:
+        rank: shape [N].
+        draws: L.
+        tests: how many are made together, such as one a parameter: p-value and band are corrected for them, by
+            Bonferroni.
+
+    Raises:
+        ValueError: for ranks that are not among 0 to L, or too few.
+    """
+    rank = np.asarray(rank)
+    count = len(rank)
+    if count < 2 or draws < 2 or rank.min() < 0 or rank.max() > draws:
+        raise ValueError(
+            f"rank, draws: expected at least two ranks from 0 to the number of draws, at least 2, got {count} ranks "
+            f"and {draws} draws"
+        )
+    edges = _edges(draws)
+    level = edges / (draws + 1)
+    below = np.sum(rank[:, None] < edges, axis=0)
+    tails = _two_sided(count, level)
+    null = _null(count, draws)
+    place = np.arange(len(edges))
+    p_values = np.minimum(1.0, tests * (1 + np.searchsorted(null, tails, side="right")) / (1 + NULL_DRAWS))
+    middle = 2 * (rank + 0.5) / (draws + 1) - 1
+    return Uniformity(
+        level=level,
+        share=below / count,
+        pointwise=_band(tails > 1 - POINTWISE) / count,
+        simultaneous=_band(p_values > SIGNIFICANCE) / count,
+        worst=float(level[np.argmin(tails[place, below])]),
+        p_value=float(np.min(p_values[place, below])),
+        # Of a uniform variable on [-1, 1] the second moment is 1/3, with a variance of 4/45.
+        shift=float(np.mean(middle) * np.sqrt(3 * count)),
+        spread=float((np.mean(middle**2) - 1 / 3) * np.sqrt(45 * count / 4)),
+    )
+
+
+def histogram(rank: Int[Array | np.ndarray, " n"], draws: int) -> Histogram:
+    """A histogram of ranks from 0 to L with its binomial band, of some ten truths a bin and at most 20 bins."""
+    rank = np.asarray(rank)
+    bins = int(np.clip(len(rank) // 10, 2, min(20, draws + 1)))
+    edges = np.round(np.linspace(0, draws + 1, bins + 1)).astype(int)
+    share = np.diff(edges) / (draws + 1)
+    count = np.histogram(rank, edges - 0.5)[0]
+    return Histogram(edges, count, len(rank) * share, _band(_two_sided(len(rank), share) > 1 - POINTWISE))
+
+
+def ranks_verdict(result: Uniformity) -> str:
+    """What ranks of a parameter say of its posterior, in words.
+
+    Ranks that crowd at both ends are those of posteriors too narrow, in the middle of posteriors too wide; truths
+    below their draws are those of posteriors too high.
+    """
+    if result.p_value > SIGNIFICANCE:
+        return OK
+    if abs(result.shift) > abs(result.spread):
+        return HIGH if result.shift < 0 else LOW
+    return OVER if result.spread > 0 else UNDER
+
+
+def coverage_verdict(result: Uniformity) -> str:
+    """What ranks of the density say: truths at low densities are of posteriors too narrow, or in a wrong place."""
+    if result.p_value > SIGNIFICANCE:
+        return OK
+    return OVER if result.shift > 0 else UNDER
+
+
+def distance_verdict(result: Uniformity) -> str:
+    """What ranks of the distance from random points say.
+
+    Where the points are near, truths beyond the draws are those of posteriors too narrow (or in a wrong place); where
+    they are far to one side or the other, truths at either end of the draws.
+    """
+    if result.p_value > SIGNIFICANCE:
+        return OK
+    return OVER if max(result.shift, result.spread, key=abs) > 0 else UNDER
+
+
+def _edges(draws: int) -> np.ndarray:
+    """The ranks below which truths are counted, at most `POINTS` of 1 to L."""
+    return np.unique(np.round(np.linspace(1, draws, min(draws, POINTS))).astype(int))
+
+
+def _two_sided(count: int, share: np.ndarray) -> np.ndarray:
+    """Probability that a binomial count is as far out as each of 0 to N, or farther, shape [K, N + 1]."""
+    log_factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, count + 1)))])
+    k = np.arange(count + 1)
+    log_choose = log_factorial[-1] - log_factorial - log_factorial[::-1]
+    mass = np.exp(log_choose + k * np.log(share)[:, None] + (count - k) * np.log1p(-share)[:, None])
+    below, above = np.cumsum(mass, axis=1), np.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
+    return np.minimum(1.0, 2 * np.minimum(below, above))
+
+
+@functools.lru_cache(maxsize=16)
+def _null(count: int, draws: int) -> np.ndarray:
+    """Least tail probabilities of calibrated curves, in ascending order; the same each time they are asked for."""
+    edges = _edges(draws)
+    share = np.diff([0, *edges, draws + 1]) / (draws + 1)
+    below = np.cumsum(np.random.default_rng(0).multinomial(count, share, NULL_DRAWS), axis=1)[:, :-1]
+    tails = _two_sided(count, edges / (draws + 1))
+    return np.sort(np.min(tails[np.arange(len(edges)), below], axis=1))
+
+
+def _band(inside: np.ndarray) -> np.ndarray:
+    """Least and greatest count that is inside, of each row [K, N + 1], shape [2, K]."""
+    return np.stack([np.argmax(inside, axis=1), inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)]).astype(float)

@@ -1,0 +1,86 @@
+"""Posterior predictive check: whether the observation looks like what the posterior simulates."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Array, Float
+
+LEAST = 20
+"""Fewest simulations that are compared with."""
+REACH = 2.0
+"""Robust deviations, after drawing in the tails, beyond which rows count no more for means and correlations."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PredictiveCheck:
+    """How unusual an observation is among N simulations.
+
+    Attributes:
+        tails: two-sided tail probability of each summary by itself, shape [S].
+        p_value: share of the observation and the simulations that are as far from all of them as the observation.
+        distance: of the observation from all, about 1 for a typical one.
+        distances: of the simulations, shape [N].
+        failed: simulations left out because they were not finite.
+    """
+
+    tails: Float[np.ndarray, " obs"]
+    p_value: float
+    distance: float
+    distances: Float[np.ndarray, " n"]
+    failed: int
+
+
+def predictive_check(
+    simulated: Float[Array | np.ndarray, "n obs"], observed: Float[Array | np.ndarray, " obs"]
+) -> PredictiveCheck:
+    """Compare an observed summary with those of simulations at posterior draws (Gelman, Meng and Stern 1996).
+
+    Each summary by itself is ranked among the simulated ones. All together are by their Mahalanobis distance from the
+    centre of the simulations *and* the observation: were the observation one of them its rank would be uniform, so
+    the p-value is exact for any number of summaries and however they are scaled. So that a few wild simulations do not
+    set the scale, summaries are first centred by their median, scaled by their median absolute deviation and drawn
+    together in the tails (inverse hyperbolic sine), and what is still far out is clipped before moments are taken; so
+    that there may be more summaries than simulations, correlations are shrunk towards zero.
+
+    A posterior that has seen the observation is expected to explain it: a small p-value is a strong sign that the
+    simulator, or the support, cannot; a p-value that is not small is a weak sign that it can.
+
+    Args:
+        simulated: summaries, shape [N, S]; rows that are not finite are left out and counted.
+        observed: shape [S].
+
+    Raises:
+        ValueError: for shapes that do not fit, an observation that is not finite, or fewer than `LEAST` finite rows.
+    """
+    simulated, observed = np.asarray(simulated, np.float64), np.asarray(observed, np.float64)
+    if simulated.ndim != 2 or observed.shape != simulated.shape[1:] or not np.isfinite(observed).all():
+        raise ValueError(
+            f"simulated, observed: expected shapes [N, S] and [S] and a finite observation, "
+            f"got {list(simulated.shape)} and {list(observed.shape)}"
+        )
+    valid = np.isfinite(simulated).all(axis=1)
+    used = simulated[valid]
+    if len(used) < LEAST:
+        raise ValueError(f"simulated: expected at least {LEAST} finite rows, got {len(used)} of {len(simulated)}")
+    below, above = np.sum(used <= observed, axis=0), np.sum(used >= observed, axis=0)
+    tails = np.minimum(1.0, 2 * (1 + np.minimum(below, above)) / (1 + len(used)))
+    distances = _distances(np.concatenate([observed[None], used]))
+    p_value = np.mean(distances >= distances[0])
+    return PredictiveCheck(tails, float(p_value), float(distances[0]), distances[1:], int(np.sum(~valid)))
+
+
+def _distances(rows: np.ndarray) -> np.ndarray:
+    """Robust Mahalanobis distance of each row from all rows, per summary; the same for rows in any order."""
+    count, size = rows.shape
+    centred = rows - np.median(rows, axis=0)
+    scale = 1.4826 * np.median(np.abs(centred), axis=0)
+    spread = np.std(rows, axis=0)
+    scale = np.where(scale > 0, scale, np.where(spread > 0, spread, 1.0))
+    z = np.arcsinh(centred / scale)
+    near = np.clip(z, -REACH, REACH)
+    mean, deviation = np.mean(near, axis=0), np.std(near, axis=0)
+    deviation = np.where(deviation > 0, deviation, 1.0)
+    z, near = (z - mean) / deviation, (near - mean) / deviation
+    shrinkage = size / (size + count)
+    correlation = (1 - shrinkage) * (near.T @ near) / count + shrinkage * np.eye(size)
+    return np.sqrt(np.mean(z * np.linalg.solve(correlation, z.T).T, axis=1))

@@ -1,0 +1,138 @@
+"""Calibration: where truths rank among posterior draws, and how often credible regions hold them."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from jaxlfi.figures.style import parameter_name
+
+COLUMNS = 4
+"""Parameters side by side."""
+COLOUR = "#15158B"
+BAND = "#8C8C8C"
+NARROW, WIDE = 0.45, 0.2
+"""Opacity of the pointwise band and of the simultaneous one."""
+
+Arrays = Mapping[str, np.ndarray]
+"""The arrays of diagnostics.npz."""
+
+
+def rows(arrays: Arrays) -> int:
+    """Rows of panels that `draw_ranks` needs, each a histogram over a curve."""
+    return -(-len(arrays["names"]) // COLUMNS)
+
+
+def draw_ranks(figure: Figure, arrays: Arrays) -> None:
+    """For each parameter a histogram of ranks, and below it their cumulative share less what it should be.
+
+    Args:
+        figure: empty.
+        arrays: of diagnostics.npz.
+    """
+    names = [str(name) for name in arrays["names"]]
+    columns = min(len(names), COLUMNS)
+    heights = [1.0, 0.7] * rows(arrays)
+    panels = figure.subplots(
+        len(heights), columns, squeeze=False, sharex=True, sharey="row", gridspec_kw={"height_ratios": heights}
+    )
+    for d in range(rows(arrays) * columns):
+        above, below = panels[2 * (d // columns), d % columns], panels[2 * (d // columns) + 1, d % columns]
+        if d >= len(names):
+            above.remove()
+            below.remove()
+            continue
+        draw_histogram(above, arrays, d)
+        draw_difference(below, arrays, d)
+        above.set_title(parameter_name(names, d))
+        if d + columns >= len(names):
+            below.set_xlabel("rank of the truth")
+            below.tick_params(labelbottom=True)
+        if d % columns == 0:
+            above.set_ylabel("truths")
+            below.set_ylabel("excess below")
+    _legend(figure, "truths", "one bin")
+
+
+def draw_histogram(axes: Axes, arrays: Arrays, d: int) -> None:
+    """Truths in each bin of ranks, with the binomial band of each bin.
+
+    Args:
+        axes: to draw on.
+        arrays: of diagnostics.npz.
+        d: index of the parameter.
+    """
+    edges = arrays["bin_edges"] / arrays["bin_edges"][-1]
+    low, high = (np.append(side, side[-1]) for side in arrays["bin_band"])
+    axes.fill_between(edges, low, high, step="post", color=BAND, alpha=NARROW, linewidth=0)
+    axes.stairs(arrays["bin_count"][d], edges, color=COLOUR, linewidth=1.0, gid="count")
+    axes.set_xlim(0, 1)
+    axes.set_ylim(bottom=0)
+
+
+def draw_difference(axes: Axes, arrays: Arrays, d: int) -> None:
+    """The cumulative share of ranks less the level, with its simultaneous band.
+
+    Args:
+        axes: to draw on.
+        arrays: of diagnostics.npz.
+        d: index of the parameter.
+    """
+    level = _with_ends(arrays["level"])
+    low, high = (_with_ends(side) - level for side in arrays["ranks_simultaneous"])
+    axes.fill_between(level, low, high, color=BAND, alpha=WIDE, linewidth=0)
+    axes.axhline(0, color="#555555", linewidth=0.6)
+    axes.plot(level, _with_ends(arrays["ranks_share"][d]) - level, color=COLOUR, gid="difference")
+    axes.grid(True)
+
+
+def draw_coverage(figure: Figure, arrays: Arrays) -> None:
+    """Share of truths in the densest region of each level: expected coverage.
+
+    Args:
+        figure: empty.
+        arrays: of diagnostics.npz.
+    """
+    _draw_curve(figure, arrays, "coverage_share", "level of the densest region", "share of truths in it")
+
+
+def draw_tarp(figure: Figure, arrays: Arrays) -> None:
+    """Share of truths in the region of each level around random points: TARP.
+
+    Args:
+        figure: empty.
+        arrays: of diagnostics.npz.
+    """
+    _draw_curve(figure, arrays, "distance_share", "level of the region around a random point", "share of truths in it")
+
+
+def _draw_curve(figure: Figure, arrays: Arrays, name: str, xlabel: str, ylabel: str) -> None:
+    axes = figure.subplots()
+    level = _with_ends(arrays["level"])
+    for band, opacity in (("simultaneous", WIDE), ("pointwise", NARROW)):
+        low, high = (_with_ends(side) for side in arrays[band])
+        axes.fill_between(level, low, high, color=BAND, alpha=opacity, linewidth=0)
+    axes.plot([0, 1], [0, 1], color="#555555", linewidth=0.6)
+    axes.plot(level, _with_ends(arrays[name]), color=COLOUR, gid="share")
+    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel=xlabel, ylabel=ylabel)
+    axes.set_aspect("equal")
+    axes.grid(True)
+    _legend(figure, "posteriors of this run's method", "one level")
+
+
+def _with_ends(values: np.ndarray) -> np.ndarray:
+    """Curve and bands all start at 0 and end at 1."""
+    return np.concatenate([[0.0], values, [1.0]])
+
+
+def _legend(figure: Figure, drawn: str, one: str) -> None:
+    handles = [
+        Line2D([], [], color=COLOUR, label=drawn),
+        Patch(color=BAND, alpha=NARROW, linewidth=0, label=f"95 % of calibrated ones, at {one}"),
+        Patch(color=BAND, alpha=WIDE, linewidth=0, label="99 %, at all together"),
+    ]
+    wide = figure.get_size_inches()[0] > 5
+    figure.legend(handles=handles, loc="outside lower center", ncols=3 if wide else 1)

@@ -1,0 +1,61 @@
+"""Truncate: shrink the support to where the posterior is, and propose from the prior over it."""
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from jaxlfi.belief import Belief
+from jaxlfi.heuristics.base import Adaptation, adapted
+from jaxlfi.mixture import GaussianMixture
+from jaxlfi.support import Support
+
+LEAST_WIDTH = 1e-3
+"""Share of Phi's width below which no support is truncated."""
+
+
+@struct.dataclass
+class Truncate:
+    """Truncated proposals on a box (Deistler et al. 2022; boxes as in Miller et al. 2021).
+
+    The support shrinks to the part of it between `quantile` and 1 - `quantile` of each marginal of the posterior, and
+    never grows. The next round draws from the *prior* over the new support, not from the posterior: the belief is
+    returned with `informed` false. Every support holds all later ones, so the pooled proposals are uniform over the
+    last (or follow the task's prior there) and need no correction.
+
+    A posterior that has left the support, or is narrower than a thousandth of Phi, would leave nothing to draw from.
+    The support then keeps that width, around the posterior or along the bound nearest to it.
+
+    Attributes:
+        quantile: posterior mass given up beyond each bound, in [0, 0.5); scalar or one value a dimension. 0 truncates
+            nothing. It is a leaf and can be vmapped over.
+
+    Raises:
+        ValueError: for a quantile outside [0, 0.5) given as a Python number.
+
+    Example:
+        >>> Truncate(quantile=0.01).quantile
+        0.01
+    """
+
+    quantile: Float[Array, ""] | Float[Array, " dim"] | float = 1e-3
+
+    def __post_init__(self):
+        if isinstance(self.quantile, float | int) and not 0 <= self.quantile < 0.5:
+            raise ValueError(f"quantile: expected a mass in [0, 0.5), got {self.quantile}")
+
+    def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
+        """Intersect the support with the posterior's interval; the evidence is the interval's two ends, shape [D]."""
+        box = previous.support
+        interval_low = posterior.marginal_quantile(self.quantile)
+        interval_high = -posterior.mirror().marginal_quantile(self.quantile)
+        low, high = jnp.clip(interval_low, box.low, box.high), jnp.clip(interval_high, box.low, box.high)
+        least = jnp.minimum(LEAST_WIDTH * feasible.width, box.width)
+        lack = 0.5 * jnp.maximum(least - (high - low), 0.0)
+        # The box's own bounds are applied last, so that rounding never grows it.
+        support = Support(
+            low=jnp.maximum(jnp.minimum(low - lack, box.high - least), box.low),
+            high=jnp.minimum(jnp.maximum(high + lack, box.low + least), box.high),
+        )
+        evidence = {"interval_low": interval_low, "interval_high": interval_high}
+        belief, adaptation = adapted(previous, posterior, support, evidence)
+        return belief.replace(informed=jnp.zeros_like(previous.informed)), adaptation

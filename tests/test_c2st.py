@@ -1,0 +1,65 @@
+"""The classifier two-sample test: closed forms, scikit-learn's, and the contracts of a pure function."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from experiments.sbibm.c2st import c2st as reference
+from jaxlfi.diagnostics import c2st
+
+# Small programs: they take less time to run than to optimise.
+COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+compiled = jax.jit(c2st, compiler_options=COMPILE)
+N = 400
+
+
+def samples(shift: float, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Two Gaussians in units that are a thousand times apart, off by a shift along the second axis."""
+    rng = np.random.default_rng(3)
+    units = np.array([1000.0, 1.0])
+    first, second = rng.normal(size=(2, N, 2))
+    return (units * first).astype(np.float32), (units * (scale * second + [0, shift])).astype(np.float32)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0, 3.0])
+def test_shifted_gaussians_are_told_apart_as_well_as_can_be(shift):
+    """The best accuracy is Phi(d / 2); three standard errors of 800 rows, and what a trained classifier loses."""
+    accuracy = float(compiled(jax.random.key(0), *samples(shift)))
+    assert norm.cdf(shift / 2) - 0.07 < accuracy < norm.cdf(shift / 2) + 0.055
+
+
+def test_a_difference_in_width_alone_is_seen_and_as_well_as_by_scikit_learn():
+    first, second = samples(0.0, scale=2.5)
+    accuracy = float(compiled(jax.random.key(0), first, second))
+    # Of radii with squares chi2 and 6.25 chi2, two degrees of freedom, the best threshold is where densities cross.
+    threshold = 2 * np.log(6.25) / (1 - 1 / 6.25)
+    best = 0.5 + 0.5 * (np.exp(-threshold / 2 / 6.25) - np.exp(-threshold / 2))
+    assert accuracy == pytest.approx(best, abs=0.06)
+    assert accuracy == pytest.approx(reference(first, second), abs=0.04)
+
+
+def test_rows_that_belong_together_are_held_out_together():
+    """The same parameters beside the same simulations: a classifier that had seen a row's twin would be below 0.5."""
+    first, _ = samples(0.0)
+    assert float(compiled(jax.random.key(0), first, first)) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_a_constant_column_and_the_order_of_rows_do_no_harm():
+    first, second = samples(3.0)
+    first[:, 0] = second[:, 0] = 7.0
+    shuffled = second[np.random.default_rng(0).permutation(N)]
+    assert float(compiled(jax.random.key(1), first, shuffled)) == pytest.approx(norm.cdf(1.5), abs=0.06)
+
+
+def test_the_same_key_gives_the_same_number():
+    first, second = samples(1.0)
+    assert float(compiled(jax.random.key(0), first, second)) == float(compiled(jax.random.key(0), first, second))
+    assert float(compiled(jax.random.key(0), first, second)) != float(compiled(jax.random.key(9), first, second))
+
+
+@pytest.mark.parametrize(("first", "second"), [((9, 2), (9, 2)), ((20, 2), (19, 2)), ((20, 2), (20, 3))])
+def test_samples_that_cannot_be_compared_are_refused(first, second):
+    with pytest.raises(Exception, match=r"same shape \[N, D\], N at least 10|dim|n"):
+        c2st(jax.random.key(0), jnp.zeros(first), jnp.zeros(second))

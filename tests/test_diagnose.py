@@ -1,0 +1,395 @@
+"""Diagnose: exact posteriors pass, wrong ones are called by name, and chunks are picked up where they were left."""
+
+import dataclasses
+import json
+import os
+import shutil
+import sys
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs import gaussian_linear
+from jaxlfi import atomic, bayessim, cli, diagnose, run_store, sweep, tasks
+from jaxlfi.belief import Belief, uninformed
+from jaxlfi.diagnose import Plan, Subject, repeat
+from jaxlfi.diagnose import subject as subjects
+from jaxlfi.estimator import Estimator, Network, initialise
+from jaxlfi.figures import calibration, checks, style
+from jaxlfi.heuristics import Edge, Fixed
+from jaxlfi.inference import Run
+from jaxlfi.keys import run_keys
+from jaxlfi.normalise import Normaliser
+from jaxlfi.observation import SimulatorError
+from jaxlfi.posterior import truncated_draws, truncated_log_prob
+from jaxlfi.sampling import network_arrays, read_run
+from jaxlfi.support import Support
+from tests.small import SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
+
+X = np.array([-0.6, -0.3], np.float32)
+BOX = gaussian().supports["ok"]
+FAST = dataclasses.replace(SETTINGS.estimator, learning_rate=2e-2)
+# Small programs: they take less time to run than to optimise.
+COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+OVER, UNDER = "miscalibrated: over-confident", "miscalibrated: under-confident"
+
+
+def make(out, support: str, heuristic, rounds: int, scale: float = 1.0, shift: float = 0.0):
+    """The folder of a run of the small settings that ended with the exact posterior on its first support.
+
+    The network is one that nobody has trained; `pretend` looks only at the wrong scale and shift in its normaliser.
+    """
+    box, small = gaussian().supports[support], settings(rounds=rounds, estimator=FAST)
+    made = run_store.run_config(
+        task=gaussian(), reference=TASK, support_name=support, support=box, heuristic=heuristic, preset=None,
+        settings=small, seed=0, configuration=support,
+    )  # fmt: skip
+
+    def fill(beside):
+        posterior = gaussian_linear.posterior(X)
+        belief = {"logits": posterior.logits, "means": posterior.means, "scale_tril": posterior.scale_tril}
+        atomic.write_arrays(beside / "posterior.npz", belief | {"support_low": box.low, "support_high": box.high})
+        atomic.write_arrays(beside / "observation.npz", {"trajectory": X, "x": X})
+        state = jax.eval_shape(lambda: bayessim.init(jax.random.key(0), gaussian(), box, small, jnp.asarray(X)))
+        network = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), state.network)
+        wrong = Normaliser(np.full(2, shift, np.float32), np.full(2, scale, np.float32))
+        atomic.write_arrays(beside / "network.npz", network_arrays(network.replace(normaliser=wrong)))
+
+    run_store.create(out, made, fill)
+    return out
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A run of two rounds on the misspecified support, adapted by EDGE."""
+    out = tmp_path_factory.mktemp("diagnose") / "run"
+    return make(out, "misspecified", Edge(), 2)
+
+
+@pytest.fixture
+def pretend(monkeypatch):
+    """Let networks say the exact posterior, wider by a factor and off by a number of deviations."""
+
+    def posterior(key, estimator, network, x, *_):
+        wrong, exact = network.normaliser, gaussian_linear.posterior(x)
+        offset = wrong.mean * exact.marginal_scales * jnp.array([1.0, -1.0])
+        means, scale_tril = exact.means + offset, wrong.scale[0] * exact.scale_tril
+        return exact.replace(means=means, scale_tril=scale_tril), jnp.asarray(1.0)
+
+    monkeypatch.setattr(repeat, "posterior", posterior)
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch):
+    """Classifiers that are trained for a few passes: programs that were not optimised are slow."""
+    monkeypatch.setattr(sys.modules["jaxlfi.diagnostics.c2st"], "MOST_PASSES", 30)
+
+
+def results(out) -> dict[str, dict]:
+    return {check["name"]: check for check in json.loads((out / "diagnostics.json").read_text())["checks"]}
+
+
+NAMES = ("rank of first", "rank of second", "coverage of densest regions", "coverage from random points (TARP)")
+CASES = {
+    "exact": ((1.0,), ("ok", "ok", "ok", "ok")),
+    "narrow": ((0.4,), (OVER, OVER, OVER, OVER)),
+    "wide": ((2.5,), (UNDER, UNDER, UNDER, UNDER)),
+    "shifted": ((1.0, 1.2), ("miscalibrated: biased high", "miscalibrated: biased low", OVER, None)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_posteriors_are_called_what_they_are(case, pretend, tmp_path, capsys):
+    how, expected = CASES[case]
+    folder = make(tmp_path / "one", "ok", Fixed(), 1, *how)
+    assert command("diagnose", folder, "--draws", 60, "--no-figures") == 0
+    found = results(folder / "diagnostics")
+    for name, verdict in zip(NAMES, expected, strict=True):
+        assert verdict is None or found[name]["verdict"] == verdict, name
+        assert verdict is None or (found[name]["p_value"] > 0.01) == (verdict == "ok")
+    assert (found["final support"]["numbers"]["truths_inside"], found["final support"]["verdict"]) == (100, "")
+    # The run's own posterior is exact, whatever is pretended of others.
+    assert found["posterior predictive"]["verdict"] == "ok"
+    told = capsys.readouterr().out
+    assert "over-confident" in told if case == "narrow" else "rank of first" in told
+    arrays = atomic.read_arrays(folder / "diagnostics" / "diagnostics.npz")
+    assert arrays["draws"].shape == (100, 60, 2) and arrays["ranks"].shape == (100, 2)
+    assert np.asarray(BOX.contains(arrays["draws"])).all()
+    assert not (folder / "diagnostics" / "figures").exists()
+
+
+@pytest.fixture(scope="module")
+def repeated(folder):
+    """Diagnostics of a run of two rounds, in two chunks of runs, with pictures and reference samples."""
+    out, reference = folder.parent / "repeated", folder.parent / "reference.csv"
+    draws = np.asarray(gaussian_linear.posterior(X).sample(jax.random.key(5), 3000))
+    draws = draws[np.asarray(gaussian().supports["misspecified"].contains(draws))][:60]
+    rows = [f"{second},{first}" for first, second in draws]  # columns in another order
+    reference.write_text("\n".join(["second,first", *rows]))
+    asked = ("--truths", 20, "--draws", 20, "--against", reference, "--out", out)
+    assert command("diagnose", folder, *asked) == 0
+    return out
+
+
+def test_a_run_of_several_rounds_is_repeated_for_each_truth(repeated, folder):
+    plan, told = (json.loads((repeated / f"{name}.json").read_text()) for name in ("plan", "diagnostics"))
+    assert told["way"] == "repeated" and plan["chunk_length"] == 10 and told["versions"]["jax"]
+    assert told["reference"]["name"] == "ok" and told["run"]["support"]["name"] == "misspecified"
+    arrays = atomic.read_arrays(repeated / "diagnostics.npz")
+    theta = arrays["theta"]
+    # Truths are drawn over the task's first support, also where the run's own does not reach.
+    assert np.asarray(BOX.contains(theta)).all() and 4 <= np.sum(theta[:, 0] > 0) <= 16
+    assert len(np.unique(theta[:, 0])) == 20
+    # Each has a posterior of its own, on a support that was adapted to it.
+    assert np.all(arrays["support_low"][:, 0] <= -3) and len(np.unique(arrays["support_high"][:, 0])) > 2
+    inside = (arrays["draws"] >= arrays["support_low"][:, None]) & (arrays["draws"] <= arrays["support_high"][:, None])
+    assert inside.all() and np.isfinite(arrays["log_prob"]).all()
+    held = np.all((theta >= arrays["support_low"]) & (theta <= arrays["support_high"]), axis=1)
+    np.testing.assert_array_equal(np.isfinite(arrays["truth_log_prob"]), held)
+    # What is inferred follows the truth.
+    assert np.corrcoef(arrays["draws"].mean(1)[:, 1], theta[:, 1])[0, 1] > 0.7
+
+
+def test_pictures_and_reference_samples(repeated):
+    """The classifier cannot tell the run's posterior from its reference, unless columns were mistaken."""
+    assert {path.name for path in (repeated / "figures").iterdir()} == {
+        "ranks.png", "coverage.png", "tarp.png", "predictive.png",
+    }  # fmt: skip
+    check = results(repeated)["classifier, reference.csv"]
+    assert check["numbers"] == {"accuracy": pytest.approx(0.5, abs=0.15), "rows": 60}
+
+
+def test_pictures_show_the_saved_arrays(repeated):
+    arrays = atomic.read_arrays(repeated / "diagnostics.npz")
+    line = lambda axes, name: next(line for line in axes.lines if line.get_gid() == name)
+    with style.context():
+        figure = style.new_figure(3.5, 3.5)
+        calibration.draw_ranks(figure, arrays)
+        above, below = figure.axes[1], figure.axes[3]  # the second parameter
+        stairs = next(patch for patch in above.patches if patch.get_gid() == "count")
+        np.testing.assert_array_equal(stairs.get_data().values, np.bincount(arrays["ranks"][:, 1] > 10)[:2])
+        share = line(below, "difference").get_ydata()[1:-1] + arrays["level"]
+        np.testing.assert_allclose(share, [np.mean(arrays["ranks"][:, 1] < k) for k in range(1, 21)])
+        for draw, rank in ((calibration.draw_coverage, "density_ranks"), (calibration.draw_tarp, "distance_ranks")):
+            figure = style.new_figure(3.5, 3.9)
+            draw(figure, arrays)
+            share = line(figure.axes[0], "share").get_ydata()[1:-1]
+            np.testing.assert_allclose(share, [np.mean(arrays[rank] < k) for k in range(1, 21)])
+        figure = style.new_figure(7.0, 2.3)
+        checks.draw(figure, arrays)
+        assert line(figure.axes[1], "observed").get_xdata()[0] == arrays["observed_distance"]
+        middle = np.median(arrays["predictive_x"], axis=0)
+        observed = line(figure.axes[0], "observed").get_ydata()
+        np.testing.assert_array_equal(np.sign(observed), np.sign(X - middle))
+
+
+def test_chunks_are_picked_up_to_the_same_arrays(repeated, folder, tmp_path):
+    out = tmp_path / "again"
+    shutil.copytree(repeated, out)
+    first, second = out / "chunks" / "000.npz", out / "chunks" / "001.npz"
+    second.unlink()
+    before = first.stat().st_mtime_ns
+    (out / "diagnostics.npz").unlink()
+    assert command("diagnose", folder, "--truths", 20, "--draws", 20, "--no-figures", "--out", out) == 0
+    assert first.stat().st_mtime_ns == before
+    whole, again = (atomic.read_arrays(path / "diagnostics.npz") for path in (repeated, out))
+    assert whole.keys() == again.keys()
+    for name in whole:
+        np.testing.assert_array_equal(whole[name], again[name], err_msg=name)
+    left = {name: check for name, check in results(repeated).items() if "reference" not in name}
+    assert results(out) == left
+
+
+def refused(capsys, *arguments) -> str:
+    capsys.readouterr()
+    assert command("diagnose", *arguments) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and "error: " in message
+    return message
+
+
+def test_other_settings_need_another_folder(repeated, folder, tmp_path, capsys):
+    asked = (folder, "--no-figures", "--out", repeated, "--draws", 20)
+    assert "another truths: take another folder by --out" in refused(capsys, *asked, "--truths", 21)
+    assert "another reference" in refused(capsys, *asked, "--truths", 20, "--reference", "broad")
+    out = tmp_path / "out"
+    shutil.copytree(repeated, out)
+    (out / "chunks" / "001.npz").write_bytes(b"cut")
+    asked = (folder, "--no-figures", "--draws", 20, "--truths", 20, "--out", out)
+    assert "001.npz: expected a whole .npz" in refused(capsys, *asked)
+    (out / "plan.json").write_text("{")
+    assert "plan.json: expected a plan" in refused(capsys, *asked)
+    (out / "plan.json").unlink()
+    assert "expected a new or empty folder" in refused(capsys, *asked)
+
+
+def test_bad_input_is_one_line(folder, tmp_path, capsys):
+    wrong = {
+        "columns.csv": "first,third\n1,2\n",
+        "few.csv": "first,second\n1,2\n",
+        "nan.csv": "\n".join(["first,second", *["nan,1"] * 30]),
+        "text.csv": "first,second\na,b\n",
+    }
+    for name, text in wrong.items():
+        (tmp_path / name).write_text(text)
+    np.savez(tmp_path / "shape.npz", theta=np.zeros((30, 3)))
+    np.savez(tmp_path / "other.npz", x=np.zeros((30, 2)))
+    for given, told in (
+        (["--truths", 19], "truths: expected at least 20, got 19"),
+        (["--draws", 0], "draws: expected at least 20, got 0"),
+        (["--seed", -1], "seed: expected at least 0"),
+        (["--reference", "x"], "reference: expected one of ['broad', 'misspecified', 'ok'], got 'x'"),
+        (["--against", tmp_path / "none.csv"], "against: cannot read"),
+        (["--against", tmp_path / "columns.csv"], "expected the columns first, second, got first, third"),
+        (["--against", tmp_path / "few.csv"], "expected at least 20 rows of finite numbers"),
+        (["--against", tmp_path / "nan.csv"], "expected at least 20 rows of finite numbers"),
+        (["--against", tmp_path / "text.csv"], "could not convert"),
+        (["--against", tmp_path / "shape.npz"], "shape [n, 2], got [30, 3]"),
+        (["--against", tmp_path / "other.npz"], "against: cannot read"),
+    ):
+        assert told in refused(capsys, folder, *given)
+    assert not (folder / "diagnostics").exists()
+
+
+@pytest.mark.parametrize("kind", ["none", "foreign", "unfinished", "runs", "compare", "grid", "changed"])
+def test_folders_that_cannot_be_diagnosed(kind, folder, tmp_path, capsys):
+    if kind == "none":
+        assert "no folder" in refused(capsys, tmp_path / "nothing")
+        return
+    config = json.loads((folder / "config.json").read_text())
+    changes, told = {
+        "foreign": ({"format": "other"}, "not of jaxlfi"),
+        "unfinished": ({"status": "running"}, "expected a finished run"),
+        "runs": ({"format": run_store.RUNS, "lanes": [{"folder": "seed_003"}]}, "one/seed_003"),
+        "compare": ({"format": run_store.COMPARE, "lanes": [{"folder": "ok/seed_000"}]}, "one/ok/seed_000"),
+        "grid": ({"format": sweep.GRID}, "got a grid's"),
+        "changed": ({"names": ["other", "second"]}, "expected the task as it was when the run was made"),
+    }[kind]
+    copy = tmp_path / "one"
+    shutil.copytree(folder, copy)
+    atomic.write_json(copy / "config.json", config | changes)
+    assert told in refused(capsys, copy)
+    assert not (copy / "diagnostics").exists()
+
+
+# -------------------------------------------------------------------------------------------------------- truths
+
+
+def subject(folder, **changes) -> Subject:
+    return Subject(read_run(folder), dataclasses.replace(gaussian(), **changes), None)
+
+
+def test_truths_that_fail_are_drawn_again_and_counted(folder):
+    def simulate(key, theta):
+        return gaussian_linear.simulate(key, theta), theta[0] < 0
+
+    truths = diagnose.draw_truths(subject(folder, simulate=simulate), Plan("ok", truths=200, seed=1))
+    assert np.all(truths["theta"][:, 0] < 0) and np.all(truths["theta"][:, 0] > -3)
+    residual = truths["x"] - truths["theta"] @ gaussian_linear.MIXING.T
+    np.testing.assert_allclose(residual.std(0), gaussian_linear.NOISE, rtol=0.2)
+    np.testing.assert_array_equal(truths["observed"], truths["x"])
+    # Every success takes two tries on average.
+    assert truths["failed"][1] == 0 and 140 < truths["failed"][0] < 270
+    never = subject(folder, simulate=lambda key, theta: (theta, theta[0] > 9))
+    with pytest.raises(SimulatorError, match="got none in 16 tries for 20 of 20"):
+        diagnose.draw_truths(never, Plan("ok", truths=20))
+
+
+def test_reference_samples_are_read_in_natural_units(tmp_path):
+    task = dataclasses.replace(
+        gaussian(), supports={"ok": Support([0.1, 0.1], [9.0, 9.0])}, feasible=Support([0.1, 0.1], [9.0, 9.0]),
+        truth=None, log=("second",),
+    )  # fmt: skip
+    theta = np.random.default_rng(0).uniform(0.5, 2.0, (30, 2))
+    np.savez(tmp_path / "theta.npz", theta=theta)
+    read = diagnose.read_reference(tmp_path / "theta.npz", task)
+    np.testing.assert_allclose(read, np.stack([theta[:, 0], np.log(theta[:, 1])], axis=1), rtol=1e-5)
+    np.savez(tmp_path / "negative.npz", theta=theta * np.array([1.0, -1.0]))
+    with pytest.raises(ValueError, match="positive ones of second"):
+        diagnose.read_reference(tmp_path / "negative.npz", task)
+
+
+def test_a_network_may_first_be_read_while_a_function_is_traced(folder):
+    run = read_run(folder)
+    scale = jax.jit(lambda factor: factor * run.network.normaliser.scale)
+    np.testing.assert_allclose(scale(2.0), 2 * np.asarray(run.network.normaliser.scale))
+
+
+def test_a_black_box_is_told_what_is_left_out(folder, tmp_path, monkeypatch, capsys):
+    def simulate(rng, theta):
+        return theta @ gaussian_linear.MIXING.T + gaussian_linear.NOISE * rng.normal(size=theta.shape)
+
+    monkeypatch.setattr(tasks, "load", lambda name: dataclasses.replace(gaussian(), simulate=simulate, black_box=True))
+    out = tmp_path / "out"
+    assert command("diagnose", folder, "--no-figures", "--out", out) == 0
+    assert "A black box is not repeated for other truths" in capsys.readouterr().out
+    assert list(results(out)) == ["posterior predictive"]
+    assert json.loads((out / "diagnostics.json").read_text())["way"] is None
+
+
+def test_chunks_are_divided_over_as_many_devices_as_they_were_begun_with(tmp_path, monkeypatch):
+    (tmp_path / "diagnostics").mkdir()
+    atomic.write_json(tmp_path / "diagnostics" / "plan.json", {"devices": 7})
+    monkeypatch.setenv("XLA_FLAGS", "")
+    cli.prepare_jax(cli.parser().parse_args(["diagnose", str(tmp_path), "--no-cache"]))
+    assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=7"
+
+
+@pytest.mark.parametrize("purpose", [subjects.TRUTHS, subjects.DRAWS])
+def test_keys_are_not_those_of_a_run_of_the_same_seed(purpose):
+    own = jax.random.key_data(Plan("ok", seed=0).key(purpose))
+    for key in jax.tree.leaves(run_keys(jax.random.key(0))):
+        assert not np.array_equal(own, jax.random.key_data(key))
+
+
+# ----------------------------------------------------------------------------------------------------- densities
+
+
+def check_density(key, log_prob, draws, box: Support, points: int = 120) -> None:
+    """It is 1 over the box (midpoint rule), nothing outside, and the draws are its own."""
+    low, high = np.asarray(box.low, np.float64), np.asarray(box.high, np.float64)
+    axes = [low[d] + (high[d] - low[d]) * (np.arange(points) + 0.5) / points for d in range(2)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    outside = np.array([low - 0.1, [high[0], high[1] + 0.1]])
+    theta = jnp.asarray(np.concatenate([grid, outside, jax.jit(draws, compiler_options=COMPILE)(key)]), jnp.float32)
+    value = np.asarray(jax.jit(log_prob, compiler_options=COMPILE)(theta), np.float64)
+    within, beyond, seen = np.split(value, [len(grid), len(grid) + 2])
+    cell = np.prod((high - low) / points)
+    assert np.sum(np.exp(within)) * cell == pytest.approx(1.0, abs=0.03)
+    assert np.all(np.isneginf(beyond))
+    mean = np.sum(np.exp(within) * within) * cell
+    assert np.mean(seen) == pytest.approx(mean, abs=0.03 + 4 * np.std(seen) / np.sqrt(len(seen)))
+
+
+def test_the_density_of_a_flow_is_that_of_its_draws():
+    """An ensemble of two perturbed flows, seen through both affine maps, in a box that cuts it."""
+    flow = Estimator(family="maf", hidden=(8, 8), transforms=2, members=2, epochs=1)
+    scale, box = Support([-10.0, 0.0], [10.0, 4.0]), Support([0.0, 0.5], [4.0, 2.5])
+    params = initialise(jax.random.key(0), flow, 2, 3)
+    leaves, structure = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    noisy = [leaf + 0.3 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
+    network = Network(
+        jax.tree.unflatten(structure, noisy),
+        Normaliser(jnp.array([1.0, 0.0, -1.0]), jnp.array([2.0, 1.0, 0.5])),
+        Normaliser(jnp.array([0.2, -0.3]), jnp.array([0.15, 0.5])),
+    )
+    belief = Belief(uninformed(box, 1).mixture, box, jnp.asarray(True))
+    x = jnp.array([0.4, 0.5, -0.7])
+    log_prob = lambda theta: truncated_log_prob(flow, network, x, scale, belief, theta)
+    draws = lambda key: truncated_draws(key, flow, network, x, scale, belief, 2000)[0]
+    whole = belief.replace(support=Support([-1e3, -1e3], [1e3, 1e3]))
+    shares = jax.jit(lambda theta: log_prob(theta) - truncated_log_prob(flow, network, x, scale, whole, theta))
+    assert 0.1 < np.exp(-float(shares(jnp.array([2.0, 1.5])))) < 0.9  # a box that cuts nothing would test nothing
+    check_density(jax.random.key(4), log_prob, draws, box)
+
+
+def test_the_density_of_a_run_is_its_mixtures_within_the_support():
+    box = Support([-1.0, -2.0], [0.5, 0.5])
+    belief = Belief(gaussian_linear.posterior(X), box, jnp.asarray(True))
+    first = SimpleNamespace(proposal=SimpleNamespace(support=jax.tree.map(lambda leaf: leaf[None], box)))
+    run = Run(belief, first, None, None, X, jnp.asarray(X), None, Fixed(), settings(restriction="reject"), gaussian())
+    check_density(jax.random.key(0), run.log_prob, lambda key: run.sample(key, 2000), box)
