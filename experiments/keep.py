@@ -2,14 +2,14 @@
 
     python -m experiments.keep runs/demo experiments/results/demo
 
-A single run keeps its ledger and posterior too.
+A single run keeps its ledger and posterior too. A run's diagnostics are kept in the same way, from their own folder.
 """
 
 import argparse
 import shutil
 from pathlib import Path
 
-KEPT = ("config.json", "table.csv", "grid.npz", "ledger.jsonl", "posterior.npz")
+KEPT = ("config.json", "table.csv", "grid.npz", "ledger.jsonl", "posterior.npz", "plan.json", "diagnostics.json")
 """Files kept where they are there, beside the pictures."""
 
 
@@ -27,8 +27,8 @@ def main() -> None:
     parser.add_argument("source", type=Path)
     parser.add_argument("target", type=Path)
     arguments = parser.parse_args()
-    if not (arguments.source / "config.json").exists():
-        parser.error(f"expected a run folder, got {arguments.source}")
+    if not any((arguments.source / name).exists() for name in ("config.json", "diagnostics.json")):
+        parser.error(f"expected a run folder or one of diagnostics, got {arguments.source}")
     for path in keep(arguments.source, arguments.target):
         print(path)
 

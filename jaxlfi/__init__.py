@@ -27,8 +27,10 @@ _HOMES = {
     "Support": "jaxlfi.support",
     "SupportWarning": "jaxlfi.inference",
     "Task": "jaxlfi.task",
+    "Truncate": "jaxlfi.heuristics",
     "infer": "jaxlfi.inference",
     "stack": "jaxlfi.lanes",
+    "with_tails": "jaxlfi.tailed",
 }
 
 __all__ = sorted(_HOMES)

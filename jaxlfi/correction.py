@@ -115,10 +115,12 @@ def importance_weights(
 
 
 def log_prior(task: Task, support: Support, theta: Float[Array, "n dim"]) -> Float[Array, " n"]:
-    """Log-density of the first round's proposal."""
+    """Log-density of the prior over a support, up to a factor that is the same for all supports."""
     if task.prior is None:
         return jnp.broadcast_to(-jnp.sum(jnp.log(support.width)), theta.shape[:-1])
-    return task.prior.log_prob(theta)
+    draws = task.prior.sample(seed=jax.random.key(0), sample_shape=MASS_DRAWS)
+    inside = jnp.mean(support.contains(draws)) + 1.0 / MASS_DRAWS
+    return task.prior.log_prob(theta) - jnp.log(inside)
 
 
 def effective_size(weights: Float[Array, " cap"]) -> Float[Array, ""]:

@@ -18,7 +18,7 @@ from jaxlfi.belief import Belief
 from jaxlfi.dataset import Dataset
 from jaxlfi.diagnostics import bound_warnings, discrepancy
 from jaxlfi.estimator import Network
-from jaxlfi.heuristics import Edge, Fixed, Heuristic
+from jaxlfi.heuristics import Edge, Fixed, Heuristic, Truncate
 from jaxlfi.history import DRAWS, apart, posterior_draws, record
 from jaxlfi.keys import run_keys
 from jaxlfi.lanes import Inputs
@@ -32,7 +32,7 @@ from jaxlfi.task import Task
 
 
 class SupportWarning(UserWarning):
-    """Posterior mass is piled on a bound of a support that was kept fixed."""
+    """Posterior mass is piled on a bound of a support that cannot grow."""
 
 
 @struct.dataclass
@@ -202,7 +202,7 @@ def infer(
         run = _as_run(task, key, settings, heuristic, observed, x, state, info)
     if concrete:
         refuse_hopeless(np.asarray(run.info.attempts.succeeded)[:1], np.asarray(run.info.failed)[0], task)
-        if isinstance(heuristic, Fixed):
+        if isinstance(heuristic, Fixed | Truncate):
             for warning in run.warnings:
                 python_warnings.warn(warning, SupportWarning, stacklevel=2)
     return run

@@ -15,7 +15,7 @@ from jaxlfi.bayessim import Settings, State
 from jaxlfi.black_box import BlackBoxEngine
 from jaxlfi.checkpoint import Checkpoint
 from jaxlfi.diagnostics import bound_warnings, edge_mass
-from jaxlfi.heuristics import Fixed
+from jaxlfi.heuristics import Fixed, Truncate
 from jaxlfi.history import apart, posterior_draws
 from jaxlfi.inference import observe, refuse_hopeless
 from jaxlfi.keys import run_keys
@@ -276,13 +276,13 @@ def results(folder: Path, plan: Plan) -> list[dict[str, Any]]:
 
 
 def support_warnings(folder: Path, plan: Plan) -> Iterator[str]:
-    """In words, where runs with a fixed support ended with posterior mass piled on a bound.
+    """In words, where runs whose support cannot grow ended with posterior mass piled on a bound.
 
     One run is told of in full; of several, in how many of them.
     """
     beliefs = [run_store.read_belief(folder / name) for name in plan.folders()]
     runs = list(zip(plan.lanes, beliefs, strict=True))
-    fixed = [(lane, belief) for lane, belief in runs if isinstance(lane.heuristic, Fixed)]
+    fixed = [(lane, belief) for lane, belief in runs if isinstance(lane.heuristic, Fixed | Truncate)]
     for configuration in dict.fromkeys(lane.configuration for lane, _ in fixed):
         own = [belief for lane, belief in fixed if lane.configuration == configuration]
         if len(own) == 1:

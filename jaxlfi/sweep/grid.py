@@ -26,6 +26,7 @@ RANGES = {
     "expansion": (0.0, math.inf),
     "shift_threshold": (0.0, math.inf),
     "proximity": (0.0, 1.0),
+    "quantile": (0.0, float(np.nextafter(np.float32(0.5), np.float32(0)))),
 }
 """What each hyperparameter can be, bounds included: fractions and masses lie in [0, 1], lengths are not negative."""
 
