@@ -124,6 +124,7 @@ def init(key: jax.Array, task: Task, support: Support, settings: Settings, obser
 def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> Float[Array, "attempts dim"]:
     """Draw theta ~ p_i (line 11): the prior over Theta_0 in the first round, then the restricted posterior.
 
+    A belief that is not informed is the prior over its support: so it is in the first round, and always by `Truncate`.
     A defensive share of the draws stays with the prior over the *current* support: it sees the ground that the
     support has gained, also where the posterior has locked itself onto a place where it learns nothing more.
     """
