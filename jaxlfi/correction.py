@@ -115,12 +115,10 @@ def importance_weights(
 
 
 def log_prior(task: Task, support: Support, theta: Float[Array, "n dim"]) -> Float[Array, " n"]:
-    """Log-density of the prior over a support, up to a factor that is the same for all supports."""
+    """Log-density of the prior over a support; a task's own prior is not normalised over it."""
     if task.prior is None:
         return jnp.broadcast_to(-jnp.sum(jnp.log(support.width)), theta.shape[:-1])
-    draws = task.prior.sample(seed=jax.random.key(0), sample_shape=MASS_DRAWS)
-    inside = jnp.mean(support.contains(draws)) + 1.0 / MASS_DRAWS
-    return task.prior.log_prob(theta) - jnp.log(inside)
+    return task.prior.log_prob(theta)
 
 
 def effective_size(weights: Float[Array, " cap"]) -> Float[Array, ""]:
