@@ -35,7 +35,7 @@ DRAWS = 10_000
 
 def mdn(settings: Settings) -> Settings:
     """The single-round method with a mixture density network of ten Gaussians in place of the flow."""
-    return settings.replace(estimator=settings.estimator.replace(family="mdn", components=10, activation="tanh"))
+    return settings.replace(estimator=settings.estimator.replace(family="mdn", components=10))
 
 
 VARIANTS = {
