@@ -64,8 +64,8 @@ def apt(settings: Settings) -> Settings:
 def npe(settings: Settings) -> Settings:
     """Neural posterior estimation: all simulations in a single round, from the prior.
 
-    One round leaves time for an ensemble: averaged over four, flows are better than each. And as no round follows, there
-    is no need to hold back where nothing was simulated: ReLU fits better than tanh where something was.
+    One round leaves time for an ensemble: averaged over four, flows are better than each. And as no round follows,
+    there is no need to hold back where nothing was simulated: ReLU fits better than tanh where something was.
     """
     return settings.replace(
         estimator=FLOW.replace(loss="likelihood", activation="relu", members=4),
