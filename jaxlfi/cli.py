@@ -262,7 +262,7 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
         "--method",
         choices=METHODS,
         default="bayessim",
-        help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: a flow, one round (default: bayessim)",
+        help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: flows, one round (default: bayessim)",
     )
     command.add_argument(
         "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"
