@@ -59,9 +59,30 @@ def environment() -> dict[str, Any]:
             "device": jax.devices()[0].device_kind,
             "cores": os.cpu_count(),
         },
-        "command_line": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command_line": command_line(sys.argv),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def command_line(argv: Sequence[str]) -> str:
+    """A command as its results tell of it: without the folders of the machine it ran on.
+
+    An absolute path is told from the working folder on where it lies below it, and by its name alone elsewhere.
+
+    Example:
+        >>> command_line(["/usr/bin/jaxlfi", "report", "/elsewhere/runs/edge"])
+        'jaxlfi report edge'
+    """
+
+    def portable(argument: str) -> str:
+        flag, equals, value = argument.partition("=") if argument.startswith("-") else ("", "", argument)
+        path = Path(value)
+        if not path.is_absolute():
+            return argument
+        inside = path.is_relative_to(Path.cwd())
+        return flag + equals + (str(path.relative_to(Path.cwd())) if inside else path.name)
+
+    return shlex.join([Path(argv[0]).name, *(portable(argument) for argument in argv[1:])])
 
 
 def processor() -> str:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -353,3 +354,21 @@ def test_occupied_folders_are_refused_and_empty_ones_taken(tmp_path):
         run_store.create(tmp_path / "new", {"a": 2}, lambda folder: None)
     assert json.loads((tmp_path / "new" / "config.json").read_text()) == {"a": 1}
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "new"]
+
+
+# ---------------------------------------------------------------------------------------------------- provenance
+
+
+def test_a_command_is_told_without_the_machines_folders(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    below, elsewhere = tmp_path / "runs" / "a b", tmp_path.parent / "other" / "table.csv"
+    argv = ["/usr/bin/jaxlfi", "infer", "task", "--out", str(below), f"--observation={elsewhere}", "--vary", "tau=0.1"]
+    told = run_store.command_line(argv)
+    assert told == "jaxlfi infer task --out 'runs/a b' --observation=table.csv --vary tau=0.1"
+    assert run_store.command_line(["jaxlfi", "grid", "runs/x", "--tail", "-1"]) == "jaxlfi grid runs/x --tail -1"
+
+
+def test_kept_results_name_no_folder_of_a_machine():
+    kept = sorted((Path(run_store.__file__).parents[1] / "experiments" / "results").rglob("*.json"))
+    commands = {path: json.loads(path.read_text()).get("command_line", "") for path in kept}
+    assert len(kept) > 20 and [path for path, told in commands.items() if " /" in told or "=/" in told] == []
