@@ -38,10 +38,10 @@ def c2st(key: jax.Array, first: Float[Array, "n dim"], second: Float[Array, "n d
     that definition relies on.
 
     Departs in two things. Training does not end in the first 50 passes: where samples are hard to tell apart the loss
-    lies on a plateau at first, and from one start in several the definition's classifier never leaves it, which looks
-    like samples that are alike. And the folds have as many rows of either sample, row i of both in the same: rows that
-    belong together, such as two parameters of one observation, are then held out together. Up to four rows are left
-    out.
+    lies on a plateau at first, where the definition's classifier stops from some starts, as if the samples were alike.
+    Longer plateaus end it still, so a small accuracy is weaker evidence than a large one. And the folds have as many
+    rows of either sample, row i of both in the same: rows that belong together, such as two parameters of one
+    observation, are then held out together. Up to four rows are left out.
 
     Jit it: all folds are trained together. The same key gives the same folds, starts and so the same number.
 
