@@ -1,0 +1,1 @@
+"""The DLO whipping task: physics, camera, reward and Real2Sim."""

@@ -1,0 +1,102 @@
+"""The parameters of the whipping scene: what is inferred, and the nuisances that are only randomised."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from jaxlfi.support import Support
+
+
+@struct.dataclass
+class WhipParameters:
+    """One whipping scene, in SI units; leaves may carry leading axes, one scene an entry (section VI-B).
+
+    Attributes:
+        length: of the DLO, l, in m.
+        young: its Young's modulus E, in Pa.
+        density: its density, in kg/m^3.
+        poisson: its Poisson's ratio. It has no effect on a planar inextensible beam, and is here to be complete.
+        cube_side: side of the cubes, in m.
+        cube_density: their density, in kg/m^3.
+        stack: displacement of the stack of cubes from its place, x and y, in m.
+        camera: displacement of the camera from its place, x, y and z, in m.
+    """
+
+    length: Float[Array, "*batch"]
+    young: Float[Array, "*batch"]
+    density: Float[Array, "*batch"]
+    poisson: Float[Array, "*batch"]
+    cube_side: Float[Array, "*batch"]
+    cube_density: Float[Array, "*batch"]
+    stack: Float[Array, "*batch 2"]
+    camera: Float[Array, "*batch 3"]
+
+
+INITIAL = Support([0.195, 1e3], [0.305, 5e4])
+"""Theta_0 of (length, young)."""
+
+FEASIBLE = Support([0.050, 0.5e3], [0.350, 5e5])
+"""Phi of (length, young)."""
+
+MEDIAN = WhipParameters(
+    length=0.250,
+    young=2.5e4,
+    density=75.0,
+    poisson=0.35,
+    cube_side=0.025,
+    cube_density=100.0,
+    stack=(0.0, 0.0),
+    camera=(0.0, 0.0, 0.0),
+)
+"""mu, what the paper calls the median of Theta_0, with nothing displaced."""
+
+LOWEST = WhipParameters(0.050, 0.5e3, 50.0, 0.3, 0.020, 80.0, (-0.02, -0.005), (-0.025, -0.025, -0.025))
+"""The least values: of length and young by Phi, of the nuisances by section VI-B and VI-H."""
+
+HIGHEST = WhipParameters(0.350, 5e5, 100.0, 0.5, 0.030, 120.0, (0.02, 0.005), (0.025, 0.025, 0.025))
+"""The greatest values."""
+
+
+def median(length: Float[Array, "*batch"] | float = MEDIAN.length, young=MEDIAN.young) -> WhipParameters:
+    """Scenes of the given length (m) and Young's modulus (Pa), all else as in mu."""
+    length, young = jnp.broadcast_arrays(jnp.asarray(length, jnp.float32), jnp.asarray(young, jnp.float32))
+    spread = lambda value: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (*length.shape, *jnp.shape(value)))
+    rest = {name: spread(getattr(MEDIAN, name)) for name in NUISANCES}
+    return WhipParameters(length=length, young=young, **rest)
+
+
+def randomised(key: jax.Array, length: Float[Array, ""], young: Float[Array, ""]) -> WhipParameters:
+    """One scene with every nuisance drawn uniformly from its range."""
+    keys = jax.random.split(key, len(NUISANCES))
+    drawn = {
+        name: jax.random.uniform(
+            keys[i],
+            jnp.shape(getattr(LOWEST, name)),
+            minval=jnp.asarray(getattr(LOWEST, name)),
+            maxval=jnp.asarray(getattr(HIGHEST, name)),
+        )
+        for i, name in enumerate(NUISANCES)
+    }
+    return WhipParameters(length=jnp.asarray(length, jnp.float32), young=jnp.asarray(young, jnp.float32), **drawn)
+
+
+NUISANCES = ("density", "poisson", "cube_side", "cube_density", "stack", "camera")
+"""Names of the parameters that are not inferred."""
+
+
+def check(parameters: WhipParameters) -> WhipParameters:
+    """Refuse parameters that no scene has.
+
+    Raises:
+        ValueError: naming the parameter, its range and what came.
+    """
+    for name in ("length", "young", *NUISANCES):
+        value = jnp.asarray(getattr(parameters, name))
+        low, high = jnp.asarray(getattr(LOWEST, name)), jnp.asarray(getattr(HIGHEST, name))
+        slack = 1e-6 * (high - low)
+        if value.shape[value.ndim - low.ndim :] != low.shape:
+            raise ValueError(f"{name}: expected shape [..., {', '.join(map(str, low.shape))}], got {value.shape}")
+        if not bool(jnp.all((value >= low - slack) & (value <= high + slack))):  # also false for NaN
+            raise ValueError(f"{name}: expected numbers between {low} and {high}, got {value}")
+    return parameters
