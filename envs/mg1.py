@@ -273,6 +273,8 @@ def task(
         summary_names=_summary_names(percentiles, whiten),
         channels=("inter-departure time",),
         record_label="rank" if order == "sorted" else "job",
+        settings={"rounds": 15},  # appendix C
+        hyperparameters={"edge": {"mass_threshold": 0.001}},
     )
 
 

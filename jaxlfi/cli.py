@@ -52,6 +52,7 @@ examples:
   jaxlfi infer lotka_volterra --mass-threshold 0.01 --expansion 0.1 0.1 0.2 0.2 --out runs/gentle
   jaxlfi infer spring:task --observation real.csv --support-low 1 0.1 --support-high 10 1 --out runs/spring
   jaxlfi infer lotka_volterra --preset paper --seeds 4 --out runs/paper
+  jaxlfi infer whip --object dlo-0 --heuristic edge --out runs/dlo-0
 
 """
 
@@ -254,7 +255,14 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = True) -> None:
     """Arguments that `infer`, `compare` and `grid` have in common; `grid` saves no networks."""
-    command.add_argument("task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory")
+    command.add_argument(
+        "task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory; NAME,key=value sets options"
+    )
+    command.add_argument(
+        "--object",
+        metavar="NAME",
+        help="what is observed, where the task knows several objects (short for TASK,object=NAME)",
+    )
     command.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results"
     )
@@ -422,6 +430,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         0; 2 for bad input; 130 where it was interrupted.
     """
     arguments = parser().parse_args(argv)
+    if getattr(arguments, "object", None) is not None:
+        arguments.task = f"{arguments.task},object={arguments.object}"
     prepare_jax(arguments)
     prepared = None
     try:

@@ -5,6 +5,7 @@ import dataclasses
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -83,7 +84,7 @@ def _describe_task(task: Task, console: Console) -> None:
 def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi infer`."""
     task = task_lookup.load(arguments.task)
-    settings = build_settings(arguments)
+    settings = build_settings(arguments, task)
     support_name, support = _support(arguments, task)
     heuristic = build_heuristic(arguments, arguments.heuristic, settings, task)
     _refuse_foreign_hyperparameters(arguments, [arguments.heuristic])
@@ -98,7 +99,7 @@ def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
 def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi compare`."""
     task = task_lookup.load(arguments.task)
-    settings = build_settings(arguments)
+    settings = build_settings(arguments, task)
     configurations = arguments.configurations or default_configurations(task)
     if len(set(configurations)) < len(configurations):
         raise ValueError(f"configurations: expected distinct ones, got {configurations}")
@@ -122,7 +123,7 @@ def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
 def grid(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi grid`."""
     task = task_lookup.load(arguments.task)
-    settings = build_settings(arguments)
+    settings = build_settings(arguments, task)
     axes = sweep.parse_axes(arguments.vary)
     _refuse_foreign_hyperparameters(arguments, [arguments.heuristic])
     for axis in axes:
@@ -324,9 +325,9 @@ def default_configurations(task: Task) -> list[str]:
     return [*supports, *(f"{adapted}+{heuristic}" for heuristic in ("edge", "mode", "centre"))]
 
 
-def build_settings(arguments: argparse.Namespace) -> Settings:
-    """The preset with the settings that were given in its place."""
-    preset = METHODS[arguments.method](PRESETS[arguments.preset])
+def build_settings(arguments: argparse.Namespace, task: Task) -> Settings:
+    """The preset, with what the task asks for in its place, and what was given in place of both."""
+    preset = METHODS[arguments.method](with_settings(PRESETS[arguments.preset], task.settings))
     given = {name: value for name, value in vars(arguments).items() if value is not None}
     if "steps" in given and "epochs" not in given:
         given["epochs"] = 0
@@ -337,11 +338,7 @@ def build_settings(arguments: argparse.Namespace) -> Settings:
     if "attempts" not in given and "additions" in given:
         # The share of failures that a round can bear stays the preset's.
         given["attempts"] = -(-given["additions"] * preset.attempts // preset.additions)
-    estimator = {f.name: given[f.name] for f in dataclasses.fields(Estimator) if f.name in given}
-    others = {f.name: given[f.name] for f in dataclasses.fields(Settings) if f.name in given}
-    settings = dataclasses.replace(
-        preset, estimator=dataclasses.replace(preset.estimator, **estimator), **others
-    )
+    settings = with_settings(preset, given)
     for name in ("learning_rate", "weight_decay", "clip_norm"):
         value = getattr(settings.estimator, name)
         if not value >= 0 or (name != "clip_norm" and not np.isfinite(value)):
@@ -349,8 +346,16 @@ def build_settings(arguments: argparse.Namespace) -> Settings:
     return settings.check()
 
 
+def with_settings(settings: Settings, given: Mapping[str, Any]) -> Settings:
+    """Settings with those numbers replaced that are named, be they of the run or of its estimator."""
+    named = lambda kind: {f.name: given[f.name] for f in dataclasses.fields(kind) if f.name in given}
+    return dataclasses.replace(
+        settings, estimator=dataclasses.replace(settings.estimator, **named(Estimator)), **named(Settings)
+    )
+
+
 def build_heuristic(arguments: argparse.Namespace, name: str, settings: Settings, task: Task) -> Heuristic:
-    """A heuristic with the hyperparameters that were given and that it has.
+    """A heuristic with the hyperparameters that were given, or else those that the task asks for.
 
     MODE compares components by their index; where networks start anew every round they are matched first.
     """
@@ -361,7 +366,10 @@ def build_heuristic(arguments: argparse.Namespace, name: str, settings: Settings
     for field in dataclasses.fields(kind):
         given = getattr(arguments, field.name)
         if given is None:
+            given = task.hyperparameters.get(name, {}).get(field.name)
+        if given is None:
             continue
+        given = np.atleast_1d(given).tolist()
         if len(given) not in (1, task.dim) or not np.isfinite(given).all():
             raise ValueError(f"{field.name}: expected one finite number or {task.dim}, got {given}")
         values[field.name] = given[0] if len(given) == 1 else np.asarray(given, np.float32)

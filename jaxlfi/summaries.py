@@ -41,6 +41,30 @@ def series(trajectory: Float[Array, "time channels"]) -> Float[Array, " obs"]:
     return jnp.concatenate([mean, jnp.log1p(variance), jnp.stack(memory, axis=-1).ravel(), coupling])
 
 
+def cross_correlation(trajectory: Float[Array, "time columns"], actions: int) -> Float[Array, " obs"]:
+    """How states go with actions, and their level and spread: psi of section VI-F, shape [Ds Da + 2 Ds].
+
+    In this order: the dot products <S_i, A_j> over time, j fastest; the means of the states; their standard deviations
+    (reading L: what the paper writes as Var).
+
+    Args:
+        trajectory: states [T, Ds] beside actions [T, Da], shape [T, Ds + Da].
+        actions: Da, the number of columns at the end that are actions.
+
+    Raises:
+        ValueError: if that leaves no states or no actions.
+
+    Example:
+        >>> cross_correlation(jnp.array([[1.0, 2.0, 1.0], [3.0, 2.0, -1.0]]), actions=1).tolist()
+        [-2.0, 0.0, 2.0, 2.0, 1.0, 0.0]
+    """
+    if not 0 < actions < trajectory.shape[-1]:
+        raise ValueError(f"actions: expected some of the {trajectory.shape[-1]} columns, got {actions}")
+    states, applied = jnp.split(trajectory, [trajectory.shape[-1] - actions], axis=-1)
+    products = jnp.einsum("ti,tj->ij", states, applied)
+    return jnp.concatenate([products.ravel(), jnp.mean(states, axis=0), jnp.std(states, axis=0)])
+
+
 SUMMARIES: dict[str, Summary] = {"identity": identity, "series": series}
 """Summaries by name; each maps one trajectory to a vector [S]."""
 

@@ -47,6 +47,9 @@ class Task:
         times: times of the rows of a trajectory, shape [T], for plots.
         record_label: what the rows of a trajectory are counted by, for plots; by default "time" where there are
             `times`, else "record".
+        settings: numbers of a run, by the names of `jaxlfi.bayessim.Settings` and `jaxlfi.estimator.Estimator`, that
+            the command line takes for this task in place of the preset's.
+        hyperparameters: of heuristics, by the heuristic's name, that it takes in place of their defaults.
         name: what the task is called in files and figures.
 
     Raises:
@@ -77,6 +80,8 @@ class Task:
     channels: Sequence[str] = ()
     times: Any = None
     record_label: str | None = None
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    hyperparameters: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     name: str = "task"
 
     def __post_init__(self):

@@ -1,0 +1,134 @@
+"""The whipping task as an environment: reset and step, pure, for one scene and batched by vmap."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from envs.whip import engine as physics
+from envs.whip import rules
+from envs.whip.camera import side_camera
+from envs.whip.engine import Engine, State
+from envs.whip.frames import Frames
+from envs.whip.keypoints import DETECTORS, Detector, Tracking, begin, track
+from envs.whip.kinematics import frames
+from envs.whip.parameters import WhipParameters
+
+OBSERVATION = 28
+"""Numbers in an observation."""
+
+
+@struct.dataclass
+class Episode:
+    """What the next step needs.
+
+    Attributes:
+        state: of the physics.
+        tracking: of the detector.
+        start: the cubes' keypoints at the start, shape [6, 2].
+        hit: cubes hit so far, bottom-up, shape [6].
+        steps: taken so far.
+    """
+
+    state: State
+    tracking: Tracking
+    start: Float[Array, "*batch 6 2"]
+    hit: Bool[Array, "*batch 6"]
+    steps: Int[Array, "*batch"]
+
+
+@struct.dataclass
+class Step:
+    """What a step gives to learn from.
+
+    Attributes:
+        observation: the gripper's x and z in m, four DLO and six cube keypoints in normalised pixels, six flags of
+            cubes that have been hit, shape [28].
+        reward: see `rules.reward`.
+        terminated: whether the top cube has been hit or the gripper has left its workspace.
+        truncated: whether the episode's time is up, or the simulation has broken down.
+        hit: cubes hit so far, bottom-up, shape [6].
+        outside: whether the gripper has left its workspace.
+        failed: whether the simulation has broken down.
+        seen: keypoints that were seen, shape [10]; of the others the last position is told.
+    """
+
+    observation: Float[Array, "*batch 28"]
+    reward: Float[Array, "*batch"]
+    terminated: Bool[Array, "*batch"]
+    truncated: Bool[Array, "*batch"]
+    hit: Bool[Array, "*batch 6"]
+    outside: Bool[Array, "*batch"]
+    failed: Bool[Array, "*batch"]
+    seen: Bool[Array, "*batch 10"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Whip:
+    """The whipping task.
+
+    Attributes:
+        engine: of its physics.
+        detector: of its keypoints.
+
+    Example:
+        >>> import jax
+        >>> from envs.whip.native import NativeEngine
+        >>> from envs.whip.parameters import median
+        >>> whip = Whip(NativeEngine())
+        >>> episode, observation = whip.reset(jax.random.key(0), median(length=0.25, young=2.5e4))
+        >>> observation.shape
+        (28,)
+    """
+
+    engine: Engine
+    detector: Detector = DETECTORS["clean"]
+
+    def reset(self, key: jax.Array, parameters: WhipParameters) -> tuple[Episode, Float[Array, "28"]]:
+        """The start of an episode in a scene, and the first observation."""
+        key_begin, key_track = jax.random.split(key)
+        state = physics.reset(self.engine.scene, parameters)
+        keypoints, _, tracking = self._look(key_track, parameters, begin(key_begin, self.detector), state)
+        hit = jnp.zeros(6, bool)
+        episode = Episode(state, tracking, keypoints[4:], hit, jnp.asarray(0))
+        return episode, observation(state.qpos[:2], keypoints, hit)
+
+    def step(
+        self, key: jax.Array, parameters: WhipParameters, episode: Episode, action: Float[Array, "2"]
+    ) -> tuple[Episode, Step]:
+        """Apply an action (dx, dz), in m."""
+        state = self.engine.advance(parameters, episode.state, rules.moved_target(episode.state.target, action))
+        keypoints, seen, tracking = self._look(key, parameters, episode.tracking, state)
+        gripper = state.qpos[:2]
+        hit = rules.hits(episode.hit, episode.start, keypoints[4:])
+        out = rules.outside(gripper)
+        steps = episode.steps + 1
+        step = Step(
+            observation=observation(gripper, keypoints, hit),
+            reward=jnp.where(state.failed, 0.0, rules.reward(hit, out)),
+            terminated=(hit[rules.TOP] | out) & ~state.failed,
+            truncated=(steps >= rules.STEPS) | state.failed,
+            hit=hit,
+            outside=out,
+            failed=state.failed,
+            seen=seen,
+        )
+        return Episode(state, tracking, episode.start, hit, steps), step
+
+    def frames(self, parameters: WhipParameters, episode: Episode) -> Frames:
+        """What there is to see."""
+        return frames(self.engine.scene, parameters, episode.state.qpos)
+
+    def _look(self, key, parameters, tracking, state):
+        seen = frames(self.engine.scene, parameters, state.qpos)
+        return track(key, self.detector, side_camera(parameters), tracking, seen)
+
+
+def observation(
+    gripper: Float[Array, "*batch 2"], keypoints: Float[Array, "*batch 10 2"], hit: Bool[Array, "*batch 6"]
+) -> Float[Array, "*batch 28"]:
+    """The observation of section VI-E: proprioception, keypoints and flags."""
+    flat = keypoints.reshape(*keypoints.shape[:-2], 20)
+    return jnp.concatenate([gripper, flat, hit.astype(jnp.float32)], axis=-1)
