@@ -1,4 +1,7 @@
-"""The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | diagnose | report`.
+"""The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | diagnose | report`, and those of tasks.
+
+A package adds commands of its own by `[project.entry-points."jaxlfi.commands"]` in pyproject.toml: a name, and a function
+that takes the words after it and returns the exit status.
 
 This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set
 before jax starts can be set after the arguments are known.
@@ -10,6 +13,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import NoReturn
 
@@ -250,7 +254,14 @@ def parser() -> argparse.ArgumentParser:
         description="Draw all pictures of a folder from its saved files.",
     )
     report.add_argument("folder", type=Path, metavar="DIR", help="a folder that infer, compare or grid wrote")
+    for name in foreign_commands():
+        commands.add_parser(name, add_help=False, help=f"commands of its own: jaxlfi {name} --help")
     return top
+
+
+def foreign_commands() -> dict[str, EntryPoint]:
+    """Commands that installed packages add, by name."""
+    return {point.name: point for point in entry_points(group="jaxlfi.commands")}
 
 
 def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = True) -> None:
@@ -429,7 +440,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0; 2 for bad input; 130 where it was interrupted.
     """
-    arguments = parser().parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and (foreign := foreign_commands().get(words[0])):
+        return foreign.load()(words[1:])
+    arguments = parser().parse_args(words)
     if getattr(arguments, "object", None) is not None:
         arguments.task = f"{arguments.task},object={arguments.object}"
     prepare_jax(arguments)

@@ -335,6 +335,63 @@ def test_tasks_are_listed_also_beside_a_broken_package(registered, capsys):
     assert "linear" in out and "first, second" in out and "cannot load 'broken'" in out
 
 
+def shouting(words):
+    print(" ".join(words).upper())
+    return 7
+
+
+def test_packages_add_commands(monkeypatch, capsys):
+    point = EntryPoint("shout", "tests.test_cli:shouting", "jaxlfi.commands")
+    monkeypatch.setattr(cli, "entry_points", lambda group: [point])
+    assert cli.main(["shout", "whip", "--help"]) == 7
+    assert capsys.readouterr().out == "WHIP --HELP\n"
+    assert "shout" in cli.parser().format_help()
+
+
+def oven(heat="1.5", rounds="3"):
+    """A task with options, which asks for a setting and a hyperparameter."""
+    return dataclasses.replace(
+        gaussian(),
+        name=f"oven at {float(heat)}",
+        settings={"rounds": int(rounds), "learning_rate": 0.25},
+        hyperparameters={"edge": {"mass_threshold": (0.125, 0.5), "expansion": 0.75}},
+    )
+
+
+def test_tasks_take_options():
+    assert tasks.load("tests.test_cli:oven").name == "oven at 1.5"
+    assert tasks.load("tests.test_cli:oven,heat=3,rounds=4").name == "oven at 3.0"
+    with pytest.raises(ValueError, match="expected options among heat, rounds, got 'tests.test_cli:oven,colour=red'"):
+        tasks.load("tests.test_cli:oven,colour=red")
+    with pytest.raises(ValueError, match="failed: ValueError: could not convert"):
+        tasks.load("tests.test_cli:oven,heat=much")
+    with pytest.raises(ValueError, match="expected options among none"):
+        tasks.load("envs.gaussian_linear:task,object=dlo-0")
+    for wrong in ("tests.test_cli:oven,heat", "tests.test_cli:oven,heat=", "tests.test_cli:oven,heat=1,heat=2"):
+        with pytest.raises(ValueError, match="expected options as NAME,key=value"):
+            tasks.load(wrong)
+
+
+def test_an_object_is_an_option_of_the_task(tmp_path, capsys):
+    message = error_line(capsys, "infer", TASK, "--object", "dlo-0", *FLAGS, "--out", tmp_path / "out")
+    assert "expected options among none" in message and "object=dlo-0" in message
+
+
+def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line(tmp_path):
+    task = oven()
+    parse = lambda *words: cli.parser().parse_args(["infer", TASK, "--out", str(tmp_path), *words])
+    settings = commands.build_settings(parse(), task)
+    assert (settings.rounds, settings.estimator.learning_rate) == (3, 0.25)
+    assert settings.estimator.hidden == PRESETS["quick"].estimator.hidden
+    given = commands.build_settings(parse("--rounds", "7"), task)
+    assert (given.rounds, given.estimator.learning_rate) == (7, 0.25)
+    edge = commands.build_heuristic(parse("--expansion", "0.1"), "edge", settings, task)
+    np.testing.assert_array_equal(edge.mass_threshold, [0.125, 0.5])
+    assert edge.expansion == 0.1
+    mode = commands.build_heuristic(parse(), "mode", PRESETS["paper"], task)
+    assert mode == HEURISTICS["mode"]()
+
+
 def test_one_task_is_described(registered, capsys):
     assert command("tasks", "linear") == 0
     out = capsys.readouterr().out
