@@ -110,7 +110,9 @@ def check_within(support: Support, feasible: Support, name: str = "support") -> 
     low, high = _checked_bounds(np.asarray(support.low), np.asarray(support.high))
     if low.shape != feasible.low.shape:
         raise ValueError(f"{name}: expected bounds for {feasible.dim} parameters, got {low.size}")
-    outside = np.flatnonzero((low < np.asarray(feasible.low)) | (high > np.asarray(feasible.high)))
+    # In one precision: a bound is not outside of itself because one of the two was rounded.
+    limits = np.asarray(feasible.low, low.dtype), np.asarray(feasible.high, high.dtype)
+    outside = np.flatnonzero((low < limits[0]) | (high > limits[1]))
     if outside.size:
         d = int(outside[0])
         raise ValueError(

@@ -125,3 +125,8 @@ def test_draws_are_uniform_over_the_box(key):
 def test_draws_stay_in_the_box(drawn, key):
     box, _ = drawn
     assert bool(jnp.all(box.contains(box.sample(key, 1000))))
+
+
+def test_a_box_is_within_itself_in_any_precision():
+    box = Support(np.array([0.05, 0.1]) * 1e3, np.array([0.35, 1 / 3]) * 1e3)  # float64, not exact in float32
+    assert check_within(box, box) is box

@@ -3,7 +3,7 @@
 What MuJoCo derives from these fields when it compiles a model (`mj_setConst`) is not among them.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import mujoco
@@ -25,6 +25,12 @@ def edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
         parameters: of one scene; NumPy's numbers for `xp=numpy`, JAX's for `xp=jax.numpy`.
         xp: the array library.
     """
+    yield from dlo_edits(scene, parameters, xp)
+    yield from cube_edits(scene, parameters, xp)
+
+
+def dlo_edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
+    """What they decide of the DLO."""
     model, chain = base_model(scene), scene.chain
     bodies = np.array([model.body(name).id for name in link_names(chain)])
     geoms = np.array([model.geom(name).id for name in link_names(chain)])
@@ -44,6 +50,10 @@ def edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
     yield "jnt_stiffness", joints, chain.stiffness(parameters.length, parameters.young)
     yield "dof_damping", freedoms, chain.damping(parameters.length, parameters.young)
 
+
+def cube_edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
+    """What they decide of the cubes."""
+    model = base_model(scene)
     side, density = parameters.cube_side, parameters.cube_density
     bodies = np.array([model.body(name).id for name in cube_names()])
     geoms = np.array([model.geom(name).id for name in cube_names()])
@@ -61,8 +71,13 @@ def edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
 
 def edited_model(scene: Scene, parameters: WhipParameters) -> mujoco.MjModel:
     """The model that `scene.compile_model` gives, by editing the compiled median one: several times faster."""
-    model = base_model(scene).__copy__()
-    for field, index, values in edits(scene, parameters):
+    return edited(base_model(scene), edits(scene, parameters))
+
+
+def edited(model: mujoco.MjModel, changes: Iterable[Edit]) -> mujoco.MjModel:
+    """A copy of a model with fields changed, and what MuJoCo derives from them."""
+    model = model.__copy__()
+    for field, index, values in changes:
         getattr(model, field)[index] = values
     mujoco.mj_setConst(model, mujoco.MjData(model))
     model.stat.meaninertia = np.mean(model.dof_M0)  # scales the solver's tolerance

@@ -15,7 +15,14 @@ START = (0.40, 0.36)
 """Where the gripper begins, x and z in m: the longest DLO just clears the table."""
 STACK = 0.60
 """Where the stack of cubes stands, x in m."""
+HAND = (0.02, 0.015, 0.03)
+"""Half the gripper's width, depth and height, in m; the DLO is held at the middle of its lower side."""
 CUBES = len(frames.COLOURS)
+SINKING = np.array([40.06, 106.59, 159.92, 199.98, 226.71, 240.08]) * 1e-6
+"""How far the cubes of a stack at rest have sunk into what is below, bottom-up, in m.
+
+It follows from the softness of the contacts and the weights above, whatever the cubes' size and density.
+"""
 
 RGBA = {
     "red": (0.85, 0.15, 0.15, 1),
@@ -122,9 +129,9 @@ def cube_names() -> list[str]:
 
 
 def cube_positions(parameters: WhipParameters, xp=np):
-    """Where the cubes' centres are at first, shape [6, 3], in m."""
+    """Where the cubes' centres are at rest, shape [6, 3], in m."""
     side, stack = parameters.cube_side, parameters.stack
-    heights = side * (xp.arange(CUBES) + 0.5)
+    heights = side * (xp.arange(CUBES) + 0.5) - SINKING
     return xp.stack([xp.full(CUBES, STACK) + stack[0], xp.zeros(CUBES) + stack[1], heights], axis=-1)
 
 
@@ -156,8 +163,8 @@ def _add_gripper(spec: mujoco.MjSpec, scene: Scene) -> None:
     hand = gripper.add_geom(
         name="gripper",
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[0.02, 0.015, 0.03],
-        pos=[0, 0, 0.03],
+        size=HAND,
+        pos=[0, 0, HAND[2]],
         rgba=RGBA["gripper"],
     )
     hand.contype = hand.conaffinity = 0
@@ -224,3 +231,22 @@ def _add_contacts(spec: mujoco.MjSpec, chain: Chain) -> None:
 def base_model(scene: Scene) -> mujoco.MjModel:
     """The model of the median scene, which all others differ from in numbers only."""
     return compile_model(scene)
+
+
+@functools.lru_cache(maxsize=8)
+def bare_model(scene: Scene) -> mujoco.MjModel:
+    """The median scene without cubes, but for that like `base_model`, with sensors of where everything is.
+
+    The sensors tell the centres of the gripper and of the links, in m.
+    """
+    spec = build(scene)
+    for pair in list(spec.pairs):
+        if pair.geomname2 in cube_names():
+            spec.delete(pair)
+    for name in cube_names():
+        spec.delete(spec.body(name))
+    for name in ("gripper", *link_names(scene.chain)):
+        spec.add_sensor(
+            type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=name, name=name
+        )
+    return refuse_plugins(spec.compile())
