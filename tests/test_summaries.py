@@ -43,3 +43,19 @@ def test_identity_flattens():
 def test_unknown_name_lists_the_known():
     with pytest.raises(ValueError, match=r"summary: expected one of \['identity', 'series'\], got 'nine'"):
         summaries.named("nine")
+
+
+def test_cross_correlation_against_loops():
+    rng = np.random.default_rng(3)
+    states, actions = rng.normal(2.0, 3.0, (16, 28)), rng.uniform(-0.06, 0.06, (16, 2))
+    x = summaries.cross_correlation(jnp.asarray(np.hstack([states, actions]), jnp.float32), actions=2)
+    products = [sum(s[i] * a[j] for s, a in zip(states, actions, strict=True)) for i in range(28) for j in range(2)]
+    expected = np.concatenate([products, states.mean(axis=0), states.std(axis=0)])
+    assert x.shape == (112,)
+    np.testing.assert_allclose(x, expected, rtol=2e-5, atol=2e-5)
+
+
+@pytest.mark.parametrize("actions", [0, 3, 4])
+def test_cross_correlation_needs_states_and_actions(actions):
+    with pytest.raises(ValueError, match=f"actions: expected some of the 3 columns, got {actions}"):
+        summaries.cross_correlation(jnp.ones((5, 3)), actions=actions)

@@ -1,0 +1,216 @@
+"""Real2Sim of the four stand-ins: what is inferred with the support fixed and adapted by EDGE, and how far it is off.
+
+    python -m experiments.real2sim --runs runs/real2sim --out experiments/results/real2sim
+
+Runs `jaxlfi compare whip --object dlo-K --configurations initial initial+edge` for each object (what is there already
+is not run again) and draws counterparts of the paper's figures from the run folders:
+
+    progression.png   fig:mog-n-param-space-progr: samples by iteration with their boxes, and the last mixtures
+    domains.png       fig:mog-posterior-for-dr: the last mixtures and the 12 domains that policies would be trained on
+    gap.png           fig:sim2real-distance-progr: distance of each iteration's best samples from the observation
+"""
+
+import argparse
+import csv
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from envs.whip.episode import OBSERVATION
+from jaxlfi import atomic, cli, run_store
+from jaxlfi.figures import History, open_collection, samples, style
+
+OBJECTS = ("dlo-0", "dlo-1", "dlo-2", "dlo-3")
+CONFIGURATIONS = ("initial", "initial+edge")
+DOMAINS = 12
+"""Environments a policy is trained in at once, each with parameters of its own (section VI-H)."""
+BEST = 0.25
+"""Share of an iteration's samples whose distance is told."""
+PIXELS = 256
+KEYPOINTS = slice(2, 22)
+"""Where an observation's keypoints are."""
+
+
+def mean_keypoints(x: np.ndarray) -> np.ndarray:
+    """Keypoints averaged over time, in pixels, from summaries [..., 112], shape [..., 10, 2]."""
+    mean = x[..., 2 * OBSERVATION : 3 * OBSERVATION][..., KEYPOINTS]
+    return PIXELS * mean.reshape(*mean.shape[:-1], 10, 2)
+
+
+def chamfer(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Bidirectional Chamfer distance of two sets of points: mean distance to the nearest, there and back, halved.
+
+    Args:
+        points: shape [..., N, 2].
+        others: shape [..., M, 2].
+    """
+    distance = np.linalg.norm(points[..., :, None, :] - others[..., None, :, :], axis=-1)
+    return (distance.min(axis=-1).mean(axis=-1) + distance.min(axis=-2).mean(axis=-1)) / 2
+
+
+def gaps(folder: Path) -> dict[str, np.ndarray]:
+    """Mean and standard deviation over each iteration's best quarter of samples, shape [R, 2] each.
+
+    Returns:
+        "summary": Euclidean distance of psi; "pixels": Chamfer distance of the DLO's and the cubes' keypoints averaged
+        over time.
+    """
+    data = atomic.read_arrays(folder / "dataset.npz")
+    observed = atomic.read_arrays(folder / "observation.npz")["x"]
+    seen, target = mean_keypoints(data["x"]), mean_keypoints(observed)
+    dlo, cubes = slice(0, 4), slice(4, 10)
+    distances = {
+        "summary": np.linalg.norm(data["x"] - observed, axis=-1),
+        # Each of its kind: a point of the DLO is no cube, however near.
+        "pixels": (4 * chamfer(seen[:, dlo], target[dlo]) + 6 * chamfer(seen[:, cubes], target[cubes])) / 10,
+    }
+    rounds = np.unique(data["round"])
+    return {name: np.array([_best(d[data["round"] == i]) for i in rounds]) for name, d in distances.items()}
+
+
+def _best(distances: np.ndarray) -> tuple[float, float]:
+    best = np.sort(distances)[: max(1, round(BEST * len(distances)))]
+    return float(best.mean()), float(best.std())
+
+
+def domains(history: History) -> np.ndarray:
+    """Low-variance draws of the last posterior, clipped to its support, in coordinates, shape [12, 2]."""
+    belief = run_store.read_belief(history.folder)
+    draws = belief.mixture.low_variance_sample(jax.random.key(0), DOMAINS)
+    return np.asarray(jnp.clip(draws, belief.support.low, belief.support.high))
+
+
+def draw_progression(figure: Figure, histories: Mapping[str, Mapping[str, History]]) -> None:
+    """A row an object: samples and last mixture, with the support fixed and adapted."""
+    axes = figure.subplots(len(histories), 4, squeeze=False)
+    for row, (name, own) in enumerate(histories.items()):
+        for column, configuration in enumerate(CONFIGURATIONS):
+            history = own[configuration]
+            left, right = axes[row, 2 * column : 2 * column + 2]
+            window = [samples.limits(list(own.values()), d) for d in (0, 1)]
+            samples.draw_proposals(left, history, (0, 1), window)
+            samples.draw_mixture(right, history, (0, 1))
+            left.set_title(f"{name}, {'EDGE' if column else 'fixed'}")
+    style.iteration_bar(figure, axes, histories[next(iter(histories))][CONFIGURATIONS[0]].rounds)
+
+
+def draw_domains(figure: Figure, histories: Mapping[str, Mapping[str, History]]) -> None:
+    """A column an object: the last mixture and twelve domains drawn from it, fixed above and adapted below."""
+    axes = figure.subplots(2, len(histories), squeeze=False)
+    for column, (name, own) in enumerate(histories.items()):
+        for row, configuration in enumerate(CONFIGURATIONS):
+            window = [samples.limits(list(own.values()), d) for d in (0, 1)]
+            samples.draw_mixture(axes[row, column], own[configuration], (0, 1), window)
+            axes[row, column].plot(
+                *domains(own[configuration]).T, "o", markersize=3, markerfacecolor="none", color="black", zorder=6
+            )
+            axes[row, column].set_title(f"{name}, {'EDGE' if row else 'fixed'}")
+
+
+def draw_gaps(figure: Figure, found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]) -> None:
+    """A column an object: distance by iteration, of summaries (bold) and of keypoints in pixels (faded)."""
+    axes = figure.subplots(1, len(found), squeeze=False)[0]
+    colours = {"initial": "tab:orange", "initial+edge": "tab:blue"}
+    for column, (name, own) in enumerate(found.items()):
+        left, right = axes[column], axes[column].twinx()
+        for configuration, gap in own.items():
+            steps = np.arange(1, len(gap["summary"]) + 1)
+            colour, label = colours[configuration], "EDGE" if "edge" in configuration else "fixed"
+            left.errorbar(steps, *gap["summary"].T, color=colour, capsize=1.5, label=label)
+            right.errorbar(steps, *gap["pixels"].T, color=colour, alpha=0.35, capsize=1.5)
+        left.set_title(name)
+        left.set_xlabel("iteration")
+        if column == 0:
+            left.set_ylabel("distance of summaries (bold)")
+            left.legend()
+        if column == len(found) - 1:
+            right.set_ylabel("Chamfer distance [px] (faded)")
+
+
+def table(histories: Mapping[str, Mapping[str, History]], found) -> list[dict[str, object]]:
+    """A line an object and configuration: where the posterior and its support ended, and the last gaps."""
+    lines = []
+    for name, own in histories.items():
+        for configuration, history in own.items():
+            belief = run_store.read_belief(history.folder)
+            draws = np.asarray(belief.mixture.sample(jax.random.key(1), 4000))
+            draws = np.clip(draws, belief.support.low, belief.support.high)
+            low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
+            gap = found[name][configuration]
+            lines.append(
+                {
+                    "object": name,
+                    "configuration": configuration,
+                    "length [mm]": f"{middle[0]:.0f} [{low[0]:.0f}, {high[0]:.0f}]",
+                    "E [kPa]": " ".join(
+                        [f"{np.exp(middle[1]) / 1e3:.2f}", f"[{np.exp(low[1]) / 1e3:.2f}, {np.exp(high[1]) / 1e3:.2f}]"]
+                    ),
+                    "support length [mm]": f"[{belief.support.low[0]:.0f}, {belief.support.high[0]:.0f}]",
+                    "support E [kPa]": "[{:.2g}, {:.2g}]".format(
+                        *(np.exp(float(b[1])) / 1e3 for b in (belief.support.low, belief.support.high))
+                    ),
+                    "summary gap": round(float(gap["summary"][-1, 0]), 3),
+                    "pixel gap": round(float(gap["pixels"][-1, 0]), 2),
+                    "seconds": round(float(np.sum(history.seconds)), 1),
+                }
+            )
+    return lines
+
+
+def main() -> None:
+    """Run what is missing, then draw."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=Path, required=True, help="where the runs are, or are to be")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--objects", nargs="+", default=OBJECTS, help="names, or recorded rollouts' .npz")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    histories, found = {}, {}
+    for name in arguments.objects:
+        folder = arguments.runs / Path(name).stem
+        words = ["compare", "whip", "--object", name, "--seeds", "1", "--first-seed", str(arguments.seed)]
+        words += ["--configurations", *CONFIGURATIONS, "--out", str(folder), "--keep-network"]
+        if not (folder / "config.json").exists():
+            if status := cli.main(words):
+                raise SystemExit(status)
+        elif run_store.read_config(folder).get("status") != "finished":
+            cli.main(["resume", str(folder)])
+        own = {label: runs[0] for label, runs in open_collection(folder).runs.items()}
+        histories[Path(name).stem] = own
+        found[Path(name).stem] = {label: gaps(history.folder) for label, history in own.items()}
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    lines = table(histories, found)
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, lines[0])
+    writer.writeheader()
+    writer.writerows(lines)
+    atomic.write_bytes(arguments.out / "table.csv", stream.getvalue().encode())
+    atomic.write_json(arguments.out / "config.json", run_store.environment())
+    arrays = {
+        f"{name}_{label.replace('+', '_')}_{kind}": value
+        for name, own in found.items()
+        for label, gap in own.items()
+        for kind, value in gap.items()
+    }
+    atomic.write_arrays(arguments.out / "gaps.npz", arrays)
+    rows = len(histories)
+    with style.context():
+        for name, size, paint in (
+            ("progression", (7.2, 1.75 * rows), lambda f: draw_progression(f, histories)),
+            ("domains", (1.8 * rows, 3.8), lambda f: draw_domains(f, histories)),
+            ("gap", (1.9 * rows, 1.9), lambda f: draw_gaps(f, found)),
+        ):
+            figure = style.new_figure(*size)
+            paint(figure)
+            style.save(figure, arguments.out / f"{name}.png", 200)
+
+
+if __name__ == "__main__":
+    main()
