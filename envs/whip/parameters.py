@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -61,7 +62,7 @@ HIGHEST = WhipParameters(0.350, 5e5, 100.0, 0.5, 0.030, 120.0, (0.02, 0.005), (0
 def median(length: Float[Array, "*batch"] | float = MEDIAN.length, young=MEDIAN.young) -> WhipParameters:
     """Scenes of the given length (m) and Young's modulus (Pa), all else as in mu."""
     length, young = jnp.broadcast_arrays(jnp.asarray(length, jnp.float32), jnp.asarray(young, jnp.float32))
-    spread = lambda value: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (*length.shape, *jnp.shape(value)))
+    spread = lambda value: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (*length.shape, *np.shape(value)))
     rest = {name: spread(getattr(MEDIAN, name)) for name in NUISANCES}
     return WhipParameters(length=length, young=young, **rest)
 
@@ -72,7 +73,7 @@ def randomised(key: jax.Array, length: Float[Array, ""], young: Float[Array, ""]
     drawn = {
         name: jax.random.uniform(
             keys[i],
-            jnp.shape(getattr(LOWEST, name)),
+            np.shape(getattr(LOWEST, name)),
             minval=jnp.asarray(getattr(LOWEST, name)),
             maxval=jnp.asarray(getattr(HIGHEST, name)),
         )

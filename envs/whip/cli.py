@@ -1,0 +1,99 @@
+"""The command line of the whipping task: `jaxlfi whip render | plan`.
+
+This module imports neither jax nor numpy, so that `--help` answers at once.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxlfi.cli import OneLineParser
+
+EXAMPLES = """\
+examples:
+  jaxlfi whip render --length 290 --young 2e3 --out runs/explore
+  jaxlfi whip render --length 250 --young 2.5e4 --policy plan --detector transporter --out runs/whip
+  jaxlfi whip plan --length 250 --young 2.5e4 --out runs/plan.npz
+  jaxlfi whip render --length 200 --young 2.5e4 --policy runs/plan.npz --out runs/shorter
+
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    formatter = argparse.RawDescriptionHelpFormatter
+    top = OneLineParser(
+        prog="jaxlfi whip",
+        description="Look at the DLO whipping task, and plan whips.",
+        epilog=EXAMPLES,
+        formatter_class=formatter,
+    )
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    render = commands.add_parser(
+        "render",
+        help="draw a rollout",
+        description="Roll out one episode and draw it: sheet.png, film.gif (half as fast as life) and rollout.npz.",
+    )
+    _add_scene(render)
+    render.add_argument(
+        "--policy",
+        default="explore",
+        metavar="NAME|FILE",
+        help="explore: to get to know the DLO; random: a draw that stays in the workspace; plan: one that hits the top "
+        'cube, searched for first; or an .npz with an array "actions" [16, 2] in m (default: explore)',
+    )
+    render.add_argument(
+        "--detector", default="clean", metavar="NAME", help="of keypoints: clean, noisy, transporter (default: clean)"
+    )
+    render.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+
+    plan = commands.add_parser(
+        "plan",
+        help="search for actions that hit the top cube only",
+        description="Search for actions that hit the top cube only, by the cross-entropy method.",
+    )
+    _add_scene(plan)
+    plan.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .npz: actions, value, history")
+    return top
+
+
+def _add_scene(command: argparse.ArgumentParser) -> None:
+    """Which DLO, and what both commands need to simulate it."""
+    command.add_argument("--length", type=float, default=250.0, metavar="MM", help="of the DLO in mm, 50 to 350")
+    command.add_argument("--young", type=float, default=2.5e4, metavar="PA", help="its modulus in Pa, 500 to 5e5")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="of all random numbers (default: 0)")
+    command.add_argument(
+        "--engine", default="auto", metavar="NAME", help="native, mjx, or auto: what suits the platform (default)"
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: the words after `jaxlfi whip`; by default those of the process.
+
+    Returns:
+        0; 2 for bad input; 130 where it was interrupted.
+    """
+    arguments = parser().parse_args(argv)
+    try:
+        from jaxlfi import compile_cache
+
+        compile_cache.enable()
+        from envs.whip import commands
+
+        getattr(commands, arguments.command)(arguments)
+    except (ValueError, OSError, ImportError) as error:
+        print(f"jaxlfi whip: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("jaxlfi whip: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,125 @@
+"""What the commands of the whipping task do; `envs.whip.cli` parses, this module works."""
+
+import argparse
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from rich.console import Console
+
+from envs.whip import planner, rules
+from envs.whip import render as drawing
+from envs.whip.engine import Engine
+from envs.whip.engines import pick
+from envs.whip.episode import Whip
+from envs.whip.exploration import exploratory_actions
+from envs.whip.frames import COLOURS
+from envs.whip.keypoints import DETECTORS
+from envs.whip.parameters import WhipParameters, check, median
+from envs.whip.scene import Scene
+from jaxlfi import atomic
+from jaxlfi.progress import RoundProgress
+
+POLICIES = ("explore", "random", "plan")
+
+
+def render(arguments: argparse.Namespace) -> None:
+    """`jaxlfi whip render`.
+
+    Raises:
+        ValueError: for bad input.
+    """
+    out, name = arguments.out, arguments.detector
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ValueError(f"out: expected a new or empty folder, got {out}")
+    if name not in DETECTORS:
+        raise ValueError(f"detector: expected one of {', '.join(DETECTORS)}, got {name!r}")
+    parameters = _parameters(arguments)
+    interval = Scene().control_interval / drawing.PIECES
+    engine, finer = pick(arguments.engine), pick(arguments.engine, Scene(control_interval=interval))
+    key_policy, key_detector = jax.random.split(jax.random.key(arguments.seed))
+    actions = _actions(arguments.policy, key_policy, engine, parameters)
+    perform = jax.jit(functools.partial(drawing.perform, whip=Whip(engine, DETECTORS[name]), parameters=parameters))
+    rollout = jax.device_get(perform(key_detector, actions=actions))
+    out.mkdir(parents=True, exist_ok=True)
+    atomic.write_arrays(out / "rollout.npz", drawing.arrays(engine, rollout))
+    title = (f"l = {arguments.length:g} mm, E = {arguments.young:g} Pa", _outcome(rollout))
+    pictures = drawing.save_pictures(out, finer, rollout, title)
+    print(_outcome(rollout))
+    print(f"wrote {', '.join(str(path) for path in (*pictures, out / 'rollout.npz'))}")
+
+
+def plan(arguments: argparse.Namespace) -> None:
+    """`jaxlfi whip plan`.
+
+    Raises:
+        ValueError: for bad input.
+    """
+    out = arguments.out
+    if out.suffix != ".npz" or out.exists():
+        raise ValueError(f"out: expected a new .npz file, got {out}")
+    parameters = _parameters(arguments)
+    found = _search(jax.random.key(arguments.seed), pick(arguments.engine), parameters)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    scene = {f"parameters/{name}": value for name, value in vars(parameters).items()}
+    atomic.write_arrays(out, {**vars(found), **scene})
+    print(f"mean return {found.value:.2f} after {found.history.size} tries, wrote {out}")
+
+
+def _parameters(arguments: argparse.Namespace) -> WhipParameters:
+    """The scene that was asked for, all else as in mu."""
+    try:
+        return check(median(arguments.length / 1e3, arguments.young))
+    except ValueError as error:
+        raise ValueError(f"{error} (m, Pa; --length is in mm)") from error
+
+
+def _actions(policy: str, key: jax.Array, engine: Engine, parameters: WhipParameters) -> Float[Array, "16 2"]:
+    """What a policy does."""
+    if policy == "explore":
+        return exploratory_actions()
+    if policy == "plan":
+        return jnp.asarray(_search(key, engine, parameters).actions)
+    if policy == "random":
+        method = planner.CrossEntropy()
+        first = planner.init(method)
+        return planner.draw(jax.random.normal(key, first.mean.shape), first.mean, first.deviation, method.correlation)
+    return jnp.asarray(_read_actions(policy))
+
+
+def _read_actions(path: str) -> np.ndarray:
+    """The array "actions" of an .npz: of a plan, of a rollout or of a recording."""
+    if not Path(path).exists():
+        raise ValueError(f"policy: expected {', '.join(POLICIES)} or an .npz file, got {path!r}")
+    actions = atomic.read_arrays(Path(path)).get("actions")
+    if actions is None or actions.shape != (rules.STEPS, 2) or actions.dtype.kind not in "fiu":
+        got = "none" if actions is None else f"{actions.dtype} of shape {list(actions.shape)}"
+        raise ValueError(f"policy: expected an array actions of shape [{rules.STEPS}, 2] in {path}, got {got}")
+    if not np.isfinite(actions).all():
+        raise ValueError(f"policy: expected finite actions in {path}, got some that are not")
+    return actions.astype(np.float32)
+
+
+def _search(key: jax.Array, engine: Engine, parameters: WhipParameters) -> planner.Plan:
+    """Plan as `planner.plan` does, and show how far it is."""
+    method = planner.CrossEntropy()
+    step = jax.jit(functools.partial(planner.step, engine=engine, parameters=parameters, method=method))
+    search, history = planner.init(method), []
+    with RoundProgress(Console(stderr=True), method.iterations, 0, "planning") as progress:
+        while len(history) < method.iterations and search.value < method.enough:
+            search, values = step(jax.random.fold_in(key, len(history)), search=search)
+            history.append(values)
+            progress.advance()
+    return jax.device_get(planner.Plan(search.actions, search.value, jnp.stack(history)))
+
+
+def _outcome(rollout: drawing.Rollout) -> str:
+    """What became of an episode, in a few words."""
+    last = int(rollout.length) - 1
+    hit = ", ".join(name for name, is_hit in zip(COLOURS, rollout.steps.hit[last], strict=True) if is_hit)
+    end = ", left the workspace" if rollout.steps.outside[last] else ""
+    end += ", unstable" if rollout.steps.failed[last] else ""
+    return f"return {rollout.value:.2f} in {last + 1} steps, hit {hit or 'nothing'}{end}"

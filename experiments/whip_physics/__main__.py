@@ -1,0 +1,155 @@
+"""The physics of the whipping scene: against beam theory, over all parameters, at rest, and how fast.
+
+    python -m experiments.whip_physics --out experiments/results/whip-physics
+
+Writes table.csv (a line a chain), results.json (all numbers, with versions and the command), arrays.npz and pictures.
+Needs the extra `whip` and SciPy.
+"""
+
+import argparse
+import csv
+import importlib.metadata
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from envs.whip.chain import Chain
+from envs.whip.engine import Engine
+from envs.whip.native import NativeEngine
+from envs.whip.scene import Scene
+from experiments.whip_physics import figures, measure
+from experiments.whip_physics.models import KINDS
+from jaxlfi import atomic
+from jaxlfi.figures import style
+from jaxlfi.run_store import command_line, environment
+
+CHAINS = {"ball joints": Chain(planar=False), "planar hinges": Chain()}
+"""Those that can be in a scene, by their kind."""
+WILD = 4.0
+"""A cube's speed far beyond that of a fall from the stack's top (1.7) and of the gripper (0.5), in m/s."""
+
+
+def engine_of(name: str, chain: Chain) -> Engine:
+    """The engine of this name, native or mjx."""
+    if name == "native":
+        return NativeEngine(Scene(chain=chain))
+    from envs.whip.mjx_engine import MjxEngine
+
+    return MjxEngine(Scene(chain=chain))
+
+
+def statistics(scenes: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """What random episodes, stacks and timing of one chain come down to."""
+    failed, wild = scenes["failed"], scenes["cube"] > WILD
+    stacks = {name.removeprefix("stack "): values for name, values in scenes.items() if name.startswith("stack ")}
+    measures = ("lateral", "vertical", "drift")
+    return {
+        "rollouts": len(failed),
+        "failed": int(failed.sum()),
+        "failed_share": float(failed.mean()),
+        "failed_saturated": int((failed & scenes["saturated"]).sum()),
+        "wild": int((wild & ~failed).sum()),
+        "fastest_cube": float(scenes["cube"][~failed].max()),
+        "deepest": float(scenes["depth"][~failed].max()),
+        "greatest_lag": float(scenes["lag"][~failed].max()),
+        "steps_per_second": float(scenes["steps_per_second"]),
+        "stacks": {name: dict(zip(measures, values.tolist(), strict=True)) for name, values in stacks.items()},
+    }
+
+
+def table(arrays: Mapping[str, np.ndarray], scenes: Mapping[str, dict]) -> list[dict[str, object]]:
+    """A line for each kind of chain, at the default number of elements; errors are relative."""
+    at = measure.ELEMENTS.index(measure.DEFAULT)
+    lines = []
+    for i, kind in enumerate(KINDS):
+        line = {"chain": kind, "elements": measure.DEFAULT}
+        line |= {f"{name}_error": f"{arrays[name][i, at]:.2e}" for name in ("tip", "mass", "length")}
+        for mode, name in enumerate(("first", "second")):
+            line[f"{name}_frequency_error"] = f"{arrays['frequency'][i, at, mode]:.2e}"
+        for name in ("rollouts", "failed", "wild", "steps_per_second"):
+            line[name] = round(scenes[kind][name]) if kind in scenes else ""
+        lines.append(line)
+    return lines
+
+
+def sag_errors(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, list[float]]]:
+    """Of the tip held horizontally: the relative error of its sag, and its error along the clamp in DLO lengths."""
+    exact = arrays["elastica"][:, -1]
+    shapes = {"plain cable": "plain", "ball joints": "balls", "planar hinges": f"sag {measure.DEFAULT}"}
+    shapes |= {f"planar hinges, N = {elements}": f"sag {elements}" for elements in measure.ELEMENTS}
+    tips = {kind: arrays[name][:, -1] for kind, name in shapes.items()}
+    return {
+        kind: {"sag": (tip[:, 1] / exact[:, 1] - 1).tolist(), "along": (tip[:, 0] - exact[:, 0]).tolist()}
+        for kind, tip in tips.items()
+    }
+
+
+THEORY = ("tip", "frequency", "rotary", "mass", "length")
+ENERGIES = ("highest", "greatest_rise", "end", "drift")
+
+
+def results(arrays: Mapping[str, np.ndarray], scenes: Mapping[str, dict]) -> dict[str, object]:
+    """All numbers, and what they are over."""
+    return {
+        "errors": {"kinds": KINDS, "elements": measure.ELEMENTS, **{name: arrays[name].tolist() for name in THEORY}},
+        "sag": {"numbers": measure.NUMBERS, **sag_errors(arrays)},
+        "energy": {
+            "swings": measure.SWINGS,
+            "timesteps": measure.TIMESTEPS,
+            "air": measure.AIR,
+            **{name: arrays[name].tolist() for name in ENERGIES},
+        },
+        "scenes": scenes,
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, write and draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("experiments/results/whip-physics"))
+    parser.add_argument("--engine", choices=("native", "mjx"), default="native", help="of the scenes")
+    parser.add_argument("--rollouts", type=int, help="random episodes a chain: 1,000, or 100 with mjx")
+    given = parser.parse_args(arguments)
+    count = given.rollouts or (1000 if given.engine == "native" else 100)
+    console, started = Console(), time.perf_counter()
+    with console.status("beams"):
+        arrays = {**measure.against_theory(), **measure.sags(), **measure.energies()}
+    scenes = {}
+    for kind, chain in CHAINS.items():
+        with console.status(f"{count} random episodes, {kind}"):
+            measured = measure.scenes(engine_of(given.engine, chain), count)
+        arrays |= {f"{kind}/{name}": values for name, values in measured.items()}
+        scenes[kind] = statistics(measured)
+    made = environment()
+    made["versions"] |= {name: importlib.metadata.version(name) for name in ("mujoco", "mujoco-mjx", "scipy")}
+    made["command_line"] = command_line(["python", "-m", "experiments.whip_physics", *(arguments or sys.argv[1:])])
+    made |= {"engine": given.engine, "seconds": time.perf_counter() - started}
+    lines = table(arrays, scenes)
+    given.out.mkdir(parents=True, exist_ok=True)
+    atomic.write_arrays(given.out / "arrays.npz", arrays)
+    atomic.write_json(given.out / "results.json", results(arrays, scenes) | made)
+    with (given.out / "table.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, lines[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
+    draw(given.out)
+    console.print((given.out / "table.csv").read_text())
+    console.print(f"wrote {given.out}")
+
+
+def draw(folder: Path) -> None:
+    """All pictures, from the arrays in a folder."""
+    arrays = atomic.read_arrays(folder / "arrays.npz")
+    with style.context():
+        for name, (picture, *size) in figures.FIGURES.items():
+            figure = style.new_figure(*size)
+            picture(figure, arrays)
+            style.save(figure, folder / f"{name}.png", 200)
+
+
+if __name__ == "__main__":
+    main()

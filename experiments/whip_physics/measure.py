@@ -1,0 +1,114 @@
+"""Everything that is measured of the chains, as named arrays."""
+
+import numpy as np
+
+from envs.whip.chain import GRAVITY, SECOND_MOMENT, SECTION, Chain
+from envs.whip.engine import Engine
+from envs.whip.parameters import MEDIAN, WhipParameters, median
+from envs.whip.scene import Scene
+from experiments.whip_physics import beam, energy, models, rollouts, statics
+
+ELEMENTS = (8, 10, 12, 16, 24)
+"""N."""
+DEFAULT = Chain().elements
+NUMBERS = (0.5, 5.8, 24.5, 100.0, 400.0, 1113.0, 4486.0)
+"""Elasto-gravity numbers: a rod, ..., the median DLO, ..., the limpest of the initial support, the limpest of Phi."""
+SMALL = 1e-3
+"""A small load at the tip, in units of E I / L^2."""
+ARC = np.linspace(0, 1, 201)
+"""Where shapes of beams are kept, in lengths of the beam."""
+TIMESTEPS = (4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4)
+"""Of the physics, in s."""
+SWINGS = ((0.05, 5e5), (0.25, 2.5e4), (0.305, 1e3), (0.35, 5e5), (0.35, 5e2))
+"""Length (m) and modulus (Pa) of DLOs let swing: corners of Phi, the limpest of the initial support, the median."""
+AIR = (0.0, Scene().air)
+"""Densities of the air, in kg/m^3."""
+CUBES = {"median": {}, "small": {"cube_side": 0.020, "cube_density": 80.0}, "large": {"cube_side": 0.030}}
+"""Stacks at rest, by what differs from the median scene."""
+
+
+def against_theory(parameters: WhipParameters = MEDIAN) -> dict[str, np.ndarray]:
+    """Relative errors of every kind of chain, shape [kinds, N], of frequencies [kinds, N, 2].
+
+    The tip's deflection is against P L^3 / (3 E I), frequencies are against Euler and Bernoulli's beam and, `rotary`,
+    against one whose section has inertia, mass and length are against what was declared.
+    """
+    rigidity = parameters.young * SECOND_MOMENT
+    line_density = parameters.density * SECTION**2
+    load = SMALL * rigidity / parameters.length**2
+    deflection = beam.tip_deflection(load, parameters.length, rigidity)
+    beams = [
+        np.array([beam.frequency(mode, parameters.length, rigidity, line_density, gyration) for mode in (1, 2)])
+        for gyration in (0.0, SECTION / 12**0.5)
+    ]
+    errors = {name: [] for name in ("tip", "frequency", "rotary", "mass", "length")}
+    for kind in models.KINDS:
+        for elements in ELEMENTS:
+            model = models.model(kind, elements, parameters)
+            slowest = statics.frequencies(model)[:2]
+            line = statics.nodes(model, statics.bent(model, np.zeros(model.nv)))
+            errors["tip"].append(statics.tip_deflection(model, load) / deflection - 1)
+            errors["frequency"].append(slowest / beams[0] - 1)
+            errors["rotary"].append(slowest / beams[1] - 1)
+            errors["mass"].append(statics.mass(model) / (line_density * parameters.length) - 1)
+            errors["length"].append(np.linalg.norm(np.diff(line, axis=0), axis=1).sum() / parameters.length - 1)
+    grid = (len(models.KINDS), len(ELEMENTS))
+    return {name: np.reshape(values, (*grid, *np.shape(values)[1:])) for name, values in errors.items()}
+
+
+def sags(parameters: WhipParameters = MEDIAN) -> dict[str, np.ndarray]:
+    """Chains and beams held horizontally, over elasto-gravity numbers, in lengths of the DLO.
+
+    Returns:
+        How far points lie from the clamp and below it: `elastica`, shape [numbers, 201, 2]; `sag N`, nodes of the
+        hinges' chain of N elements, shape [numbers, N + 2, 2]; `balls` and `plain`, nodes of the ball joints' chain and
+        of MuJoCo's cable, of 12 elements.
+    """
+
+    def shapes(kind, elements):
+        made = [models.model(kind, elements, models.with_number(parameters, number)) for number in NUMBERS]
+        return np.stack([statics.sagged(model, GRAVITY) for model in made]) / parameters.length
+
+    return {
+        "elastica": np.stack([beam.heavy_elastica(number, ARC) for number in NUMBERS]),
+        **{f"sag {elements}": shapes("planar hinges", elements) for elements in ELEMENTS},
+        "plain": shapes("plain cable", DEFAULT),
+        "balls": shapes("ball joints", DEFAULT),
+    }
+
+
+def energies(kind: str = "planar hinges") -> dict[str, np.ndarray]:
+    """Energy of chains of 12 elements that swing for 2 s, as shares of what they begin with.
+
+    Returns:
+        Of damped chains without air and with it, over `SWINGS` and `TIMESTEPS`, shape [2, swings, timesteps]: the
+        `highest` energy after the first step, the `greatest_rise` in a step and the energy at the `end`. Of the median
+        chain without damping and air: the greatest change, `drift`, with timesteps from 1 ms down, by Euler's method
+        and by Runge and Kutta's, shape [2, timesteps - 2].
+    """
+    highest, rise, end = np.empty((3, 2, len(SWINGS), len(TIMESTEPS)))
+    for air, density in enumerate(AIR):
+        for dlo, (length, young) in enumerate(SWINGS):
+            for step, timestep in enumerate(TIMESTEPS):
+                model = models.model(kind, DEFAULT, MEDIAN.replace(length=length, young=young))
+                model.opt.density = density
+                curve = energy.swing(model, timestep)
+                at = (air, dlo, step)
+                highest[at], rise[at], end[at] = curve[1:].max(), np.diff(curve).max(), curve[-1]
+    drift = np.empty((2, len(TIMESTEPS) - 2))
+    for method in (0, 1):
+        for step, timestep in enumerate(TIMESTEPS[2:]):
+            model = models.model(kind, DEFAULT, MEDIAN)
+            model.dof_damping[:] = 0
+            drift[method, step] = np.abs(energy.swing(model, timestep, runge_kutta=bool(method)) - 1).max()
+    return {"highest": highest, "greatest_rise": rise, "end": end, "drift": drift}
+
+
+def scenes(engine: Engine, count: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Random episodes (`rollouts.random_episodes`), stacks at rest for 5 s (`stack NAME`, shape [3]) and the speed."""
+    rest = {
+        f"stack {name}": np.array(list(rollouts.stack_at_rest(engine, median().replace(**changes)).values()))
+        for name, changes in CUBES.items()
+    }
+    speed = rollouts.steps_per_second(engine, seed)
+    return {**rest, **rollouts.random_episodes(engine, seed, count), "steps_per_second": np.array(speed)}

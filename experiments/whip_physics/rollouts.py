@@ -1,0 +1,132 @@
+"""Whole scenes through an engine: random episodes over all parameters, the stack at rest, and the speed."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from envs.whip import rules
+from envs.whip.chain import SECTION
+from envs.whip.engine import Engine, State, reset, rollout
+from envs.whip.kinematics import frames
+from envs.whip.parameters import FEASIBLE, WhipParameters, randomised
+from envs.whip.scene import CUBES, START
+
+BATCH = 100
+"""Scenes that are simulated together."""
+
+
+def random_scene(key: jax.Array) -> WhipParameters:
+    """A DLO from all of Phi, its length uniform and its modulus log-uniform, and every nuisance from its range."""
+    key_length, key_young, key_rest = jax.random.split(key, 3)
+    (shortest, softest), (longest, stiffest) = FEASIBLE.low, FEASIBLE.high
+    length = jax.random.uniform(key_length, minval=shortest, maxval=longest)
+    young = jnp.exp(jax.random.uniform(key_young, minval=jnp.log(softest), maxval=jnp.log(stiffest)))
+    return randomised(key_rest, length, young)
+
+
+def random_targets(key: jax.Array, saturated: Array | bool) -> Float[Array, "16 2"]:
+    """Set-points of an episode of random actions, each cut off where it would leave the workspace.
+
+    Args:
+        key: of the episode.
+        saturated: whether actions are as large as they can be, as those of many learnt policies are; else uniform.
+    """
+    actions = jax.random.uniform(key, (rules.STEPS, 2), minval=-1.0, maxval=1.0)
+    actions = rules.ACTION_LIMIT * jnp.where(saturated, jnp.sign(actions), actions)
+
+    def move(target, action):
+        target = jnp.clip(target + action, *rules.WORKSPACE)
+        return target, target
+
+    return jax.lax.scan(move, jnp.asarray(START), actions)[1]
+
+
+def fastest_cube(states: State) -> Float[Array, ""]:
+    """Greatest speed of a cube at the end of a control step, in m/s."""
+    velocities = states.qvel[:, -6 * CUBES :].reshape(-1, CUBES, 6)[..., :3]
+    return jnp.linalg.norm(velocities, axis=-1).max()
+
+
+def random_episodes(engine: Engine, seed: int, count: int) -> dict[str, np.ndarray]:
+    """Random episodes in random scenes, every other one with saturated actions.
+
+    Returns:
+        Of each: the DLO's `length` (m) and `young` (Pa), whether its actions were `saturated`, whether it `failed`, the
+        speed of its fastest cube (`cube`, m/s), how deep the DLO went into the table (`depth`, m), and how far the
+        gripper was from its set-point at most (`lag`, m).
+    """
+
+    def episode(key, saturated):
+        key_scene, key_targets = jax.random.split(key)
+        parameters, targets = random_scene(key_scene), random_targets(key_targets, saturated)
+        states = rollout(engine, parameters, targets)
+        view = jax.vmap(lambda qpos: frames(engine.scene, parameters, qpos))(states.qpos)
+        return {
+            "length": parameters.length,
+            "young": parameters.young,
+            "saturated": saturated,
+            "failed": states.failed[-1],
+            "cube": fastest_cube(states),
+            "depth": SECTION / 2 - view.dlo[..., 2].min(),
+            "lag": jnp.linalg.norm(view.gripper - states.target, axis=-1).max(),
+        }
+
+    keys = jax.random.split(jax.random.key(seed), count)
+    saturated = jnp.arange(count) % 2 == 1
+    run = jax.jit(jax.vmap(episode))
+    parts = [run(keys[i : i + BATCH], saturated[i : i + BATCH]) for i in range(0, count, BATCH)]
+    return {name: np.concatenate([np.asarray(part[name]) for part in parts]) for name in parts[0]}
+
+
+NUDGE = 1e-6
+"""Speed at which cubes at rest are set going, in m/s, so that no engine may leave them out as being at rest."""
+
+
+def stack_at_rest(engine: Engine, parameters: WhipParameters, seconds: float = 5.0) -> dict[str, float]:
+    """How the stack of cubes moves while the gripper stays where it is, in m.
+
+    Returns:
+        The greatest movement of a cube from its place, `lateral` and `vertical`, and its greatest movement between one
+        second and the end, `drift`.
+    """
+    start = reset(engine.scene, parameters)
+    start = start.replace(qvel=start.qvel.at[-6 * CUBES :].add(NUDGE))
+    steps = round(seconds / engine.scene.control_interval)
+
+    @jax.jit
+    def run(parameters, state):
+        def wait(state, _):
+            state = engine.advance(parameters, state, state.target)
+            return state, state.qpos[-7 * CUBES :].reshape(CUBES, 7)[:, :3]
+
+        return jax.lax.scan(wait, state, None, steps)[1]
+
+    cubes = np.asarray(run(parameters, start), np.float64)
+    moved = cubes - np.asarray(start.qpos, np.float64)[-7 * CUBES :].reshape(CUBES, 7)[:, :3]
+    settled = round(1 / engine.scene.control_interval)
+    return {
+        "lateral": float(np.linalg.norm(moved[..., :2], axis=-1).max()),
+        "vertical": float(np.abs(moved[..., 2]).max()),
+        "drift": float(np.linalg.norm(cubes[settled:] - cubes[settled], axis=-1).max()),
+    }
+
+
+def steps_per_second(engine: Engine, seed: int, repeats: int = 3) -> float:
+    """Steps of the physics in a second, of all threads together, in random episodes of random scenes; the best time."""
+
+    @jax.jit
+    def run(keys):
+        scenes, targets = jax.vmap(random_scene)(keys), jax.vmap(lambda key: random_targets(key, False))(keys)
+        return jax.vmap(lambda *one: rollout(engine, *one).qpos[-1])(scenes, targets)
+
+    keys = jax.random.split(jax.random.key(seed), BATCH)
+    run(keys).block_until_ready()
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        run(keys).block_until_ready()
+        seconds.append(time.perf_counter() - start)
+    return BATCH * rules.STEPS * engine.scene.substeps / min(seconds)
