@@ -25,7 +25,7 @@ from rich.table import Table
 import jaxlfi
 from envs.whip.chain import elasto_gravity
 from envs.whip.parameters import MEDIAN
-from envs.whip.task import task
+from envs.whip.real2sim import task
 from jaxlfi import atomic, run_store
 from jaxlfi.belief import RESTRICTIONS
 from jaxlfi.figures import style

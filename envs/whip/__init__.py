@@ -5,7 +5,7 @@ Needs the extra `whip` (MuJoCo and MJX).
 
 
 def task(**options):
-    """The Real2Sim task, see `envs.whip.task.task`.
+    """The Real2Sim task, see `envs.whip.real2sim.task`.
 
     Raises:
         ImportError: where MuJoCo is not installed, with what to install.
@@ -14,6 +14,6 @@ def task(**options):
         import mujoco  # noqa: F401
     except ImportError as error:
         raise ImportError("the whipping task needs MuJoCo and MJX: pip install 'jaxlfi[whip]'") from error
-    from envs.whip.task import task as make
+    from envs.whip.real2sim import task as make
 
     return make(**options)

@@ -147,7 +147,7 @@ def step(
     """
     noise = jax.random.normal(key, (method.population, rules.STEPS, 2))
     tried = jax.vmap(lambda noise: draw(noise, search.mean, search.deviation, method.correlation))(noise)
-    values = jax.vmap(lambda actions: mean_return(engine, parameters, actions, method))(tried)
+    values = jax.vmap(lambda actions: mean_return(engine, parameters, actions, method.stacks, method.jitter))(tried)
     everything = jnp.concatenate([search.actions[None], tried])
     all_values = jnp.concatenate([search.value[None], values])
     _, best = jax.lax.top_k(all_values, method.elites)
@@ -190,13 +190,21 @@ def inside(actions: Float[Array, "16 2"]) -> Float[Array, "16 2"]:
 
 
 def mean_return(
-    engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"], method: CrossEntropy
+    engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"], stacks: int, jitter: float
 ) -> Float[Array, ""]:
-    """The return of actions, averaged over places of the stack: the middles of equal parts of its range along x."""
-    middles = (2 * np.arange(method.stacks) + 1) / method.stacks - 1
-    shifts = np.stack([method.jitter * middles, np.zeros(method.stacks)], axis=-1).astype(np.float32)
+    """The return of actions, averaged over places of the stack: the middles of equal parts of a range along x.
+
+    Args:
+        engine: of the physics.
+        parameters: of the scene; its own place of the stack is the middle of the range.
+        actions: in m.
+        stacks: number of places.
+        jitter: half the range, in m.
+    """
+    middles = (2 * np.arange(stacks) + 1) / stacks - 1
+    shifts = jnp.asarray(np.stack([jitter * middles, np.zeros(stacks)], axis=-1), jnp.float32)
     displaced = lambda shift: parameters.replace(stack=parameters.stack + shift)
-    return jnp.mean(jax.vmap(lambda shift: play(engine, displaced(shift), actions).value)(jnp.asarray(shifts)))
+    return jnp.mean(jax.vmap(lambda shift: play(engine, displaced(shift), actions).value)(shifts))
 
 
 def play(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> Outcome:

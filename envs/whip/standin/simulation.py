@@ -1,7 +1,6 @@
 """The stand-in, to be acted on like a real rig: one object, one episode after another."""
 
-import math
-
+import jax
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -53,8 +52,7 @@ class StandIn:
         self._data = mujoco.MjData(self._model)
         self._target = np.array(START)
         self._data.ctrl[:] = START
-        mujoco.mj_step(self._model, self._data, nstep=round(SETTLING / TIMESTEP))
-        self._check()
+        self._advance(round(SETTLING / TIMESTEP))
         self._data.time = 0.0
         self._rest = self._state()
 
@@ -85,9 +83,8 @@ class StandIn:
         seen, substeps = [], round(CONTROL_INTERVAL / TIMESTEP)
         for i in range(1, substeps + 1):
             self._data.ctrl[:] = before + i / substeps * action
-            mujoco.mj_step(self._model, self._data)
+            self._advance()
             if i % round(FRAME_INTERVAL / TIMESTEP) == 0:
-                self._check()
                 seen.append(self._look())
         return _stacked(seen)
 
@@ -105,7 +102,7 @@ class StandIn:
             StandInError: where the simulation breaks down.
         """
         frames = [_stacked([self.reset()]), *(self.step(action) for action in np.asarray(actions, float))]
-        together = Frames(*(np.concatenate(parts) for parts in zip(*map(_leaves, frames), strict=True)))
+        together = jax.tree.map(lambda *parts: np.concatenate(parts), *frames)
         return np.arange(len(together.gripper)) * FRAME_INTERVAL, together
 
     def _look(self) -> Frames:
@@ -125,16 +122,15 @@ class StandIn:
         mujoco.mj_getState(self._model, self._data, state, kind)
         return state
 
-    def _check(self) -> None:
-        counts = {name: self._data.warning[getattr(mujoco.mjtWarning, name)].number for name in FATAL}
-        broken = [name for name, count in counts.items() if count]
-        if broken or not all(map(math.isfinite, self._data.qpos)):
-            raise StandInError(f"{self.thing.name}: simulation broke down at {self._data.time:.3f} s: {broken}")
-
-
-def _leaves(frames: Frames) -> tuple[np.ndarray, ...]:
-    return frames.gripper, frames.dlo, frames.cubes, frames.turns
+    def _advance(self, steps: int = 1) -> None:
+        try:
+            mujoco.mj_step(self._model, self._data, nstep=steps)
+        except mujoco.FatalError as error:  # the first of a broken simulation's contacts
+            raise StandInError(f"{self.thing.name}: {error}") from error
+        broken = [name for name in FATAL if self._data.warning[getattr(mujoco.mjtWarning, name)].number]
+        if broken or not np.isfinite(self._data.qpos).all():
+            raise StandInError(f"{self.thing.name}: broke down at {self._data.time:.3f} s: {broken}")
 
 
 def _stacked(frames: list[Frames]) -> Frames:
-    return Frames(*(np.stack(parts) for parts in zip(*map(_leaves, frames), strict=True)))
+    return jax.tree.map(lambda *parts: np.stack(parts), *frames)
