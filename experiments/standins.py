@@ -26,9 +26,9 @@ from jaxlfi import atomic
 from jaxlfi.figures import style
 
 HOW = (
-    "young is such that the soft body, clamped horizontally at an elasto-gravity number of about 5, sags as much as the "
-    "heavy elastica of effective_young and 15 x 15 mm; light_young is that of a beam of 75 kg/m^3 that moves alike; "
-    "hanging_length is at 9.81 m/s^2. Units: m, kg, s, Pa; sag and reach are fractions of the length."
+    "young is such that the soft body, clamped horizontally at an elasto-gravity number of about 5, sags as much as "
+    "the heavy elastica of effective_young and 15 x 15 mm. light_young is that of a beam of 75 kg/m^3 that moves "
+    "alike; hanging_length is at 9.81 m/s^2. Units: m, kg, s, Pa; sag and reach are fractions of length."
 )
 COLUMNS = {
     "object": lambda thing, _: thing.name,

@@ -4,8 +4,8 @@ Needs the extra `whip` (MuJoCo and MJX).
 """
 
 
-def task(**options):
-    """The Real2Sim task, see `envs.whip.real2sim.task`.
+def task(object: str | None = None, detector: str = "transporter", nuisances: str = "fixed", engine: str = "auto"):
+    """The Real2Sim task; its options are those of `envs.whip.real2sim.task`.
 
     Raises:
         ImportError: where MuJoCo is not installed, with what to install.
@@ -16,4 +16,4 @@ def task(**options):
         raise ImportError("the whipping task needs MuJoCo and MJX: pip install 'jaxlfi[whip]'") from error
     from envs.whip.real2sim import task as make
 
-    return make(**options)
+    return make(object=object, detector=detector, nuisances=nuisances, engine=engine)
