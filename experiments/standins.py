@@ -11,7 +11,6 @@ import dataclasses
 from pathlib import Path
 
 import jax
-import mujoco
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -21,6 +20,7 @@ from envs.whip.keypoints import ON_DLO
 from envs.whip.standin.calibration import Calibration, calibrated
 from envs.whip.standin.objects import TABLE, Object
 from envs.whip.standin.observation import in_every_frame, look, record
+from envs.whip.standin.scene import SIMULATOR
 from envs.whip.standin.simulation import StandIn
 from jaxlfi import atomic
 from jaxlfi.figures import style
@@ -107,7 +107,7 @@ def main(arguments: list[str] | None = None) -> None:
         objects,
         {
             "how": HOW,
-            "simulator": f"MuJoCo {mujoco.__version__}",
+            "simulator": SIMULATOR,
             "objects": {thing.name: described(thing, found) for thing, found in calibrations},
         },
     )

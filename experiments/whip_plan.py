@@ -1,10 +1,10 @@
-"""Which DLOs can hit the top cube, and how hard it is to find out how: open-loop plans over a grid of length and modulus.
+"""Which DLOs can hit the top cube, and how hard it is to find out how: plans over a grid of length and modulus.
 
     python -m experiments.whip_plan --out experiments/results/whip-plan
 
-For every DLO the cross-entropy method (`envs.whip.planner`) looks for actions whose return is the greatest on average over
-places of the stack, and ends early where it hits the top cube only in all of them. What it finds is then tried on places
-in between, of which it knew nothing.
+For every DLO the cross-entropy method (`envs.whip.planner`) looks for actions of the greatest return on average over
+places of the stack, and ends early where they hit the top cube only in all of them. What it has found is then tried on
+places in between, of which it knew nothing.
 """
 
 import argparse
@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 

@@ -325,14 +325,13 @@ def test_the_table_by_hand():
         "depth": np.array([0.01, 0.5, 0.02, -0.1]),
         "lag": np.array([0.03, 0.9, 0.02, 0.01]),
         "stack median": np.array([1e-4, 2e-4, 3e-4]),
-        "steps_per_second": np.array(1234.6),
     }
     numbers = statistics(episodes)
     assert numbers["failed"] == numbers["failed_saturated"] == numbers["wild"] == 1
     assert numbers["failed_share"] == 0.25
     assert (numbers["fastest_cube"], numbers["deepest"], numbers["greatest_lag"]) == (4.5, 0.02, 0.03)
     assert numbers["stacks"] == {"median": {"lateral": 1e-4, "vertical": 2e-4, "drift": 3e-4}}
-    plain, balls, planar = table(arrays, {"planar hinges": numbers})
+    plain, balls, planar = table(arrays, {"planar hinges": {**numbers, "steps_per_second": 1234.6}})
     assert planar["tip_error"] == "-1.74e-03" and balls["second_frequency_error"] == "2.50e-01"
     assert (planar["failed"], planar["rollouts"], planar["steps_per_second"]) == (1, 4, 1235)
     assert plain["failed"] == plain["steps_per_second"] == ""

@@ -102,7 +102,7 @@ def test_an_object_sags_in_the_shape_of_the_elastica():
 
 def test_an_object_swings_at_the_frequency_of_a_beam():
     """1.8751^2 / (2 pi) sqrt(E I / (rho A L^4)), without gravity: the mass is where it should be, too."""
-    thing = dataclasses.replace(load("dlo-0"), damping=0.0)
+    thing = dataclasses.replace(load("dlo-0"), damping=1e-6)
     model = cantilever_model(thing, (2.0, 0.0, 0.0), timestep=0.001)
     data, places = mujoco.MjData(model), []
     mujoco.mj_step(model, data, nstep=60)
@@ -179,8 +179,8 @@ def test_steps_make_a_rollout_and_a_reset_forgets(rig):
 
     target = np.array(scene.START) + np.cumsum(actions, axis=0)
     assert np.abs(frames.gripper[10::10] - target).max() < 0.03  # it lags by some 2 / 30 s
-    assert np.linalg.norm(frames.cubes[-1, 5] - frames.cubes[0, 5]) > 0.03  # hit
-    assert np.linalg.norm(frames.cubes[-1, 0] - frames.cubes[0, 0]) < 0.01
+    moved = frames.cubes[-1, :, 0] - frames.cubes[0, :, 0]
+    assert moved.max() > 0.03 and moved.min() > 0  # all have been pushed away
     np.testing.assert_allclose(np.linalg.norm(frames.turns, axis=-1), 1, atol=1e-9)
     lengths = np.linalg.norm(np.diff(frames.dlo, axis=1), axis=-1).sum(axis=1) / rig.thing.length
     assert 0.9 < lengths.min() and lengths.max() < 1.1 and frames.dlo[..., 2].min() > -0.01

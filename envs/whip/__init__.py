@@ -4,7 +4,7 @@ Needs the extra `whip` (MuJoCo and MJX).
 """
 
 
-def task(object: str | None = None, detector: str = "transporter", nuisances: str = "fixed", engine: str = "auto"):
+def task(object: str | None = None, detector: str = "mask", nuisances: str = "fixed", engine: str = "auto"):
     """The Real2Sim task; its options are those of `envs.whip.real2sim.task`.
 
     Raises:

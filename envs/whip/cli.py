@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
         'cube, searched for first; or an .npz with an array "actions" [16, 2] in m (default: explore)',
     )
     render.add_argument(
-        "--detector", default="clean", metavar="NAME", help="of keypoints: clean, noisy, transporter (default: clean)"
+        "--detector", default="clean", metavar="NAME", help="of keypoints: clean, mask, noisy, transporter (default: clean)"
     )
     render.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
 

@@ -12,7 +12,7 @@ from envs.whip import rules
 from envs.whip.camera import side_camera
 from envs.whip.engine import Engine, State
 from envs.whip.frames import Frames
-from envs.whip.keypoints import DETECTORS, Detector, Tracking, begin, track
+from envs.whip.keypoints import DETECTORS, Detector, Tracking, begin, measured, track
 from envs.whip.kinematics import frames
 from envs.whip.parameters import WhipParameters
 
@@ -88,25 +88,26 @@ class Whip:
 
     def reset(self, key: jax.Array, parameters: WhipParameters) -> tuple[Episode, Float[Array, "28"]]:
         """The start of an episode in a scene, and the first observation."""
-        key_begin, key_track = jax.random.split(key)
+        key_begin, key_track, key_gripper = jax.random.split(key, 3)
         state = physics.reset(self.engine.scene, parameters)
         keypoints, _, tracking = self._look(key_track, parameters, begin(key_begin, self.detector), state)
         hit = jnp.zeros(6, bool)
         episode = Episode(state, tracking, keypoints[4:], hit, jnp.asarray(0))
-        return episode, observation(state.qpos[:2], keypoints, hit)
+        return episode, observation(measured(key_gripper, self.detector, state.qpos[:2]), keypoints, hit)
 
     def step(
         self, key: jax.Array, parameters: WhipParameters, episode: Episode, action: Float[Array, "2"]
     ) -> tuple[Episode, Step]:
         """Apply an action (dx, dz), in m."""
         state = self.engine.advance(parameters, episode.state, rules.moved_target(episode.state.target, action))
-        keypoints, seen, tracking = self._look(key, parameters, episode.tracking, state)
+        key_track, key_gripper = jax.random.split(key)
+        keypoints, seen, tracking = self._look(key_track, parameters, episode.tracking, state)
         gripper = state.qpos[:2]
         hit = rules.hits(episode.hit, episode.start, keypoints[4:])
         out = rules.outside(gripper)
         steps = episode.steps + 1
         step = Step(
-            observation=observation(gripper, keypoints, hit),
+            observation=observation(measured(key_gripper, self.detector, gripper), keypoints, hit),
             reward=jnp.where(state.failed, 0.0, rules.reward(hit, out)),
             terminated=(hit[rules.TOP] | out) & ~state.failed,
             truncated=(steps >= rules.STEPS) | state.failed,

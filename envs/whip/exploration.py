@@ -3,16 +3,16 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-_ALONG_X = (-0.03, -0.055, 0.0, 0.06, 0.06, -0.03, -0.06, 0.0, 0.06, 0.03, -0.06, -0.03, 0.06, 0.03, -0.06, 0.0)
+_ALONG_X = (-0.03, -0.05, 0.0, 0.055, 0.055, -0.03, -0.05, 0.0, 0.05, 0.03, -0.05, -0.03, 0.05, 0.03, -0.05, 0.0)
 _ALONG_Z = (0.02, 0.02, 0.02, 0.02, *(0.0,) * 12)
 
 
 def exploratory_actions() -> Float[Array, "16 2"]:
     """Draw back and up, then whip to and fro three times, faster and faster.
 
-    The gripper keeps at least 1 cm within its workspace, and no DLO of the initial support reaches the cubes, so that
-    what is seen depends smoothly on the DLO. Going through three frequencies excites the pendulum of a limp DLO as well
-    as the first bending mode of a stiff one.
+    The gripper keeps at least 1 cm within its workspace, and no DLO of the initial support reaches the cubes or leaves
+    the image, so that what is seen depends smoothly on the DLO. Going through three frequencies excites the pendulum of
+    a limp DLO as well as the first bending mode of a stiff one.
 
     Returns:
         Displacements dx, dz of the gripper's set-point, in m, shape [16, 2].

@@ -33,6 +33,8 @@ class Detector:
             ("temporally consistent, but permutation invariance is not guaranteed", section VI-G).
         noise: standard deviation of each coordinate in each frame, in normalised pixels.
         missing: probability that a point of the DLO is not found in a frame; it then stays where it was last seen.
+        bias: standard deviation of each coordinate's error that lasts through a trajectory, in normalised pixels.
+        slip: standard deviation of what the gripper's measured x and z are off in each frame, in m.
     """
 
     nearest: Float[Array, ""] | float = 0.25
@@ -41,15 +43,25 @@ class Detector:
     shuffled: Float[Array, ""] | float = 0.0
     noise: Float[Array, ""] | float = 0.0
     missing: Float[Array, ""] | float = 0.0
+    bias: Float[Array, ""] | float = 0.0
+    slip: Float[Array, ""] | float = 0.0
 
 
 CLEAN = Detector()
 """The truth at the quarters of the DLO, the last at its tip."""
+MASK = Detector(noise=0.005, bias=0.005, slip=0.002)
+"""The same as it is found along the DLO's segmentation mask (`envs.whip.masks`), a pixel off here and there, beside a
+gripper that follows its set-point as well as another controller does.
+
+Errors that are not simulated make an observation unlike all simulations, and a network's answer to it arbitrary.
+"""
 NOISY = Detector(noise=0.01)
 """The same with 2.6 pixels of 256 of noise."""
 TRANSPORTER = Detector(nearest=0.1, spacing=0.1, shuffled=1.0, noise=0.01, missing=0.02)
 """Unknown places in an unknown order, as unsupervised keypoints are."""
-DETECTORS: Mapping[str, Detector] = types.MappingProxyType({"clean": CLEAN, "noisy": NOISY, "transporter": TRANSPORTER})
+DETECTORS: Mapping[str, Detector] = types.MappingProxyType(
+    {"clean": CLEAN, "mask": MASK, "noisy": NOISY, "transporter": TRANSPORTER}
+)
 """Detectors by name."""
 
 
@@ -59,11 +71,13 @@ class Tracking:
 
     Attributes:
         arcs: the fractions of the DLO's length at which it sees, in its own order, shape [4].
+        bias: each keypoint's lasting error, in normalised pixels, shape [10, 2].
         last: where each keypoint was last seen, in normalised pixels, shape [10, 2].
         begun: whether there has been a frame.
     """
 
     arcs: Float[Array, "4"]
+    bias: Float[Array, "10 2"]
     last: Float[Array, "10 2"]
     begun: Bool[Array, ""]
 
@@ -77,12 +91,14 @@ def along(centreline: Float[Array, "points dim"], fractions: Float[Array, " k"])
 
 def begin(key: jax.Array, detector: Detector) -> Tracking:
     """Start a trajectory: draw where on the DLO, and in which order, its keypoints will be."""
-    key_arcs, key_order, key_shuffled = jax.random.split(key, 3)
+    key_arcs, key_order, key_shuffled, key_bias = jax.random.split(key, 4)
     slack = detector.farthest - detector.nearest - (ON_DLO - 1) * detector.spacing
     steps = jnp.sort(jax.random.uniform(key_arcs, (ON_DLO,))) * slack + jnp.arange(ON_DLO) * detector.spacing
     shuffled = jax.random.bernoulli(key_shuffled, detector.shuffled)
     order = jnp.where(shuffled, jax.random.permutation(key_order, ON_DLO), jnp.arange(ON_DLO))
-    return Tracking(arcs=(detector.nearest + steps)[order], last=jnp.zeros((KEYPOINTS, 2)), begun=jnp.asarray(False))
+    bias = detector.bias * jax.random.normal(key_bias, (KEYPOINTS, 2))
+    nowhere = jnp.zeros((KEYPOINTS, 2))
+    return Tracking((detector.nearest + steps)[order], bias, last=nowhere, begun=jnp.asarray(False))
 
 
 def track(
@@ -97,11 +113,17 @@ def track(
     """
     key_noise, key_missing = jax.random.split(key)
     points = jnp.concatenate([along(frames.dlo, tracking.arcs), frames.cubes])
-    found = project(camera, points) + detector.noise * jax.random.normal(key_noise, (KEYPOINTS, 2))
+    noise = detector.noise * jax.random.normal(key_noise, (KEYPOINTS, 2))
+    found = project(camera, points) + tracking.bias + noise
     missing = jax.random.bernoulli(key_missing, detector.missing, (ON_DLO,)) & tracking.begun
     seen = jnp.concatenate([~missing, jnp.ones(KEYPOINTS - ON_DLO, bool)])
     keypoints = jnp.where(seen[:, None], found, tracking.last)
-    return keypoints, seen, Tracking(arcs=tracking.arcs, last=keypoints, begun=jnp.asarray(True))
+    return keypoints, seen, tracking.replace(last=keypoints, begun=jnp.asarray(True))
+
+
+def measured(key: jax.Array, detector: Detector, gripper: Float[Array, "*time 2"]) -> Float[Array, "*time 2"]:
+    """Where the gripper says it is, x and z in m."""
+    return gripper + detector.slip * jax.random.normal(key, gripper.shape)
 
 
 def detect(

@@ -8,7 +8,7 @@ from envs.whip.keypoints import along
 from envs.whip.raster import DLO
 
 EVEN = (0.25, 0.5, 0.75, 1.0)
-"""Fractions of the visible DLO's length, from the grip, at which it gets its keypoints."""
+"""Fractions of the visible DLO's length, from the grip, at which it gets its keypoints; those of `keypoints.CLEAN`."""
 FEWEST = 5
 """Pixels below which nothing counts as seen."""
 SAMPLES, KNOTS = 256, 32

@@ -209,12 +209,11 @@ def mean_return(
 
 def play(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> Outcome:
     """One episode of given actions, as it is seen without error."""
-    whip = Whip(engine)
-    unused = jax.random.key(0)  # of a detector without noise
+    whip, key = Whip(engine), jax.random.key(0)  # which a detector without noise makes no use of
 
-    def act(carry, action):
-        episode, over, before = carry
-        episode, now = whip.step(unused, parameters, episode, action)
+    def act(carry, at):
+        (episode, over, before), (time, action) = carry, at
+        episode, now = whip.step(jax.random.fold_in(key, time), parameters, episode, action)
         done = now.terminated | now.truncated
         outcome = Outcome(before.value + now.reward, now.hit, now.outside, now.failed, before.steps + 1)
         outcome = jax.tree.map(lambda old, new: jnp.where(over, old, new), before, outcome)
@@ -222,7 +221,7 @@ def play(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2
         state = episode.state.replace(failed=episode.state.failed | done)
         return (episode.replace(state=state), over | done, outcome), None
 
-    episode, _ = whip.reset(unused, parameters)
+    episode, _ = whip.reset(jax.random.fold_in(key, 0), parameters)
     no = jnp.asarray(False)
     start = (episode, no, Outcome(jnp.asarray(0.0), jnp.zeros(6, bool), no, no, jnp.asarray(0)))
-    return jax.lax.scan(act, start, actions)[0][2]
+    return jax.lax.scan(act, start, (jnp.arange(len(actions)) + 1, actions))[0][2]

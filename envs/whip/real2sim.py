@@ -53,7 +53,7 @@ SUMMARY_NAMES = (
 
 def task(
     object: str | None = None,
-    detector: str = "transporter",
+    detector: str = "mask",
     nuisances: str = "fixed",
     engine: str = "auto",
 ) -> Task:
@@ -66,7 +66,8 @@ def task(
         object: what is observed: a stand-in for a real object by name ("dlo-0" to "dlo-3"), or the path of a recorded
             rollout's .npz (`envs.whip.recording`). The simulator applies its actions and looks from where its camera
             stood. Without one, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory actions.
-        detector: what is done to simulated keypoints, as a learnt detector would: "clean", "noisy" or "transporter".
+        detector: how simulated keypoints err (`envs.whip.keypoints.DETECTORS`): "clean", "mask", "noisy" or
+            "transporter". It ought to be like the detector that made the observation; the stand-ins' is "mask".
         nuisances: "fixed": density, cubes and placement are as in mu; "random": only their ranges are known.
         engine: "native", "mjx" or "auto", the one that suits the platform.
 

@@ -10,7 +10,7 @@ from envs.whip.camera import Camera
 from envs.whip.engine import Engine
 from envs.whip.episode import observation
 from envs.whip.frames import Frames
-from envs.whip.keypoints import ON_DLO, Detector, detect
+from envs.whip.keypoints import ON_DLO, Detector, detect, measured
 from envs.whip.kinematics import frames
 from envs.whip.parameters import WhipParameters
 
@@ -32,7 +32,7 @@ def seen(
     return view, states.failed[-1]
 
 
-def states_of(frames: Frames, keypoints: Float[Array, "time 10 2"]) -> Float[Array, "time 28"]:
+def states_of(gripper: Float[Array, "time 2"], keypoints: Float[Array, "time 10 2"]) -> Float[Array, "time 28"]:
     """Observations of a trajectory, with the flags of the cubes that have been hit so far."""
     cubes = keypoints[:, ON_DLO:]
 
@@ -41,7 +41,7 @@ def states_of(frames: Frames, keypoints: Float[Array, "time 10 2"]) -> Float[Arr
         return hit, hit
 
     _, hit = jax.lax.scan(step, jnp.zeros(cubes.shape[1], bool), cubes)
-    return observation(frames.gripper, keypoints, hit)
+    return observation(gripper, keypoints, hit)
 
 
 def trajectory(
@@ -59,5 +59,7 @@ def trajectory(
     """
     # The last action has its effect after the last state.
     view, failed = seen(engine, parameters, actions[:-1])
-    keypoints, _ = detect(key, detector, camera, view)
-    return jnp.concatenate([states_of(view, keypoints), actions], axis=-1), ~failed
+    key_keypoints, key_gripper = jax.random.split(key)
+    keypoints, _ = detect(key_keypoints, detector, camera, view)
+    gripper = measured(key_gripper, detector, view.gripper)
+    return jnp.concatenate([states_of(gripper, keypoints), actions], axis=-1), ~failed

@@ -21,7 +21,7 @@ from envs.whip.chain import Chain
 from envs.whip.engine import Engine
 from envs.whip.native import NativeEngine
 from envs.whip.scene import Scene
-from experiments.whip_physics import figures, measure
+from experiments.whip_physics import figures, measure, rollouts
 from experiments.whip_physics.models import KINDS
 from jaxlfi import atomic
 from jaxlfi.figures import style
@@ -43,7 +43,7 @@ def engine_of(name: str, chain: Chain) -> Engine:
 
 
 def statistics(scenes: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """What random episodes, stacks and timing of one chain come down to."""
+    """What random episodes and stacks of one chain come down to."""
     failed, wild = scenes["failed"], scenes["cube"] > WILD
     stacks = {name.removeprefix("stack "): values for name, values in scenes.items() if name.startswith("stack ")}
     measures = ("lateral", "vertical", "drift")
@@ -56,7 +56,6 @@ def statistics(scenes: Mapping[str, np.ndarray]) -> dict[str, float]:
         "fastest_cube": float(scenes["cube"][~failed].max()),
         "deepest": float(scenes["depth"][~failed].max()),
         "greatest_lag": float(scenes["lag"][~failed].max()),
-        "steps_per_second": float(scenes["steps_per_second"]),
         "stacks": {name: dict(zip(measures, values.tolist(), strict=True)) for name, values in stacks.items()},
     }
 
@@ -118,12 +117,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     console, started = Console(), time.perf_counter()
     with console.status("beams"):
         arrays = {**measure.against_theory(), **measure.sags(), **measure.energies()}
+    engines = {kind: engine_of(given.engine, chain) for kind, chain in CHAINS.items()}
+    with console.status("speed"):
+        speeds = rollouts.steps_per_second(list(engines.values()))
     scenes = {}
-    for kind, chain in CHAINS.items():
+    for (kind, engine), speed in zip(engines.items(), speeds, strict=True):
         with console.status(f"{count} random episodes, {kind}"):
-            measured = measure.scenes(engine_of(given.engine, chain), count)
+            measured = measure.scenes(engine, count)
         arrays |= {f"{kind}/{name}": values for name, values in measured.items()}
-        scenes[kind] = statistics(measured)
+        scenes[kind] = {**statistics(measured), "steps_per_second": speed}
     made = environment()
     made["versions"] |= {name: importlib.metadata.version(name) for name in ("mujoco", "mujoco-mjx", "scipy")}
     made["command_line"] = command_line(["python", "-m", "experiments.whip_physics", *(arguments or sys.argv[1:])])

@@ -105,10 +105,9 @@ def energies(kind: str = "planar hinges") -> dict[str, np.ndarray]:
 
 
 def scenes(engine: Engine, count: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Random episodes (`rollouts.random_episodes`), stacks at rest for 5 s (`stack NAME`, shape [3]) and the speed."""
+    """Random episodes (`rollouts.random_episodes`) and stacks at rest for 5 s (`stack NAME`, shape [3])."""
     rest = {
         f"stack {name}": np.array(list(rollouts.stack_at_rest(engine, median().replace(**changes)).values()))
         for name, changes in CUBES.items()
     }
-    speed = rollouts.steps_per_second(engine, seed)
-    return {**rest, **rollouts.random_episodes(engine, seed, count), "steps_per_second": np.array(speed)}
+    return rest | rollouts.random_episodes(engine, seed, count)

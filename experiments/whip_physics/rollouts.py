@@ -1,6 +1,8 @@
 """Whole scenes through an engine: random episodes over all parameters, the stack at rest, and the speed."""
 
+import functools
 import time
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -114,19 +116,23 @@ def stack_at_rest(engine: Engine, parameters: WhipParameters, seconds: float = 5
     }
 
 
-def steps_per_second(engine: Engine, seed: int, repeats: int = 3) -> float:
-    """Steps of the physics in a second, of all threads together, in random episodes of random scenes; the best time."""
+def steps_per_second(engines: Sequence[Engine], seed: int = 0, repeats: int = 5) -> list[float]:
+    """Steps of the physics in a second, of all threads together, in random episodes of random scenes.
 
-    @jax.jit
-    def run(keys):
+    Each engine's best of some repetitions, in turns, so that what else the machine does is not counted against one.
+    """
+
+    def run(engine, keys):
         scenes, targets = jax.vmap(random_scene)(keys), jax.vmap(lambda key: random_targets(key, False))(keys)
         return jax.vmap(lambda *one: rollout(engine, *one).qpos[-1])(scenes, targets)
 
     keys = jax.random.split(jax.random.key(seed), BATCH)
-    run(keys).block_until_ready()
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run(keys).block_until_ready()
-        seconds.append(time.perf_counter() - start)
-    return BATCH * rules.STEPS * engine.scene.substeps / min(seconds)
+    programs = [jax.jit(functools.partial(run, engine)) for engine in engines]
+    seconds = np.empty((1 + repeats, len(programs)))
+    for repeat in range(1 + repeats):  # in the first, programs are compiled and models built
+        for i, program in enumerate(programs):
+            start = time.perf_counter()
+            program(keys).block_until_ready()
+            seconds[repeat, i] = time.perf_counter() - start
+    substeps = np.array([engine.scene.substeps for engine in engines])
+    return (BATCH * rules.STEPS * substeps / seconds[1:].min(axis=0)).tolist()

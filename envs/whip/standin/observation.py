@@ -5,7 +5,6 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -14,6 +13,7 @@ from envs.whip.camera import Camera, project, side_camera
 from envs.whip.frames import COLOURS, Frames
 from envs.whip.raster import noisy, segmentation
 from envs.whip.recording import Recording, hit_flags
+from envs.whip.standin.scene import SIMULATOR
 from envs.whip.standin.simulation import CONTROL_INTERVAL, FRAME_INTERVAL, StandIn
 
 IMAGE_SIZE = 256
@@ -84,6 +84,6 @@ def record(key: jax.Array, rig: StandIn, actions: Float[Array, "16 2"]) -> tuple
             "effective Young's modulus (Pa)": thing.effective_young,
             "effective Young's modulus of a DLO of 75 kg/m^3 that moves alike (Pa)": round(thing.light_young),
         },
-        provenance={"simulator": f"MuJoCo {mujoco.__version__}, trilinear finite elements"},
+        provenance={"simulator": SIMULATOR},
     )
     return dataclasses.replace(recording, hits=hit_flags(recording)), frames

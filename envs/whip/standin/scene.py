@@ -7,6 +7,8 @@ from envs.whip.frames import COLOURS
 from envs.whip.parameters import MEDIAN, WhipParameters
 from envs.whip.standin.objects import SECTION, Object
 
+SIMULATOR = f"MuJoCo {mujoco.__version__}, trilinear finite elements"
+"""What simulates it."""
 START = (0.40, 0.36)
 """Where the gripper begins, x and z in m."""
 STACK = 0.60

@@ -1,0 +1,341 @@
+"""The whipping task for other people's learners: a gymnasium environment, and a vector of them stepped by one engine.
+
+    gymnasium.make("envs.whip.gym:jaxlfi/Whip-v0")
+    gymnasium.make_vec("envs.whip.gym:jaxlfi/Whip-v0", num_envs=12, vectorization_mode="vector_entry_point")
+
+Actions are in metres; `gymnasium.wrappers.RescaleAction` brings them to [-1, 1].
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.whip import rules
+from envs.whip.camera import side_camera
+from envs.whip.engine import Engine
+from envs.whip.engines import pick
+from envs.whip.episode import OBSERVATION, Episode, Step, Whip
+from envs.whip.keypoints import DETECTORS, Detector
+from envs.whip.parameters import INITIAL, WhipParameters, check, median, randomised
+from envs.whip.raster import segmentation
+from envs.whip.render import PALETTE
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise ImportError("envs.whip.gym needs gymnasium: pip install 'jaxlfi[whip]'") from error
+
+Domain = Callable[[jax.Array], WhipParameters]
+"""Draws a scene with a key."""
+
+ACTIONS = spaces.Box(-rules.ACTION_LIMIT, rules.ACTION_LIMIT, (2,), np.float32)
+OBSERVATIONS = spaces.Box(
+    np.float32([-np.inf] * (OBSERVATION - 6) + [0.0] * 6), np.float32([np.inf] * (OBSERVATION - 6) + [1.0] * 6)
+)
+"""The gripper and the keypoints may be anywhere; see `episode.Step.observation`."""
+
+
+def initial_domain(key: jax.Array) -> WhipParameters:
+    """A scene of the initial support: length, modulus and all nuisances uniform in their ranges (section VI-H)."""
+    key_theta, key_rest = jax.random.split(key)
+    length, young = jax.random.uniform(key_theta, (2,), minval=INITIAL.low, maxval=INITIAL.high)
+    return randomised(key_rest, length, young)
+
+
+class WhipGym(gymnasium.Env):
+    """The whipping task as a gymnasium environment.
+
+    `info` tells of `hit` [6], `outside`, `failed`, `seen` [10] (see `episode.Step`), and the scene's `length` in m and
+    `young` in Pa. Actions beyond their limit are clipped; one that is no action is refused, and the episode goes on.
+
+    Example:
+        >>> environment = WhipGym()
+        >>> observation, info = environment.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = environment.step([0.0, 0.01])
+        >>> float(reward), terminated, truncated
+        (0.0, False, False)
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 6}  # noqa: RUF012
+
+    def __init__(
+        self,
+        parameters: WhipParameters | Domain | None = None,
+        detector: str | Detector = "clean",
+        engine: str | Engine = "auto",
+        render_mode: str | None = None,
+    ):
+        """Nothing is simulated yet.
+
+        Args:
+            parameters: of the scene; or a function of a key that draws one for every episode, such as
+                `initial_domain`; by default mu.
+            detector: of keypoints, or its name: "clean", "mask", "noisy" or "transporter".
+            engine: of the physics, or its name: "native", "mjx" or "auto".
+            render_mode: "rgb_array" for `render`.
+
+        Raises:
+            ValueError: for parameters that no scene has, and names that are not known.
+        """
+        self.action_space, self.observation_space = ACTIONS, OBSERVATIONS
+        self.render_mode = _mode(render_mode)
+        self._parts = _parts(engine, parameters)
+        self._detector, self._parameters = _detector(detector), _fixed(parameters, ())
+        self._key = self._scene = self._episode = None
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        """Begin an episode, in a scene of its own where they are drawn."""
+        super().reset(seed=seed)
+        if seed is not None or self._key is None:
+            self._key = jax.random.key(_entropy(self.np_random) if seed is None else seed)
+        self._key, self._scene, self._episode, now = _begin(self._parts, self._detector, self._parameters, self._key)
+        return np.asarray(now.observation), _one(_info(self._scene, now))
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """Apply an action (dx, dz), in m.
+
+        Raises:
+            ValueError: for what is not two finite numbers.
+            ResetNeeded: before the first `reset`.
+        """
+        if self._episode is None:
+            raise gymnasium.error.ResetNeeded("step: expected a reset before it, got none")
+        action = _action(action, (2,))
+        self._key, self._episode, now = _go_on(
+            self._parts[0], self._detector, self._scene, self._key, self._episode, action
+        )
+        now = jax.device_get(now)
+        ends = bool(now.terminated), bool(now.truncated)
+        return now.observation, float(now.reward), *ends, _one(_info(self._scene, now))
+
+    def render(self) -> np.ndarray | None:
+        """The segmentation image in colours, uint8 [256, 256, 3], where `render_mode` asks for it."""
+        if self.render_mode is None:
+            return None
+        if self._episode is None:
+            raise gymnasium.error.ResetNeeded("render: expected a reset before it, got none")
+        return np.asarray(_picture(self._parts[0], self._scene, self._episode))
+
+
+class WhipVector(VectorEnv):
+    """Many whipping scenes stepped together; each is as a `WhipGym` of its own, with the seed `seed + i`.
+
+    A scene whose episode has ended begins anew in the next step, whose action it does not need (gymnasium's
+    `AutoresetMode.NEXT_STEP`).
+
+    Example:
+        >>> environments = WhipVector(3, initial_domain)
+        >>> observations, info = environments.reset(seed=0)
+        >>> observations.shape, info["young"].shape
+        ((3, 28), (3,))
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": [], "render_fps": 6}  # noqa: RUF012
+
+    def __init__(
+        self,
+        num_envs: int,
+        parameters: WhipParameters | Domain | None = None,
+        detector: str | Detector = "clean",
+        engine: str | Engine = "auto",
+    ):
+        """Nothing is simulated yet.
+
+        Args:
+            num_envs: N.
+            parameters: as of `WhipGym`; also those of N scenes, with a leading axis.
+            detector: see `WhipGym`.
+            engine: see `WhipGym`.
+
+        Raises:
+            ValueError: see `WhipGym`.
+        """
+        if num_envs < 1:
+            raise ValueError(f"num_envs: expected at least 1, got {num_envs}")
+        self.num_envs, self.render_mode = num_envs, None
+        self.single_action_space, self.single_observation_space = ACTIONS, OBSERVATIONS
+        self.action_space, self.observation_space = (batch_space(space, num_envs) for space in (ACTIONS, OBSERVATIONS))
+        self._parts = _parts(engine, parameters)
+        self._detector, self._parameters = _detector(detector), _fixed(parameters, (num_envs,))
+        self._keys = self._scenes = self._episodes = None
+        self._over = np.zeros(num_envs, bool)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict | None = None
+    ) -> tuple[np.ndarray, dict]:
+        """Begin all episodes.
+
+        Args:
+            seed: of the first scene; or of each.
+            options: unused.
+
+        Raises:
+            ValueError: for another number of seeds.
+        """
+        super().reset(seed=seed if seed is None or np.ndim(seed) == 0 else seed[0])
+        seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if np.ndim(seed) == 0 else [*seed]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed: expected {self.num_envs} of them, got {len(seeds)}")
+        if self._keys is None:
+            self._keys = jax.random.split(jax.random.key(_entropy(self.np_random)), self.num_envs)
+        given = {i: jax.random.key(own) for i, own in enumerate(seeds) if own is not None}
+        self._keys = jnp.stack([given.get(i, self._keys[i]) for i in range(self.num_envs)])
+        self._keys, self._scenes, self._episodes, now = _begin_many(
+            self._parts, self._detector, self._parameters, self._keys
+        )
+        self._over[:] = False
+        return np.asarray(now.observation), _many(_info(self._scenes, now))
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+        """Apply actions (dx, dz), in m, shape [N, 2].
+
+        Raises:
+            ValueError: for another shape, and numbers that are not finite.
+            ResetNeeded: before the first `reset`.
+        """
+        if self._episodes is None:
+            raise gymnasium.error.ResetNeeded("step: expected a reset before it, got none")
+        actions = _action(actions, (self.num_envs, 2))
+        self._keys, self._scenes, self._episodes, now = _go_on_many(
+            self._parts,
+            self._detector,
+            self._parameters,
+            self._scenes,
+            self._keys,
+            self._episodes,
+            actions,
+            self._over,
+        )
+        now = jax.device_get(now)
+        self._over = now.terminated | now.truncated
+        info = _many(_info(self._scenes, now))
+        return now.observation, now.reward, now.terminated.copy(), now.truncated.copy(), info
+
+
+# ---------------------------------------------------------------------------------------------------- one scene
+
+Parts = tuple[Engine, Domain | None]
+"""What programs are compiled for: the physics, and how scenes are drawn where they are."""
+
+
+def _start(parts: Parts, detector: Detector, parameters: WhipParameters, key: jax.Array):
+    """A scene, the beginning of an episode in it, and what it looks like."""
+    engine, draw = parts
+    key_scene, key_reset = jax.random.split(key)
+    scene = parameters if draw is None else draw(key_scene)
+    episode, observation = Whip(engine, detector).reset(key_reset, scene)
+    no = jnp.asarray(False)
+    return scene, episode, Step(observation, jnp.asarray(0.0), no, no, episode.hit, no, no, jnp.ones(10, bool))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _begin(parts: Parts, detector: Detector, parameters: WhipParameters, key: jax.Array):
+    """The key that is left, and `_start`."""
+    key, key_start, _ = jax.random.split(key, 3)
+    return key, *_start(parts, detector, parameters, key_start)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _go_on(engine: Engine, detector: Detector, scene: WhipParameters, key: jax.Array, episode: Episode, action):
+    """The key that is left, the episode after an action, and what came of it."""
+    key, _, key_step = jax.random.split(key, 3)
+    return key, *Whip(engine, detector).step(key_step, scene, episode, action)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _begin_many(parts: Parts, detector: Detector, parameters: WhipParameters, keys: jax.Array):
+    return jax.vmap(functools.partial(_begin, parts, detector))(parameters, keys)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _go_on_many(parts: Parts, detector: Detector, parameters: WhipParameters, scenes, keys, episodes, actions, over):
+    """As `_go_on`, but as `_begin` where the episode was over; the scenes too."""
+
+    def one(parameters, scene, key, episode, action, over):
+        key, key_start, key_step = jax.random.split(key, 3)
+        # To the engine an episode that is over has failed: such scenes it need not simulate.
+        idle = episode.replace(state=episode.state.replace(failed=episode.state.failed | over))
+        went_on = (scene, *Whip(parts[0], detector).step(key_step, scene, idle, action))
+        started = _start(parts, detector, parameters, key_start)
+        return key, *jax.tree.map(lambda yes, no: jnp.where(over, yes, no), started, went_on)
+
+    return jax.vmap(one)(parameters, scenes, keys, episodes, actions, over)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _picture(engine: Engine, scene: WhipParameters, episode: Episode):
+    labels = segmentation(side_camera(scene), Whip(engine).frames(scene, episode), scene.cube_side)
+    return jnp.round(255 * jnp.asarray(PALETTE)[labels]).astype(jnp.uint8)
+
+
+# -------------------------------------------------------------------------------------------------- what is given
+
+
+def _parts(engine: str | Engine, parameters: WhipParameters | Domain | None) -> Parts:
+    return pick(engine) if isinstance(engine, str) else engine, parameters if callable(parameters) else None
+
+
+def _fixed(parameters: WhipParameters | Domain | None, batch: tuple[int, ...]) -> WhipParameters:
+    """Scenes of a batch shape; where they are drawn, a placeholder."""
+    one = median()
+    given = one if parameters is None or callable(parameters) else check(parameters)
+    spread = {}
+    for name, like in vars(one).items():
+        value = jnp.asarray(getattr(given, name), jnp.float32)
+        own = value.shape[: value.ndim - like.ndim]
+        if own not in ((), batch):
+            raise ValueError(f"parameters: expected one scene's or {list(batch)}, got {list(own)} for {name}")
+        spread[name] = jnp.broadcast_to(value, (*batch, *like.shape))
+    return WhipParameters(**spread)
+
+
+def _detector(detector: str | Detector) -> Detector:
+    if isinstance(detector, str) and detector not in DETECTORS:
+        raise ValueError(f"detector: expected one of {', '.join(DETECTORS)}, got {detector!r}")
+    return DETECTORS[detector] if isinstance(detector, str) else detector
+
+
+def _mode(mode: str | None) -> str | None:
+    if mode not in (None, *WhipGym.metadata["render_modes"]):
+        raise ValueError(f"render_mode: expected rgb_array or none, got {mode!r}")
+    return mode
+
+
+def _action(action, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        checked = np.asarray(action, np.float32)
+    except (TypeError, ValueError):
+        raise ValueError(f"action: expected numbers of shape {list(shape)}, got {action!r}") from None
+    if checked.shape != shape:
+        raise ValueError(f"action: expected numbers of shape {list(shape)}, got shape {list(checked.shape)}")
+    if not np.isfinite(checked).all():
+        raise ValueError(f"action: expected finite numbers, got {checked.tolist()}")
+    return checked
+
+
+def _entropy(random: np.random.Generator) -> int:
+    return int(random.integers(2**31))
+
+
+def _info(scene: WhipParameters, now: Step) -> dict[str, np.ndarray]:
+    told = {"hit": now.hit, "outside": now.outside, "failed": now.failed, "seen": now.seen}
+    return {name: np.asarray(value) for name, value in {**told, "length": scene.length, "young": scene.young}.items()}
+
+
+def _one(info: dict[str, np.ndarray]) -> dict:
+    """Of one scene: scalars as Python's."""
+    return {name: value if value.ndim else value.item() for name, value in info.items()}
+
+
+def _many(info: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Of many, with the masks of those that told, as gymnasium has them."""
+    return {**info, **{f"_{name}": np.ones(len(value), bool) for name, value in info.items()}}
+
+
+gymnasium.register("jaxlfi/Whip-v0", entry_point="envs.whip.gym:WhipGym", vector_entry_point="envs.whip.gym:WhipVector")
