@@ -42,9 +42,9 @@ HEURISTICS = {
     "edge": jaxlfi.Edge(mass_threshold=jnp.array([0.003, 0.005])),
 }
 SETTINGS = QUICK.replace(
-    rounds=10, additions=60, attempts=75, estimator=QUICK.estimator.replace(batch_size=10)
+    rounds=8, additions=60, attempts=75, estimator=QUICK.estimator.replace(batch_size=10)
 )
-"""`quick` with 600 simulations a run, where the paper has 1,500."""
+"""`quick` with 480 simulations a run, where the paper has 1,500."""
 DRAWS = 500
 LANES = 14
 """Runs in a chunk."""
@@ -175,7 +175,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--detectors", nargs="+", default=["clean", "noisy", "transporter"])
+    parser.add_argument("--detectors", nargs="+", default=["clean", "mask", "transporter"])
     arguments = parser.parse_args()
     console = Console()
     arguments.out.joinpath("chunks").mkdir(parents=True, exist_ok=True)

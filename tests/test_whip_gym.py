@@ -108,7 +108,7 @@ def test_seeds_decide_scenes_and_noise():
 
 
 def test_the_initial_domain_is_the_initial_support():
-    scenes = jax.vmap(initial_domain)(jax.random.split(jax.random.key(0), 400))
+    scenes = jax.jit(jax.vmap(initial_domain))(jax.random.split(jax.random.key(0), 400))
     check(scenes)
     drawn = np.stack([scenes.length, scenes.young], axis=-1)
     low, high = np.asarray(INITIAL.low), np.asarray(INITIAL.high)

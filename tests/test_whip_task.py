@@ -224,17 +224,17 @@ def test_unstable_physics_truncates_without_reward():
 # ------------------------------------------------------------------------------------------------- real physics
 
 NO_SCRIPT = np.zeros(0, np.float32)
+reset = jax.jit(Whip(ENGINE, DETECTORS["transporter"]).reset)
 
 
 def test_eager_is_jitted_and_the_second_call_compiles_nothing():
-    whip, parameters = Whip(ENGINE, DETECTORS["transporter"]), median(length=0.3, young=5e3)
-    traced = []
+    whip, traced = Whip(ENGINE, DETECTORS["transporter"]), []
 
     def step(key, episode, action):
         traced.append(action)
-        return whip.step(key, parameters, episode, action)
+        return whip.step(key, MEDIAN, episode, action)
 
-    episode, _ = jax.jit(whip.reset)(jax.random.key(0), parameters)
+    episode, _ = reset(jax.random.key(0), MEDIAN)
     compiled = jax.jit(step)
     for seed in (1, 2):
         eager, jitted = (made(jax.random.key(seed), episode, WHIP[0]) for made in (step, compiled))
@@ -265,7 +265,7 @@ def test_a_batch_is_a_loop(key):
 
 
 def test_an_episode_survives_flattening():
-    episode, _ = jax.jit(Whip(ENGINE, DETECTORS["transporter"]).reset)(jax.random.key(0), MEDIAN)
+    episode, _ = reset(jax.random.key(0), MEDIAN)
     leaves, structure = jax.tree.flatten(episode)
     again = jax.tree.unflatten(structure, [np.asarray(leaf) for leaf in leaves])
     assert jax.tree.structure(again) == structure and all(hasattr(leaf, "shape") for leaf in leaves)

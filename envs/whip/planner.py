@@ -190,7 +190,11 @@ def inside(actions: Float[Array, "16 2"]) -> Float[Array, "16 2"]:
 
 
 def mean_return(
-    engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"], stacks: int, jitter: float
+    engine: Engine,
+    parameters: WhipParameters,
+    actions: Float[Array, "16 2"],
+    stacks: int,
+    jitter: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
     """The return of actions, averaged over places of the stack: the middles of equal parts of a range along x.
 
@@ -202,7 +206,7 @@ def mean_return(
         jitter: half the range, in m.
     """
     middles = (2 * np.arange(stacks) + 1) / stacks - 1
-    shifts = jnp.asarray(np.stack([jitter * middles, np.zeros(stacks)], axis=-1), jnp.float32)
+    shifts = jitter * jnp.asarray(np.stack([middles, np.zeros(stacks)], axis=-1), jnp.float32)
     displaced = lambda shift: parameters.replace(stack=parameters.stack + shift)
     return jnp.mean(jax.vmap(lambda shift: play(engine, displaced(shift), actions).value)(shifts))
 

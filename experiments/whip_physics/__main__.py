@@ -53,9 +53,9 @@ def statistics(scenes: Mapping[str, np.ndarray]) -> dict[str, float]:
         "failed_share": float(failed.mean()),
         "failed_saturated": int((failed & scenes["saturated"]).sum()),
         "wild": int((wild & ~failed).sum()),
-        "fastest_cube": float(scenes["cube"][~failed].max()),
-        "deepest": float(scenes["depth"][~failed].max()),
-        "greatest_lag": float(scenes["lag"][~failed].max()),
+        "fastest_cube": float(scenes["cube"][~failed].max(initial=0.0)),
+        "deepest": float(scenes["depth"][~failed].max(initial=0.0)),
+        "greatest_lag": float(scenes["lag"][~failed].max(initial=0.0)),
         "stacks": {name: dict(zip(measures, values.tolist(), strict=True)) for name, values in stacks.items()},
     }
 
