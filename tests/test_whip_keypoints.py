@@ -10,7 +10,19 @@ from scipy import stats
 
 from envs.whip.camera import project, side_camera
 from envs.whip.frames import Frames
-from envs.whip.keypoints import CLEAN, DETECTORS, NOISY, TRANSPORTER, Detector, along, begin, detect, track
+from envs.whip.keypoints import (
+    CLEAN,
+    DETECTORS,
+    MASK,
+    NOISY,
+    TRANSPORTER,
+    Detector,
+    along,
+    begin,
+    detect,
+    measured,
+    track,
+)
 from envs.whip.parameters import MEDIAN
 
 CAMERA = side_camera(MEDIAN)
@@ -108,7 +120,7 @@ def test_a_transporters_orders_are_uniform(key):
 
 def test_places_and_order_stay_through_a_trajectory(key):
     """Without noise, a shuffled detector sees the same points of the DLO in all frames."""
-    quiet = TRANSPORTER.replace(noise=0.0, missing=0.0)
+    quiet = TRANSPORTER.replace(noise=0.0, cube_noise=0.0, missing=0.0)
     keypoints, _ = one(key, quiet, CAMERA, FRAMES)
     arcs = begin(jax.random.fold_in(key, 0), quiet).arcs
     assert sorted(arcs.tolist()) != arcs.tolist()
@@ -117,7 +129,7 @@ def test_places_and_order_stay_through_a_trajectory(key):
 
 def test_noise_is_white(key):
     keypoints, _ = many(jax.random.split(key, MANY), NOISY, CAMERA, FRAMES)
-    noise = np.asarray(keypoints - TRUTH) / 0.01
+    noise = np.asarray(keypoints - TRUTH) / np.array([0.01] * 4 + [0.001] * 6)[:, None]
     assert stats.kstest(noise.ravel()[::7], "norm").pvalue > 1e-3
     np.testing.assert_allclose(noise.std(axis=(0, 1)), 1.0, atol=0.06)  # every keypoint and coordinate
     for a, b in [
@@ -188,3 +200,21 @@ def test_a_failed_simulation_is_seen_as_nothing(key):
     broken = jax.tree.map(lambda leaf: leaf.at[5:].set(jnp.nan), FRAMES)
     keypoints, _ = one(key, CLEAN, CAMERA, broken)
     assert np.isfinite(keypoints[:5]).all() and np.isnan(keypoints[5:]).all()
+
+
+def test_lasting_errors_are_the_same_in_all_frames_and_others_in_every_trajectory(key):
+    detector = Detector(bias=0.005)
+    keypoints, _ = many(jax.random.split(key, MANY), detector, CAMERA, FRAMES)
+    error = np.asarray(keypoints - TRUTH) / 0.005
+    np.testing.assert_allclose(error, np.broadcast_to(error[:, :1], error.shape), atol=1e-3)
+    lasting = error[:, 0].reshape(MANY, -1)
+    assert stats.kstest(lasting.ravel(), "norm").pvalue > 1e-3
+    correlation = np.corrcoef(lasting.T) - np.eye(20)
+    assert np.abs(correlation).max() < 5 / np.sqrt(MANY)
+
+
+def test_the_gripper_slips_by_its_own_amount(key):
+    gripper = jnp.tile(jnp.array([0.4, 0.36]), (4000, 1))
+    error = np.asarray(measured(key, MASK, gripper) - gripper) / 0.002
+    assert stats.kstest(error.ravel(), "norm").pvalue > 1e-3
+    np.testing.assert_array_equal(measured(key, Detector(), gripper), gripper)

@@ -24,12 +24,14 @@ def apply_parameters(scene: Scene, model: mjx.Model, parameters: WhipParameters)
         model: of one of them, as from `mjx.put_model(base_model(scene))`.
         parameters: of the scene.
     """
-    changed = {}
+    compiled, changed = base_model(scene), {}
     for field, index, values in (*edits(scene, parameters, jnp), *derived(scene, parameters)):
-        before = changed.get(field, getattr(model, field))
+        before = changed.get(field, getattr(model, field).reshape(getattr(compiled, field).shape))
         changed[field] = before.at[index].set(values)
     inertia = jnp.mean(changed["dof_M0"])  # scales the solver's tolerance
-    return model.tree_replace(changed | {"stat.meaninertia": inertia})
+    # Warp's bounding boxes have an axis more than MuJoCo's.
+    fields = {field: values.reshape(getattr(model, field).shape) for field, values in changed.items()}
+    return model.tree_replace(fields | {"stat.meaninertia": inertia})
 
 
 def derived(scene: Scene, parameters: WhipParameters):

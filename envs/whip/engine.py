@@ -76,5 +76,6 @@ def ramp(before: Float[Array, "2"], after: Float[Array, "2"], substeps: int, xp=
     A set-point that jumped would make soft DLOs chaotic: a change of 10 % in the modulus, or of the time step, would
     move their keypoints by a tenth of the image.
     """
-    share = (xp.arange(substeps) + 1)[:, None] / substeps
+    # From the start on, as semi-implicit Euler's positions lead by a substep.
+    share = xp.arange(substeps)[:, None] / substeps
     return before + share * (after - before)

@@ -23,7 +23,8 @@ class Detector:
 
     It tracks four points of the DLO. Where they lie is drawn once a trajectory, uniformly among all places from
     `nearest` to `farthest` that are at least `spacing` apart: a spacing of a third of that range leaves one choice, so
-    they are then fixed and equally spaced. Cubes come from their masks, so only the noise is theirs.
+    they are then fixed and equally spaced. Cubes come from their masks: they have a noise of their own, and are never
+    missing.
 
     Attributes:
         nearest: least distance from the grip, as a fraction of the DLO's length.
@@ -31,7 +32,8 @@ class Detector:
         spacing: least distance between neighbours.
         shuffled: probability that a trajectory's four come in a random order, the same in all its frames
             ("temporally consistent, but permutation invariance is not guaranteed", section VI-G).
-        noise: standard deviation of each coordinate in each frame, in normalised pixels.
+        noise: standard deviation of each coordinate of the DLO's points in each frame, in normalised pixels.
+        cube_noise: the same of the cubes', whose masks have centroids that hardly move.
         missing: probability that a point of the DLO is not found in a frame; it then stays where it was last seen.
         bias: standard deviation of each coordinate's error that lasts through a trajectory, in normalised pixels.
         slip: standard deviation of what the gripper's measured x and z are off in each frame, in m.
@@ -42,6 +44,7 @@ class Detector:
     spacing: Float[Array, ""] | float = 0.25
     shuffled: Float[Array, ""] | float = 0.0
     noise: Float[Array, ""] | float = 0.0
+    cube_noise: Float[Array, ""] | float = 0.0
     missing: Float[Array, ""] | float = 0.0
     bias: Float[Array, ""] | float = 0.0
     slip: Float[Array, ""] | float = 0.0
@@ -49,15 +52,15 @@ class Detector:
 
 CLEAN = Detector()
 """The truth at the quarters of the DLO, the last at its tip."""
-MASK = Detector(noise=0.005, bias=0.005, slip=0.002)
+MASK = Detector(noise=0.004, cube_noise=0.001, bias=0.005, slip=0.002)
 """The same as it is found along the DLO's segmentation mask (`envs.whip.masks`), a pixel off here and there, beside a
 gripper that follows its set-point as well as another controller does.
 
 Errors that are not simulated make an observation unlike all simulations, and a network's answer to it arbitrary.
 """
-NOISY = Detector(noise=0.01)
+NOISY = Detector(noise=0.01, cube_noise=0.001)
 """The same with 2.6 pixels of 256 of noise."""
-TRANSPORTER = Detector(nearest=0.1, spacing=0.1, shuffled=1.0, noise=0.01, missing=0.02)
+TRANSPORTER = Detector(nearest=0.1, spacing=0.1, shuffled=1.0, noise=0.01, cube_noise=0.001, missing=0.02)
 """Unknown places in an unknown order, as unsupervised keypoints are."""
 DETECTORS: Mapping[str, Detector] = types.MappingProxyType(
     {"clean": CLEAN, "mask": MASK, "noisy": NOISY, "transporter": TRANSPORTER}
@@ -113,7 +116,8 @@ def track(
     """
     key_noise, key_missing = jax.random.split(key)
     points = jnp.concatenate([along(frames.dlo, tracking.arcs), frames.cubes])
-    noise = detector.noise * jax.random.normal(key_noise, (KEYPOINTS, 2))
+    spread = jnp.where(jnp.arange(KEYPOINTS) < ON_DLO, detector.noise, detector.cube_noise)
+    noise = spread[:, None] * jax.random.normal(key_noise, (KEYPOINTS, 2))
     found = project(camera, points) + tracking.bias + noise
     missing = jax.random.bernoulli(key_missing, detector.missing, (ON_DLO,)) & tracking.begun
     seen = jnp.concatenate([~missing, jnp.ones(KEYPOINTS - ON_DLO, bool)])

@@ -1,6 +1,8 @@
 """Physics by MJX: MuJoCo in JAX, the fast engine on accelerators."""
 
 import functools
+import importlib.util
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -15,19 +17,45 @@ from envs.whip.parameters import WhipParameters
 from envs.whip.scene import Scene, base_model
 
 
+IMPLEMENTATIONS = ("jax", "warp")
+"""Of MJX: its own, and kernels in Warp for NVIDIA's accelerators."""
+CONTACTS = 96
+"""Of a scene, for which there is room with Warp: twice what a stack of cubes and a DLO on the table have."""
+
+
 class MjxEngine:
     """MJX, in the precision that JAX is set to, single as a rule."""
 
-    def __init__(self, scene: Scene = Scene()):
-        """An engine; the scene is what all its scenes have in common."""
+    def __init__(self, scene: Scene = Scene(), implementation: str = "jax", scenes: int = 4096):
+        """An engine.
+
+        Args:
+            scene: what all its scenes have in common.
+            implementation: "jax" or "warp".
+            scenes: the most in a batch, of Warp, where they share the room for contacts.
+
+        Raises:
+            ValueError: for another implementation.
+            ImportError: where Warp is not installed, with what to install.
+        """
+        if implementation not in IMPLEMENTATIONS:
+            raise ValueError(f"implementation: expected one of {IMPLEMENTATIONS}, got {implementation!r}")
+        if implementation == "warp" and importlib.util.find_spec("warp") is None:
+            raise ImportError("engine: 'warp' needs Warp: pip install 'mujoco-mjx[warp]'")
         self.scene = scene
         compiled = base_model(scene).__copy__()
-        # Sparse matrices, MJX's choice for the chain of balls, are unrolled into a program of their own length.
-        compiled.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        if implementation == "jax":
+            # Sparse matrices, MJX's choice for the chain of balls, are unrolled into a program of their own length.
+            compiled.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+            room, advanced = {}, functools.partial(step, scene)
+        else:
+            compiled.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_AUTORESET  # unknown to Warp, which never resets
+            room, advanced = {"naconmax": CONTACTS * scenes, "njmax": 4 * CONTACTS}, mjx.step
         with jax.ensure_compile_time_eval():  # also where a traced function makes the engine
-            self._model, self._data = mjx.put_model(compiled), mjx.make_data(compiled)
+            model = mjx.put_model(compiled, impl=implementation)
+            data = mjx.make_data(compiled, impl=implementation, **room)
         # Traced once, whatever programs it is called from: that takes seconds, most of them of collisions.
-        self._simulate = jax.jit(functools.partial(_simulate, scene, self._model, self._data))
+        self._simulate = jax.jit(functools.partial(_simulate, scene, advanced, model, data))
 
     def advance(self, parameters: WhipParameters, state: State, target: Float[Array, "2"]) -> State:
         """One control interval; see `Engine.advance`."""
@@ -35,14 +63,22 @@ class MjxEngine:
             return settled(state, *self._simulate(parameters, state, target))
 
 
-def _simulate(scene: Scene, model: mjx.Model, data: mjx.Data, parameters: WhipParameters, state: State, target):
+def _simulate(
+    scene: Scene,
+    advanced: Callable[[mjx.Model, mjx.Data], mjx.Data],
+    model: mjx.Model,
+    data: mjx.Data,
+    parameters: WhipParameters,
+    state: State,
+    target,
+):
     """Positions and velocities after a control interval, the target, and whether the simulation has broken down."""
     model = apply_parameters(scene, model, parameters)
     precision = data.qpos.dtype
 
     def substep(carry, control):
         (qpos, qvel, warm), failed = carry
-        now = step(scene, model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=control))
+        now = advanced(model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=control))
         # Where MuJoCo gives up, though its numbers may become reasonable again.
         worst = jnp.max(jnp.abs(jnp.concatenate([now.qpos, now.qvel, now.qacc])))
         carry = (now.qpos, now.qvel, now.qacc_warmstart)

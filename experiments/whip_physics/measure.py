@@ -1,5 +1,6 @@
 """Everything that is measured of the chains, as named arrays."""
 
+import jax.numpy as jnp
 import numpy as np
 
 from envs.whip.chain import GRAVITY, SECOND_MOMENT, SECTION, Chain
@@ -106,8 +107,8 @@ def energies(kind: str = "planar hinges") -> dict[str, np.ndarray]:
 
 def scenes(engine: Engine, count: int, seed: int = 0) -> dict[str, np.ndarray]:
     """Random episodes (`rollouts.random_episodes`) and stacks at rest for 5 s (`stack NAME`, shape [3])."""
-    rest = {
-        f"stack {name}": np.array(list(rollouts.stack_at_rest(engine, median().replace(**changes)).values()))
-        for name, changes in CUBES.items()
-    }
+    rest = {}
+    for name, changes in CUBES.items():
+        parameters = median().replace(**{name: jnp.float32(value) for name, value in changes.items()})
+        rest[f"stack {name}"] = np.array(list(rollouts.stack_at_rest(engine, parameters).values()))
     return rest | rollouts.random_episodes(engine, seed, count)

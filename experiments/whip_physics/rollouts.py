@@ -97,16 +97,7 @@ def stack_at_rest(engine: Engine, parameters: WhipParameters, seconds: float = 5
     start = reset(engine.scene, parameters)
     start = start.replace(qvel=start.qvel.at[-6 * CUBES :].add(NUDGE))
     steps = round(seconds / engine.scene.control_interval)
-
-    @jax.jit
-    def run(parameters, state):
-        def wait(state, _):
-            state = engine.advance(parameters, state, state.target)
-            return state, state.qpos[-7 * CUBES :].reshape(CUBES, 7)[:, :3]
-
-        return jax.lax.scan(wait, state, None, steps)[1]
-
-    cubes = np.asarray(run(parameters, start), np.float64)
+    cubes = np.asarray(_waiting(engine, steps, parameters, start), np.float64)
     moved = cubes - np.asarray(start.qpos, np.float64)[-7 * CUBES :].reshape(CUBES, 7)[:, :3]
     settled = round(1 / engine.scene.control_interval)
     return {
@@ -116,7 +107,18 @@ def stack_at_rest(engine: Engine, parameters: WhipParameters, seconds: float = 5
     }
 
 
-def steps_per_second(engines: Sequence[Engine], seed: int = 0, repeats: int = 5) -> list[float]:
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _waiting(engine: Engine, steps: int, parameters: WhipParameters, state: State) -> Float[Array, "steps 6 3"]:
+    """Where the cubes are after each control step without an action."""
+
+    def wait(state, _):
+        state = engine.advance(parameters, state, state.target)
+        return state, state.qpos[-7 * CUBES :].reshape(CUBES, 7)[:, :3]
+
+    return jax.lax.scan(wait, state, None, steps)[1]
+
+
+def steps_per_second(engines: Sequence[Engine], seed: int = 0, repeats: int = 3) -> list[float]:
     """Steps of the physics in a second, of all threads together, in random episodes of random scenes.
 
     Each engine's best of some repetitions, in turns, so that what else the machine does is not counted against one.
