@@ -125,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("experiments/results/whip-plan"))
     parser.add_argument("--quick", action="store_true", help="nine DLOs only")
-    parser.add_argument("--engine", default="auto", help="native, mjx or auto")
+    parser.add_argument("--engine", default="auto", help="native, mjx, warp or auto (default)")
     given = parser.parse_args(arguments)
     lengths, moduli = QUICK if given.quick else (LENGTHS, MODULI)
     method, engine, rows = planner.CrossEntropy(), pick(given.engine), []

@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
         'cube, searched for first; or an .npz with an array "actions" [16, 2] in m (default: explore)',
     )
     render.add_argument(
-        "--detector", default="clean", metavar="NAME", help="of keypoints: clean, mask, noisy, transporter (default: clean)"
+        "--detector", default="clean", metavar="NAME", help="clean, mask, noisy or transporter (default: clean)"
     )
     render.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
 
@@ -65,7 +65,7 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
     command.add_argument("--young", type=float, default=2.5e4, metavar="PA", help="its modulus in Pa, 500 to 5e5")
     command.add_argument("--seed", type=int, default=0, metavar="N", help="of all random numbers (default: 0)")
     command.add_argument(
-        "--engine", default="auto", metavar="NAME", help="native, mjx, or auto: what suits the platform (default)"
+        "--engine", default="auto", metavar="NAME", help="native, mjx, warp, or auto: what suits the platform (default)"
     )
 
 

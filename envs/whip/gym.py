@@ -77,7 +77,7 @@ class WhipGym(gymnasium.Env):
             parameters: of the scene; or a function of a key that draws one for every episode, such as
                 `initial_domain`; by default mu.
             detector: of keypoints, or its name: "clean", "mask", "noisy" or "transporter".
-            engine: of the physics, or its name: "native", "mjx" or "auto".
+            engine: of the physics, or its name (`engines.pick`).
             render_mode: "rgb_array" for `render`.
 
         Raises:

@@ -16,7 +16,6 @@ from envs.whip.mjx_step import step
 from envs.whip.parameters import WhipParameters
 from envs.whip.scene import Scene, base_model
 
-
 IMPLEMENTATIONS = ("jax", "warp")
 """Of MJX: its own, and kernels in Warp for NVIDIA's accelerators."""
 CONTACTS = 96
@@ -49,7 +48,8 @@ class MjxEngine:
             compiled.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
             room, advanced = {}, functools.partial(step, scene)
         else:
-            compiled.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_AUTORESET  # unknown to Warp, which never resets
+            # Warp never resets, and refuses to be told not to.
+            compiled.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
             room, advanced = {"naconmax": CONTACTS * scenes, "njmax": 4 * CONTACTS}, mjx.step
         with jax.ensure_compile_time_eval():  # also where a traced function makes the engine
             model = mjx.put_model(compiled, impl=implementation)

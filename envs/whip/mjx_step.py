@@ -51,7 +51,7 @@ def kinematics(scene: Scene, model: mjx.Model, data: mjx.Data) -> mjx.Data:
     upright = jnp.tile(jnp.eye(1, 4), (2, 1))
     xquat = jnp.concatenate([upright, turns[:1], turns, cubes[:, 3:]])
     xmat = rotation(xquat)
-    offsets = _turned(xmat[3:-CUBES - 1], model.body_pos[4:-CUBES])
+    offsets = _turned(xmat[3 : -CUBES - 1], model.body_pos[4:-CUBES])
     xpos = jnp.concatenate([world, held, grip[None], grip + jnp.cumsum(offsets, axis=0), cubes[:, :3]])
 
     of_geoms, of_joints = model.geom_bodyid, model.jnt_bodyid

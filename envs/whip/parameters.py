@@ -99,5 +99,5 @@ def check(parameters: WhipParameters) -> WhipParameters:
         if value.shape[value.ndim - low.ndim :] != low.shape:
             raise ValueError(f"{name}: expected shape [..., {', '.join(map(str, low.shape))}], got {value.shape}")
         if not bool(jnp.all((value >= low - slack) & (value <= high + slack))):  # also false for NaN
-            raise ValueError(f"{name}: expected numbers between {low} and {high}, got {value}")
+            raise ValueError(f"{name}: expected numbers between {low!s} and {high!s}, got {value!s}")
     return parameters

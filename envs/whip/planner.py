@@ -8,9 +8,11 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from envs.whip import engine as physics
 from envs.whip import rules
+from envs.whip.camera import project, side_camera
 from envs.whip.engine import Engine
-from envs.whip.episode import Whip
+from envs.whip.kinematics import frames
 from envs.whip.parameters import HIGHEST, WhipParameters
 from envs.whip.scene import START
 
@@ -212,20 +214,23 @@ def mean_return(
 
 
 def play(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> Outcome:
-    """One episode of given actions, as it is seen without error."""
-    whip, key = Whip(engine), jax.random.key(0)  # which a detector without noise makes no use of
+    """One episode of given actions, as `episode.Whip` has it, but of the cubes only, which are seen without error."""
+    camera = side_camera(parameters)
+    see = lambda state: project(camera, frames(engine.scene, parameters, state.qpos).cubes)
+    first = physics.reset(engine.scene, parameters)
+    start = see(first)
 
-    def act(carry, at):
-        (episode, over, before), (time, action) = carry, at
-        episode, now = whip.step(jax.random.fold_in(key, time), parameters, episode, action)
-        done = now.terminated | now.truncated
-        outcome = Outcome(before.value + now.reward, now.hit, now.outside, now.failed, before.steps + 1)
+    def act(carry, action):
+        state, over, before = carry
+        state = engine.advance(parameters, state, rules.moved_target(state.target, action))
+        hit, out = rules.hits(before.hit, start, see(state)), rules.outside(state.qpos[:2])
+        earned = jnp.where(state.failed, 0.0, rules.reward(hit, out))
+        outcome = Outcome(before.value + earned, hit, out, state.failed, before.steps + 1)
         outcome = jax.tree.map(lambda old, new: jnp.where(over, old, new), before, outcome)
+        over |= hit[rules.TOP] | out | state.failed
         # To the engine an episode that is over has failed: such scenes it need not simulate.
-        state = episode.state.replace(failed=episode.state.failed | done)
-        return (episode.replace(state=state), over | done, outcome), None
+        return (state.replace(failed=over), over, outcome), None
 
-    episode, _ = whip.reset(jax.random.fold_in(key, 0), parameters)
     no = jnp.asarray(False)
-    start = (episode, no, Outcome(jnp.asarray(0.0), jnp.zeros(6, bool), no, no, jnp.asarray(0)))
-    return jax.lax.scan(act, start, (jnp.arange(len(actions)) + 1, actions))[0][2]
+    nothing = Outcome(jnp.asarray(0.0), jnp.zeros(6, bool), no, no, jnp.asarray(0))
+    return jax.lax.scan(act, (first, no, nothing), actions)[0][2]
