@@ -13,7 +13,7 @@ help:  ## what there is to make
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,dev,whip]'
 	@touch $@
 
 demo: $(VENV)/.installed  ## the main job: supports and heuristics compared on Lotka-Volterra

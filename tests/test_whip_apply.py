@@ -14,7 +14,7 @@ mjx = pytest.importorskip("mujoco.mjx")
 
 from envs.whip.apply import apply_parameters, respond
 from envs.whip.chain import Chain
-from envs.whip.parameters import FEASIBLE, HIGHEST, LOWEST, WhipParameters, randomised
+from envs.whip.parameters import FEASIBLE, HIGHEST, LOWEST, WhipParameters
 from envs.whip.scene import Scene, base_model, compile_model
 
 PLANAR, BALLS = Scene(), Scene(chain=Chain(planar=False))
@@ -38,17 +38,28 @@ def mjx_model(scene: Scene) -> mjx.Model:
     return mjx.put_model(base_model(scene))
 
 
+NAMES = [field.name for field in dataclasses.fields(WhipParameters)]
+
+
+@functools.cache
 def scenes() -> WhipParameters:
     """The corners of Phi with the nuisances at either end, and some from within, batched."""
     corners = [
         dataclasses.replace(nuisances, length=length, young=young)
         for length, young, nuisances in itertools.product(*np.stack([FEASIBLE.low, FEASIBLE.high]).T, (LOWEST, HIGHEST))
     ]
-    keys = jax.random.split(jax.random.key(5), 4)
-    within = [randomised(key, 0.1 + 0.06 * i, 10.0 ** (3 + 0.7 * i)) for i, key in enumerate(keys)]
-    names = [field.name for field in dataclasses.fields(WhipParameters)]
+    generator = np.random.default_rng(5)
+    draw = lambda name: generator.uniform(getattr(LOWEST, name), getattr(HIGHEST, name))
+    within = [WhipParameters(**{name: draw(name) for name in NAMES}) for _ in range(4)]
     stack = lambda name: np.stack([np.asarray(getattr(one, name), np.float32) for one in (*corners, *within)])
-    return WhipParameters(**{name: jnp.asarray(stack(name)) for name in names})
+    return WhipParameters(**{name: stack(name) for name in NAMES})
+
+
+@functools.cache
+def applied(scene: Scene) -> dict[str, np.ndarray]:
+    """The models of all these scenes, by one compiled program."""
+    apply = jax.jit(jax.vmap(functools.partial(apply_parameters, scene, mjx_model(scene))))
+    return leaves_of(jax.device_get(apply(scenes())))
 
 
 def leaves_of(tree) -> dict[str, np.ndarray]:
@@ -58,32 +69,25 @@ def leaves_of(tree) -> dict[str, np.ndarray]:
 @both
 def test_applying_is_compiling(scene):
     """Every field of the model, the inverse inertias among them, to single precision."""
-    parameters = scenes()
-    apply = jax.jit(jax.vmap(functools.partial(apply_parameters, scene, mjx_model(scene))))
-    applied, differing = leaves_of(apply(parameters)), set()
-    for i in range(len(parameters.length)):
-        one = jax.tree.map(lambda leaf, i=i: np.float64(leaf[i]), parameters)
-        compiled = leaves_of(mjx.put_model(compile_model(scene, one)))
-        assert compiled.keys() == applied.keys()
-        base = leaves_of(mjx_model(scene))
+    base, differing = leaves_of(jax.device_get(mjx_model(scene))), set()
+    for i in range(len(scenes().length)):
+        one = jax.tree.map(lambda leaf, i=i: np.float64(leaf[i]), scenes())
+        compiled = leaves_of(jax.device_get(mjx.put_model(compile_model(scene, one))))
+        assert compiled.keys() == applied(scene).keys()
         for name in compiled.keys() - WITHOUT_EFFECT:
-            actual, expected = np.asarray(applied[name][i], np.float64), np.asarray(compiled[name], np.float64)
             rtol = 5e-6 if name in DERIVED else 2e-6
-            np.testing.assert_allclose(actual, expected, rtol=rtol, atol=1e-12, err_msg=name)
-            if not np.array_equal(expected, base[name]):
+            np.testing.assert_allclose(applied(scene)[name][i], compiled[name], rtol, atol=1e-12, err_msg=name)
+            if not np.array_equal(compiled[name], base[name]):
                 differing.add(name)
     assert differing > DERIVED | {".body_pos", ".body_mass", ".jnt_stiffness", ".qpos0", ".geom_rbound"}
 
 
 def test_a_scene_of_a_batch_is_what_it_is_alone():
     """Whatever the model it is made from."""
-    parameters = scenes()
-    apply, base = functools.partial(apply_parameters, PLANAR), mjx_model(PLANAR)
-    batch = jax.jit(jax.vmap(lambda one: apply(base, one)))(parameters)
-    first, other = (jax.tree.map(lambda leaf, i=i: leaf[i], parameters) for i in (1, 6))
-    alone = jax.jit(lambda one, other: apply(apply(base, other), one))(first, other)
-    for name, leaf in leaves_of(alone).items():
-        np.testing.assert_allclose(leaf, leaves_of(batch)[name][1], rtol=1e-6, atol=0, err_msg=name)
+    first, other = (jax.tree.map(lambda leaf, i=i: leaf[i], scenes()) for i in (1, 6))
+    twice = lambda one, other: apply_parameters(PLANAR, apply_parameters(PLANAR, mjx_model(PLANAR), other), one)
+    for name, leaf in leaves_of(jax.device_get(jax.jit(twice)(first, other))).items():
+        np.testing.assert_allclose(leaf, applied(PLANAR)[name][1], rtol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize("base", [0.8, np.inf])

@@ -32,13 +32,10 @@ WHIP = np.array([[-0.06, 0.0]] * 2 + [[0.06, 0.0]] * 4 + [[0.0, 0.0]] * 10, np.f
 @pytest.fixture(autouse=True, scope="module")
 def quick_compilation():
     """Compiling takes longer than running here, and most of it is for the random numbers."""
-    quick = {"jax_disable_most_optimizations": True, "jax_default_prng_impl": "rbg"}
-    before = {name: getattr(jax.config, name) for name in quick}
-    for settings in (quick, before):
-        for name, value in settings.items():
-            jax.config.update(name, value)
-        if settings is quick:
-            yield
+    jax.config.update("jax_disable_most_optimizations", True)
+    with jax.default_prng_impl("rbg"):
+        yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(autouse=True)

@@ -306,7 +306,7 @@ def test_a_rollout_is_a_plain_simulation(scene):
         for step, target in enumerate(np.asarray(SWEEP)):
             hits = 0
             for substep in range(40):
-                data.ctrl[:] = before + (substep + 1) / 40 * (target - before)
+                data.ctrl[:] = before + substep / 40 * (target - before)
                 mujoco.mj_step(model, data)
                 hits += touches(model, data)
             before = target

@@ -18,8 +18,7 @@ import numpy as np
 from rich.console import Console
 
 from envs.whip.chain import Chain
-from envs.whip.engine import Engine
-from envs.whip.native import NativeEngine
+from envs.whip.engines import pick
 from envs.whip.scene import Scene
 from experiments.whip_physics import figures, measure, rollouts
 from experiments.whip_physics.models import KINDS
@@ -31,15 +30,6 @@ CHAINS = {"ball joints": Chain(planar=False), "planar hinges": Chain()}
 """Those that can be in a scene, by their kind."""
 WILD = 4.0
 """A cube's speed far beyond that of a fall from the stack's top (1.7) and of the gripper (0.5), in m/s."""
-
-
-def engine_of(name: str, chain: Chain) -> Engine:
-    """The engine of this name, native or mjx."""
-    if name == "native":
-        return NativeEngine(Scene(chain=chain))
-    from envs.whip.mjx_engine import MjxEngine
-
-    return MjxEngine(Scene(chain=chain))
 
 
 def statistics(scenes: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -110,14 +100,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, write and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("experiments/results/whip-physics"))
-    parser.add_argument("--engine", choices=("native", "mjx"), default="native", help="of the scenes")
-    parser.add_argument("--rollouts", type=int, help="random episodes a chain: 1,000, or 100 with mjx")
+    parser.add_argument("--engine", choices=("native", "mjx", "warp"), default="native", help="of the scenes")
+    parser.add_argument("--rollouts", type=int, help="random episodes a chain: 1,000 with native, else 100")
     given = parser.parse_args(arguments)
     count = given.rollouts or (1000 if given.engine == "native" else 100)
     console, started = Console(), time.perf_counter()
     with console.status("beams"):
         arrays = {**measure.against_theory(), **measure.sags(), **measure.energies()}
-    engines = {kind: engine_of(given.engine, chain) for kind, chain in CHAINS.items()}
+    engines = {kind: pick(given.engine, Scene(chain=chain)) for kind, chain in CHAINS.items()}
     with console.status("speed"):
         speeds = rollouts.steps_per_second(list(engines.values()))
     scenes = {}
