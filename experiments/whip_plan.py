@@ -3,7 +3,7 @@
     python -m experiments.whip_plan --out experiments/results/whip-plan
 
 For every DLO the cross-entropy method (`envs.whip.planner`) looks for actions of the greatest return on average over
-places of the stack, and ends early where they hit the top cube only in all of them. What it has found is then tried on
+places of the stack, and ends early where they hit hardly anything but the top cube. What it has found is then tried on
 places in between, of which it knew nothing.
 """
 

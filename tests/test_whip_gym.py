@@ -133,6 +133,7 @@ def test_a_vector_is_single_ones_which_begin_anew(key):
         actions = np.stack([[0.0, 0.05], [-0.02, 0.0], [0.01 * (-1) ** t, 0.0]]).astype(np.float32)
         observations, rewards, terminated, truncated, info = many.step(actions)
         assert rewards.shape == terminated.shape == truncated.shape == (3,) and observations.dtype == np.float32
+        assert observations.flags.writeable and rewards.flags.writeable
         for i, environment in enumerate(single):
             if t and ended[t - 1, i]:
                 (own, own_info), ends = environment.reset(), (0.0, False, False)

@@ -14,7 +14,7 @@ from envs.whip import rules
 from envs.whip.chain import GRAVITY, SECTION, Chain
 from envs.whip.kinematics import frames
 from envs.whip.native import NativeEngine
-from envs.whip.parameters import MEDIAN, check, median
+from envs.whip.parameters import MEDIAN, median
 from envs.whip.scene import START, Scene, compile_model
 from experiments.whip_physics import beam, models, statics
 from experiments.whip_physics.__main__ import statistics, table
@@ -158,13 +158,12 @@ def test_a_plucked_beam_comes_back_after_a_period():
     model.opt.timestep = period / 4000
     data = mujoco.MjData(model)
     data.qpos[:] = small
-    start = statics.nodes(model, statics.bent(model, data.qpos.copy()))[-1, 0]
-    tip = []
+    last = statics.links(model)[-1]
+    displacements = [statics.tip(model, statics.bent(model, data.qpos.copy()), last)[0] - START[0]]
     for _ in range(4000):
         mujoco.mj_step(model, data)
-        tip.append(statics.nodes(model, data)[-1, 0])
-    rest = statics.nodes(model, statics.bent(model, np.zeros(12)))[-1, 0]
-    displaced = (np.array(tip) - rest) / (start - rest)
+        displacements.append(statics.tip(model, data, last)[0] - START[0])
+    displaced = np.array(displacements)[1:] / displacements[0]
     assert displaced[1999] == pytest.approx(-1, abs=0.06)  # the second mode has some part in it
     assert displaced[3999] == pytest.approx(1, abs=0.06)
     assert np.flatnonzero(np.diff(np.sign(displaced))).size == 2
@@ -179,7 +178,7 @@ def test_energy_is_conserved_without_damping():
     def drift(timestep, runge_kutta):
         model = models.model("planar hinges", 12, MEDIAN)
         model.dof_damping[:] = 0
-        return np.abs(swing(model, timestep, 1.0, runge_kutta) - 1).max()
+        return np.abs(swing(model, timestep, 0.6, runge_kutta) - 1).max()
 
     assert drift(1e-3, False) < 0.05
     assert drift(1e-3, False) / drift(5e-4, False) == pytest.approx(2.0, rel=0.15)
@@ -289,8 +288,8 @@ def test_mirrored_actions_give_mirrored_motion(planar, key):
 
 def test_random_episodes_are_of_all_scenes_and_stay_in_the_workspace(key):
     key_scenes, key_targets = jax.random.split(key)
-    scenes = check(jax.jit(jax.vmap(random_scene))(jax.random.split(key_scenes, 400)))
-    for value, low, high in ((scenes.length, 0.05, 0.35), (jnp.log(scenes.young), np.log(500), np.log(5e5))):
+    scenes = jax.jit(jax.vmap(random_scene))(jax.random.split(key_scenes, 400))
+    for value, low, high in ((scenes.length, 0.05, 0.35), (np.log(scenes.young), np.log(500), np.log(5e5))):
         counts, _ = np.histogram(value, bins=4, range=(low, high))
         assert counts.sum() == 400 and counts.min() > 60
     saturated = jnp.arange(200) % 2 == 1

@@ -44,7 +44,7 @@ class Terrain:
 
 
 TERRAIN = Terrain()
-METHOD = CrossEntropy(population=16, elites=4, iterations=6, stacks=3)
+METHOD = CrossEntropy(population=16, elites=4, iterations=6, stacks=3, enough=1.999)
 
 
 play = jax.jit(functools.partial(planner.play, TERRAIN))

@@ -90,12 +90,13 @@ class WhipGym(gymnasium.Env):
         self._key = self._scene = self._episode = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        """Begin an episode, in a scene of its own where they are drawn."""
+        """Begin an episode, in a scene of its own where they are drawn; there are no options."""
         super().reset(seed=seed)
         if seed is not None or self._key is None:
             self._key = jax.random.key(_entropy(self.np_random) if seed is None else seed)
         self._key, self._scene, self._episode, now = _begin(self._parts, self._detector, self._parameters, self._key)
-        return np.asarray(now.observation), _one(_info(self._scene, now))
+        now = _own(now)
+        return now.observation, _one(_info(self._scene, now))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Apply an action (dx, dz), in m.
@@ -110,7 +111,7 @@ class WhipGym(gymnasium.Env):
         self._key, self._episode, now = _go_on(
             self._parts[0], self._detector, self._scene, self._key, self._episode, action
         )
-        now = jax.device_get(now)
+        now = _own(now)
         ends = bool(now.terminated), bool(now.truncated)
         return now.observation, float(now.reward), *ends, _one(_info(self._scene, now))
 
@@ -136,7 +137,7 @@ class WhipVector(VectorEnv):
         ((3, 28), (3,))
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": [], "render_fps": 6}  # noqa: RUF012
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
         self,
@@ -178,10 +179,10 @@ class WhipVector(VectorEnv):
         Raises:
             ValueError: for another number of seeds.
         """
-        super().reset(seed=seed if seed is None or np.ndim(seed) == 0 else seed[0])
         seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if np.ndim(seed) == 0 else [*seed]
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed: expected {self.num_envs} of them, got {len(seeds)}")
+        super().reset(seed=seeds[0])
         if self._keys is None:
             self._keys = jax.random.split(jax.random.key(_entropy(self.np_random)), self.num_envs)
         given = {i: jax.random.key(own) for i, own in enumerate(seeds) if own is not None}
@@ -189,8 +190,8 @@ class WhipVector(VectorEnv):
         self._keys, self._scenes, self._episodes, now = _begin_many(
             self._parts, self._detector, self._parameters, self._keys
         )
-        self._over[:] = False
-        return np.asarray(now.observation), _many(_info(self._scenes, now))
+        self._over, now = np.zeros(self.num_envs, bool), _own(now)
+        return now.observation, _many(_info(self._scenes, now))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         """Apply actions (dx, dz), in m, shape [N, 2].
@@ -212,10 +213,9 @@ class WhipVector(VectorEnv):
             actions,
             self._over,
         )
-        now = jax.device_get(now)
+        now = _own(now)
         self._over = now.terminated | now.truncated
-        info = _many(_info(self._scenes, now))
-        return now.observation, now.reward, now.terminated.copy(), now.truncated.copy(), info
+        return now.observation, now.reward, now.terminated, now.truncated, _many(_info(self._scenes, now))
 
 
 # ---------------------------------------------------------------------------------------------------- one scene
@@ -317,6 +317,11 @@ def _action(action, shape: tuple[int, ...]) -> np.ndarray:
     if not np.isfinite(checked).all():
         raise ValueError(f"action: expected finite numbers, got {checked.tolist()}")
     return checked
+
+
+def _own(now: Step) -> Step:
+    """Arrays of NumPy's that may be written to."""
+    return jax.tree.map(np.array, now)
 
 
 def _entropy(random: np.random.Generator) -> int:

@@ -7,13 +7,15 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 from mujoco import mjx
 
 from envs.whip.apply import apply_parameters
-from envs.whip.engine import State, ramp, settled
+from envs.whip.engine import State, ramp, reset, settled
 from envs.whip.mjx_step import step
-from envs.whip.parameters import WhipParameters
+from envs.whip.parameters import WhipParameters, median
 from envs.whip.scene import Scene, base_model
 
 IMPLEMENTATIONS = ("jax", "warp")
@@ -51,16 +53,26 @@ class MjxEngine:
             # Warp never resets, and refuses to be told not to.
             compiled.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
             room, advanced = {"naconmax": CONTACTS * scenes, "njmax": 4 * CONTACTS}, mjx.step
+        zeros = _zeros(scene)
         with jax.ensure_compile_time_eval():  # also where a traced function makes the engine
             model = mjx.put_model(compiled, impl=implementation)
             data = mjx.make_data(compiled, impl=implementation, **room)
-        # Traced once, whatever programs it is called from: that takes seconds, most of them of collisions.
-        self._simulate = jax.jit(functools.partial(_simulate, scene, advanced, model, data))
+            _, unravel = ravel_pytree(zeros)
+        # Tracing takes seconds. So it is done once for all programs, and as the arguments are one vector, once for each
+        # kind of batch, whichever of them have the batch's axis.
+        self._simulate = jax.jit(lambda flat: _simulate(scene, advanced, model, data, *unravel(flat)))
 
     def advance(self, parameters: WhipParameters, state: State, target: Float[Array, "2"]) -> State:
         """One control interval; see `Engine.advance`."""
         with jax.default_matmul_precision("highest"):  # accelerators' 10 bits would not do
-            return settled(state, *self._simulate(parameters, state, target))
+            flat, _ = ravel_pytree((parameters, state, target))
+            return settled(state, *self._simulate(flat.astype(jnp.float32)))
+
+
+def _zeros(scene: Scene):
+    """Arguments of `advance`, to tell their shapes."""
+    kinds = jax.eval_shape(lambda: (median(), reset(scene, median()), jnp.zeros(2)))
+    return jax.tree.map(lambda kind: np.zeros(kind.shape, kind.dtype), kinds)
 
 
 def _simulate(
@@ -84,7 +96,7 @@ def _simulate(
         carry = (now.qpos, now.qvel, now.qacc_warmstart)
         return (carry, failed | ~(worst < mujoco.mjMAXVAL)), None
 
-    start = (state.qpos.astype(precision), state.qvel.astype(precision), jnp.zeros_like(state.qvel, precision))
+    start = (state.qpos.astype(precision), state.qvel.astype(precision), 0 * state.qvel.astype(precision))
     controls = ramp(state.target, jnp.asarray(target), scene.substeps).astype(precision)
-    ((qpos, qvel, _), failed), _ = jax.lax.scan(substep, (start, jnp.asarray(False)), controls)
+    ((qpos, qvel, _), failed), _ = jax.lax.scan(substep, (start, state.failed), controls)
     return qpos.astype(jnp.float32), qvel.astype(jnp.float32), target, failed

@@ -55,13 +55,12 @@ class Rollout:
     value: Float[Array, ""]
 
 
-@functools.partial(jax.jit, static_argnums=1)
 def perform(key: jax.Array, whip: Whip, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> Rollout:
     """Roll out actions to their end.
 
     Args:
         key: of the detector.
-        whip: the task; a program is compiled for each.
+        whip: the task.
         parameters: of the scene.
         actions: to apply, in m.
     """
@@ -87,7 +86,6 @@ def perform(key: jax.Array, whip: Whip, parameters: WhipParameters, actions: Flo
     )
 
 
-@functools.partial(jax.jit, static_argnums=(0, 2))
 def film(engine: Engine, rollout: Rollout, pieces: int) -> Frames:
     """What there is to see between control steps too.
 

@@ -109,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arrays = {**measure.against_theory(), **measure.sags(), **measure.energies()}
     engines = {kind: pick(given.engine, Scene(chain=chain)) for kind, chain in CHAINS.items()}
     with console.status("speed"):
-        speeds = rollouts.steps_per_second(list(engines.values()))
+        speeds = rollouts.steps_per_second(list(engines.values()), min(count, rollouts.BATCH))
     scenes = {}
     for (kind, engine), speed in zip(engines.items(), speeds, strict=True):
         with console.status(f"{count} random episodes, {kind}"):

@@ -118,7 +118,7 @@ def _waiting(engine: Engine, steps: int, parameters: WhipParameters, state: Stat
     return jax.lax.scan(wait, state, None, steps)[1]
 
 
-def steps_per_second(engines: Sequence[Engine], seed: int = 0, repeats: int = 3) -> list[float]:
+def steps_per_second(engines: Sequence[Engine], batch: int = BATCH, seed: int = 0, repeats: int = 3) -> list[float]:
     """Steps of the physics in a second, of all threads together, in random episodes of random scenes.
 
     Each engine's best of some repetitions, in turns, so that what else the machine does is not counted against one.
@@ -128,7 +128,7 @@ def steps_per_second(engines: Sequence[Engine], seed: int = 0, repeats: int = 3)
         scenes, targets = jax.vmap(random_scene)(keys), jax.vmap(lambda key: random_targets(key, False))(keys)
         return jax.vmap(lambda *one: rollout(engine, *one).qpos[-1])(scenes, targets)
 
-    keys = jax.random.split(jax.random.key(seed), BATCH)
+    keys = jax.random.split(jax.random.key(seed), batch)
     programs = [jax.jit(functools.partial(run, engine)) for engine in engines]
     seconds = np.empty((1 + repeats, len(programs)))
     for repeat in range(1 + repeats):  # in the first, programs are compiled and models built
@@ -137,4 +137,4 @@ def steps_per_second(engines: Sequence[Engine], seed: int = 0, repeats: int = 3)
             program(keys).block_until_ready()
             seconds[repeat, i] = time.perf_counter() - start
     substeps = np.array([engine.scene.substeps for engine in engines])
-    return (BATCH * rules.STEPS * substeps / seconds[1:].min(axis=0)).tolist()
+    return (batch * rules.STEPS * substeps / seconds[1:].min(axis=0)).tolist()

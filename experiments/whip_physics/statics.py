@@ -18,18 +18,27 @@ def mass(model: mujoco.MjModel) -> float:
 def nodes(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Points of the centreline from the grip to the tip, in m, shape [links + 1, 3]."""
     bodies = links(model)
-    length = 2 * model.geom_size[model.body_geomadr[bodies[-1]], 1]
-    tip = data.xpos[bodies[-1]] + length * data.xmat[bodies[-1]].reshape(3, 3)[:, 0]
-    return np.concatenate([data.xpos[bodies], tip[None]])
+    return np.concatenate([data.xpos[bodies], tip(model, data, bodies[-1])[None]])
+
+
+def tip(model: mujoco.MjModel, data: mujoco.MjData, link: int) -> np.ndarray:
+    """The far end of a link, in m, shape [3]."""
+    length = 2 * model.geom_size[model.body_geomadr[link], 1]
+    return data.xpos[link] + length * data.xmat[link].reshape(3, 3)[:, 0]
 
 
 def bent(model: mujoco.MjModel, angles: np.ndarray) -> mujoco.MjData:
     """The chain turned by a rotation vector (or an angle) at each of its joints, at rest, shape [nv]."""
     data = mujoco.MjData(model)
+    _bend(model, data, angles)
+    return data
+
+
+def _bend(model, data, angles) -> None:
+    data.qpos[:] = model.qpos0
     mujoco.mj_integratePos(model, data.qpos, angles, 1.0)
     mujoco.mj_fwdPosition(model, data)
     mujoco.mj_fwdVelocity(model, data)
-    return data
 
 
 def equilibrium(model: mujoco.MjModel, force: np.ndarray, weight: np.ndarray, loads: int = 1) -> mujoco.MjData:
@@ -46,12 +55,12 @@ def equilibrium(model: mujoco.MjModel, force: np.ndarray, weight: np.ndarray, lo
     """
     lever = float(np.ptp(nodes(model, bent(model, np.zeros(model.nv)))[:, 2]))
     scale = lever * (np.linalg.norm(force) + np.linalg.norm(weight) * mass(model))
-    jacobian = np.zeros((3, model.nv))
+    data, jacobian, last = mujoco.MjData(model), np.zeros((3, model.nv)), links(model)[-1]
 
     def imbalance(angles, share):
         model.opt.gravity = share * weight
-        data = bent(model, angles)
-        mujoco.mj_jac(model, data, jacobian, None, nodes(model, data)[-1], links(model)[-1])
+        _bend(model, data, angles)
+        mujoco.mj_jac(model, data, jacobian, None, tip(model, data, last), last)
         return (data.qfrc_passive - data.qfrc_bias + share * jacobian.T @ force) / scale
 
     angles = np.zeros(model.nv)
@@ -61,7 +70,7 @@ def equilibrium(model: mujoco.MjModel, force: np.ndarray, weight: np.ndarray, lo
     left = np.abs(imbalance(angles, 1.0)).max()
     if not left < 1e-9:
         raise RuntimeError(f"equilibrium: expected torques that balance to 1e-9 of load times length, got {left:.1e}")
-    return bent(model, angles)
+    return data
 
 
 def tip_deflection(model: mujoco.MjModel, load: float) -> float:

@@ -127,7 +127,7 @@ class _Picture:
     """One instant on axes, which can be changed to another."""
 
     def __init__(self, axes: Axes, instants: Instants, scale: float = 1.0):
-        self._instants, self._axes = instants, axes
+        self._instants = instants
         for name, line in instants.lines.items():
             axes.plot(*line.T, **LINES[name], zorder=1)
         size = instants.labels.shape[-1]
