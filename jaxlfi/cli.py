@@ -1,7 +1,7 @@
 """The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | diagnose | report`, and those of tasks.
 
-A package adds commands of its own by `[project.entry-points."jaxlfi.commands"]` in pyproject.toml: a name, and a function
-that takes the words after it and returns the exit status.
+A package adds commands of its own by `[project.entry-points."jaxlfi.commands"]` in pyproject.toml: a name, and a
+function that takes the words after it and returns the exit status.
 
 This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set
 before jax starts can be set after the arguments are known.

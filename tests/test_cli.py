@@ -361,7 +361,7 @@ def oven(heat="1.5", rounds="3"):
 def test_tasks_take_options():
     assert tasks.load("tests.test_cli:oven").name == "oven at 1.5"
     assert tasks.load("tests.test_cli:oven,heat=3,rounds=4").name == "oven at 3.0"
-    with pytest.raises(ValueError, match="expected options among heat, rounds, got 'tests.test_cli:oven,colour=red'"):
+    with pytest.raises(ValueError, match=r"expected options among heat, rounds, got 'tests.test_cli:oven,colour=red'"):
         tasks.load("tests.test_cli:oven,colour=red")
     with pytest.raises(ValueError, match="failed: ValueError: could not convert"):
         tasks.load("tests.test_cli:oven,heat=much")

@@ -19,9 +19,9 @@ from envs.whip.exploration import exploratory_actions
 from envs.whip.keypoints import DETECTORS
 from envs.whip.native import NativeEngine
 from envs.whip.parameters import median
+from envs.whip.real2sim import CHANNELS, DATA, NUISANCES, recorded, task, whip_task
 from envs.whip.rollout import trajectory
 from envs.whip.scene import Scene
-from envs.whip.real2sim import CHANNELS, DATA, NUISANCES, recorded, task, whip_task
 from jaxlfi import tasks
 from jaxlfi.simulation import trajectory_and_outcome
 from jaxlfi.support import check_within

@@ -14,6 +14,7 @@ from mujoco import mjx
 
 from envs.whip.apply import apply_parameters
 from envs.whip.engine import State, ramp, reset, settled
+from envs.whip.kinematics import initial_positions
 from envs.whip.mjx_step import step
 from envs.whip.parameters import WhipParameters, median
 from envs.whip.scene import Scene, base_model
@@ -86,17 +87,19 @@ def _simulate(
 ):
     """Positions and velocities after a control interval, the target, and whether the simulation has broken down."""
     model = apply_parameters(scene, model, parameters)
-    precision = data.qpos.dtype
+    kind = data.qpos.dtype
+    rest = (initial_positions(scene, parameters).astype(kind), jnp.zeros(model.nv, kind), jnp.zeros(model.nv, kind))
+    # What has broken down goes on from rest, as the solver's iterations on it would hold up the whole batch.
+    calmed = lambda failed, moving: jax.tree.map(lambda calm, now: jnp.where(failed, calm, now), rest, moving)
 
     def substep(carry, control):
         (qpos, qvel, warm), failed = carry
         now = advanced(model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=control))
-        # Where MuJoCo gives up, though its numbers may become reasonable again.
-        worst = jnp.max(jnp.abs(jnp.concatenate([now.qpos, now.qvel, now.qacc])))
-        carry = (now.qpos, now.qvel, now.qacc_warmstart)
-        return (carry, failed | ~(worst < mujoco.mjMAXVAL)), None
+        # Where MuJoCo gives up, though the numbers may become reasonable again.
+        failed |= ~(jnp.max(jnp.abs(jnp.concatenate([now.qpos, now.qvel, now.qacc]))) < mujoco.mjMAXVAL)
+        return (calmed(failed, (now.qpos, now.qvel, now.qacc_warmstart)), failed), None
 
-    start = (state.qpos.astype(precision), state.qvel.astype(precision), 0 * state.qvel.astype(precision))
-    controls = ramp(state.target, jnp.asarray(target), scene.substeps).astype(precision)
+    start = calmed(state.failed, (state.qpos.astype(kind), state.qvel.astype(kind), rest[2]))
+    controls = ramp(state.target, target, scene.substeps).astype(kind)
     ((qpos, qvel, _), failed), _ = jax.lax.scan(substep, (start, state.failed), controls)
     return qpos.astype(jnp.float32), qvel.astype(jnp.float32), target, failed
