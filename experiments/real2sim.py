@@ -13,6 +13,7 @@ is not run again) and draws counterparts of the paper's figures from the run fol
 import argparse
 import csv
 import io
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -104,8 +105,7 @@ def draw_domains(figure: Figure, histories: Mapping[str, Mapping[str, History]])
     axes = figure.subplots(2, len(histories), squeeze=False)
     for column, (name, own) in enumerate(histories.items()):
         for row, configuration in enumerate(CONFIGURATIONS):
-            window = [samples.limits(list(own.values()), d) for d in (0, 1)]
-            samples.draw_mixture(axes[row, column], own[configuration], (0, 1), window)
+            samples.draw_mixture(axes[row, column], own[configuration], (0, 1))
             axes[row, column].plot(
                 *domains(own[configuration]).T, "o", markersize=3, markerfacecolor="none", color="black", zorder=6
             )
@@ -192,7 +192,8 @@ def main() -> None:
     writer.writeheader()
     writer.writerows(lines)
     atomic.write_bytes(arguments.out / "table.csv", stream.getvalue().encode())
-    atomic.write_json(arguments.out / "config.json", run_store.environment())
+    command = run_store.command_line(["python", "-m", "experiments.real2sim", *sys.argv[1:]])
+    atomic.write_json(arguments.out / "config.json", run_store.environment() | {"command_line": command})
     arrays = {
         f"{name}_{label.replace('+', '_')}_{kind}": value
         for name, own in found.items()

@@ -12,6 +12,7 @@ import argparse
 import csv
 import io
 import itertools
+import sys
 from pathlib import Path
 
 import jax
@@ -188,7 +189,8 @@ def main() -> None:
     atomic.write_bytes(arguments.out / "table.csv", stream.getvalue().encode())
     for name, own in found.items():
         atomic.write_arrays(arguments.out / f"{name}.npz", {k.replace("/", "_"): v for k, v in own.items()})
-    atomic.write_json(arguments.out / "config.json", run_store.environment())
+    command = run_store.command_line(["python", "-m", "experiments.sim2sim", *sys.argv[1:]])
+    atomic.write_json(arguments.out / "config.json", run_store.environment() | {"command_line": command})
     shown = Table(*table[0])
     for line in table:
         shown.add_row(*(f"{v:.3g}" if isinstance(v, float) else str(v) for v in line.values()))

@@ -1,0 +1,256 @@
+"""Speed and agreement of the whipping task's engines: `python -m experiments.benchmarks.whip`.
+
+Prints
+
+* steps of the physics and episodes a second, of random episodes in random scenes, by each engine for several sizes of
+  batches; against MuJoCo called by a plain Python loop on one core, and its own loop in C on one core, which is the
+  floor: the same models and actions. MJX's larger batches are cut to the first control steps on a processor;
+* seconds of tracing and compiling an episode of MJX, cold and from the cache on disk;
+* how far MJX agrees with MuJoCo: of twelve DLOs, most of them at the corners of Phi and Theta_0, each moved in five
+  ways, how many knock the same cubes off. After contact motions are chaotic, so the yardstick is MuJoCo against itself
+  with set-points that differ by 10 micrometres. Where nothing is touched, the distance of the DLOs' points;
+* whether a chain without damping, in long steps, is reported as failed.
+
+`--out` keeps the numbers as JSON. Best of several calls, since other programs may share the machine.
+"""
+
+import argparse
+import functools
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+from envs.whip import rules
+from envs.whip.chain import Chain
+from envs.whip.edits import edited_model
+from envs.whip.engine import Engine, State, ramp, rollout
+from envs.whip.engines import pick
+from envs.whip.exploration import exploratory_actions
+from envs.whip.kinematics import frames
+from envs.whip.native import NativeEngine
+from envs.whip.parameters import FEASIBLE, INITIAL, WhipParameters, median
+from envs.whip.scene import CUBES, START, Scene
+from experiments.whip_physics.rollouts import random_scene, random_targets
+from jaxlfi import atomic
+
+SCENE = Scene()
+EPISODE = rules.STEPS * SCENE.substeps
+"""Steps of the physics."""
+PATIENCE = 82_000
+"""Steps of the physics that MJX takes at most in a timed call on a processor."""
+
+
+def random_batch(count: int) -> tuple[WhipParameters, jax.Array]:
+    """Scenes over all of Phi and their set-points, shape [count, 16, 2]."""
+    keys = jax.random.split(jax.random.key(0), 2 * count)
+    targets = jax.vmap(functools.partial(random_targets, saturated=False))(keys[count:])
+    return jax.vmap(random_scene)(keys[:count]), targets
+
+
+def best(call: Callable[[], object], repeats: int) -> float:
+    """Seconds of the fastest call, after one to warm up."""
+    seconds = []
+    for _ in range(1 + repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        seconds.append(time.perf_counter() - start)
+    return min(seconds[1:])
+
+
+def by_engine(engine: Engine, batch: int, controls: int, repeats: int) -> float:
+    """Steps a second of rollouts of so many control steps."""
+    scenes, targets = random_batch(batch)
+    run = jax.jit(jax.vmap(functools.partial(rollout, engine)))
+    return batch * controls * SCENE.substeps / best(lambda: run(scenes, targets[:, :controls]), repeats)
+
+
+def by_mujoco(count: int, repeats: int) -> dict[str, float]:
+    """Steps a second of MuJoCo on one core, called from Python for every step, or once for all episodes."""
+    scenes, targets = jax.device_get(random_batch(count))
+    models = [edited_model(SCENE, jax.tree.map(lambda leaf, i=i: np.float64(leaf[i]), scenes)) for i in range(count)]
+    before = np.concatenate([np.broadcast_to(START, (count, 1, 2)), targets[:, :-1]], axis=1)
+    controls = ramp(before[:, :, None], targets[:, :, None], SCENE.substeps, np).reshape(count, EPISODE, 2)
+
+    def in_python():
+        for model, episode in zip(models, controls, strict=True):
+            data = mujoco.MjData(model)
+            for control in episode:
+                data.ctrl[:] = control
+                mujoco.mj_step(model, data)
+
+    start = np.stack([np.concatenate([[0.0], model.qpos0, np.zeros(model.nv)]) for model in models])
+    pool, data = mujoco.rollout.Rollout(nthread=0), [mujoco.MjData(models[0])]
+    in_c = lambda: pool.rollout(models, data, start, controls)
+    calls = {"MuJoCo, a loop in Python, one core": in_python, "MuJoCo, its loop in C, one core (floor)": in_c}
+    return {name: count * EPISODE / best(call, repeats) for name, call in calls.items()}
+
+
+def speed(batches: list[int], repeats: int) -> dict[str, dict[str, float]]:
+    """Steps a second, by engine and batch."""
+    rates: dict[str, dict[str, float]] = {name: {"12": rate} for name, rate in by_mujoco(12, repeats).items()}
+    print(f"{jax.default_backend()}, {len(os.sched_getaffinity(0))} cores\n")
+    print(f"{'':<42}{'batch':>6}{'steps/s':>10}{'episodes/s':>12}")
+    for name, of in rates.items():
+        _line(name, "12", of["12"])
+    engines = {"native, one thread": NativeEngine(SCENE, threads=1), "native": NativeEngine(SCENE), "mjx": pick("mjx")}
+    patient = jax.default_backend() != "cpu"
+    for name, engine in engines.items():
+        rates[name] = {}
+        for batch in batches:
+            most = rules.STEPS if patient or name != "mjx" else max(1, PATIENCE // (batch * SCENE.substeps))
+            controls = min(rules.STEPS, most)
+            rates[name][str(batch)] = rate = by_engine(engine, batch, controls, repeats)
+            _line(name if controls == rules.STEPS else f"{name}, {controls} control steps", str(batch), rate)
+    print()
+    return rates
+
+
+def _line(name: str, batch: str, rate: float) -> None:
+    print(f"{name:<42}{batch:>6}{rate:>10,.0f}{rate / EPISODE:>12.1f}", flush=True)
+
+
+_COMPILE_AN_EPISODE = """
+import time
+from jaxlfi import compile_cache
+compile_cache.enable()
+import jax
+from envs.whip.engine import rollout
+from envs.whip.engines import pick
+from experiments.benchmarks.whip import random_batch
+engine = pick("mjx")
+scenes, targets = random_batch(12)
+start = time.perf_counter()
+lowered = jax.jit(jax.vmap(lambda *one: rollout(engine, *one))).lower(scenes, targets)
+traced = time.perf_counter()
+lowered.compile()
+print(traced - start, time.perf_counter() - traced)
+"""
+
+
+def compiling() -> dict[str, float]:
+    """Seconds of tracing and compiling twelve episodes of MJX, in fresh processes that share an empty cache."""
+    seconds = {}
+    with tempfile.TemporaryDirectory() as cache:
+        environment = {**os.environ, "XDG_CACHE_HOME": cache}
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        for name in ("compiling", "from the cache on disk"):
+            done = subprocess.run(
+                [sys.executable, "-c", _COMPILE_AN_EPISODE], env=environment, capture_output=True, text=True, check=True
+            )
+            seconds["tracing"], seconds[name] = map(float, done.stdout.split())
+    print(f"{'twelve episodes of MJX':<42}{'s':>10}")
+    for name, value in seconds.items():
+        print(f"{name:<42}{value:>10.1f}")
+    print()
+    return seconds
+
+
+def dlos() -> WhipParameters:
+    """Twelve: the corners of Phi and Theta_0, and four from within."""
+    corners = [(length, young) for box in (FEASIBLE, INITIAL) for length in _ends(box, 0) for young in _ends(box, 1)]
+    length, young = np.array([*corners, (0.25, 2.5e4), (0.29, 2e3), (0.20, 1e5), (0.27, 1e4)]).T
+    return median(length, young)
+
+
+def _ends(box, axis) -> tuple[float, float]:
+    return float(box.low[axis]), float(box.high[axis])
+
+
+def movements() -> dict[str, np.ndarray]:
+    """Set-points of five ways of moving a DLO, shape [16, 2] each."""
+    back = np.array([[-0.04, 0.02]] * 2)
+    whip = np.concatenate([back, [[0.06, 0.0]] * 4, [[0.0, 0.0]] * 10])
+    lash = np.concatenate([back, [[0.06, 0.01]] * 4, [[-0.05, 0.0]] * 3, [[0.05, -0.01]] * 4, [[0.0, 0.0]] * 3])
+    drop = np.concatenate([[[0.05, 0.0]] * 3, [[0.0, -0.06]] * 3, [[0.0, 0.06]] * 4, [[0.0, 0.0]] * 6])
+    displaced = {"explore": np.asarray(exploratory_actions()), "whip": whip, "lash": lash, "drop": drop}
+    targets = {name: np.asarray(START) + np.cumsum(actions, axis=0) for name, actions in displaced.items()}
+    return targets | {"random": np.asarray(random_targets(jax.random.key(3), saturated=True))}
+
+
+def knocked(states: State) -> np.ndarray:
+    """Which cubes have moved by more than the distance of a hit in the plane of the picture, shape [..., 6]."""
+    cubes = np.asarray(states.qpos)[..., SCENE.first_cube :].reshape(*states.qpos.shape[:-1], CUBES, 7)[..., [0, 2]]
+    moved = np.linalg.norm(cubes - cubes[..., :1, :, :], axis=-1)
+    return (moved > 0.6 * rules.HIT_DISTANCE).any(axis=-2)  # the picture is 0.6 m wide there
+
+
+def agreement() -> dict[str, dict[str, float]]:
+    """MJX against MuJoCo, and MuJoCo against itself."""
+    scenes, moves = dlos(), movements()
+    count, names = len(scenes.length), list(moves)
+    targets = np.stack(list(moves.values())).astype(np.float32)
+    nudged = (targets + np.random.default_rng(0).normal(size=targets.shape, scale=1e-5)).astype(np.float32)
+
+    def roll(engine, targets):
+        every = jax.vmap(jax.vmap(functools.partial(rollout, engine), (None, 0)), (0, None))
+        return jax.device_get(jax.jit(every)(scenes, targets))
+
+    native, mjx = NativeEngine(SCENE), pick("mjx")
+    reference, others = roll(native, targets), {"mjx": roll(mjx, targets), "native, nudged": roll(native, nudged)}
+    look = jax.jit(jax.vmap(jax.vmap(jax.vmap(functools.partial(frames, SCENE), (None, 0)), (None, 0))))
+    first, found = look(scenes, reference.qpos), {}
+    lowest = np.asarray(first.dlo)[..., 2].min(axis=(-1, -2))
+    free = (np.abs(np.asarray(first.cubes - first.cubes[:, :, :1])).max(axis=(2, 3, 4)) < 1e-5) & (lowest > 0.01)
+    print(f"{'same cubes knocked off, of ' + str(count):<30}" + "".join(f"{name:>9}" for name in names) + f"{'all':>7}")
+    for name, states in others.items():
+        same = (knocked(states) == knocked(reference)).all(axis=-1)
+        per = {move: int(same[:, i].sum()) for i, move in enumerate(names)}
+        distance = np.abs(np.asarray(look(scenes, states.qpos).dlo - first.dlo))[free].max()
+        found[name] = per | {"all": int(same.sum()), "failed": int(states.failed[..., -1].sum())}
+        found[name]["free motion, m"] = float(distance)
+        print(f"{name:<30}" + "".join(f"{value:>9}" for value in per.values()) + f"{same.sum():>7}")
+    hit = knocked(reference).any(axis=-1)
+    found["scenes"] = {"all": hit.size, "cubes knocked off": int(hit.sum()), "nothing touched": int(free.sum())}
+    print(f"cubes were knocked off in {hit.sum()}, nothing was touched in {free.sum()} of {hit.size}; there the DLOs")
+    print("differ by at most " + ", ".join(f"{found[name]['free motion, m'] * 1e3:.4f} mm ({name})" for name in others))
+    print()
+    return found
+
+
+def failures() -> dict[str, list[bool]]:
+    """Scenes that are reported as failed, of twelve undamped ones in steps of 5 ms, moved at random."""
+    scene = Scene(chain=Chain(elements=16, retardation=0.0, viscosity=0.0), timestep=0.005)
+    targets = movements()["random"].astype(np.float32)
+    found = {}
+    for name, engine in (("native", NativeEngine(scene)), ("mjx", pick("mjx", scene))):
+        states = jax.jit(jax.vmap(functools.partial(rollout, engine), (0, None)))(dlos(), targets)
+        found[name] = np.asarray(states.failed[:, -1]).tolist()
+        finite = bool(jnp.isfinite(states.qpos).all())
+        print(f"undamped, {name}: {sum(found[name])} of 12 reported as failed; all states are finite: {finite}")
+    print()
+    return found
+
+
+PARTS = {"speed": speed, "compiling": compiling, "agreement": agreement, "failures": failures}
+
+
+def main() -> None:
+    """Measure, print and keep."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", default=list(PARTS), help=f"of {', '.join(PARTS)} (default: all)")
+    parser.add_argument("--batches", nargs="+", type=int, default=[1, 12, 100, 1024])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--out", type=Path, help="folder for a JSON file of each part")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.parts) - set(PARTS):
+        parser.error(f"parts: expected some of {', '.join(PARTS)}, got {', '.join(sorted(unknown))}")
+    for name in arguments.parts:
+        measure = functools.partial(speed, arguments.batches, arguments.repeats) if name == "speed" else PARTS[name]
+        result = measure()
+        if arguments.out:
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            atomic.write_json(arguments.out / f"{name}.json", result)
+
+
+if __name__ == "__main__":
+    main()
