@@ -75,27 +75,28 @@ def _judge(method, engine, parameters, actions):
 
 
 def draw(figure: Figure, lengths: Sequence[float], moduli: Sequence[float], found: dict[str, np.ndarray]) -> None:
-    """Best mean returns with the cubes that are hit, and rollouts until the first good plan.
+    """Best mean returns, in brackets those elsewhere, and the cubes that are hit; rollouts until the first good plan.
 
     Args:
         figure: empty.
         lengths: in m, shape [L].
         moduli: in Pa, shape [E].
-        found: `value` and `first`, shape [E, L], and `hit`, shape [E, L, 6].
+        found: `value`, `elsewhere` and `first`, shape [E, L], and `hit`, shape [E, L, 6].
     """
-    left, right = figure.subplots(1, 2, sharey=True)
-    returns = left.imshow(found["value"], cmap="viridis", vmin=1.0, vmax=2.0, aspect="auto", origin="lower")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.2, 1))
+    returns = left.imshow(found["value"], cmap="viridis", vmin=1.8, vmax=2.0, aspect="auto", origin="lower")
     rollouts = right.imshow(
         np.log10(found["first"]), cmap="viridis_r", vmin=0.5, vmax=3.5, aspect="auto", origin="lower"
     )
     for e, l in np.ndindex(found["value"].shape):
         letters = " ".join(name[0].upper() for name, hit in zip(COLOURS, found["hit"][e, l], strict=True) if hit)
-        value, first = found["value"][e, l], found["first"][e, l]
-        left.text(l, e, f"{value:.2f}\n{letters or '-'}", ha="center", va="center", color=_ink(value > 1.6))
+        value, elsewhere, first = (found[name][e, l] for name in ("value", "elsewhere", "first"))
+        told = f"{value:.2f} ({elsewhere:.2f})\n{letters or '-'}"
+        left.text(l, e, told, ha="center", va="center", color=_ink(value > 1.9), fontsize=6.0)
         told = "none" if np.isnan(first) else f"{first:.0f}"
         right.text(l, e, told, ha="center", va="center", color=_ink(not first > 60))
     left.set(ylabel="Young's modulus [Pa]", yticks=range(len(moduli)), yticklabels=[f"{e:g}" for e in moduli])
-    titles = ("best mean return; cubes hit, bottom-up", f"rollouts until the first return of {GOOD}")
+    titles = ("best mean return (elsewhere); cubes hit, bottom-up", f"rollouts until the first return of {GOOD}")
     for axes, title in zip((left, right), titles, strict=True):
         axes.set(xlabel="length [mm]", xticks=range(len(lengths)), title=title)
         axes.set_xticklabels([f"{1e3 * l:g}" for l in lengths])
