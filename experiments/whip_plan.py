@@ -91,16 +91,19 @@ def draw(figure: Figure, lengths: Sequence[float], moduli: Sequence[float], foun
     for e, l in np.ndindex(found["value"].shape):
         letters = " ".join(name[0].upper() for name, hit in zip(COLOURS, found["hit"][e, l], strict=True) if hit)
         value, elsewhere, first = (found[name][e, l] for name in ("value", "elsewhere", "first"))
-        told = f"{value:.2f} ({elsewhere:.2f})\n{letters or '-'}"
-        left.text(l, e, told, ha="center", va="center", color=_ink(value > 1.9), fontsize=6.0)
+        told = f"{value:.2f} {letters or '-'}\n({elsewhere:.2f})"
+        left.text(l, e, told, ha="center", va="center", color=_ink(value > 1.9))
         told = "none" if np.isnan(first) else f"{first:.0f}"
         right.text(l, e, told, ha="center", va="center", color=_ink(not first > 60))
     left.set(ylabel="Young's modulus [Pa]", yticks=range(len(moduli)), yticklabels=[f"{e:g}" for e in moduli])
-    titles = ("best mean return (elsewhere); cubes hit, bottom-up", f"rollouts until the first return of {GOOD}")
+    titles = (
+        "best mean return and cubes hit, bottom-up (return elsewhere)",
+        f"rollouts until the first return of {GOOD}",
+    )
     for axes, title in zip((left, right), titles, strict=True):
         axes.set(xlabel="length [mm]", xticks=range(len(lengths)), title=title)
         axes.set_xticklabels([f"{1e3 * l:g}" for l in lengths])
-    figure.colorbar(returns, ax=left, extend="min")
+    figure.colorbar(returns, ax=left, extend="min", ticks=[1.8, 1.85, 1.9, 1.95, 2.0])
     bar = figure.colorbar(rollouts, ax=right, ticks=[1, 2, 3])
     bar.ax.set_yticklabels(["10", "100", "1,000"])
 
