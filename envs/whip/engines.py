@@ -1,6 +1,7 @@
 """Engines by name."""
 
 import contextlib
+import functools
 import io
 
 import jax
@@ -12,6 +13,7 @@ NAMES = ("auto", "native", "mjx", "warp")
 """What `pick` takes."""
 
 
+@functools.lru_cache(maxsize=16)  # programs are compiled for an engine, and one is as good as another
 def pick(name: str = "auto", scene: Scene = Scene()) -> Engine:
     """The engine of a name.
 
