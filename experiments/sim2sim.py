@@ -121,7 +121,7 @@ def lines(found: dict[str, np.ndarray], detector: str) -> list[dict[str, object]
     groups |= {
         f"inside, {text}": ~outside & chosen
         for text, chosen in (
-            ("G < 10", number < 10), ("10 < G < 60", (number >= 10) & (number < 60)), ("G > 60", number >= 60),
+            ("G < 50", number < 50), ("50 < G < 200", (number >= 50) & (number < 200)), ("G > 200", number >= 200),
         )
     }  # fmt: skip
     table = []
@@ -134,12 +134,12 @@ def lines(found: dict[str, np.ndarray], detector: str) -> list[dict[str, object]
                 "truths": group,
                 "n": int(chosen.sum()),
                 "support": name,
-                "length error [mm]": own["error"][:, 0].mean(),
-                "ln E error": own["error"][:, 1].mean(),
-                "length sd / width": (own["sd"][:, 0] / width[0]).mean(),
-                "ln E sd / width": (own["sd"][:, 1] / width[1]).mean(),
-                "length in 90 %": own["covered"][:, 0].mean(),
-                "ln E in 90 %": own["covered"][:, 1].mean(),
+                "length error [mm]": float(own["error"][:, 0].mean()),
+                "ln E error": float(own["error"][:, 1].mean()),
+                "length sd / width": float(own["sd"][:, 0].mean() / width[0]),
+                "ln E sd / width": float(own["sd"][:, 1].mean() / width[1]),
+                "length in 90 %": float(own["covered"][:, 0].mean()),
+                "ln E in 90 %": float(own["covered"][:, 1].mean()),
                 "failed": int(found[f"{name}/failed"][chosen].sum()),
             }
         )
@@ -178,7 +178,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--detectors", nargs="+", default=["clean", "mask", "transporter"])
     arguments = parser.parse_args()
-    console = Console()
+    console = Console(width=160)
     arguments.out.joinpath("chunks").mkdir(parents=True, exist_ok=True)
     found = {name: study(arguments.out, name, console) for name in arguments.detectors}
     table = [line for name, own in found.items() for line in lines(own, name)]
