@@ -214,4 +214,4 @@ def test_what_is_not_installed_is_told(name, missing, advice, monkeypatch):
         monkeypatch.delattr(mujoco, "mjx")
         monkeypatch.delitem(sys.modules, "envs.whip.mjx_engine")
     with pytest.raises(ImportError, match=f"engine: '{name}' needs .*{advice}"):
-        pick(name)
+        pick(name, Scene(iterations=12))  # one that is not made yet

@@ -13,7 +13,6 @@ NAMES = ("auto", "native", "mjx", "warp")
 """What `pick` takes."""
 
 
-@functools.lru_cache(maxsize=16)  # programs are compiled for an engine, and one is as good as another
 def pick(name: str = "auto", scene: Scene = Scene()) -> Engine:
     """The engine of a name.
 
@@ -35,6 +34,11 @@ def pick(name: str = "auto", scene: Scene = Scene()) -> Engine:
         raise ValueError(f"engine: expected one of {', '.join(NAMES)}, got {name!r}")
     if name == "auto":
         name = "native" if jax.default_backend() == "cpu" else "mjx"
+    return _made(name, scene)
+
+
+@functools.lru_cache(maxsize=16)  # programs are compiled for an engine, and one is as good as another
+def _made(name: str, scene: Scene) -> Engine:
     if name == "native":
         from envs.whip.native import NativeEngine
 
