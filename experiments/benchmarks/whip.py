@@ -3,8 +3,9 @@
 Prints
 
 * steps of the physics and episodes a second, of random episodes in random scenes, by each engine for several sizes of
-  batches; against MuJoCo called by a plain Python loop on one core, and its own loop in C on one core, which is the
-  floor: the same models and actions. MJX's larger batches are cut to the first control steps on a processor;
+  batches, and how many failed; against MuJoCo called by a plain Python loop on one core, and its own loop in C on one
+  core, which is the floor: the same models and actions. MJX's larger batches are cut to the first control steps on a
+  processor;
 * seconds of tracing and compiling an episode of MJX, cold and from the cache on disk;
 * how far MJX agrees with MuJoCo: of twelve DLOs, most of them at the corners of Phi and Theta_0, each moved in five
   ways, how many knock the same cubes off. After contact motions are chaotic, so the yardstick is MuJoCo against itself
@@ -34,7 +35,7 @@ from envs.whip import rules
 from envs.whip.chain import Chain
 from envs.whip.edits import edited_model
 from envs.whip.engine import Engine, State, ramp, rollout
-from envs.whip.engines import pick
+from envs.whip.engines import NAMES, pick
 from envs.whip.exploration import exploratory_actions
 from envs.whip.kinematics import frames
 from envs.whip.native import NativeEngine
@@ -51,27 +52,31 @@ PATIENCE = 82_000
 
 
 def random_batch(count: int) -> tuple[WhipParameters, jax.Array]:
-    """Scenes over all of Phi and their set-points, shape [count, 16, 2]."""
+    """Scenes over all of Phi and their set-points, of every other one by saturated actions, shape [count, 16, 2]."""
     keys = jax.random.split(jax.random.key(0), 2 * count)
-    targets = jax.vmap(functools.partial(random_targets, saturated=False))(keys[count:])
+    targets = jax.vmap(random_targets)(keys[count:], jnp.arange(count) % 2 == 1)
     return jax.vmap(random_scene)(keys[:count]), targets
 
 
 def best(call: Callable[[], object], repeats: int) -> float:
-    """Seconds of the fastest call, after one to warm up."""
+    """Seconds of the fastest call."""
     seconds = []
-    for _ in range(1 + repeats):
+    for _ in range(repeats):
         start = time.perf_counter()
         jax.block_until_ready(call())
         seconds.append(time.perf_counter() - start)
-    return min(seconds[1:])
+    return min(seconds)
 
 
-def by_engine(engine: Engine, batch: int, controls: int, repeats: int) -> float:
-    """Steps a second of rollouts of so many control steps."""
+def by_engine(engine: Engine, batch: int, controls: int, repeats: int) -> dict[str, float]:
+    """Steps a second of rollouts of so many control steps, how many failed, and seconds to the first one's end."""
     scenes, targets = random_batch(batch)
     run = jax.jit(jax.vmap(functools.partial(rollout, engine)))
-    return batch * controls * SCENE.substeps / best(lambda: run(scenes, targets[:, :controls]), repeats)
+    start = time.perf_counter()
+    failed = int(run(scenes, targets[:, :controls]).failed[:, -1].sum())
+    first = time.perf_counter() - start
+    seconds = best(lambda: run(scenes, targets[:, :controls]), repeats)
+    return {"steps/s": batch * controls * SCENE.substeps / seconds, "failed": failed, "first call, s": first}
 
 
 def by_mujoco(count: int, repeats: int) -> dict[str, float]:
@@ -92,31 +97,39 @@ def by_mujoco(count: int, repeats: int) -> dict[str, float]:
     pool, data = mujoco.rollout.Rollout(nthread=0), [mujoco.MjData(models[0])]
     in_c = lambda: pool.rollout(models, data, start, controls)
     calls = {"MuJoCo, a loop in Python, one core": in_python, "MuJoCo, its loop in C, one core (floor)": in_c}
-    return {name: count * EPISODE / best(call, repeats) for name, call in calls.items()}
+    return {name: count * EPISODE / best(call, 1 + repeats) for name, call in calls.items()}  # the first warms up
 
 
-def speed(batches: list[int], repeats: int) -> dict[str, dict[str, float]]:
+def speed(engines: list[str], batches: list[int], repeats: int) -> dict[str, dict[str, dict[str, float]]]:
     """Steps a second, by engine and batch."""
-    rates: dict[str, dict[str, float]] = {name: {"12": rate} for name, rate in by_mujoco(12, repeats).items()}
-    print(f"{jax.default_backend()}, {len(os.sched_getaffinity(0))} cores\n")
-    print(f"{'':<42}{'batch':>6}{'steps/s':>10}{'episodes/s':>12}")
-    for name, of in rates.items():
-        _line(name, "12", of["12"])
-    engines = {"native, one thread": NativeEngine(SCENE, threads=1), "native": NativeEngine(SCENE), "mjx": pick("mjx")}
+    print(f"{jax.devices()[0].device_kind}, {len(os.sched_getaffinity(0))} cores\n")
+    print(f"{'':<42}{'batch':>6}{'steps/s':>12}{'episodes/s':>12}{'failed':>8}{'first call, s':>15}")
+    rates: dict[str, dict[str, dict[str, float]]] = {}
+    if "native" in engines:
+        for name, rate in by_mujoco(12, repeats).items():
+            _line(name, 12, rate)
+            rates[name] = {"12": {"steps/s": rate}}
+    made = {f"{name}{threads}": engine for name in engines for threads, engine in _made(name).items()}
     patient = jax.default_backend() != "cpu"
-    for name, engine in engines.items():
+    for name, engine in made.items():
         rates[name] = {}
         for batch in batches:
             most = rules.STEPS if patient or name != "mjx" else max(1, PATIENCE // (batch * SCENE.substeps))
             controls = min(rules.STEPS, most)
             rates[name][str(batch)] = rate = by_engine(engine, batch, controls, repeats)
-            _line(name if controls == rules.STEPS else f"{name}, {controls} control steps", str(batch), rate)
+            rate["control steps"] = controls
+            shown = name if controls == rules.STEPS else f"{name}, {controls} control steps"
+            _line(shown, batch, rate["steps/s"], f"{rate['failed']:>8}{rate['first call, s']:>15.1f}")
     print()
     return rates
 
 
-def _line(name: str, batch: str, rate: float) -> None:
-    print(f"{name:<42}{batch:>6}{rate:>10,.0f}{rate / EPISODE:>12.1f}", flush=True)
+def _made(name: str) -> dict[str, Engine]:
+    return {", one thread": NativeEngine(SCENE, threads=1), "": pick(name)} if name == "native" else {"": pick(name)}
+
+
+def _line(name: str, batch: int, rate: float, more: str = "") -> None:
+    print(f"{name:<42}{batch:>6}{rate:>12,.0f}{rate / EPISODE:>12.1f}{more}", flush=True)
 
 
 _COMPILE_AN_EPISODE = """
@@ -125,7 +138,7 @@ from jaxlfi import compile_cache
 compile_cache.enable()
 import jax
 from envs.whip.engine import rollout
-from envs.whip.engines import pick
+from envs.whip.engines import NAMES, pick
 from experiments.benchmarks.whip import random_batch
 engine = pick("mjx")
 scenes, targets = random_batch(12)
@@ -238,15 +251,16 @@ def main() -> None:
     """Measure, print and keep."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", default=list(PARTS), help=f"of {', '.join(PARTS)} (default: all)")
+    parser.add_argument("--engines", nargs="+", choices=NAMES[1:], default=["native", "mjx"], help="of `speed`")
     parser.add_argument("--batches", nargs="+", type=int, default=[1, 12, 100, 1024])
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--out", type=Path, help="folder for a JSON file of each part")
     arguments = parser.parse_args()
     if unknown := set(arguments.parts) - set(PARTS):
         parser.error(f"parts: expected some of {', '.join(PARTS)}, got {', '.join(sorted(unknown))}")
+    parts = PARTS | {"speed": functools.partial(speed, arguments.engines, arguments.batches, arguments.repeats)}
     for name in arguments.parts:
-        measure = functools.partial(speed, arguments.batches, arguments.repeats) if name == "speed" else PARTS[name]
-        result = measure()
+        result = parts[name]()
         if arguments.out:
             arguments.out.mkdir(parents=True, exist_ok=True)
             atomic.write_json(arguments.out / f"{name}.json", result)
