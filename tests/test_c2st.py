@@ -8,10 +8,9 @@ from scipy.stats import norm
 
 from experiments.sbibm.c2st import c2st as reference
 from jaxlfi.diagnostics import c2st
+from tests.compiling import PLAIN
 
-# Small programs: they take less time to run than to optimise.
-COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-compiled = jax.jit(c2st, compiler_options=COMPILE)
+compiled = jax.jit(c2st, compiler_options=PLAIN)
 N = 400
 
 

@@ -16,6 +16,7 @@ from jaxlfi.dataset import Dataset
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.support import Support
 from jaxlfi.task import Task
+from tests.compiling import PLAIN
 
 BOX = Support([-9.0, -7.0], [9.0, 7.0])
 
@@ -25,10 +26,8 @@ def task(prior=None) -> Task:
     return Task(lambda key, theta: theta, ("a", "b"), {"box": BOX}, BOX, prior=prior)
 
 
-# Small programs: they take less time to run than to optimise.
-COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-multiplied = jax.jit(CORRECTIONS["paper"].change, static_argnums=0, compiler_options=COMPILE)
-importance = jax.jit(importance_weights, static_argnums=0, compiler_options=COMPILE)
+multiplied = jax.jit(CORRECTIONS["paper"].change, static_argnums=0, compiler_options=PLAIN)
+importance = jax.jit(importance_weights, static_argnums=0, compiler_options=PLAIN)
 
 
 def gaussian(mean, factor) -> GaussianMixture:

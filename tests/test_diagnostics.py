@@ -12,10 +12,9 @@ from jaxlfi.diagnostics import bound_warnings, discrepancy, edge_mass, trajector
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.support import Support
 from jaxlfi.task import Task
+from tests.compiling import PLAIN
 
-# Small programs: they take less time to run than to optimise.
-COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-see = jax.jit(discrepancy, static_argnames=("task", "restriction", "n"), compiler_options=COMPILE)
+see = jax.jit(discrepancy, static_argnames=("task", "restriction", "n"), compiler_options=PLAIN)
 BOX = Support([0.0, -2.0], [4.0, 6.0])
 PHI = Support([-10.0, -2.0], [10.0, 10.0])
 

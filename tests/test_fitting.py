@@ -15,6 +15,7 @@ from jaxlfi.estimator import Estimator, Network, condition, initialise
 from jaxlfi.fitting import fit
 from jaxlfi.normalise import fit_normaliser
 from jaxlfi.support import Support
+from tests.compiling import PLAIN
 
 SCALE = Support([-4.0, -6.0], [4.0, 2.0])
 CAPACITY, SIZE = 48, 40
@@ -28,8 +29,6 @@ VALIDATED = dataclasses.replace(
 PATIENT = dataclasses.replace(VALIDATED, patience=6)
 WHOLE = dataclasses.replace(SMALL, batch_size=60, epochs=12)
 """Every minibatch of sixty is all of 10, 12 or 15 rows, several times over."""
-# Each of these is compiled once. The programs are small, and take less time to run than to optimise.
-QUICK_TO_COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 MIXING = np.array([[1.0, 0.4], [-0.2, 0.8]])
 NOISE = np.diag([0.3, 0.6])
 PRIOR_SD = np.array([1.2, 0.7])
@@ -52,16 +51,16 @@ def toy(seed: int, size: int, capacity: int | None = None) -> Dataset:
 
 DATA = toy(0, SIZE, CAPACITY)
 
-_initialise = jax.jit(initialise, static_argnames=("dim", "obs"), compiler_options=QUICK_TO_COMPILE)
+_initialise = jax.jit(initialise, static_argnames=("dim", "obs"), compiler_options=PLAIN)
 _normaliser = jax.jit(fit_normaliser, static_argnames="name")
-_condition = jax.jit(condition, compiler_options=QUICK_TO_COMPILE)
+_condition = jax.jit(condition, compiler_options=PLAIN)
 
 
 def _train(key, estimator, network, dataset, weights, expected):
     return fit(key, estimator, network, dataset, weights, SCALE, expected)
 
 
-_fit = jax.jit(_train, compiler_options=QUICK_TO_COMPILE)
+_fit = jax.jit(_train, compiler_options=PLAIN)
 
 
 def start(estimator: Estimator, dataset: Dataset = DATA, seed: int = 5) -> Network:
@@ -416,7 +415,7 @@ def test_vmap_is_a_loop():
     one = lambda seed, rate, data: _train(
         jax.random.key(seed), change(SMALL, learning_rate=rate), network, data, data.valid.astype(float), SIZE
     )
-    compiled = jax.jit(jax.vmap(one), compiler_options=QUICK_TO_COMPILE)
+    compiled = jax.jit(jax.vmap(one), compiler_options=PLAIN)
     both, info = jax.device_get(compiled(jnp.array([1, 2]), jnp.asarray(rates), stacked))
     for i in range(2):
         alone, expected = fitted(change(SMALL, learning_rate=rates[i]), data[i], seed=i + 1, network=network)

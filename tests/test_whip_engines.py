@@ -22,13 +22,11 @@ from envs.whip.mjx_step import kinematics
 from envs.whip.native import NativeEngine
 from envs.whip.parameters import HIGHEST, WhipParameters, median
 from envs.whip.scene import CUBES, Scene, base_model, compile_model
+from tests.compiling import PLAIN, QUICK
 
 SCENE = Scene()
 HIT = 0.036
 """Displacement in the plane of the picture, in m, that counts as a hit."""
-
-QUICK = {"xla_backend_optimization_level": 0}
-"""Compiling takes longer than running here."""
 
 # Two by three scenes. In the first two the DLO swings freely: long and soft, short and stiff. In the next three it
 # knocks cubes off a stack that stands nearer, each in another way. The last has negative stiffness and damping.
@@ -81,7 +79,7 @@ def rolled(engine, targets=TARGETS, **options) -> State:
 
 @pytest.fixture(scope="module")
 def by_mjx(engine) -> State:
-    return rolled(engine, compiler_options=QUICK | {"xla_cpu_use_fusion_emitters": False})
+    return rolled(engine, compiler_options=PLAIN)
 
 
 @pytest.fixture(scope="module")

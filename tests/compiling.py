@@ -1,0 +1,9 @@
+"""How tests compile: their programs run for milliseconds and would be optimised for seconds."""
+
+import jax
+
+QUICK = {"xla_backend_optimization_level": 0}
+"""Options of `jax.jit` for programs with little to fuse."""
+
+PLAIN = QUICK | ({"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 10) else {})
+"""The same without the processor's newer fusions, which later XLA cannot do without."""
