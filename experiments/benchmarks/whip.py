@@ -4,8 +4,8 @@ Prints
 
 * steps of the physics and episodes a second, of random episodes in random scenes, by each engine for several sizes of
   batches, and how many failed; against MuJoCo called by a plain Python loop on one core, and its own loop in C on one
-  core, which is the floor: the same models and actions. MJX's larger batches are cut to the first control steps on a
-  processor;
+  core, which is the floor: the same models and actions. On a processor, MJX's batches are shared out among as many
+  devices as there are cores, and larger ones are cut to the first control steps;
 * seconds of tracing and compiling an episode of MJX, cold and from the cache on disk;
 * how far MJX agrees with MuJoCo: of twelve DLOs, most of them at the corners of Phi and Theta_0, each moved in five
   ways, how many knock the same cubes off. After contact motions are chaotic, so the yardstick is MuJoCo against itself
@@ -25,6 +25,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+if "XLA_FLAGS" not in os.environ:  # read once, when jax starts
+    os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={os.cpu_count() or 1}"
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -38,6 +41,7 @@ from envs.whip.engine import Engine, State, ramp, rollout
 from envs.whip.engines import NAMES, pick
 from envs.whip.exploration import exploratory_actions
 from envs.whip.kinematics import frames
+from envs.whip.mjx_engine import MjxEngine
 from envs.whip.native import NativeEngine
 from envs.whip.parameters import FEASIBLE, INITIAL, WhipParameters, median
 from envs.whip.scene import CUBES, START, Scene
@@ -47,7 +51,7 @@ from jaxlfi import atomic
 SCENE = Scene()
 EPISODE = rules.STEPS * SCENE.substeps
 """Steps of the physics."""
-PATIENCE = 82_000
+PATIENCE = 20_000
 """Steps of the physics that MJX takes at most in a timed call on a processor."""
 
 
@@ -71,7 +75,10 @@ def best(call: Callable[[], object], repeats: int) -> float:
 def by_engine(engine: Engine, batch: int, controls: int, repeats: int) -> dict[str, float]:
     """Steps a second of rollouts of so many control steps, how many failed, and seconds to the first one's end."""
     scenes, targets = random_batch(batch)
-    run = jax.jit(jax.vmap(functools.partial(rollout, engine)))
+    run = jax.vmap(functools.partial(rollout, engine))
+    if isinstance(engine, MjxEngine) and batch % jax.device_count() == 0:
+        run = jax.shard_map(run, mesh=_all_devices(), in_specs=ALONG, out_specs=ALONG, check_vma=False)
+    run = jax.jit(run)
     start = time.perf_counter()
     failed = int(run(scenes, targets[:, :controls]).failed[:, -1].sum())
     first = time.perf_counter() - start
@@ -98,6 +105,13 @@ def by_mujoco(count: int, repeats: int) -> dict[str, float]:
     in_c = lambda: pool.rollout(models, data, start, controls)
     calls = {"MuJoCo, a loop in Python, one core": in_python, "MuJoCo, its loop in C, one core (floor)": in_c}
     return {name: count * EPISODE / best(call, 1 + repeats) for name, call in calls.items()}  # the first warms up
+
+
+ALONG = jax.sharding.PartitionSpec("scenes")
+
+
+def _all_devices() -> jax.sharding.Mesh:
+    return jax.make_mesh((jax.device_count(),), ("scenes",), axis_types=(jax.sharding.AxisType.Auto,))
 
 
 def speed(engines: list[str], batches: list[int], repeats: int) -> dict[str, dict[str, dict[str, float]]]:
