@@ -24,6 +24,7 @@ test: $(VENV)/.installed  ## all tests
 
 lint: $(VENV)/.installed  ## style
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check --quiet .
 
 bench: $(VENV)/.installed  ## benchmarks against NumPy, numba and PyTorch
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'

@@ -46,9 +46,7 @@ _PREY = 1
 # e^60 keeps total rates finite in float32, and is far beyond what 10,000 events allow.
 _MAX_LOG_RATE = 60.0
 
-Simulate = Callable[
-    [Key[Array, ""], Float[Array, "4"]], tuple[Float[Array, "records 2"], Int[Array, ""]]
-]
+Simulate = Callable[[Key[Array, ""], Float[Array, "4"]], tuple[Float[Array, "records 2"], Int[Array, ""]]]
 """One simulation: key and log-rates to trajectory and failure code."""
 
 
@@ -232,9 +230,7 @@ def _count_earlier(times: jax.Array, lane: jax.Array, target: jax.Array) -> jax.
     return lax.scan(bisect, jnp.zeros_like(lane), steps)[0]
 
 
-def _work_off(
-    process: JumpProcess, schedule: Schedule, seeds: counter_rng.Seed, log_rates: jax.Array
-) -> Simulations:
+def _work_off(process: JumpProcess, schedule: Schedule, seeds: counter_rng.Seed, log_rates: jax.Array) -> Simulations:
     """Runs N queued simulations, seeds [N] and log_rates [N, 4]."""
     simulations = log_rates.shape[0]
     width, phase, intervals = schedule.lanes, schedule.phase, process.intervals
@@ -249,9 +245,7 @@ def _work_off(
         source = jnp.minimum(simulation, simulations - 1)
         return _Lanes(
             simulation=simulation,
-            seed=jax.tree.map(
-                lambda queue, lane: jnp.where(finished, queue[source], lane), seeds, lanes.seed
-            ),
+            seed=jax.tree.map(lambda queue, lane: jnp.where(finished, queue[source], lane), seeds, lanes.seed),
             rates=jnp.where(finished, rates[:, source], lanes.rates),
             state=jnp.where(finished, initial, lanes.state),
             cell=jnp.where(finished, 0, lanes.cell),
@@ -358,17 +352,13 @@ def make_batch_simulator(
     The function returned takes typed keys [N] and natural logarithms of the rates [N, 4], N >= 1.
     """
 
-    def simulate_batch(
-        keys: Key[Array, " batch"], log_rates: Float[Array, "batch 4"]
-    ) -> Simulations:
+    def simulate_batch(keys: Key[Array, " batch"], log_rates: Float[Array, "batch 4"]) -> Simulations:
         return _work_off(process, schedule, jax.vmap(counter_rng.seed_from_key)(keys), log_rates)
 
     return simulate_batch
 
 
-def make_simulator(
-    process: JumpProcess = JumpProcess(), schedule: Schedule = Schedule()
-) -> Simulate:
+def make_simulator(process: JumpProcess = JumpProcess(), schedule: Schedule = Schedule()) -> Simulate:
     """Returns the simulator of one trajectory, to be batched by `jax.vmap`.
 
     Algorithm: direct method of Gillespie (1977); reactions in the order of their rates are predator
@@ -408,9 +398,7 @@ def make_simulator(
         outputs = jax.tree.map(lambda out: out.reshape(axis_size, -1, *out.shape[1:]), outputs)
         return outputs, (True, True)
 
-    def simulate(
-        key: Key[Array, ""], log_rates: Float[Array, "4"]
-    ) -> tuple[Float[Array, "records 2"], Int[Array, ""]]:
+    def simulate(key: Key[Array, ""], log_rates: Float[Array, "4"]) -> tuple[Float[Array, "records 2"], Int[Array, ""]]:
         seed = jax.tree.map(lambda word: word[None], counter_rng.seed_from_key(key))
         log_rates = jnp.asarray(log_rates, jnp.float32)
         if log_rates.shape != (4,):

@@ -47,6 +47,7 @@ MATRIX: dict[str, tuple[str, str]] = {
 }
 """Configurations: (support, heuristic)."""
 
+
 @dataclasses.dataclass(frozen=True)
 class Variant:
     """One row of the ablation.

@@ -164,9 +164,7 @@ def table(histories: Mapping[str, Mapping[str, History]], found) -> list[dict[st
 
 def main() -> None:
     """Run what is missing, then draw."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, required=True, help="where the runs are, or are to be")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--objects", nargs="+", default=OBJECTS, help="names, or recorded rollouts' .npz")

@@ -42,9 +42,7 @@ HEURISTICS = {
     "fixed": jaxlfi.Fixed(),
     "edge": jaxlfi.Edge(mass_threshold=jnp.array([0.003, 0.005])),
 }
-SETTINGS = QUICK.replace(
-    rounds=8, additions=60, attempts=75, estimator=QUICK.estimator.replace(batch_size=10)
-)
+SETTINGS = QUICK.replace(rounds=8, additions=60, attempts=75, estimator=QUICK.estimator.replace(batch_size=10))
 """`quick` with 480 simulations a run, where the paper has 1,500."""
 DRAWS = 500
 LANES = 14
@@ -172,9 +170,7 @@ def draw(figure: Figure, found: dict[str, dict[str, np.ndarray]]) -> None:
 
 def main() -> None:
     """The study, its table and its picture."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--detectors", nargs="+", default=["clean", "mask", "transporter"])
     arguments = parser.parse_args()

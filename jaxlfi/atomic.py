@@ -59,7 +59,5 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except (
-        Exception
-    ) as error:  # zipfile, zlib, numpy and the operating system each have their own for a damaged file
+    except Exception as error:  # zipfile, zlib, numpy and the operating system each have their own for a damaged file
         raise ValueError(f"{path}: expected a whole .npz file, got a missing or damaged one") from error

@@ -166,9 +166,7 @@ def update(
     # An MDN is read off, a flow is drawn from.
     key_fit, key_draw = jax.random.split(key) if settings.estimator.is_flow else (key, None)
     log_prior = None if task.prior is None else task.prior.log_prob(dataset.theta)
-    network, fit_info = fit(
-        key_fit, settings.estimator, network, dataset, weights, state.feasible, expected, log_prior
-    )
+    network, fit_info = fit(key_fit, settings.estimator, network, dataset, weights, state.feasible, expected, log_prior)
     q, inside = posterior(key_draw, settings.estimator, network, observed, state.feasible, state.belief.support)
     mixture, not_positive_definite = correction.change(task, q, state.belief)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)

@@ -90,9 +90,7 @@ class BlackBoxEngine:
 
     def _update_one(self, lane: Inputs, state: State, index, attempts: Attempts):
         _, _, key_update = jax.random.split(round_key(lane, index), 3)
-        return bayessim.update(
-            key_update, self._task, self._settings, lane.heuristic, lane.x, state, index, attempts
-        )
+        return bayessim.update(key_update, self._task, self._settings, lane.heuristic, lane.x, state, index, attempts)
 
 
 def simulate_within_budget(

@@ -34,9 +34,7 @@ class Checkpoint:
     def write_start(self, observed: np.ndarray, x: np.ndarray) -> None:
         """Keep the lanes' observations, shape [L, T, C], and their summaries, shape [L, S]."""
         self.folder.mkdir(parents=True)
-        atomic.write_arrays(
-            self.folder / "start.npz", {"observed": observed, "x": x}, compress=False, durable=True
-        )
+        atomic.write_arrays(self.folder / "start.npz", {"observed": observed, "x": x}, compress=False, durable=True)
 
     def read_start(self) -> tuple[np.ndarray, np.ndarray]:
         """The lanes' observations and summaries."""

@@ -125,12 +125,8 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"jaxlfi {jaxlfi.__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    tasks = commands.add_parser(
-        "tasks", help="list tasks, or describe one", description="List tasks, or describe one."
-    )
-    tasks.add_argument(
-        "name", nargs="?", metavar="TASK", help="describe this one: parameters, units, supports, truth"
-    )
+    tasks = commands.add_parser("tasks", help="list tasks, or describe one", description="List tasks, or describe one.")
+    tasks.add_argument("name", nargs="?", metavar="TASK", help="describe this one: parameters, units, supports, truth")
 
     infer = commands.add_parser(
         "infer",
@@ -274,9 +270,7 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
         metavar="NAME",
         help="what is observed, where the task knows several objects (short for TASK,object=NAME)",
     )
-    command.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results"
-    )
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results")
     command.add_argument(
         "--method",
         choices=METHODS,
@@ -286,12 +280,8 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
     command.add_argument(
         "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"
     )
-    command.add_argument(
-        "--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})"
-    )
-    command.add_argument(
-        "--first-seed", type=int, default=0, metavar="N", help="the first run's seed (default: 0)"
-    )
+    command.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})")
+    command.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first run's seed (default: 0)")
     command.add_argument(
         "--observation",
         type=Path,
@@ -301,22 +291,16 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
     )
     _add_machine(command)
     if networks:
-        command.add_argument(
-            "--keep-network", action="store_true", help="also save the trained networks (network.npz)"
-        )
+        command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
 
     rounds = command.add_argument_group("rounds (default: the preset's)")
     rounds.add_argument("--rounds", type=int, metavar="N", help="inference rounds, N_LFI")
     rounds.add_argument("--additions", type=int, metavar="N", help="simulations added each round, at most")
-    rounds.add_argument(
-        "--attempts", type=int, metavar="N", help="simulations attempted each round, failures included"
-    )
+    rounds.add_argument("--attempts", type=int, metavar="N", help="simulations attempted each round, failures included")
     rounds.add_argument(
         "--correction", metavar="NAME", help="from the network to the posterior: none, paper, importance"
     )
-    rounds.add_argument(
-        "--restriction", metavar="NAME", help="how draws are kept in the support: clip, reject"
-    )
+    rounds.add_argument("--restriction", metavar="NAME", help="how draws are kept in the support: clip, reject")
     rounds.add_argument(
         "--defensive",
         type=float,
@@ -333,19 +317,13 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
     network.add_argument("--components", type=int, metavar="K", help="Gaussians in each network's mixture")
     network.add_argument("--prune", type=float, metavar="X", help="components of less weight than this are dropped")
     network.add_argument("--members", type=int, metavar="N", help="networks in the ensemble")
-    network.add_argument(
-        "--normaliser", metavar="NAME", help="what is done to summaries: zscore, asinh, none"
-    )
+    network.add_argument("--normaliser", metavar="NAME", help="what is done to summaries: zscore, asinh, none")
     network.add_argument("--epochs", type=int, metavar="N", help="full passes over the data each round")
-    network.add_argument(
-        "--steps", type=int, metavar="N", help="gradient steps each round, in place of --epochs"
-    )
+    network.add_argument("--steps", type=int, metavar="N", help="gradient steps each round, in place of --epochs")
     network.add_argument("--batch-size", type=int, metavar="N", help="simulations in a minibatch")
     network.add_argument("--learning-rate", type=float, metavar="X", help="Adam's step size")
     network.add_argument("--weight-decay", type=float, metavar="X", help="decoupled weight decay")
-    network.add_argument(
-        "--clip-norm", type=float, metavar="X", help="norm the gradients are clipped to (inf: not)"
-    )
+    network.add_argument("--clip-norm", type=float, metavar="X", help="norm the gradients are clipped to (inf: not)")
     network.add_argument("--schedule", metavar="NAME", help="of the learning rate: constant, cosine")
     network.add_argument(
         "--validation", type=float, metavar="X", help="fraction held out to choose the best weights by"
@@ -378,9 +356,7 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
 def _add_machine(command: argparse.ArgumentParser) -> None:
     """Arguments about how, not what."""
     command.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
-    command.add_argument(
-        "--no-cache", action="store_true", help="compile anew, without the cache of compiled programs"
-    )
+    command.add_argument("--no-cache", action="store_true", help="compile anew, without the cache of compiled programs")
 
 
 def prepare_jax(arguments: argparse.Namespace) -> None:
@@ -393,9 +369,7 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
     lanes = _lanes(arguments)
     flags = os.environ.get("XLA_FLAGS", "")
     if lanes > 1 and "xla_force_host_platform_device_count" not in flags:
-        devices = min(
-            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, lanes
-        )
+        devices = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, lanes)
         if recorded := _recorded(arguments).get("devices"):
             devices = recorded  # the same lanes on the same number of devices repeat bit for bit
         os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={devices}".strip()

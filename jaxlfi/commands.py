@@ -51,13 +51,7 @@ def tasks(arguments: argparse.Namespace, console: Console) -> None:
         except ValueError as error:  # one broken package must not hide the others
             table.add_row(name, "", "", str(error).splitlines()[0])
             continue
-        given = (
-            "given"
-            if task.observation is not None
-            else "simulated at the truth"
-            if task.truth is not None
-            else "-"
-        )
+        given = "given" if task.observation is not None else "simulated at the truth" if task.truth is not None else "-"
         table.add_row(name, ", ".join(task.coordinates), ", ".join(task.supports), given)
     console.print(table)
     console.print("Details: jaxlfi tasks NAME. Your own: module:factory in place of a name.")
@@ -69,16 +63,11 @@ def _describe_task(task: Task, console: Console) -> None:
         columns.append("truth")
     table = Table(*columns, title=task.name)
     for d, name in enumerate(task.coordinates):
-        boxes = [
-            f"[{float(box.low[d]):g}, {float(box.high[d]):g}]"
-            for box in (*task.supports.values(), task.feasible)
-        ]
+        boxes = [f"[{float(box.low[d]):g}, {float(box.high[d]):g}]" for box in (*task.supports.values(), task.feasible)]
         truth = [f"{float(task.truth[d]):.4g}"] if task.truth is not None else []
         table.add_row(name, task.units[d], *boxes, *truth)
     console.print(table)
-    console.print(
-        "Supports and Phi are boxes for the parameters as they are named here; the first is the default."
-    )
+    console.print("Supports and Phi are boxes for the parameters as they are named here; the first is the default.")
 
 
 def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
@@ -107,15 +96,11 @@ def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
     _refuse_foreign_hyperparameters(arguments, [heuristic for _, heuristic in parts])
     # Seeds are the slow index, so that every device gets all configurations, fast and slow ones.
     lanes = tuple(
-        Lane(
-            name, support, task.support(support), build_heuristic(arguments, heuristic, settings, task), seed
-        )
+        Lane(name, support, task.support(support), build_heuristic(arguments, heuristic, settings, task), seed)
         for seed in _seeds(arguments)
         for name, (support, heuristic) in zip(configurations, parts, strict=True)
     )
-    plan = Plan(
-        run_store.COMPARE, arguments.task, task, arguments.preset, settings, lanes, arguments.keep_network
-    )
+    plan = Plan(run_store.COMPARE, arguments.task, task, arguments.preset, settings, lanes, arguments.keep_network)
     session.begin(arguments.out, plan, _observation(arguments, task))
     return arguments.out, plan
 
@@ -157,9 +142,7 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
         console.print(_COMPLETE.format(folder=folder))
         return None
     if "lanes" not in config:
-        raise run_store.StoreError(
-            f"expected the folder a command was given, got {str(folder)!r}, one run of several"
-        )
+        raise run_store.StoreError(f"expected the folder a command was given, got {str(folder)!r}, one run of several")
     return folder, session.plan_of(config)
 
 
@@ -208,7 +191,9 @@ def sample(arguments: argparse.Namespace, console: Console) -> None:
     if inside < LEAKAGE:
         console.print(
             f"warning: only {inside:.2g} of the posterior lies in the support it was truncated to; it may be wrong.",
-            style="yellow", soft_wrap=True, highlight=False,
+            style="yellow",
+            soft_wrap=True,
+            highlight=False,
         )
 
 
@@ -398,9 +383,7 @@ def _configuration(name: str) -> tuple[str, str]:
     """Support and heuristic of "support" or "support+heuristic"."""
     support, plus, heuristic = name.partition("+")
     if plus and heuristic not in HEURISTICS:
-        raise ValueError(
-            f"configurations: expected support+heuristic with one of {sorted(HEURISTICS)}, got {name!r}"
-        )
+        raise ValueError(f"configurations: expected support+heuristic with one of {sorted(HEURISTICS)}, got {name!r}")
     return support, heuristic or "none"
 
 
@@ -424,8 +407,7 @@ def _observation(arguments: argparse.Namespace, task: Task) -> np.ndarray | None
 def _seeds(arguments: argparse.Namespace) -> range:
     if arguments.seeds < 1 or not 0 <= arguments.first_seed < 2**31 - arguments.seeds:
         raise ValueError(
-            "seeds: expected at least 1, and first_seed at least 0, "
-            f"got {arguments.seeds} and {arguments.first_seed}"
+            f"seeds: expected at least 1, and first_seed at least 0, got {arguments.seeds} and {arguments.first_seed}"
         )
     return range(arguments.first_seed, arguments.first_seed + arguments.seeds)
 
@@ -434,9 +416,7 @@ def summary_table(folder: Path, plan: Plan) -> Table:
     """What came out: one line a configuration, over its seeds."""
     beliefs = [run_store.read_belief(folder / name) for name in plan.folders()]
     lines = session.results(folder, plan)
-    table = Table(
-        "configuration", "seeds", "theta error [95 %]", "median", "traj. error", "success", "final support"
-    )
+    table = Table("configuration", "seeds", "theta error [95 %]", "median", "traj. error", "success", "final support")
     for column in table.columns[:-1]:
         column.no_wrap = True
     for configuration in dict.fromkeys(lane.configuration for lane in plan.lanes):

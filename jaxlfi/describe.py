@@ -15,9 +15,7 @@ from jaxlfi.support import Support
 def settings_to_json(settings: Settings) -> dict[str, Any]:
     """All settings by name, the estimator's in a dictionary of their own."""
     plain = {field.name: plain_value(getattr(settings, field.name)) for field in _other_fields(settings)}
-    estimator = {
-        f.name: plain_value(getattr(settings.estimator, f.name)) for f in dataclasses.fields(Estimator)
-    }
+    estimator = {f.name: plain_value(getattr(settings.estimator, f.name)) for f in dataclasses.fields(Estimator)}
     return plain | {"estimator": estimator}
 
 
@@ -44,9 +42,7 @@ def heuristic_from_json(description: dict[str, Any]) -> Heuristic:
     """The heuristic that `heuristic_to_json` described."""
     if description["name"] not in HEURISTICS:
         raise ValueError(f"heuristic: expected one of {sorted(HEURISTICS)}, got {description['name']!r}")
-    rule = HEURISTICS[description["name"]](
-        **{k: _restored(v) for k, v in description["hyperparameters"].items()}
-    )
+    rule = HEURISTICS[description["name"]](**{k: _restored(v) for k, v in description["hyperparameters"].items()})
     return Matched(rule) if description["matched"] else rule
 
 

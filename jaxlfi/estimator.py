@@ -166,9 +166,7 @@ def normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tuple
     return of_x, fit_normaliser("zscore", scale.to_unit(dataset.theta), dataset.valid)
 
 
-def condition(
-    estimator: Estimator, network: Network, x: Float[Array, " obs"], scale: Support
-) -> GaussianMixture:
+def condition(estimator: Estimator, network: Network, x: Float[Array, " obs"], scale: Support) -> GaussianMixture:
     """q_phi(theta | x) in coordinates, all members pooled: members * K components.
 
     Args:

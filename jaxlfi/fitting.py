@@ -114,9 +114,7 @@ def _fit_member(key, estimator, params, data, size, expected_size):
     mean_weight = jnp.sum(jnp.where(jnp.arange(capacity) < size, data.weights, 0.0)) / jnp.maximum(size, 1)
     data = data.replace(weights=data.weights / jnp.maximum(mean_weight, 1e-30))
     held_out_data = data.take(held_out_rows)
-    held_out_data = held_out_data.replace(
-        weights=jnp.where(held_out_places < held_out, held_out_data.weights, 0.0)
-    )
+    held_out_data = held_out_data.replace(weights=jnp.where(held_out_places < held_out, held_out_data.weights, 0.0))
 
     key_loss, key_held_out = jax.random.fold_in(key_passes, passes), jax.random.fold_in(key_passes, passes + 1)
 

@@ -103,9 +103,7 @@ def own_evidence(row: Mapping[str, Any], place: int | None) -> dict[str, Any]:
     return kept | {EVIDENCE + name[len(own) :]: value for name, value in row.items() if name.startswith(own)}
 
 
-def ledger_line(
-    index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, ...], seconds: float
-) -> dict[str, Any]:
+def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, ...], seconds: float) -> dict[str, Any]:
     """What the ledger says of a round.
 
     Args:
@@ -120,13 +118,8 @@ def ledger_line(
         "attempted": int(row["attempted"]),
         "succeeded": int(row["succeeded"]),
         "failed": {reason: int(count) for reason, count in zip(reasons, row["failed"], strict=True)},
-        **{
-            name: row[name].tolist()
-            for name in ("support_low", "support_high", "proposal_low", "proposal_high")
-        },
-        "evidence": {
-            name[len(EVIDENCE) :]: value.tolist() for name, value in row.items() if name.startswith(EVIDENCE)
-        },
+        **{name: row[name].tolist() for name in ("support_low", "support_high", "proposal_low", "proposal_high")},
+        "evidence": {name[len(EVIDENCE) :]: value.tolist() for name, value in row.items() if name.startswith(EVIDENCE)},
         "low_shift": row["low_shift"].tolist(),
         "high_shift": row["high_shift"].tolist(),
         "loss": float(np.mean(row["loss"][members, row["chosen_pass"]])),

@@ -192,9 +192,7 @@ def infer(
     concrete = _is_concrete((key, observation, support, heuristic, settings))
     if task.black_box:
         if not concrete:
-            raise ValueError(
-                "infer: expected concrete arguments for a black box, which cannot be traced or vmapped"
-            )
+            raise ValueError("infer: expected concrete arguments for a black box, which cannot be traced or vmapped")
         run = _infer_black_box(key, task, observation, support, heuristic, settings)
     else:
         observed, x = observe(run_keys(key).observe, task, observation, concrete)
@@ -208,9 +206,7 @@ def infer(
     return run
 
 
-def observe(
-    key: jax.Array, task: Task, observation: Any, concrete: bool = True
-) -> tuple[jax.Array, jax.Array]:
+def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True) -> tuple[jax.Array, jax.Array]:
     """The observed trajectory, checked, and its summary.
 
     Args:
@@ -252,8 +248,7 @@ def check_heuristic(heuristic: Heuristic, task: Task) -> None:
     for leaf in jax.tree.leaves(heuristic):
         if np.shape(leaf) not in ((), (task.dim,)):
             raise ValueError(
-                f"heuristic: expected hyperparameters that are scalars or {task.dim} values, "
-                f"got shape {np.shape(leaf)}"
+                f"heuristic: expected hyperparameters that are scalars or {task.dim} values, got shape {np.shape(leaf)}"
             )
 
 

@@ -99,17 +99,13 @@ def stack_heuristics(rules: Sequence[Heuristic]) -> tuple[Heuristic, list[int | 
     places = [kinds.index(structure) for structure in structures]
     examples = [rules[structures.index(kind)] for kind in kinds]
     choices = [
-        Choice(
-            index=place, rules=tuple(rule if place == slot else other for slot, other in enumerate(examples))
-        )
+        Choice(index=place, rules=tuple(rule if place == slot else other for slot, other in enumerate(examples)))
         for rule, place in zip(rules, places, strict=True)
     ]
     return stack(choices), places
 
 
-def stack_inputs(
-    lanes: Sequence[Lane], observed: np.ndarray, x: np.ndarray
-) -> tuple[Inputs, list[int | None]]:
+def stack_inputs(lanes: Sequence[Lane], observed: np.ndarray, x: np.ndarray) -> tuple[Inputs, list[int | None]]:
     """Inputs of all lanes, and each lane's place in the choice of heuristics.
 
     Args:
@@ -200,15 +196,11 @@ class LaneEngine:
         many = jax.vmap(one, in_axes=in_axes)
         if self._mesh.size > 1:
             specs = tuple(PartitionSpec() if axis is None else PartitionSpec(AXIS) for axis in in_axes)
-            many = jax.shard_map(
-                many, mesh=self._mesh, in_specs=specs, out_specs=PartitionSpec(AXIS), check_vma=False
-            )
+            many = jax.shard_map(many, mesh=self._mesh, in_specs=specs, out_specs=PartitionSpec(AXIS), check_vma=False)
         return jax.jit(many, donate_argnums=donate)
 
 
-def rounds(
-    engine: Engine, state: State, first: int, last: int
-) -> Iterator[tuple[int, State, dict[str, np.ndarray]]]:
+def rounds(engine: Engine, state: State, first: int, last: int) -> Iterator[tuple[int, State, dict[str, np.ndarray]]]:
     """Step the rounds from `first` up to but not including `last`, yielding each as it ends."""
     for index in range(first, last):
         state, rows = engine.round(state, index)

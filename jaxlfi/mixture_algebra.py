@@ -89,9 +89,7 @@ def product(a: GaussianMixture, b: GaussianMixture) -> tuple[GaussianMixture, Pa
     return mixture, Pairing(jnp.zeros_like(pairs.absent), jnp.asarray(False))
 
 
-def quotient(
-    a: GaussianMixture, b: GaussianMixture, policy: str = "floor"
-) -> tuple[GaussianMixture, Pairing]:
+def quotient(a: GaussianMixture, b: GaussianMixture, policy: str = "floor") -> tuple[GaussianMixture, Pairing]:
     """The quotient a(theta) / b(theta), one component for each pair.
 
     N(m_1, P_1) / N(m_2, P_2) = c N(m, P) with P = P_1 - P_2, P m = P_1 m_1 - P_2 m_2 and
@@ -235,15 +233,11 @@ def _paired(a: GaussianMixture, b: GaussianMixture) -> _Pairs:
 def _combined(pairs: _Pairs, ratio: Float[Array, "pairs dim"], sign: float) -> GaussianMixture:
     """Multiply (sign 1) or divide (sign -1) each pair, with b's inverse scales replaced by `ratio`."""
     # Narrower or wider about the same mean: offsets, in units of b's scales, change in proportion.
-    offset = pairs.offset * jnp.where(
-        pairs.ratio > 0, ratio / jnp.where(pairs.ratio > 0, pairs.ratio, 1.0), 1.0
-    )
+    offset = pairs.offset * jnp.where(pairs.ratio > 0, ratio / jnp.where(pairs.ratio > 0, pairs.ratio, 1.0), 1.0)
     precision = 1.0 + ratio**2 if sign > 0 else (1.0 - ratio) * (1.0 + ratio)
     mean = pairs.origin + jnp.einsum("pij,pj->pi", pairs.frame, sign * ratio / precision * offset)
     scale_tril = _triangular(pairs.frame / jnp.sqrt(precision)[:, None, :])
-    exponent = sign * pairs.log_peak - 0.5 * jnp.sum(
-        jnp.log(precision) + sign * offset**2 / precision, axis=-1
-    )
+    exponent = sign * pairs.log_peak - 0.5 * jnp.sum(jnp.log(precision) + sign * offset**2 / precision, axis=-1)
     return GaussianMixture(jnp.where(pairs.absent, -jnp.inf, pairs.log_weight + exponent), mean, scale_tril)
 
 

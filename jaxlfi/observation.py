@@ -53,8 +53,7 @@ def simulator_shapes(task: Task) -> Shapes:
     trajectory, outcome = result if isinstance(result, tuple) and len(result) == 2 else (result, None)
     if not isinstance(trajectory, jax.ShapeDtypeStruct) or trajectory.ndim == 0:
         raise SimulatorError(
-            "simulate: expected one array [T] or [T, C], or (array, outcome), "
-            f"got {jax.tree.map(_shape, result)}"
+            f"simulate: expected one array [T] or [T, C], or (array, outcome), got {jax.tree.map(_shape, result)}"
         )
     if outcome is not None and getattr(outcome, "shape", None) != ():
         raise SimulatorError(f"simulate: expected a scalar outcome, got {jax.tree.map(_shape, outcome)}")
@@ -77,9 +76,7 @@ def _summary_size(task: Task, shape: tuple[int, ...]) -> int:
             f"got {type(error).__name__}: {_first_line(error)}"
         ) from error
     if getattr(summary, "ndim", None) != 1:
-        raise SimulatorError(
-            f"summary: expected a vector [S] of one trajectory, got {jax.tree.map(_shape, summary)}"
-        )
+        raise SimulatorError(f"summary: expected a vector [S] of one trajectory, got {jax.tree.map(_shape, summary)}")
     return summary.shape[0]
 
 
@@ -107,24 +104,18 @@ def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
         SimulatorError: where no try succeeds.
     """
     if task.truth is None:
-        raise ValueError(
-            "observation: expected one, as the task has neither an observation nor a known truth"
-        )
+        raise ValueError("observation: expected one, as the task has neither an observation nor a known truth")
     for attempt in range(TRIES):
         trajectory, failure = _at_truth(jax.random.fold_in(key, attempt), task)
         if failure == 0:
             return np.asarray(trajectory)
-    raise SimulatorError(
-        f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries"
-    )
+    raise SimulatorError(f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries")
 
 
 def trace_observation(key: jax.Array, task: Task) -> jax.Array:
     """As `simulate_observation`, inside a traced function: the first try, whatever comes of it."""
     if task.truth is None:
-        raise ValueError(
-            "observation: expected one, as the task has neither an observation nor a known truth"
-        )
+        raise ValueError("observation: expected one, as the task has neither an observation nor a known truth")
     return trajectory_and_outcome(task, jax.random.fold_in(key, 0), task.truth)[0]
 
 
@@ -176,9 +167,7 @@ def fitted(trajectory: np.ndarray, shapes: Shapes) -> np.ndarray:
 
 
 def _read_csv(path: Path) -> np.ndarray:
-    rows = [
-        line.strip() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")
-    ]
+    rows = [line.strip() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
     if not rows:
         raise ValueError("expected at least one row of numbers, got none")
     heading = [cell.strip().strip('"').lower() for cell in rows[0].split(",")]

@@ -74,6 +74,4 @@ class RoundProgress:
             return
         elapsed = time.monotonic() - self._began
         left = elapsed / (self._done - self._first) * (self._rounds - self._done)
-        self._console.print(
-            f"round {self._done} of {self._rounds}, {elapsed:.0f} s elapsed, about {left:.0f} s left"
-        )
+        self._console.print(f"round {self._done} of {self._rounds}, {elapsed:.0f} s elapsed, about {left:.0f} s left")

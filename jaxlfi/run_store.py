@@ -123,9 +123,7 @@ def create(folder: Path, config: Mapping[str, Any], fill) -> None:
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     except OSError as error:
-        raise StoreError(
-            f"out: expected a folder that can be written, got {str(folder)!r}: {error}"
-        ) from error
+        raise StoreError(f"out: expected a folder that can be written, got {str(folder)!r}: {error}") from error
     try:
         beside.chmod(0o755)
         fill(beside)
@@ -148,9 +146,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     try:
         config = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise StoreError(
-            f"expected a run folder, got {str(folder)!r} without a readable config.json"
-        ) from error
+        raise StoreError(f"expected a run folder, got {str(folder)!r} without a readable config.json") from error
     kind = config.get("format") if isinstance(config, dict) else None
     if kind not in (RUN, RUNS, COMPARE):
         known = isinstance(kind, str) and kind.startswith("jaxlfi-")
@@ -165,9 +161,7 @@ def write_ledger(
     folder: Path, rows: Sequence[Mapping[str, np.ndarray]], reasons: Sequence[str], seconds: Sequence[float]
 ):
     """Write ledger.jsonl anew from the records of the rounds so far."""
-    lines = [
-        ledger_line(i, row, tuple(reasons), s) for i, (row, s) in enumerate(zip(rows, seconds, strict=True))
-    ]
+    lines = [ledger_line(i, row, tuple(reasons), s) for i, (row, s) in enumerate(zip(rows, seconds, strict=True))]
     atomic.write_json_lines(folder / "ledger.jsonl", lines)
 
 
@@ -242,9 +236,7 @@ def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     atomic.write_bytes(path, text.getvalue().encode())
 
 
-def lane_rows(
-    rows: Sequence[Mapping[str, np.ndarray]], lane: int, place: int | None
-) -> list[dict[str, Any]]:
+def lane_rows(rows: Sequence[Mapping[str, np.ndarray]], lane: int, place: int | None) -> list[dict[str, Any]]:
     """One lane's records out of those of all lanes."""
     return [own_evidence({name: value[lane] for name, value in row.items()}, place) for row in rows]
 
@@ -319,18 +311,13 @@ def read_ledger(folder: Path) -> list[dict[str, Any]]:
         lines = [json.loads(line) for line in path.read_text().splitlines()]
     except (OSError, ValueError) as error:
         raise StoreError(f"expected a ledger, got a missing or damaged {path}") from error
-    return [
-        {name: float("nan") if value is None else value for name, value in line.items()} for line in lines
-    ]
+    return [{name: float("nan") if value is None else value for name, value in line.items()} for line in lines]
 
 
 def read_table(path: Path) -> list[dict[str, Any]]:
     """The table of a comparison; what was unknown is NaN."""
     with path.open(newline="") as file:
         return [
-            {
-                name: value if name == "configuration" else float(value or "nan")
-                for name, value in line.items()
-            }
+            {name: value if name == "configuration" else float(value or "nan") for name, value in line.items()}
             for line in csv.DictReader(file)
         ]

@@ -75,9 +75,7 @@ def begin(folder: Path, plan: Plan, observation: Any = None) -> None:
     run_store.refuse_occupied(folder)
     plan.settings.check()
     seeds = sorted({lane.seed for lane in plan.lanes})
-    by_seed = {
-        seed: observe(run_keys(jax.random.key(seed)).observe, plan.task, observation) for seed in seeds
-    }
+    by_seed = {seed: observe(run_keys(jax.random.key(seed)).observe, plan.task, observation) for seed in seeds}
     observed = np.stack([np.asarray(by_seed[lane.seed][0]) for lane in plan.lanes])
     x = np.stack([np.asarray(by_seed[lane.seed][1]) for lane in plan.lanes])
     config, lane_configs = _configs(plan)
@@ -286,9 +284,7 @@ def support_warnings(folder: Path, plan: Plan) -> Iterator[str]:
     for configuration in dict.fromkeys(lane.configuration for lane, _ in fixed):
         own = [belief for lane, belief in fixed if lane.configuration == configuration]
         if len(own) == 1:
-            yield from (
-                f"{configuration}: {text}" for text in bound_warnings(plan.task, own[0], WARNING_MASS)
-            )
+            yield from (f"{configuration}: {text}" for text in bound_warnings(plan.task, own[0], WARNING_MASS))
             continue
         masses = np.stack([np.stack(_edge_mass(belief)) for belief in own])  # [seed, side, D]
         bounds = own[0].support.low, own[0].support.high

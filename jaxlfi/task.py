@@ -103,10 +103,7 @@ class Task:
         store("feasible", self._box_to_coordinates(self.feasible, "feasible"))
         store(
             "supports",
-            {
-                label: self._box_to_coordinates(box, f"supports[{label!r}]")
-                for label, box in self.supports.items()
-            },
+            {label: self._box_to_coordinates(box, f"supports[{label!r}]") for label, box in self.supports.items()},
         )
         if self.truth is not None:
             truth = _vector(self.truth, len(names), "truth")

@@ -16,9 +16,7 @@ TASK = "envs.gaussian_linear:task"
 # Few and small steps: training amplifies rounding, and runs that ought to be equal are compared to a
 # tolerance.
 SETTINGS = Settings(
-    estimator=Estimator(
-        hidden=(16,), learning_rate=1e-3, epochs=0, steps=100, batch_size=20, warm_start=False
-    ),
+    estimator=Estimator(hidden=(16,), learning_rate=1e-3, epochs=0, steps=100, batch_size=20, warm_start=False),
     rounds=2,
     additions=20,
     attempts=25,

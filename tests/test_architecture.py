@@ -20,8 +20,7 @@ FORBIDDEN = {
 }
 """Strictly downward: experiments -> envs -> jaxlfi."""
 NETWORKS = {
-    f"jaxlfi.{name}"
-    for name in "mdn estimator fitting losses normalise posterior npe bayessim correction".split()
+    f"jaxlfi.{name}" for name in "mdn estimator fitting losses normalise posterior npe bayessim correction".split()
 }
 
 

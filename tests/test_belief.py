@@ -18,9 +18,7 @@ REJECTED = jax.jit(RESTRICTIONS["reject"], static_argnames=("n", "tries"))
 N = 20_000
 MEAN, SCALE = np.array([0.4, 5.0]), np.array([1.5, 0.7])
 GAUSSIAN = Belief(
-    GaussianMixture(
-        jnp.zeros(1), jnp.asarray(MEAN)[None].astype(jnp.float32), jnp.diag(jnp.asarray(SCALE))[None]
-    ),
+    GaussianMixture(jnp.zeros(1), jnp.asarray(MEAN)[None].astype(jnp.float32), jnp.diag(jnp.asarray(SCALE))[None]),
     Support([0.0, 3.0], [2.0, 5.5]),
     jnp.asarray(True),
 )

@@ -90,13 +90,9 @@ def test_the_posterior_is_the_exact_one():
         SETTINGS,
         additions=300,
         attempts=300,
-        estimator=dataclasses.replace(
-            SETTINGS.estimator, steps=1500, batch_size=100, learning_rate=1e-2, components=1
-        ),
+        estimator=dataclasses.replace(SETTINGS.estimator, steps=1500, batch_size=100, learning_rate=1e-2, components=1),
     )
-    run = jaxlfi.infer(
-        jax.random.key(3), boxed(), OBSERVED, support="ok", heuristic=Edge(), settings=settings
-    )
+    run = jaxlfi.infer(jax.random.key(3), boxed(), OBSERVED, support="ok", heuristic=Edge(), settings=settings)
     exact = posterior(OBSERVED)
     spread = np.sqrt(np.diag(exact.covariance))
     assert np.all(np.abs(run.mixture.mean - exact.mean) < 0.6 * spread)

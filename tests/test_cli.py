@@ -32,14 +32,10 @@ def error_line(capsys, *arguments) -> str:
 
 
 def test_help_teaches_and_does_not_wait_for_jax():
-    script = (
-        "import sys, jaxlfi.cli as c; c.main(['--help'] if len(sys.argv) < 2 else [sys.argv[1], '--help'])"
-    )
+    script = "import sys, jaxlfi.cli as c; c.main(['--help'] if len(sys.argv) < 2 else [sys.argv[1], '--help'])"
     check = "import atexit, sys; atexit.register(lambda: print('jax' in sys.modules)); "
     for name, wanted in (("infer", "delta"), ("compare", "SUPPORT[+HEURISTIC]"), ("grid", "NAME=V,V,...")):
-        done = subprocess.run(
-            [sys.executable, "-c", check + script, name], capture_output=True, text=True, check=True
-        )
+        done = subprocess.run([sys.executable, "-c", check + script, name], capture_output=True, text=True, check=True)
         assert done.stdout.rstrip().endswith("False"), "jax was imported"
         assert "examples:" in done.stdout and wanted in done.stdout
 
@@ -48,9 +44,7 @@ def test_every_setting_and_hyperparameter_has_a_documented_flag():
     choices = cli.parser()._subparsers._group_actions[0].choices
     for name in ("infer", "compare", "grid"):
         documented = {action.dest for action in choices[name]._actions if action.help}
-        fields = {field.name for kind in (Settings, Estimator) for field in dataclasses.fields(kind)} - {
-            "estimator"
-        }
+        fields = {field.name for kind in (Settings, Estimator) for field in dataclasses.fields(kind)} - {"estimator"}
         assert fields | set(commands.hyperparameters()) <= documented
 
 
@@ -172,10 +166,7 @@ def comparison(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
     """A small comparison."""
     out = tmp_path_factory.mktemp("compare") / "out"
     configurations = ("ok", "misspecified", "misspecified+edge")
-    assert (
-        command("compare", TASK, "--configurations", *configurations, *FLAGS, "--seeds", "2", "--out", out)
-        == 0
-    )
+    assert command("compare", TASK, "--configurations", *configurations, *FLAGS, "--seeds", "2", "--out", out) == 0
     return out
 
 
@@ -184,9 +175,7 @@ def test_compare_writes_its_table(comparison):
         lines = list(csv.DictReader(file))
     assert tuple(lines[0]) == run_store.TABLE_COLUMNS
     assert [(line["configuration"], line["seed"]) for line in lines] == [
-        (configuration, str(seed))
-        for configuration in ("ok", "misspecified", "misspecified+edge")
-        for seed in (0, 1)
+        (configuration, str(seed)) for configuration in ("ok", "misspecified", "misspecified+edge") for seed in (0, 1)
     ]
     for line in lines:
         folder = comparison / line["configuration"] / f"seed_{int(line['seed']):03d}"

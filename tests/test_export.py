@@ -43,9 +43,7 @@ def folder(tmp_path_factory):
         atomic.write_arrays(beside / "observation.npz", {"trajectory": trajectory, "x": X} | about)
         error = np.array([[1.0] * 4, [0.1, np.nan, 0.3, 0.4]])
         simulated = np.arange(24.0).reshape(4, 3, 2)
-        atomic.write_arrays(
-            beside / "history.npz", {"final_trajectory": simulated, "sample_trajectory_error": error}
-        )
+        atomic.write_arrays(beside / "history.npz", {"final_trajectory": simulated, "sample_trajectory_error": error})
 
     run_store.create(out, config, fill)
     return out

@@ -86,11 +86,7 @@ def write_run(
     fraction = 1.0
     mean, scale = (low + high) / 2, (high - low) / 3
     for i in range(rounds):
-        theta = (
-            rng.uniform(low, high, (attempts, dim))
-            if i == 0
-            else mean + scale * rng.normal(size=(attempts, dim))
-        )
+        theta = rng.uniform(low, high, (attempts, dim)) if i == 0 else mean + scale * rng.normal(size=(attempts, dim))
         theta = theta.clip(low, high)
         fraction = failures * (0.7**i)
         failure = rng.binomial(1, fraction, attempts) * rng.integers(1, 3, attempts)
@@ -119,9 +115,7 @@ def write_run(
         logits = rng.normal(size=components)
         logits[-1] = -np.inf if components > 1 else 0.0
         means = mean + 0.6 * scale * rng.normal(size=(components, dim))
-        factor = np.tril(0.3 * rng.normal(size=(components, dim, dim))) * (1 - np.eye(dim)) + 0.9 * np.eye(
-            dim
-        )
+        factor = np.tril(0.3 * rng.normal(size=(components, dim, dim))) * (1 - np.eye(dim)) + 0.9 * np.eye(dim)
         tril = scale[:, None] * factor
         keep("logits", logits), keep("means", means), keep("scale_tril", tril)
         steps = np.arange(1, passes + 1)
@@ -207,9 +201,7 @@ def write_compare(folder: Path, configurations=COMPARED, count: int = 3, **optio
     rows = []
     for name in configurations:
         for seed in range(count):
-            run = load(
-                write_run(folder / name / f"seed_{seed:03d}", configuration=name, seed=seed, **options)
-            )
+            run = load(write_run(folder / name / f"seed_{seed:03d}", configuration=name, seed=seed, **options))
             errors = run.final_theta_error, run.final_trajectory_error
             rows.append([name, seed, *errors, run.success_rate, run.seconds.sum()])
     config = {"format": "jaxlfi-compare", "task": "lotka_volterra", "preset": "quick"}
@@ -217,9 +209,7 @@ def write_compare(folder: Path, configurations=COMPARED, count: int = 3, **optio
     (folder / "config.json").write_text(json.dumps(config))
     with (folder / "table.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(
-            ["configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds"]
-        )
+        writer.writerow(["configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds"])
         writer.writerows([["" if value != value else value for value in row] for row in rows])
     return folder
 
@@ -285,10 +275,7 @@ def test_marginal_density_is_scipys_and_integrates_to_one(pair):
     points = np.stack(np.meshgrid(*[axis] * len(pair)), -1)
     ours = density.density(points, weight, mean, covariance)
     full = tril @ np.swapaxes(tril, 1, 2)
-    each = [
-        stats.multivariate_normal(m[list(pair)], c[np.ix_(pair, pair)])
-        for m, c in zip(means, full, strict=True)
-    ]
+    each = [stats.multivariate_normal(m[list(pair)], c[np.ix_(pair, pair)]) for m, c in zip(means, full, strict=True)]
     expected = sum(
         w * normal.pdf(points) for w, normal in zip(np.exp(logits) / np.exp(logits).sum(), each, strict=True)
     )
@@ -394,9 +381,7 @@ def test_curves_are_means_of_exp_of_negative_losses(compared):
     np.testing.assert_allclose(line(panel(figure, "trajectory"), label).get_ydata(), expected)
     for d, name in enumerate(NAMES):
         theta = np.stack([h.theta_error[..., d] for h in histories])
-        np.testing.assert_allclose(
-            line(panel(figure, name), label).get_ydata(), np.exp(-0.5 * theta).mean((0, 2))
-        )
+        np.testing.assert_allclose(line(panel(figure, name), label).get_ydata(), np.exp(-0.5 * theta).mean((0, 2)))
 
 
 def test_discrepancy_bars_are_means_with_standard_deviations(compared):
@@ -405,9 +390,7 @@ def test_discrepancy_bars_are_means_with_standard_deviations(compared):
         trajectory = np.concatenate([h.trajectory_error[-1] for h in histories])
         trajectory = trajectory[~np.isnan(trajectory)]
         expected = {"trajectory": trajectory}
-        expected |= {
-            n: np.concatenate([h.theta_error[-1, :, d] for h in histories]) for d, n in enumerate(NAMES)
-        }
+        expected |= {n: np.concatenate([h.theta_error[-1, :, d] for h in histories]) for d, n in enumerate(NAMES)}
         for title, values in expected.items():
             bars = panel(figure, title).containers
             drawn_bars = [bar for bar in bars if bar.get_label() == style.configuration_label(name)]
@@ -640,9 +623,7 @@ def test_colours_stay_apart_for_the_colour_blind():
         ],
     }
     for matrix in deficiencies.values():
-        lab = np.array(
-            [cielab(np.clip(np.asarray(matrix) @ linear(to_rgb(colour)), 0, 1)) for colour in colours]
-        )
+        lab = np.array([cielab(np.clip(np.asarray(matrix) @ linear(to_rgb(colour)), 0, 1)) for colour in colours])
         distance = np.linalg.norm(lab[:, None] - lab[None], axis=-1)[np.triu_indices(len(lab), 1)]
         assert distance.min() > 20
 
@@ -789,9 +770,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
     write_compare(tmp_path, ("ok", "misspecified"), 2, dim=2, rounds=3)
     (tmp_path / "ok" / "seed_001" / "history.npz").unlink()
     shorter = tmp_path / "misspecified" / "seed_000"
-    change(
-        shorter, "history.npz", lambda a: a.update({n: v[:2] for n, v in a.items() if v.shape[:1] == (3,)})
-    )
+    change(shorter, "history.npz", lambda a: a.update({n: v[:2] for n, v in a.items() if v.shape[:1] == (3,)}))
     collection = open_collection(tmp_path)
     assert {name: len(runs) for name, runs in collection.runs.items()} == {"ok": 1, "misspecified": 1}
     assert {Path(path).parent.name for path in collection.unfinished} == {"ok", "misspecified"}

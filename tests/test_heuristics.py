@@ -54,8 +54,7 @@ def any_rule() -> st.SearchStrategy[Heuristic]:
 def decided(rule, previous, posterior, feasible, margin: float = 1e-3) -> bool:
     """Whether every comparison the rule makes is decided by more than rounding, and no quantile lies in a gap."""
     evidence = {
-        name: np.asarray(seen)
-        for name, seen in apply(rule, *(previous, posterior, feasible))[1].evidence.items()
+        name: np.asarray(seen) for name, seen in apply(rule, *(previous, posterior, feasible))[1].evidence.items()
     }
     gaps = [np.ones(1)]
     if isinstance(rule, Edge):
@@ -116,8 +115,7 @@ def random_cases(seed: int, n: int = 400, components: int = 3, dim: int = 3):
     logits = draw.normal(0, 1, (2, n, components))
     as_jax = lambda value: jnp.asarray(value, jnp.float32)
     mixtures = [
-        GaussianMixture(as_jax(logits[i]), as_jax(mean), as_jax(tril))
-        for i, mean in enumerate((before, means))
+        GaussianMixture(as_jax(logits[i]), as_jax(mean), as_jax(tril)) for i, mean in enumerate((before, means))
     ]
     support = Support(as_jax(low), as_jax(low + width))
     feasible = Support(as_jax(low - gaps[0]), as_jax(low + width + gaps[1]))
@@ -227,9 +225,7 @@ def test_mode_is_algorithm_3(rule, seed):
 
 
 def test_mode_does_nothing_in_the_first_iteration_of_algorithm_3():
-    box = oracle.mode(
-        [0.0], [1.0], [-1.0], [2.0], [1.0], np.array([[0.1]]), np.array([[0.9]]), 0.0, 1.0, 0.0, 0.2, 0
-    )
+    box = oracle.mode([0.0], [1.0], [-1.0], [2.0], [1.0], np.array([[0.1]]), np.array([[0.9]]), 0.0, 1.0, 0.0, 0.2, 0)
     assert (box[0], box[1]) == (0.0, 1.0)
 
 
@@ -512,9 +508,7 @@ def test_the_order_of_dimensions_does_not_matter(rule, problem, data):
         return jax.tree.map(leaf, tree)
 
     def keep_logits(mixture):
-        return GaussianMixture(
-            mixture.logits, *(reorder(part) for part in (mixture.means, mixture.scale_tril))
-        )
+        return GaussianMixture(mixture.logits, *(reorder(part) for part in (mixture.means, mixture.scale_tril)))
 
     previous, posterior, feasible = problem
     belief, _ = apply(rule, *problem)
@@ -621,9 +615,7 @@ def test_reading_f_zone_width_is_absolute_and_zone_fraction_relative():
         }.items()
     }
     np.testing.assert_allclose(masses["F"], posterior.marginal_cdf(box.low + 0.3), rtol=1e-5)
-    np.testing.assert_allclose(
-        masses["both"], posterior.marginal_cdf(box.low + 0.3 + 0.1 * box.width), rtol=1e-5
-    )
+    np.testing.assert_allclose(masses["both"], posterior.marginal_cdf(box.low + 0.3 + 0.1 * box.width), rtol=1e-5)
 
 
 @pytest.mark.parametrize("tail", [0.0, 0.25, 1.0])
@@ -640,12 +632,8 @@ def test_reading_g_tail_weighs_the_mass_beyond_the_bound(tail):
 
 def test_reading_g_keeps_edge_working_when_the_mode_has_left_the_box():
     previous, posterior, feasible = example()
-    gone = GaussianMixture(
-        posterior.logits, jnp.array([[-3.0, 4.0], [-3.5, 4.0]]), 0.1 * posterior.scale_tril
-    )
-    with_tail, zone_alone = (
-        apply(Edge(tail=tail), previous, gone, feasible)[0].support for tail in (1.0, 0.0)
-    )
+    gone = GaussianMixture(posterior.logits, jnp.array([[-3.0, 4.0], [-3.5, 4.0]]), 0.1 * posterior.scale_tril)
+    with_tail, zone_alone = (apply(Edge(tail=tail), previous, gone, feasible)[0].support for tail in (1.0, 0.0))
     np.testing.assert_allclose(with_tail.low, [-0.8, 2.0], rtol=1e-6)
     np.testing.assert_array_equal(zone_alone.low, [0.0, 2.0])
 
@@ -751,9 +739,7 @@ def test_vmap_over_hyperparameters_is_a_loop(name):
     rule = RULES[name]
     lanes = [rule, jax.tree.map(lambda value: value * 2, rule)]
     together = jax.jit(jax.vmap(lambda lane: lane(*example())))(stack(*lanes))
-    chex.assert_trees_all_close(
-        together, stack(*(apply(lane, *example()) for lane in lanes)), rtol=1e-6, atol=1e-6
-    )
+    chex.assert_trees_all_close(together, stack(*(apply(lane, *example()) for lane in lanes)), rtol=1e-6, atol=1e-6)
 
 
 def test_pytree_round_trip(rule):

@@ -56,9 +56,7 @@ def test_the_command_line_and_the_library_agree(tmp_path):
     assert files[0] == files[1]
     for name in ("posterior.npz", "dataset.npz", "history.npz", "observation.npz"):
         ours, same = (atomic.read_arrays(tmp_path / folder / name) for folder in ("library", "cli"))
-        assert {key: value.shape for key, value in ours.items()} == {
-            key: value.shape for key, value in same.items()
-        }
+        assert {key: value.shape for key, value in ours.items()} == {key: value.shape for key, value in same.items()}
     history, same = (atomic.read_arrays(tmp_path / folder / "history.npz") for folder in ("library", "cli"))
     # The two programs round differently, and a draw on the edge between two components may fall to either.
     near = np.isclose(history["sample_theta"], same["sample_theta"], rtol=5e-3, atol=5e-3).all(axis=-1)

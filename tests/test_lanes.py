@@ -72,19 +72,14 @@ def test_each_lane_is_the_pure_run_of_its_seed(stepped, index):
 def test_lanes_of_one_seed_share_their_first_draws(stepped):
     _, rows, _, _ = stepped
     theta = rows[0]["theta"]
-    unit = [
-        (t - np.asarray(x.support.low)) / np.asarray(x.support.width)
-        for t, x in zip(theta, LANES, strict=True)
-    ]
+    unit = [(t - np.asarray(x.support.low)) / np.asarray(x.support.width) for t, x in zip(theta, LANES, strict=True)]
     np.testing.assert_allclose(unit[0], unit[1], atol=1e-5)
     assert not np.allclose(unit[1], unit[2], atol=1e-2)
 
 
 def test_evidence_is_the_lanes_own(stepped):
     _, rows, places, _ = stepped
-    seen = [
-        {name for name in own_evidence(rows[0], place) if name.startswith("evidence/")} for place in places
-    ]
+    seen = [{name for name in own_evidence(rows[0], place) if name.startswith("evidence/")} for place in places]
     assert seen[0] == set()
     assert seen[1] == seen[3] == {"evidence/mass_left", "evidence/mass_right"}
     assert seen[2] == {"evidence/mode_shift", "evidence/weight_left", "evidence/weight_right"}

@@ -101,16 +101,12 @@ class TestDistribution:
         trajectory = trajectory[failure == lv.SUCCESS]
         states = trajectory[:, GOLDEN_RECORDS].reshape(len(trajectory), -1)
         ours = np.concatenate([np.asarray(summarise_many(trajectory)), states], axis=1)
-        pvalues = [
-            stats.ks_2samp(*columns).pvalue for columns in zip(ours.T, expected.T, strict=True)
-        ]
+        pvalues = [stats.ks_2samp(*columns).pvalue for columns in zip(ours.T, expected.T, strict=True)]
         assert min(pvalues) > 1e-3, pvalues
 
     def test_pure_prey_birth_is_a_yule_process(self):
         rate, initial, count = 0.7, 20, 8192
-        process = lv.JumpProcess(
-            predators=0, prey=initial, duration=2.0, interval=0.5, record="before"
-        )
+        process = lv.JumpProcess(predators=0, prey=initial, duration=2.0, interval=0.5, record="before")
         trajectory, failure = draw(5, [NEVER, NEVER, np.log(rate), NEVER], count, batched(process))
         assert not failure.any() and not trajectory[..., 0].any()
         growth = np.exp(rate * 0.5 * np.arange(1, 5))
@@ -177,16 +173,12 @@ class TestDistribution:
         keys = jax.random.split(jax.random.key(9), count)
         log_rates = jax.random.uniform(jax.random.key(10), (count, 4), minval=-5, maxval=2)
         trajectory, failure = simulate_many(keys, log_rates)
-        summaries = np.asarray(summarise_many(trajectory))[np.asarray(failure) == lv.SUCCESS][
-            :20_000
-        ]
+        summaries = np.asarray(summarise_many(trajectory))[np.asarray(failure) == lv.SUCCESS][:20_000]
         assert len(summaries) == 20_000
         error = np.array(PILOT_STD) / np.sqrt(PILOT_SIZE)
         assert np.all(np.abs(summaries.mean(0) - PILOT_MEAN) < 4 * error)
         bounded = slice(4, 9)  # correlations: their standard deviation has a small error of its own
-        assert np.allclose(
-            summaries.std(0, ddof=1)[bounded], np.array(PILOT_STD)[bounded], rtol=0.12
-        )
+        assert np.allclose(summaries.std(0, ddof=1)[bounded], np.array(PILOT_STD)[bounded], rtol=0.12)
 
 
 class TestRecords:
@@ -231,9 +223,7 @@ class TestRecords:
         trajectory, failure = draw(14, [2.0, NEVER, 2.0, NEVER], 256)
         assert (failure == lv.TOO_MANY_EVENTS).all()
         assert np.isfinite(trajectory).all()
-        assert (
-            trajectory[:, -1].sum(-1) == 150 + 10_000
-        ).all()  # births only: the last state counts events
+        assert (trajectory[:, -1].sum(-1) == 150 + 10_000).all()  # births only: the last state counts events
 
     @pytest.mark.parametrize("limit", [127, 128, 129])
     def test_event_limit_is_exact(self, limit):
@@ -432,9 +422,7 @@ class TestCounterRng:
         assert stats.kstest(uniforms, "uniform").pvalue > 1e-3
         assert stats.kstest(exponentials, "expon").pvalue > 1e-3
         tail = (exponentials > 10).sum()
-        assert stats.poisson(exponentials.size * np.exp(-10)).cdf(tail) == pytest.approx(
-            0.5, abs=0.499
-        )
+        assert stats.poisson(exponentials.size * np.exp(-10)).cdf(tail) == pytest.approx(0.5, abs=0.499)
 
     def test_ends_of_the_range(self):
         ends = jnp.array([0, 1, 2**32 - 1], jnp.uint32)

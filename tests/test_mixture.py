@@ -65,9 +65,7 @@ def reference_mass(mixture: GaussianMixture, low, high) -> np.ndarray:
 @given(shapes().flatmap(lambda kd: st.tuples(mixtures(*kd), vectors(-5.0, 5.0, 6, kd[1]))))
 def test_log_prob_is_scipys(drawn):
     mixture, theta = drawn
-    np.testing.assert_allclose(
-        LOG_PROB(mixture, theta), reference_log_prob(mixture, theta), rtol=1e-3, atol=1e-3
-    )
+    np.testing.assert_allclose(LOG_PROB(mixture, theta), reference_log_prob(mixture, theta), rtol=1e-3, atol=1e-3)
 
 
 @given(shapes().flatmap(lambda kd: st.tuples(mixtures(*kd), vectors(-5.0, 5.0, kd[1]))))
@@ -75,9 +73,7 @@ def test_component_log_prob_adds_up_to_log_prob(drawn):
     mixture, theta = drawn
     _, means, covariances = reference(mixture)
     each = jax.jit(component_log_prob)(mixture, jnp.asarray(theta))
-    expected = [
-        stats.multivariate_normal(m, c).logpdf(theta) for m, c in zip(means, covariances, strict=True)
-    ]
+    expected = [stats.multivariate_normal(m, c).logpdf(theta) for m, c in zip(means, covariances, strict=True)]
     np.testing.assert_allclose(each, expected, rtol=1e-3, atol=1e-3)
 
 
@@ -85,9 +81,7 @@ def test_component_log_prob_adds_up_to_log_prob(drawn):
 def test_interval_mass_and_cdf_are_scipys(drawn):
     mixture, bounds = drawn
     low, high = np.sort(bounds, axis=0)
-    np.testing.assert_allclose(
-        INTERVAL_MASS(mixture, low, high), reference_mass(mixture, low, high), atol=3e-6
-    )
+    np.testing.assert_allclose(INTERVAL_MASS(mixture, low, high), reference_mass(mixture, low, high), atol=3e-6)
     expected = reference_mass(mixture, np.full_like(low, -np.inf), high)
     np.testing.assert_allclose(MARGINAL_CDF(mixture, high), expected, atol=3e-6)
 
@@ -101,21 +95,15 @@ def test_far_tails_keep_their_relative_precision(z, length, scale, upper):
     low, high = (near, far) if upper else (far, near)
     # A rounded bound moves the mass by about z times its error in scales.
     tolerance = 1e-4 * (1 + z / scale)
-    np.testing.assert_allclose(
-        INTERVAL_MASS(mixture, low, high), reference_mass(mixture, low, high), rtol=tolerance
-    )
+    np.testing.assert_allclose(INTERVAL_MASS(mixture, low, high), reference_mass(mixture, low, high), rtol=tolerance)
     infinite = np.full(2, np.inf, np.float32)
     low, high = (near, infinite) if upper else (-infinite, near)
-    np.testing.assert_allclose(
-        INTERVAL_MASS(mixture, low, high), reference_mass(mixture, low, high), rtol=tolerance
-    )
+    np.testing.assert_allclose(INTERVAL_MASS(mixture, low, high), reference_mass(mixture, low, high), rtol=tolerance)
 
 
 def test_tail_masses_by_hand():
     """Phi(-6) - Phi(-7) and the like, also where a plain difference of CDFs would be zero in float32."""
-    mixture = GaussianMixture(
-        jnp.log(jnp.array([0.75, 0.25])), jnp.array([[0.0], [100.0]]), jnp.ones((2, 1, 1))
-    )
+    mixture = GaussianMixture(jnp.log(jnp.array([0.75, 0.25])), jnp.array([[0.0], [100.0]]), jnp.ones((2, 1, 1)))
     for low, high, mass in (
         (6.0, 7.0, 0.75 * 9.853078e-10),
         (-7.0, -6.0, 0.75 * 9.853078e-10),
@@ -278,11 +266,7 @@ def test_low_variance_draws_come_in_random_order(key):
     assert abs(second[:1000].sum() - 500) < 5 * np.sqrt(2000) / 4
 
 
-@given(
-    shapes().flatmap(
-        lambda kd: st.tuples(mixtures(*kd), vectors(0.1, 3.0, kd[1]), vectors(-3.0, 3.0, 2, kd[1]))
-    )
-)
+@given(shapes().flatmap(lambda kd: st.tuples(mixtures(*kd), vectors(0.1, 3.0, kd[1]), vectors(-3.0, 3.0, 2, kd[1]))))
 def test_affine_changes_variables(drawn):
     mixture, scale, (shift, theta) = drawn
     moved = AFFINE(mixture, scale, shift)
@@ -330,14 +314,9 @@ def test_properties_of_a_batch_are_those_of_its_members():
         return mixture.weights, mixture.covariances, mixture.marginal_scales, mixture.mean, mixture.covariance
 
     batch = GaussianMixture(
-        *(
-            np.stack([leaf, 0.5 * np.asarray(leaf)])
-            for leaf in (EXAMPLE.logits, EXAMPLE.means, EXAMPLE.scale_tril)
-        )
+        *(np.stack([leaf, 0.5 * np.asarray(leaf)]) for leaf in (EXAMPLE.logits, EXAMPLE.means, EXAMPLE.scale_tril))
     )
     together = jax.jit(properties)(batch)
     for i in range(2):
         alone = jax.jit(properties)(jax.tree.map(lambda leaf, i=i: leaf[i], batch))
-        chex.assert_trees_all_close(
-            tuple(np.asarray(part)[i] for part in together), alone, rtol=1e-5, atol=1e-6
-        )
+        chex.assert_trees_all_close(tuple(np.asarray(part)[i] for part in together), alone, rtol=1e-5, atol=1e-6)

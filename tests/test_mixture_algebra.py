@@ -36,9 +36,7 @@ GRID = jnp.stack(jnp.meshgrid(jnp.linspace(-2.0, 2.5, 9), jnp.linspace(-2.0, 2.0
 def gaussian(mean, covariance) -> GaussianMixture:
     """One Gaussian as a mixture."""
     tril = np.linalg.cholesky(np.asarray(covariance, float))
-    return GaussianMixture(
-        jnp.zeros(1), jnp.asarray([mean], jnp.float32), jnp.asarray(tril[None], jnp.float32)
-    )
+    return GaussianMixture(jnp.zeros(1), jnp.asarray([mean], jnp.float32), jnp.asarray(tril[None], jnp.float32))
 
 
 _log_prob = jax.jit(GaussianMixture.log_prob)
@@ -62,9 +60,7 @@ def is_density_of(mixture: GaussianMixture, expected, theta, **tolerance):
 
 @given(
     shapes().flatmap(
-        lambda kd: st.tuples(
-            mixtures(*kd, spread=1.5), mixtures(3, kd[1], spread=1.5), vectors(-2.0, 2.0, 5, kd[1])
-        )
+        lambda kd: st.tuples(mixtures(*kd, spread=1.5), mixtures(3, kd[1], spread=1.5), vectors(-2.0, 2.0, 5, kd[1]))
     )
 )
 def test_product_is_the_product_of_densities(drawn):
@@ -77,9 +73,7 @@ def test_product_is_the_product_of_densities(drawn):
 
 
 @given(
-    shapes().flatmap(
-        lambda kd: st.tuples(mixtures(*kd, spread=1.5), mixtures(1, kd[1]), vectors(-2.0, 2.0, 5, kd[1]))
-    )
+    shapes().flatmap(lambda kd: st.tuples(mixtures(*kd, spread=1.5), mixtures(1, kd[1]), vectors(-2.0, 2.0, 5, kd[1])))
 )
 def test_quotient_by_a_wide_gaussian_is_the_quotient_of_densities(drawn):
     a, b, theta = drawn
@@ -105,9 +99,7 @@ def test_product_and_quotient_are_their_densities_on_a_grid():
 def test_pairs_are_ordered_a_first():
     both, _ = PRODUCT(
         A,
-        GaussianMixture(
-            jnp.zeros(2), jnp.array([[9.0, 9.0], [0.0, 0.0]]), 1e-3 * jnp.eye(2)[None].repeat(2, 0)
-        ),
+        GaussianMixture(jnp.zeros(2), jnp.array([[9.0, 9.0], [0.0, 0.0]]), 1e-3 * jnp.eye(2)[None].repeat(2, 0)),
     )
     # The second factor is so narrow that each pair's mean is its own.
     np.testing.assert_allclose(both.means, [[9.0, 9.0], [0.0, 0.0]] * 3, atol=1e-2)
@@ -122,24 +114,19 @@ def test_one_dimension_by_hand():
     np.testing.assert_allclose(both.logits, [stats.norm(3.0, 1.25**0.5).logpdf(1.0)], rtol=1e-5)
     np.testing.assert_allclose(ratio.means, [[1 / 3]], rtol=1e-5)
     np.testing.assert_allclose(ratio.covariances, [[[1 / 3]]], rtol=1e-5)
-    expected = (
-        stats.norm(1, 0.5).logpdf(0) - stats.norm(3, 1).logpdf(0) - stats.norm(1 / 3, 3**-0.5).logpdf(0)
-    )
+    expected = stats.norm(1, 0.5).logpdf(0) - stats.norm(3, 1).logpdf(0) - stats.norm(1 / 3, 3**-0.5).logpdf(0)
     np.testing.assert_allclose(ratio.logits, [expected], rtol=1e-5)
 
 
 def test_weights_by_hand():
     """Asymmetric weights of two components times, and over, one Gaussian (the signs others got wrong)."""
-    a = GaussianMixture(
-        jnp.log(jnp.array([0.5, 0.5])), jnp.array([[0.0], [2.0]]), jnp.array([[[0.5]], [[0.4]]])
-    )
+    a = GaussianMixture(jnp.log(jnp.array([0.5, 0.5])), jnp.array([[0.0], [2.0]]), jnp.array([[[0.5]], [[0.4]]]))
     b = gaussian([3.0], [[4.0]])
     evidence = np.array([stats.norm(3, np.sqrt(4.0 + s**2)).pdf(m) for m, s in ((0.0, 0.5), (2.0, 0.4))])
     np.testing.assert_allclose(PRODUCT(a, b)[0].weights, evidence / evidence.sum(), rtol=1e-5)
     theta = np.linspace(-6.0, 8.0, 20_001)
     over = [
-        np.trapezoid(stats.norm(m, s).pdf(theta) / stats.norm(3, 2).pdf(theta), theta)
-        for m, s in ((0, 0.5), (2, 0.4))
+        np.trapezoid(stats.norm(m, s).pdf(theta) / stats.norm(3, 2).pdf(theta), theta) for m, s in ((0, 0.5), (2, 0.4))
     ]
     np.testing.assert_allclose(QUOTIENT(a, b)[0].weights, over / np.sum(over), rtol=1e-4)
 
@@ -180,9 +167,7 @@ def test_pairs_that_are_not_positive_definite_are_reported():
 def test_definite_pairs_are_exact_under_every_policy(policy):
     ratio, _ = QUOTIENT(A, NARROW_IN_ONE, policy=policy)
     precision = np.linalg.inv(np.asarray(A.covariances[1], float)) - np.diag([1 / 0.45**2, 1 / 81])
-    np.testing.assert_allclose(
-        np.linalg.inv(np.asarray(ratio.covariances[1], float)), precision, rtol=1e-3, atol=1e-3
-    )
+    np.testing.assert_allclose(np.linalg.inv(np.asarray(ratio.covariances[1], float)), precision, rtol=1e-3, atol=1e-3)
     alone = jax.tree.map(lambda leaf: leaf[1:2], A)
     exact = log_prob(alone, GRID) + np.log(0.3) - log_prob(NARROW_IN_ONE, GRID)
     kept = GaussianMixture(ratio.logits[1:2], ratio.means[1:2], ratio.scale_tril[1:2])
@@ -277,9 +262,7 @@ def test_a_divisor_in_equal_parts_is_the_divisor():
         jnp.log(jnp.array([0.2, 0.8])),
         *(jnp.concatenate([leaf, leaf]) for leaf in (WIDE.means, WIDE.scale_tril)),
     )
-    is_density_of(
-        QUOTIENT(A, halves)[0], log_prob(A, GRID) - log_prob(WIDE, GRID), GRID, rtol=1e-4, atol=1e-3
-    )
+    is_density_of(QUOTIENT(A, halves)[0], log_prob(A, GRID) - log_prob(WIDE, GRID), GRID, rtol=1e-4, atol=1e-3)
 
 
 def test_a_divisor_of_several_components_bounds_the_quotient_from_above():
@@ -341,9 +324,7 @@ def test_reduction_merges_clusters(order):
     sizes, centres = (1, 2, 3), ((0.0, 0.0), (30.0, 5.0), (-5.0, 40.0))
     draw = np.random.default_rng(3)
     weights = draw.uniform(0.5, 2.0, 6)
-    means = np.concatenate(
-        [centre + draw.normal(0, 0.7, (n, 2)) for n, centre in zip(sizes, centres, strict=True)]
-    )
+    means = np.concatenate([centre + draw.normal(0, 0.7, (n, 2)) for n, centre in zip(sizes, centres, strict=True)])
     scales = draw.uniform(0.5, 1.5, 6)
     mixture = GaussianMixture(
         jnp.asarray(np.log(weights), jnp.float32),
@@ -358,14 +339,10 @@ def test_reduction_merges_clusters(order):
         share = weights[group] / weights[group].sum()
         mean = share @ means[group]
         spread = means[group] - mean
-        covariance = np.einsum("k,ki,kj->ij", share, spread, spread) + (share @ scales[group] ** 2) * np.eye(
-            2
-        )
+        covariance = np.einsum("k,ki,kj->ij", share, spread, spread) + (share @ scales[group] ** 2) * np.eye(2)
         assert np.exp(reduced.logits[k]) == pytest.approx(weights[group].sum() / weights.sum(), rel=1e-5)
         np.testing.assert_allclose(reduced.means[k], mean, rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(
-            reduced.scale_tril[k] @ reduced.scale_tril[k].T, covariance, rtol=1e-3, atol=1e-4
-        )
+        np.testing.assert_allclose(reduced.scale_tril[k] @ reduced.scale_tril[k].T, covariance, rtol=1e-3, atol=1e-4)
 
 
 def reference_reduction(mixture: GaussianMixture, components: int):
@@ -440,9 +417,7 @@ def test_reduction_drops_absent_components_first(present, components):
 
 @pytest.mark.parametrize("components", [0, 4])
 def test_impossible_numbers_of_components_are_named(components):
-    with pytest.raises(
-        ValueError, match=f"components: expected between 1 and the mixture's 3, got {components}"
-    ):
+    with pytest.raises(ValueError, match=f"components: expected between 1 and the mixture's 3, got {components}"):
         reduce(A, components)
 
 

@@ -162,17 +162,11 @@ def test_the_ledger_agrees_with_the_history(folder):
     history = atomic.read_arrays(folder / "history.npz")
     assert [line["round"] for line in ledger] == [0, 1]
     for i, line in enumerate(ledger):
-        assert (
-            line["attempted"]
-            == history["counted"][i].sum()
-            == line["succeeded"] + sum(line["failed"].values())
-        )
+        assert line["attempted"] == history["counted"][i].sum() == line["succeeded"] + sum(line["failed"].values())
         assert line["support_low"] == history["support_low"][i].tolist()
         assert line["proposal_high"] == history["proposal_high"][i].tolist()
         assert line["evidence"]["mass_right"] == history["evidence/mass_right"][i].tolist()
-        np.testing.assert_allclose(
-            line["theta_error"], history["sample_theta_error"][i].sum(-1).mean(), rtol=1e-6
-        )
+        np.testing.assert_allclose(line["theta_error"], history["sample_theta_error"][i].sum(-1).mean(), rtol=1e-6)
         assert np.isnan(line["validation_loss"])  # null in the file: there was nothing held out
     assert history["proposal_low"][0].tolist() == [-3, -3]
     np.testing.assert_array_equal(history["proposal_high"][1], history["support_high"][0])
@@ -208,9 +202,7 @@ def test_settings_survive_their_description(preset):
 def test_heuristics_survive_their_description(heuristic):
     again = heuristic_from_json(json.loads(json.dumps(heuristic_to_json(heuristic))))
     assert jax.tree.structure(again) == jax.tree.structure(heuristic)
-    assert all(
-        np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(heuristic), strict=True)
-    )
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(heuristic), strict=True))
 
 
 class Killed(BaseException):
@@ -330,9 +322,7 @@ def test_python_objects_are_never_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "content", [None, "{", "[]", '{"format": "other"}', '{"format": "jaxlfi-run", "version": 99}']
-)
+@pytest.mark.parametrize("content", [None, "{", "[]", '{"format": "other"}', '{"format": "jaxlfi-run", "version": 99}'])
 def test_foreign_folders_are_refused(tmp_path, content):
     if content is not None:
         (tmp_path / "config.json").write_text(content)

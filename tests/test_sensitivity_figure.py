@@ -18,9 +18,7 @@ SHAPE = (2, 3, 4, 5)
 def grid_of_noise(**arrays) -> sensitivity.Grid:
     """Every axis of another length, so that a swapped one shows; a few runs without a trajectory error."""
     rng = np.random.default_rng(0)
-    made = {
-        name: rng.gamma(2.0, 1.0, SHAPE) for name in ("theta_error", "trajectory_error", "success_rate")
-    }
+    made = {name: rng.gamma(2.0, 1.0, SHAPE) for name in ("theta_error", "trajectory_error", "success_rate")}
     made["trajectory_error"][0, 1, :2, 3] = np.nan
     return sensitivity.Grid(NAMES, VALUES, DEFAULTS, made | arrays)
 
@@ -70,9 +68,7 @@ def test_the_diagonal_shows_each_hyperparameter_alone():
     for place in range(3):
         upper, lower = panels[place, place].images
         for image, name in ((upper, "trajectory_error"), (lower, "theta_error")):
-            expected = [
-                by_hand(grid.arrays[name], **{NAMES[place]: i}).mean() for i in range(SHAPE[place])
-            ]
+            expected = [by_hand(grid.arrays[name], **{NAMES[place]: i}).mean() for i in range(SHAPE[place])]
             np.testing.assert_allclose(image.get_array()[0], expected)
         # The axis runs downwards: the trajectory's band ends where the parameters' begins.
         assert upper.get_extent()[2] == lower.get_extent()[3]
@@ -133,8 +129,7 @@ def test_any_number_of_hyperparameters_fits(axes):
     names = ("zone_fraction", "mass_threshold", "expansion", "tail", "zone_width")[:axes]
     shape = (3,) * axes + (2,)
     arrays = {
-        name: np.random.default_rng(1).random(shape)
-        for name in ("theta_error", "trajectory_error", "success_rate")
+        name: np.random.default_rng(1).random(shape) for name in ("theta_error", "trajectory_error", "success_rate")
     }
     grid = sensitivity.Grid(names, ((0.1, 0.2, 0.3),) * axes, (0.2,) * axes, arrays)
     width, _ = sensitivity.size(grid, 2)
@@ -156,10 +151,7 @@ def folder(tmp_path):
         "settings": {"rounds": 2},
         "seeds": [0, 1, 2, 3, 4],
         "runs": 120,
-        "axes": [
-            {"name": n, "values": list(v), "default": d}
-            for n, v, d in zip(NAMES, VALUES, DEFAULTS, strict=True)
-        ],
+        "axes": [{"name": n, "values": list(v), "default": d} for n, v, d in zip(NAMES, VALUES, DEFAULTS, strict=True)],
     }
     atomic.write_json(tmp_path / "config.json", config)
     values = {f"values/{name}": np.array(v) for name, v in zip(NAMES, VALUES, strict=True)}

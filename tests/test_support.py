@@ -105,9 +105,7 @@ def test_bounds_belong_to_the_box():
 
 
 def test_to_unit_takes_the_bounds_to_plus_and_minus_one():
-    np.testing.assert_allclose(
-        PHI.to_unit(jnp.stack([PHI.low, PHI.high, PHI.centre])), [[-1, -1], [1, 1], [0, 0]]
-    )
+    np.testing.assert_allclose(PHI.to_unit(jnp.stack([PHI.low, PHI.high, PHI.centre])), [[-1, -1], [1, 1], [0, 0]])
     np.testing.assert_allclose(PHI.to_unit(jnp.array([0.0, 2.5])), [-0.6, -0.5], rtol=1e-6)
 
 

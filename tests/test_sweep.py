@@ -414,9 +414,7 @@ def test_two_devices_give_what_one_gives(finished, tmp_path):
     assert "in 2 chunks of 5" in told and json.loads((out / "config.json").read_text())["devices"] == 2
     arrays = atomic.read_arrays(out / "grid.npz")
     for name in sweep.MEASURES:  # seeds 0 and 1 here, 3, 0 and 1 there
-        np.testing.assert_allclose(
-            arrays[name], finished[2][name][:, :, 1:], rtol=5e-3, atol=5e-3, err_msg=name
-        )
+        np.testing.assert_allclose(arrays[name], finished[2][name][:, :, 1:], rtol=5e-3, atol=5e-3, err_msg=name)
 
 
 TWO_PROCESSES = """

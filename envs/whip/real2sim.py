@@ -150,4 +150,3 @@ def whip_task(
 
 def _told(box: Support) -> Support:
     return Support(np.asarray(box.low) * MILLIMETRES, np.asarray(box.high) * MILLIMETRES)
-

@@ -15,9 +15,7 @@ from envs.whip.kinematics import frames
 from envs.whip.parameters import WhipParameters
 
 
-def seen(
-    engine: Engine, parameters: WhipParameters, actions: Float[Array, "time 2"]
-) -> tuple[Frames, Bool[Array, ""]]:
+def seen(engine: Engine, parameters: WhipParameters, actions: Float[Array, "time 2"]) -> tuple[Frames, Bool[Array, ""]]:
     """What there is to see of one scene before each action and after the last, T + 1 frames.
 
     The actions are applied to their end, whatever is hit and wherever the gripper goes.

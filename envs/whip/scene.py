@@ -202,9 +202,7 @@ def _add_cubes(spec: mujoco.MjSpec, parameters: WhipParameters) -> None:
         body = spec.worldbody.add_body(name=name, pos=place)
         _set_inertia(body, density * side**3, [density * side**5 / 6] * 3)
         body.add_freejoint(name=name)
-        geom = body.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[side / 2] * 3, rgba=RGBA[colour], mass=0
-        )
+        geom = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[side / 2] * 3, rgba=RGBA[colour], mass=0)
         geom.contype = geom.conaffinity = 0
 
 

@@ -102,9 +102,7 @@ def ours(config: Config, setting: str, shards: int) -> tuple[Run, float]:
         split = jax.sharding.PartitionSpec("shard")
         place = jax.sharding.NamedSharding(mesh, split)
         arguments = jax.device_put((keys, log_rates), place)
-        compiled = jax.jit(
-            jax.shard_map(function, mesh=mesh, in_specs=split, out_specs=outputs(split))
-        )
+        compiled = jax.jit(jax.shard_map(function, mesh=mesh, in_specs=split, out_specs=outputs(split)))
         return lambda: compiled(*arguments)
 
     def work(keys, log_rates):
@@ -160,9 +158,7 @@ def textbook_numba(config: Config, setting: str) -> Run:
     try:
         import numba
     except ImportError as error:
-        raise ImportError(
-            "numba is missing: install the extra `bench` to compare with it"
-        ) from error
+        raise ImportError("numba is missing: install the extra `bench` to compare with it") from error
 
     rates = np.exp(np.asarray(log_rates_of(setting, config.simulations), np.float64))
     initial = (float(PROCESS.predators), float(PROCESS.prey))

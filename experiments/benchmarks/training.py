@@ -79,12 +79,8 @@ def our_steps(estimator: Estimator, steps: int) -> Callable[[], object]:
         round=jnp.zeros(ROWS, jnp.int32),
         size=jnp.asarray(ROWS),
     )
-    network = Network(
-        initialise(key, estimator, DIM, OBS), fit_normaliser(estimator.normaliser, data.x, data.valid)
-    )
-    run = jax.jit(
-        lambda key: fit(key, estimator, network, data, jnp.ones(ROWS), task.feasible, ROWS)[1].loss
-    )
+    network = Network(initialise(key, estimator, DIM, OBS), fit_normaliser(estimator.normaliser, data.x, data.valid))
+    run = jax.jit(lambda key: fit(key, estimator, network, data, jnp.ones(ROWS), task.feasible, ROWS)[1].loss)
     return lambda: jax.block_until_ready(run(key))
 
 

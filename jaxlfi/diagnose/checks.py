@@ -127,9 +127,7 @@ def _curve_check(name: str, result: diagnostics.Uniformity, verdict: str) -> Che
     return Check(name, statistic, expected, result.p_value, verdict, numbers)
 
 
-def _classifier_check(
-    subject: Subject, plan: Plan, truths: Mapping[str, np.ndarray], draws: np.ndarray
-) -> Check:
+def _classifier_check(subject: Subject, plan: Plan, truths: Mapping[str, np.ndarray], draws: np.ndarray) -> Check:
     """Whether truths can be told from posterior draws, when their simulations are seen as well."""
     x = np.asarray(TRANSFORMS[subject.run.settings.estimator.normaliser](jnp.asarray(truths["x"])))
     rows = [np.concatenate([theta, x], axis=1) for theta in (truths["theta"], draws[:, 0])]

@@ -67,9 +67,7 @@ class Collection:
 
 def representative(histories: Sequence[History]) -> History:
     """The seed of median parameter error (the lower of two); the first where the truth is unknown."""
-    ranked = sorted(
-        (h for h in histories if np.isfinite(h.final_theta_error)), key=lambda h: h.final_theta_error
-    )
+    ranked = sorted((h for h in histories if np.isfinite(h.final_theta_error)), key=lambda h: h.final_theta_error)
     return ranked[(len(ranked) - 1) // 2] if ranked else histories[0]
 
 
@@ -97,9 +95,7 @@ def open_collection(folder: Path | str) -> Collection:
         runs = {histories[0].configuration: histories} if histories else {}
     else:
         folders = {
-            path.name: path
-            for path in folder.iterdir()
-            if path.name != "checkpoint" and any(path.glob("seed_*"))
+            path.name: path for path in folder.iterdir() if path.name != "checkpoint" and any(path.glob("seed_*"))
         }
         runs = {name: _seeds(folders[name], name, unfinished) for name in _ordered(folders, config)}
     runs = _alike(folder, runs, unfinished)
@@ -162,9 +158,7 @@ def _ordered(names: Mapping[str, Path], config: Mapping[str, Any]) -> list[str]:
     return sorted(names, key=rank)
 
 
-def _alike(
-    folder: Path, runs: Mapping[str, list[History]], unfinished: list[str]
-) -> dict[str, list[History]]:
+def _alike(folder: Path, runs: Mapping[str, list[History]], unfinished: list[str]) -> dict[str, list[History]]:
     """The runs that can be put side by side: of the same parameters, and as many rounds as the longest."""
     every = [history for histories in runs.values() for history in histories]
     for history in every[1:]:

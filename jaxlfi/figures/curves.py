@@ -33,9 +33,7 @@ def middle_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def drawable(runs: Runs) -> bool:
     """Whether there is a discrepancy to show."""
-    return any(
-        h.trajectory_error is not None or h.theta_error is not None for hs in runs.values() for h in hs
-    )
+    return any(h.trajectory_error is not None or h.theta_error is not None for hs in runs.values() for h in hs)
 
 
 def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:

@@ -16,9 +16,7 @@ def weighted_mean(logits: np.ndarray, means: np.ndarray) -> np.ndarray:
     return np.einsum("...k,...kd->...d", weights(logits), means)
 
 
-def marginal(
-    means: np.ndarray, scale_tril: np.ndarray, dims: tuple[int, ...]
-) -> tuple[np.ndarray, np.ndarray]:
+def marginal(means: np.ndarray, scale_tril: np.ndarray, dims: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Means [K, m] and covariances [K, m, m] of the components over some of the parameters."""
     chosen = list(dims)
     factor = scale_tril[:, chosen, :].astype(float)

@@ -163,11 +163,7 @@ class History:
     @property
     def final_trajectory_error(self) -> float:
         """Last round's distance from the observed trajectory, averaged over samples that did not fail."""
-        return (
-            float("nan")
-            if self.trajectory_error is None
-            else float(statistics.mean(self.trajectory_error[-1]))
-        )
+        return float("nan") if self.trajectory_error is None else float(statistics.mean(self.trajectory_error[-1]))
 
     @property
     def success_rate(self) -> float:
@@ -205,9 +201,7 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
         configuration=configuration or _configuration(config),
         seed=config["seed"] if isinstance(config.get("seed"), int) else 0,
         config=config,
-        names=_texts(
-            observation.get("names"), config.get("coordinates") or config.get("names"), dim, "theta {}"
-        ),
+        names=_texts(observation.get("names"), config.get("coordinates") or config.get("names"), dim, "theta {}"),
         units=_texts(None, config.get("units"), dim, ""),
         counted=counted,
         kept=arrays["kept"].astype(bool),
@@ -249,9 +243,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / "config.json"
     if not path.is_file():
-        raise ValueError(
-            f"{folder}: expected a folder with config.json, as `jaxlfi infer --out` writes, found none"
-        )
+        raise ValueError(f"{folder}: expected a folder with config.json, as `jaxlfi infer --out` writes, found none")
     try:
         config = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -323,9 +315,7 @@ def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     }.items():
         got = arrays[name].shape if name in arrays else shape
         if len(got) != len(shape) or any(s not in (None, g) for s, g in zip(shape, got, strict=True)):
-            raise ValueError(
-                f"{path}: expected {name} of shape {shape}, got {got}".replace("None", "samples")
-            )
+            raise ValueError(f"{path}: expected {name} of shape {shape}, got {got}".replace("None", "samples"))
 
 
 def _optional(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:

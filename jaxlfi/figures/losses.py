@@ -58,14 +58,10 @@ def draw(figure: Figure, runs: Runs) -> None:
                 values = [by_round(h, panel) for h in histories if getattr(h, panel) is not None]
                 if values:
                     x = np.arange(1, every[0].rounds + 1)
-                    draw_band(
-                        axes[panel], x, statistics.mean(values, 0), statistics.sd(values, 0), look[name]
-                    )
+                    draw_band(axes[panel], x, statistics.mean(values, 0), statistics.sd(values, 0), look[name])
             iterations_axis(axes[panel], every[0].rounds)
         seeds = max(len(histories) for histories in runs.values())
-        title = "last pass of training, best of validation" + (
-            f"; mean ± sd over {seeds} seeds" if seeds > 1 else ""
-        )
+        title = "last pass of training, best of validation" + (f"; mean ± sd over {seeds} seeds" if seeds > 1 else "")
         legend(figure, look, title)
     for panel in shown:
         axes[panel].set_title(PANELS[panel])

@@ -143,9 +143,7 @@ def _facts(collection: Collection) -> str:
         return next((config[name] for config in configs for name in names if config.get(name)), None)
 
     facts = {
-        "Parameters": ", ".join(
-            f"{n} [{u}]" if u else n for n, u in zip(first.names, first.units, strict=True)
-        ),
+        "Parameters": ", ".join(f"{n} [{u}]" if u else n for n, u in zip(first.names, first.units, strict=True)),
         "Rounds": first.rounds,
         "Seeds": max(len(histories) for histories in collection.runs.values()),
         **_provenance(get),
@@ -170,9 +168,7 @@ def _definitions(facts: Mapping[str, Any]) -> str:
     for name, value in facts.items():
         if value in (None, "", {}):
             continue
-        text = (
-            ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, Mapping) else _short(value)
-        )
+        text = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, Mapping) else _short(value)
         text = html.escape(text)
         lines.append(f"<dt>{name}</dt><dd>{f'<code>{text}</code>' if name == 'Command' else text}</dd>")
     return f"<dl>{''.join(lines)}</dl>"

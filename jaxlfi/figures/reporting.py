@@ -75,9 +75,7 @@ Made = tuple[Figure, str, str] | None
 def columns(runs: Runs, most: int = 4) -> tuple[list[History], list[str]]:
     """One run for each of up to four configurations, the seed of median error, and the columns' titles."""
     preferred = [name for name in COLUMNS if name in runs]
-    chosen = (
-        list(runs) if len(runs) <= most else [*preferred, *(n for n in runs if n not in preferred)][:most]
-    )
+    chosen = list(runs) if len(runs) <= most else [*preferred, *(n for n in runs if n not in preferred)][:most]
     histories = [representative(runs[name]) for name in chosen]
     look = style.looks(chosen)
     titles = []
@@ -116,9 +114,7 @@ def _curves(collection: Collection) -> Made:
     wide = dim > 4
     rows = -(-dim // (3 if wide else 2))
     known = any(h.theta_error is not None for histories in collection.runs.values() for h in histories)
-    figure = style.new_figure(
-        TEXT_WIDTH if wide and known else COLUMN_WIDTH, 2.3 + (1.2 * rows if known else 0.2)
-    )
+    figure = style.new_figure(TEXT_WIDTH if wide and known else COLUMN_WIDTH, 2.3 + (1.2 * rows if known else 0.2))
     curves.draw(figure, collection.runs)
     caption = (
         "exp(-loss) of posterior samples in each iteration, 1 is perfect: Euclidean distance to the observed "
@@ -169,9 +165,7 @@ def _predictive(collection: Collection) -> Made:
     width = COLUMN_WIDTH if len(histories) == 1 else TEXT_WIDTH
     figure = style.new_figure(width, 0.8 + 1.35 * len(histories[0].channels))
     predictive.draw(figure, histories, titles)
-    caption = "Simulations of samples of the last posterior, against the observed trajectory." + _which_seed(
-        runs
-    )
+    caption = "Simulations of samples of the last posterior, against the observed trajectory." + _which_seed(runs)
     return figure, "Posterior predictive", caption
 
 
@@ -209,7 +203,8 @@ def _polars(collection: Collection) -> Made:
     caption = (
         "Absolute discrepancy of posterior samples after the last iteration: "
         + "; ".join(units[name] for name in rows)
-        + ". A flow's samples are those of the mixture that is fitted to it." + _which_seed(collection.runs)
+        + ". A flow's samples are those of the mixture that is fitted to it."
+        + _which_seed(collection.runs)
     )
     return figure, "Discrepancy by parameter and summary", caption
 

@@ -120,9 +120,7 @@ def draw_proposals(
         (history.kept, {"s": 3.5, "linewidths": 0}),
     ):
         chosen = chosen & np.isfinite(points).all(-1)
-        axes.scatter(
-            *points[chosen].T, c=iteration[chosen], cmap=colours, norm=norm, alpha=0.75, zorder=2, **style
-        )
+        axes.scatter(*points[chosen].T, c=iteration[chosen], cmap=colours, norm=norm, alpha=0.75, zorder=2, **style)
     for i in range(history.rounds):
         low, high = history.proposal_low[i], history.proposal_high[i]
         _add_box(axes, low, high, pair, i + 1, edgecolor=colours(norm(i + 1)), linewidth=0.9, zorder=3)
@@ -192,9 +190,7 @@ def _draw_density(axes: Axes, weight, mean, covariance, window, look: Look) -> N
         axes.set_ylim(0, 1.15 * likelihood.max() or 1.0)
         axes.set_ylabel("likelihood")
         return
-    mesh: QuadMesh = axes.pcolormesh(
-        *grids, likelihood, cmap=look.density, vmin=0, shading="nearest", zorder=1
-    )
+    mesh: QuadMesh = axes.pcolormesh(*grids, likelihood, cmap=look.density, vmin=0, shading="nearest", zorder=1)
     # As wide as the panel, so that columns of panels stay aligned.
     bar = axes.figure.colorbar(mesh, cax=axes.inset_axes([0.0, 1.03, 1.0, 0.045]), orientation="horizontal")
     bar.locator = MaxNLocator(nbins=3, min_n_ticks=2)
@@ -253,9 +249,7 @@ def _plane(theta: np.ndarray, pair: tuple[int, ...], iteration: np.ndarray) -> n
     return np.stack([theta[..., pair[0]], height], -1)
 
 
-def _add_box(
-    axes: Axes, low: np.ndarray, high: np.ndarray, pair: tuple[int, ...], iteration: int, **style
-) -> None:
+def _add_box(axes: Axes, low: np.ndarray, high: np.ndarray, pair: tuple[int, ...], iteration: int, **style) -> None:
     if len(pair) == 2:
         corner, size = low[list(pair)], (high - low)[list(pair)]
     else:
@@ -273,9 +267,7 @@ def _mark_truth(axes: Axes, history: History, pair: tuple[int, ...]) -> None:
         axes.axvline(truth[0], color="black", linestyle=(0, (4, 2)), linewidth=0.9, zorder=10, gid="truth")
 
 
-def _frame(
-    axes: Axes, history: History, pair: tuple[int, ...], window: Sequence[tuple[float, float]]
-) -> None:
+def _frame(axes: Axes, history: History, pair: tuple[int, ...], window: Sequence[tuple[float, float]]) -> None:
     axes.set_xlim(*window[0])
     axes.set_xlabel(parameter_label(history.names, history.units, pair[0]))
     axes.xaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10]))
@@ -300,9 +292,7 @@ def _legend(figure: Figure, histories: Sequence[History]) -> None:
             label="mean of data",
             **plain,
         ),
-        Line2D(
-            [], [], marker="s", markersize=6, color=grey, markerfacecolor="none", label="support", **plain
-        ),
+        Line2D([], [], marker="s", markersize=6, color=grey, markerfacecolor="none", label="support", **plain),
         Line2D(
             [],
             [],
@@ -320,6 +310,4 @@ def _legend(figure: Figure, histories: Sequence[History]) -> None:
         else:
             handles.append(Line2D([], [], label="truth", **TRUTH))
     columns = len(handles) if figure.get_size_inches()[0] > 5 else 3
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=columns, handletextpad=0.2, columnspacing=1.2
-    )
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, handletextpad=0.2, columnspacing=1.2)

@@ -200,9 +200,7 @@ def _font(figure: Figure, cells: int) -> float:
     return points if points >= 3.0 else 0.0
 
 
-def _pair(
-    axes: Axes, grid: Grid, row: int, column: int, measure: Measure, scale: Normalize, font: float
-) -> None:
+def _pair(axes: Axes, grid: Grid, row: int, column: int, measure: Measure, scale: Normalize, font: float) -> None:
     mean, sd = marginal(measure.scale * grid.arrays[measure.name], row, column)
     chosen = np.outer(_chosen(grid, row), _chosen(grid, column))
     _cells(axes, mean, sd, chosen, measure, scale, font)

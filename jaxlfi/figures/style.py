@@ -228,9 +228,7 @@ def iterations_axis(axes: Axes, rounds: int, first: int = 1, label: bool = True)
 def iteration_bar(figure: Figure, axes: np.ndarray, rounds: int) -> Colorbar:
     """A colorbar of iterations to the right of some axes."""
     colours, norm = iteration_colours(rounds)
-    bar = figure.colorbar(
-        ScalarMappable(norm, colours), ax=list(axes.ravel()), label="iteration", aspect=40, pad=0.01
-    )
+    bar = figure.colorbar(ScalarMappable(norm, colours), ax=list(axes.ravel()), label="iteration", aspect=40, pad=0.01)
     bar.locator = MaxNLocator(nbins=10, integer=True, min_n_ticks=1)
     bar.minorticks_off()
     bar.update_ticks()

@@ -37,9 +37,7 @@ def draw_bounds(axes: Axes, histories: Sequence[History], d: int, look: Look) ->
     iteration = np.arange(bounds.shape[-1])
     axes.fill_between(iteration, low, high, color=look.colour, alpha=0.07, linewidth=0)
     if len(histories) > 1:
-        axes.plot(
-            iteration, bounds.reshape(-1, bounds.shape[-1]).T, color=look.colour, linewidth=0.35, alpha=0.5
-        )
+        axes.plot(iteration, bounds.reshape(-1, bounds.shape[-1]).T, color=look.colour, linewidth=0.35, alpha=0.5)
     for bound in (low, high):
         axes.plot(iteration, bound, **look.line)
 

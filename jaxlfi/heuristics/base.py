@@ -30,9 +30,7 @@ class Adaptation:
 class Heuristic(Protocol):
     """A pure, branch-free rule. Hyperparameters are leaves: scalars or one value per dimension, shape [D]."""
 
-    def __call__(
-        self, previous: Belief, posterior: GaussianMixture, feasible: Support
-    ) -> tuple[Belief, Adaptation]:
+    def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Adapt the support.
 
         Args:
