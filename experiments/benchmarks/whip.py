@@ -41,7 +41,6 @@ from envs.whip.engine import Engine, State, ramp, rollout
 from envs.whip.engines import NAMES, pick
 from envs.whip.exploration import exploratory_actions
 from envs.whip.kinematics import frames
-from envs.whip.mjx_engine import MjxEngine
 from envs.whip.native import NativeEngine
 from envs.whip.parameters import FEASIBLE, INITIAL, WhipParameters, median
 from envs.whip.scene import CUBES, START, Scene
@@ -76,7 +75,7 @@ def by_engine(engine: Engine, batch: int, controls: int, repeats: int) -> dict[s
     """Steps a second of rollouts of so many control steps, how many failed, and seconds to the first one's end."""
     scenes, targets = random_batch(batch)
     run = jax.vmap(functools.partial(rollout, engine))
-    if isinstance(engine, MjxEngine) and batch % jax.device_count() == 0:
+    if not isinstance(engine, NativeEngine) and jax.device_count() > 1 and batch % jax.device_count() == 0:
         run = jax.shard_map(run, mesh=_all_devices(), in_specs=ALONG, out_specs=ALONG, check_vma=False)
     run = jax.jit(run)
     start = time.perf_counter()
