@@ -173,7 +173,7 @@ def compiling() -> dict[str, float]:
             done = subprocess.run(
                 [sys.executable, "-c", _COMPILE_AN_EPISODE], env=environment, capture_output=True, text=True, check=True
             )
-            seconds["tracing"], seconds[name] = map(float, done.stdout.split())
+            seconds["tracing"], seconds[name] = map(float, done.stdout.splitlines()[-1].split())
     print(f"{'twelve episodes of MJX':<42}{'s':>10}")
     for name, value in seconds.items():
         print(f"{name:<42}{value:>10.1f}")
