@@ -17,6 +17,7 @@ Prints
 
 import argparse
 import functools
+import importlib.metadata
 import os
 import subprocess
 import sys
@@ -46,6 +47,7 @@ from envs.whip.parameters import FEASIBLE, INITIAL, WhipParameters, median
 from envs.whip.scene import CUBES, START, Scene
 from experiments.whip_physics.rollouts import random_scene, random_targets
 from jaxlfi import atomic
+from jaxlfi.run_store import command_line, environment
 
 SCENE = Scene()
 EPISODE = rules.STEPS * SCENE.substeps
@@ -272,11 +274,14 @@ def main() -> None:
     if unknown := set(arguments.parts) - set(PARTS):
         parser.error(f"parts: expected some of {', '.join(PARTS)}, got {', '.join(sorted(unknown))}")
     parts = PARTS | {"speed": functools.partial(speed, arguments.engines, arguments.batches, arguments.repeats)}
+    made = environment()
+    made["command_line"] = command_line(["python", "-m", "experiments.benchmarks.whip", *sys.argv[1:]])
+    made["versions"] |= {name: importlib.metadata.version(name) for name in ("mujoco", "mujoco-mjx")}
     for name in arguments.parts:
         result = parts[name]()
         if arguments.out:
             arguments.out.mkdir(parents=True, exist_ok=True)
-            atomic.write_json(arguments.out / f"{name}.json", result)
+            atomic.write_json(arguments.out / f"{name}.json", {"measured": result} | made)
 
 
 if __name__ == "__main__":
