@@ -1,4 +1,4 @@
-"""What all tests share: strict JAX, one deterministic hypothesis profile, one key a test."""
+"""What all tests share: strict JAX, quick compiling, one deterministic hypothesis profile, one key a test."""
 
 import zlib
 
@@ -25,3 +25,11 @@ hypothesis.settings.load_profile("jaxlfi")
 def key(request: pytest.FixtureRequest) -> jax.Array:
     """A typed key of the test's own: the same in every run, another in every test."""
     return jax.random.key(zlib.crc32(request.node.nodeid.encode()))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiling(request: pytest.FixtureRequest):
+    """Compile without most optimisations, as tests run for milliseconds, but for modules that set `OPTIMISED`."""
+    jax.config.update("jax_disable_most_optimizations", not getattr(request.module, "OPTIMISED", False))
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)

@@ -79,7 +79,7 @@ def whole_runs(tmp_path_factory):
     """What tests of whole runs need of jax; import this into their module.
 
     A cache of compiled programs, shared with processes that a test starts: compiling is nearly all that these
-    tests wait for, and is done without most optimisations. And no key-reuse checker: it takes a vmapped scan
+    tests wait for, and is done without most optimisations there too. And no key-reuse checker: it takes a vmapped scan
     over keys for a reuse (jax 0.9.2). Unbatched runs are checked elsewhere.
     """
     folder = str(tmp_path_factory.getbasetemp() / "xla")
@@ -91,10 +91,8 @@ def whole_runs(tmp_path_factory):
         before = {name: getattr(jax.config, name) for name in CACHE_SETTINGS}
         for name, value in zip(CACHE_SETTINGS, (folder, 0.2), strict=True):
             jax.config.update(name, value)
-        jax.config.update("jax_disable_most_optimizations", True)
         compilation_cache.reset_cache()  # so that the new folder is looked at
         yield
         for name, value in before.items():
             jax.config.update(name, value)
-        jax.config.update("jax_disable_most_optimizations", False)
         compilation_cache.reset_cache()

@@ -12,6 +12,9 @@ from envs import lotka_volterra_mjp as lv
 from jaxlfi import counter_rng
 from tests.oracles import gillespie
 
+OPTIMISED = True
+"""Its programs run for longer than they are compiled."""
+
 GOLDEN = pathlib.Path(__file__).with_name("golden") / "gillespie.npz"
 TRUTH = np.log([0.01, 0.5, 1.0, 0.01]).astype(np.float32)
 GOLDEN_RATES = {"truth": (0.01, 0.5, 1.0, 0.01), "asymmetric": (0.004, 0.25, 0.4, 0.009)}

@@ -22,6 +22,9 @@ from jaxlfi.heuristics import Choice, Edge, Fixed
 from jaxlfi.keys import run_keys
 from jaxlfi.presets import QUICK
 
+OPTIMISED = True
+"""Its programs run for longer than they are compiled."""
+
 SETTINGS = QUICK
 """Of the acceptance test."""
 SEED = 0

@@ -31,14 +31,6 @@ from jaxlfi.simulation import simulate
 TRUTH = np.array([1.0, 5.0, 0.2])
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Compiling takes longer than running here."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @functools.cache
 def batched(jobs: int, floor: float = RATE_FLOOR):
     """Service times, gaps, waits and inter-departure times of one queue for each key and theta."""

@@ -25,14 +25,6 @@ WITHOUT_EFFECT = {".stat.center", ".stat.extent", ".stat.meanmass", ".stat.means
 DERIVED = {".stat.meaninertia", ".body_subtreemass", ".body_invweight0", ".dof_invweight0", ".dof_M0"}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Compiling takes longer than running here."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @functools.cache
 def mjx_model(scene: Scene) -> mjx.Model:
     return mjx.put_model(base_model(scene))

@@ -29,14 +29,6 @@ WHIP = np.array([[-0.06, 0.0]] * 2 + [[0.06, 0.0]] * 4 + [[0.0, 0.0]] * 10, np.f
 """Back and forth: a DLO of 250 mm and 25 kPa hits the top cube only, with the seventh."""
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Compiling takes longer than running here."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Small films and searches, by engines that are compiled for once."""

@@ -24,14 +24,6 @@ WHIP = np.array([[-0.06, 0.0]] * 2 + [[0.06, 0.0]] * 4 + [[0.0, 0.0]] * 10, np.f
 """Back and forth: mu's DLO hits the top cube only, with the seventh."""
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Compiling takes longer than running here."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 def play(environment, actions, seed=0):
     """An episode, or as much of it as there are actions for: observations, rewards, ends and the last info."""
     observation, info = environment.reset(seed=seed)

@@ -28,14 +28,6 @@ from envs.whip.parameters import MEDIAN
 CAMERA = side_camera(MEDIAN)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Compiling takes longer than running here."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 def swinging(steps: int) -> Frames:
     """A DLO of unequal segments that swings and bends as it goes; the cubes drift apart."""
     time = np.linspace(0, 1, steps)[:, None]

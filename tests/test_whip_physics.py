@@ -29,14 +29,6 @@ RIGIDITY, LINE_DENSITY = 1.7e4 * 0.015**4 / 12, 64.0 * 0.015**2
 both = pytest.mark.parametrize("kind", OURS)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Compiling takes longer than running here."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 # ------------------------------------------------------------------------------------------------------- the theory
 
 

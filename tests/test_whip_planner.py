@@ -18,14 +18,6 @@ from envs.whip.scene import START, Scene
 from experiments import whip_plan
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Compiling takes longer than running here."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 class Terrain:
     """Physics of places: the gripper is where its set-point is, and what it does there depends on the place.
 

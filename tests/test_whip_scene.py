@@ -32,14 +32,6 @@ NAMES = ("length", "young", *NUISANCES)
 both = pytest.mark.parametrize("scene", [PLANAR, BALLS], ids=["planar", "balls"])
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Compiling takes longer than running here."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 def within_ranges(shares) -> WhipParameters:
     """Parameters at these shares of their ranges, one an entry of `NAMES` (two for the stack, three for the camera)."""
     shares = iter(shares)

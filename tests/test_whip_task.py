@@ -22,14 +22,6 @@ from envs.whip.scene import Scene
 from jaxlfi.summaries import cross_correlation
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Compiling takes longer than running here."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 class Puppet:
     """Physics by a script: the gripper is where its set-point is; where that is far enough, cubes are pushed along x.
 
