@@ -20,7 +20,7 @@ demo: $(VENV)/.installed  ## the main job: supports and heuristics compared on L
 	$(BIN)/jaxlfi compare lotka_volterra --preset quick --seeds 6 --out $(OUT)
 
 test: $(VENV)/.installed  ## all tests
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile  # so that what a file's tests share is made once
 
 lint: $(VENV)/.installed  ## style
 	$(BIN)/ruff check .
