@@ -19,8 +19,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: $(VENV)/.installed  ## the main job: supports and heuristics compared on Lotka-Volterra
 	$(BIN)/jaxlfi compare lotka_volterra --preset quick --seeds 6 --out $(OUT)
 
+# What the tests of a file share is made once, as one process runs them all.
 test: $(VENV)/.installed  ## all tests
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile  # so that what a file's tests share is made once
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 lint: $(VENV)/.installed  ## style
 	$(BIN)/ruff check .

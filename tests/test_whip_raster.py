@@ -177,7 +177,11 @@ def mujocos(camera: Camera, frames: Frames, side: float) -> np.ndarray:
 
 @pytest.fixture
 def renders(monkeypatch):
-    """MuJoCo draws in memory, whichever way it would otherwise; the test is skipped where that cannot be."""
+    """MuJoCo draws in memory, whichever way it would otherwise.
+
+    Skipped without a software GL, a library of the system that pip cannot install. The rasteriser is there so that
+    nothing else depends on one; against polygons drawn by hand it is tested everywhere.
+    """
     pytest.importorskip("mujoco")
     try:
         from mujoco.osmesa import GLContext

@@ -11,6 +11,7 @@ import argparse
 import csv
 import io
 import itertools
+import json
 import time
 from pathlib import Path
 
@@ -77,14 +78,22 @@ def posterior_draws(task_name: str, settings: Settings, seed: int) -> dict[str, 
 
 
 def kept_draws(out: Path, task: str, method: str, simulations: int, seed: int) -> dict[str, np.ndarray]:
-    """What `posterior_draws` gives, from the folder if it is there already."""
+    """What `posterior_draws` gives, from the folder if it is there already.
+
+    Raises:
+        SystemExit: if the folder's are of other settings or another seed.
+    """
     name, settings = f"{task}_{method}_{simulations}", settings_of(method, simulations)
-    path = out / "draws" / f"{name}.npz"
+    path, described = out / "draws" / f"{name}.npz", out / f"{name}.json"
+    config = {"settings": settings_to_json(settings), "seed": seed}
+    if described.exists():
+        before = json.loads(described.read_text())
+        if config != {part: before.get(part) for part in config}:
+            raise SystemExit(f"{described}: made with other settings or another seed; give another folder as --out")
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
+        atomic.write_json(described, config | environment())
         atomic.write_arrays(path, posterior_draws(task, settings, seed))
-        config = {"settings": settings_to_json(settings), "seed": seed, **environment()}
-        atomic.write_json(out / f"{name}.json", config)
     return atomic.read_arrays(path)
 
 
