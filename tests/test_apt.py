@@ -25,7 +25,6 @@ from jaxlfi.presets import METHODS, QUICK
 from jaxlfi.sampling import posterior_samples
 from jaxlfi.support import Support
 from jaxlfi.task import Task
-from tests.compiling import PLAIN
 
 ATOMIC = dataclasses.replace(MODEST, hidden=(32, 32), steps=2000, learning_rate=3e-3, loss="atomic")
 FLOW = Estimator(
@@ -72,7 +71,7 @@ def test_a_prior_of_the_tasks_own_is_the_posteriors():
     def one(key):
         return bayessim.run(key, task, settings, Fixed(), X, box)[0].belief.mixture
 
-    learnt = jax.jit(one, compiler_options=PLAIN)(jax.random.key(2))
+    learnt = jax.jit(one)(jax.random.key(2))
     precision = np.linalg.inv(np.asarray(EXACT.covariance, np.float64)) + np.diag(prior_scale.astype(np.float64) ** -2)
     covariance = np.linalg.inv(precision)
     mean = covariance @ np.linalg.inv(np.asarray(EXACT.covariance, np.float64)) @ np.asarray(EXACT.mean)
@@ -89,9 +88,7 @@ def test_a_prior_of_the_tasks_own_is_the_posteriors():
 @pytest.fixture(scope="module")
 def flow_run():
     settings = Settings(estimator=FLOW, rounds=2, additions=30, attempts=30, restriction="reject")
-    run = jax.jit(
-        lambda key: bayessim.run(key, TASK, settings, Fixed(), X, TASK.supports["ok"]), compiler_options=PLAIN
-    )
+    run = jax.jit(lambda key: bayessim.run(key, TASK, settings, Fixed(), X, TASK.supports["ok"]))
     return run, jax.device_get(run(jax.random.key(0)))
 
 
@@ -107,9 +104,7 @@ def test_a_flow_runs_in_the_same_loop_and_repeats(flow_run):
 def test_a_flows_mixture_has_the_moments_of_its_draws_inside(flow_run):
     _, (state, _) = flow_run
     support, key = Support([-1.0, -2.0], [2.0, 1.5]), jax.random.key(1)
-    mixture, inside = jax.jit(posterior, static_argnums=1, compiler_options=PLAIN)(
-        key, FLOW, state.network, X, state.feasible, support
-    )
+    mixture, inside = jax.jit(posterior, static_argnums=1)(key, FLOW, state.network, X, state.feasible, support)
     draws = draw(jax.random.key(2), FLOW, state.network, X, state.feasible, 20000)
     kept = np.asarray(draws)[np.asarray(support.contains(draws))]
     assert float(inside) == pytest.approx(len(kept) / 20000, abs=0.08)  # 5 standard errors of 1000 draws

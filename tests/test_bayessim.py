@@ -20,7 +20,6 @@ from jaxlfi.heuristics import Choice, Edge, Fixed
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.support import Support
 from jaxlfi.task import Task
-from tests.compiling import PLAIN
 
 TASK = gaussian_linear.task()
 X = jnp.asarray(gaussian_linear.MIXING @ np.array([1.0, -0.5], np.float32))
@@ -50,7 +49,7 @@ def infer(settings: Settings, names: tuple[str, ...], places: tuple[int, ...], s
 
     supports = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(TASK.supports[name] for name in names))
     keys = jax.random.split(jax.random.key(seed), len(names))
-    return jax.device_get(jax.jit(jax.vmap(one), compiler_options=PLAIN)(keys, jnp.array(places), supports))
+    return jax.device_get(jax.jit(jax.vmap(one))(keys, jnp.array(places), supports))
 
 
 def lane(tree, i: int):
@@ -185,9 +184,9 @@ def flaky(key, theta):
 FLAKY = Task(flaky, ("first", "second"), TASK.supports, TASK.feasible, truth=TASK.truth, failures=("jammed", "slipped"))
 BOX = TASK.supports["misspecified"]
 
-_run = jax.jit(bayessim.run, static_argnums=1, compiler_options=PLAIN)
-_init = jax.jit(bayessim.init, static_argnums=1, compiler_options=PLAIN)
-_step = jax.jit(bayessim.step, static_argnums=1, compiler_options=PLAIN)
+_run = jax.jit(bayessim.run, static_argnums=1)
+_init = jax.jit(bayessim.init, static_argnums=1)
+_step = jax.jit(bayessim.step, static_argnums=1)
 
 
 def run(seed: int, rate: float = 1e-2, threshold: float = 0.005, task: Task = FLAKY):
@@ -225,7 +224,7 @@ def test_vmap_is_a_loop_over_seeds_thresholds_and_learning_rates():
     def one(seed, rate, threshold):
         return bayessim.run(jax.random.key(seed), FLAKY, tiny(rate), Edge(mass_threshold=threshold), X, BOX)
 
-    compiled = jax.jit(jax.vmap(one), compiler_options=PLAIN)
+    compiled = jax.jit(jax.vmap(one))
     batch = jax.device_get(compiled(jnp.array(seeds), jnp.array(rates), jnp.array(thresholds)))
     for i, arguments in enumerate(zip(seeds, rates, thresholds, strict=True)):
         chex.assert_trees_all_close(lane(batch, i), run(*arguments), rtol=1e-2, atol=1e-2)
@@ -316,7 +315,7 @@ NARROW = Belief(
     jnp.asarray(True),
 )
 MANY = dataclasses.replace(TINY, attempts=4000)
-_propose = jax.jit(bayessim.propose, static_argnums=1, compiler_options=PLAIN)
+_propose = jax.jit(bayessim.propose, static_argnums=1)
 
 
 def uniform_share(settings: Settings, key) -> float:

@@ -8,9 +8,8 @@ from scipy.stats import norm
 
 from experiments.sbibm.c2st import c2st as reference
 from jaxlfi.diagnostics import c2st
-from tests.compiling import PLAIN
 
-compiled = jax.jit(c2st, compiler_options=PLAIN)
+compiled = jax.jit(c2st)
 N = 400
 
 

@@ -16,7 +16,6 @@ from jaxlfi.dataset import Dataset
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.support import Support
 from jaxlfi.task import Task
-from tests.compiling import PLAIN
 
 BOX = Support([-9.0, -7.0], [9.0, 7.0])
 
@@ -26,8 +25,8 @@ def task(prior=None) -> Task:
     return Task(lambda key, theta: theta, ("a", "b"), {"box": BOX}, BOX, prior=prior)
 
 
-multiplied = jax.jit(CORRECTIONS["paper"].change, static_argnums=0, compiler_options=PLAIN)
-importance = jax.jit(importance_weights, static_argnums=0, compiler_options=PLAIN)
+multiplied = jax.jit(CORRECTIONS["paper"].change, static_argnums=0)
+importance = jax.jit(importance_weights, static_argnums=0)
 
 
 def gaussian(mean, factor) -> GaussianMixture:

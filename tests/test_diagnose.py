@@ -27,7 +27,6 @@ from jaxlfi.observation import SimulatorError
 from jaxlfi.posterior import truncated_draws, truncated_log_prob
 from jaxlfi.sampling import network_arrays, read_run
 from jaxlfi.support import Support
-from tests.compiling import PLAIN
 from tests.small import SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 X = np.array([-0.6, -0.3], np.float32)
@@ -353,9 +352,9 @@ def check_density(key, log_prob, draws, box: Support, points: int = 120) -> floa
     axes = [low[d] + (high[d] - low[d]) * (np.arange(points) + 0.5) / points for d in range(2)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     outside = np.array([low - 0.1, [high[0], high[1] + 0.1]])
-    drawn, inside = jax.jit(draws, compiler_options=PLAIN)(key)
+    drawn, inside = jax.jit(draws)(key)
     theta = jnp.asarray(np.concatenate([grid, outside, drawn]), jnp.float32)
-    value = np.asarray(jax.jit(log_prob, compiler_options=PLAIN)(theta), np.float64)
+    value = np.asarray(jax.jit(log_prob)(theta), np.float64)
     within, beyond, seen = np.split(value, [len(grid), len(grid) + 2])
     cell = np.prod((high - low) / points)
     assert np.sum(np.exp(within)) * cell == pytest.approx(1.0, abs=0.03)

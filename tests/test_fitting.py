@@ -15,7 +15,6 @@ from jaxlfi.estimator import Estimator, Network, condition, initialise
 from jaxlfi.fitting import fit
 from jaxlfi.normalise import fit_normaliser
 from jaxlfi.support import Support
-from tests.compiling import PLAIN
 
 SCALE = Support([-4.0, -6.0], [4.0, 2.0])
 CAPACITY, SIZE = 48, 40
@@ -51,16 +50,16 @@ def toy(seed: int, size: int, capacity: int | None = None) -> Dataset:
 
 DATA = toy(0, SIZE, CAPACITY)
 
-_initialise = jax.jit(initialise, static_argnames=("dim", "obs"), compiler_options=PLAIN)
+_initialise = jax.jit(initialise, static_argnames=("dim", "obs"))
 _normaliser = jax.jit(fit_normaliser, static_argnames="name")
-_condition = jax.jit(condition, compiler_options=PLAIN)
+_condition = jax.jit(condition)
 
 
 def _train(key, estimator, network, dataset, weights, expected):
     return fit(key, estimator, network, dataset, weights, SCALE, expected)
 
 
-_fit = jax.jit(_train, compiler_options=PLAIN)
+_fit = jax.jit(_train)
 
 
 def start(estimator: Estimator, dataset: Dataset = DATA, seed: int = 5) -> Network:
@@ -415,7 +414,7 @@ def test_vmap_is_a_loop():
     one = lambda seed, rate, data: _train(
         jax.random.key(seed), change(SMALL, learning_rate=rate), network, data, data.valid.astype(float), SIZE
     )
-    compiled = jax.jit(jax.vmap(one), compiler_options=PLAIN)
+    compiled = jax.jit(jax.vmap(one))
     both, info = jax.device_get(compiled(jnp.array([1, 2]), jnp.asarray(rates), stacked))
     for i in range(2):
         alone, expected = fitted(change(SMALL, learning_rate=rates[i]), data[i], seed=i + 1, network=network)

@@ -14,7 +14,6 @@ from jaxlfi.mdn import MDN
 from jaxlfi.npe.flows import FLOWS, MAF, NSF, coupling, spline
 
 SMALL = {"transforms": 2, "hidden": 8, "blocks": 1}
-FAST = {"xla_backend_optimization_level": 0}
 """For what takes longer to compile than to run."""
 
 X = jnp.array([0.4, -1.3, 0.9])
@@ -22,7 +21,7 @@ families = pytest.mark.parametrize("family", FLOWS)
 
 
 def jitted(function, *args):
-    return jax.jit(function, compiler_options=FAST)(*args)
+    return jax.jit(function)(*args)
 
 
 def perturbed(module, seed: int = 0, size: float = 0.15, obs: int = 3):
@@ -183,7 +182,7 @@ def test_batches_are_rows_by_themselves_and_axes_in_front_are_more_theta(family)
 
     batched = jitted(jax.vmap(log_prob, (0, None, None)), members, x, theta)
     assert batched.shape == (2, 5, 4)
-    alone = jax.jit(log_prob, compiler_options=FAST)
+    alone = jax.jit(log_prob)
     for e, m, b in itertools.product(range(2), (0, 3), range(4)):
         single = alone(jax.tree.map(lambda leaf, e=e: leaf[e], members), x[b], theta[m, b])
         np.testing.assert_allclose(batched[e, m, b], single, rtol=1e-4, atol=1e-4)
@@ -199,7 +198,7 @@ def test_draws_of_a_batch_belong_to_their_x(family):
     draws = jitted(lambda params: module.apply(params, x).sample(key, 50), params)
     assert draws.shape == (50, 2, 2)
     noise = jax.random.normal(jax.random.clone(key), (50, 2, 2))
-    to_base = jax.jit(lambda x, draws: module.apply(params, x).forward(draws)[0], compiler_options=FAST)
+    to_base = jax.jit(lambda x, draws: module.apply(params, x).forward(draws)[0])
     for b in (0, 1):
         np.testing.assert_allclose(to_base(x[b], draws[:, b]), noise[:, b], rtol=2e-3, atol=2e-3)
     assert np.abs(to_base(x[0], draws[:, 1]) - noise[:, 1]).max() > 0.05
@@ -230,7 +229,7 @@ def test_spline_is_that_of_distrax():
     knobs = jnp.concatenate([knobs[..., : 2 * bins], unused, knobs[..., 2 * bins :], unused], axis=-1)
     theirs = distrax.RationalQuadraticSpline(knobs, -tail, tail, "identity", 2 * tail * 1e-3, 1e-3)
     for inverse, expected in ((False, theirs.forward_and_log_det(x)), (True, theirs.inverse_and_log_det(x))):
-        value, log_slope = jax.jit(spline, static_argnums=(2, 3), compiler_options=FAST)(x, raw, tail, inverse)
+        value, log_slope = jax.jit(spline, static_argnums=(2, 3))(x, raw, tail, inverse)
         np.testing.assert_allclose(value, expected[0], rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(log_slope, expected[1], rtol=2e-3, atol=2e-3)
         outside = np.abs(x) >= tail

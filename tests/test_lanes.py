@@ -117,7 +117,8 @@ np.savez(sys.argv[1], *map(np.asarray, jax.tree.leaves(state)))
 
 def test_two_devices_give_what_one_gives(stepped, tmp_path):
     """Five lanes on two devices: one of them is padding."""
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
+    environment = os.environ | {"XLA_FLAGS": flags}
     command = [sys.executable, "-c", TWO_DEVICES, str(tmp_path / "two.npz")]
     subprocess.run(command, env=environment, check=True, capture_output=True)
     leaves = jax.tree.leaves(stepped[0])

@@ -8,11 +8,7 @@ from scipy import special, stats
 
 from jaxlfi.npe.mixture_fit import fit_mixture
 
-FIT = jax.jit(
-    fit_mixture,
-    static_argnames=("components", "iterations", "restarts"),
-    compiler_options={"xla_backend_optimization_level": 0},
-)
+FIT = jax.jit(fit_mixture, static_argnames=("components", "iterations", "restarts"))
 SETTINGS = {"components": 3, "iterations": 15, "restarts": 2}
 """One compiled program for most tests."""
 

@@ -385,7 +385,6 @@ import sys
 from pathlib import Path
 from jaxlfi.cli import main
 import jax
-jax.config.update("jax_disable_most_optimizations", True)
 assert jax.local_device_count() == 2
 sys.exit(main(sys.argv[1:]))
 """
@@ -393,7 +392,8 @@ sys.exit(main(sys.argv[1:]))
 
 def start(script: str, *arguments, devices: int) -> subprocess.Popen:
     """A process of its own with so many devices."""
-    environment = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
+    environment = os.environ | {"XLA_FLAGS": flags}
     return subprocess.Popen(
         [sys.executable, "-c", script, *map(str, arguments)],
         env=environment,
@@ -422,7 +422,6 @@ import sys
 from pathlib import Path
 import jax
 jax.config.update("jax_cpu_collectives_implementation", "gloo")
-jax.config.update("jax_disable_most_optimizations", True)
 jax.distributed.initialize(sys.argv[1], num_processes=2, process_id=int(sys.argv[2]))
 from rich.console import Console
 from jaxlfi import sweep

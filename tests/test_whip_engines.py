@@ -22,7 +22,6 @@ from envs.whip.mjx_step import kinematics
 from envs.whip.native import NativeEngine
 from envs.whip.parameters import HIGHEST, WhipParameters, median
 from envs.whip.scene import CUBES, Scene, base_model, compile_model
-from tests.compiling import PLAIN, QUICK
 
 SCENE = Scene()
 HIT = 0.036
@@ -79,7 +78,7 @@ def rolled(engine, targets=TARGETS, **options) -> State:
 
 @pytest.fixture(scope="module")
 def by_mjx(engine) -> State:
-    return rolled(engine, compiler_options=PLAIN)
+    return rolled(engine)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +112,7 @@ def test_kinematics_are_those_of_mujoco(planar):
     reference.qpos = compiled.qpos0 + np.random.default_rng(0).normal(size=compiled.nq, scale=0.5)
     mujoco.mj_kinematics(compiled, reference)
 
-    move = jax.jit(lambda qpos: kinematics(scene, model, data.replace(qpos=qpos)), compiler_options=QUICK)
+    move = jax.jit(lambda qpos: kinematics(scene, model, data.replace(qpos=qpos)))
     ours = jax.device_get(move(jnp.asarray(reference.qpos)))
     for name in ("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat"):
         expected, actual = getattr(reference, name), getattr(ours, name)
@@ -145,7 +144,7 @@ def test_no_kernel_computes_a_links_ancestors_anew():
     def program(scene, move):
         model, data = mjx.put_model(base_model(scene)), mjx.make_data(base_model(scene))
         places = jax.jit(jax.vmap(lambda qpos: move(model, data.replace(qpos=qpos)).geom_xpos))
-        return places.lower(jnp.zeros((3, model.nq))).compile(QUICK).as_text()
+        return places.lower(jnp.zeros((3, model.nq))).compile().as_text()
 
     for scene in (SCENE, Scene(chain=Chain(planar=False))):
         assert 1 < recomputed(program(scene, functools.partial(kinematics, scene))) < 200
