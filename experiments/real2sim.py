@@ -3,7 +3,8 @@
     python -m experiments.real2sim --runs runs/real2sim --out experiments/results/real2sim
 
 Runs `jaxlfi compare whip --object dlo-K --configurations initial initial+edge` for each object (what is there already
-is not run again) and draws counterparts of the paper's figures from the run folders:
+is not run again), tells what every seed came to in table.csv, and draws counterparts of the paper's figures from the
+first seed's folders:
 
     progression.png   fig:mog-n-param-space-progr: samples by iteration with their boxes, and the last mixtures
     domains.png       fig:mog-posterior-for-dr: the last mixtures and the 12 domains that policies would be trained on
@@ -14,7 +15,7 @@ import argparse
 import csv
 import io
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -132,33 +133,39 @@ def draw_gaps(figure: Figure, found: Mapping[str, Mapping[str, Mapping[str, np.n
             right.set_ylabel("Chamfer distance [px] (faded)")
 
 
-def table(histories: Mapping[str, Mapping[str, History]], found) -> list[dict[str, object]]:
-    """A line an object and configuration: where the posterior and its support ended, and the last gaps."""
+def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str, object]]:
+    """A line an object, configuration and seed: where the posterior and its support ended, and the last gaps."""
+    every = [
+        (name, configuration, seed, history)
+        for name, own in runs.items()
+        for configuration, seeds in own.items()
+        for seed, history in enumerate(seeds)
+    ]
     lines = []
-    for name, own in histories.items():
-        for configuration, history in own.items():
-            belief = run_store.read_belief(history.folder)
-            draws = np.asarray(belief.mixture.sample(jax.random.key(1), 4000))
-            draws = np.clip(draws, belief.support.low, belief.support.high)
-            low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
-            gap = found[name][configuration]
-            lines.append(
-                {
-                    "object": name,
-                    "configuration": configuration,
-                    "length [mm]": f"{middle[0]:.0f} [{low[0]:.0f}, {high[0]:.0f}]",
-                    "E [kPa]": " ".join(
-                        [f"{np.exp(middle[1]) / 1e3:.2f}", f"[{np.exp(low[1]) / 1e3:.2f}, {np.exp(high[1]) / 1e3:.2f}]"]
-                    ),
-                    "support length [mm]": f"[{belief.support.low[0]:.0f}, {belief.support.high[0]:.0f}]",
-                    "support E [kPa]": "[{:.2g}, {:.2g}]".format(
-                        *(np.exp(float(b[1])) / 1e3 for b in (belief.support.low, belief.support.high))
-                    ),
-                    "summary gap": round(float(gap["summary"][-1, 0]), 3),
-                    "pixel gap": round(float(gap["pixels"][-1, 0]), 2),
-                    "seconds": round(float(np.sum(history.seconds)), 1),
-                }
-            )
+    for name, configuration, seed, history in every:
+        belief = run_store.read_belief(history.folder)
+        draws = np.asarray(belief.mixture.sample(jax.random.key(1), 4000))
+        draws = np.clip(draws, belief.support.low, belief.support.high)
+        low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
+        gap = gaps(history.folder)
+        lines.append(
+            {
+                "object": name,
+                "configuration": configuration,
+                "seed": seed,
+                "length [mm]": f"{middle[0]:.0f} [{low[0]:.0f}, {high[0]:.0f}]",
+                "E [kPa]": " ".join(
+                    [f"{np.exp(middle[1]) / 1e3:.2f}", f"[{np.exp(low[1]) / 1e3:.2f}, {np.exp(high[1]) / 1e3:.2f}]"]
+                ),
+                "support length [mm]": f"[{belief.support.low[0]:.0f}, {belief.support.high[0]:.0f}]",
+                "support E [kPa]": "[{:.2g}, {:.2g}]".format(
+                    *(np.exp(float(b[1])) / 1e3 for b in (belief.support.low, belief.support.high))
+                ),
+                "summary gap": round(float(gap["summary"][-1, 0]), 3),
+                "pixel gap": round(float(gap["pixels"][-1, 0]), 2),
+                "seconds": round(float(np.sum(history.seconds)), 1),
+            }
+        )
     return lines
 
 
@@ -168,23 +175,21 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, required=True, help="where the runs are, or are to be")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--objects", nargs="+", default=OBJECTS, help="names, or recorded rollouts' .npz")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, default=3, help="runs of each, side by side")
     arguments = parser.parse_args()
-    histories, found = {}, {}
+    runs = {}
     for name in arguments.objects:
         folder = arguments.runs / Path(name).stem
-        words = ["compare", "whip", "--object", name, "--seeds", "1", "--first-seed", str(arguments.seed)]
+        words = ["compare", "whip", "--object", name, "--seeds", str(arguments.seeds)]
         words += ["--configurations", *CONFIGURATIONS, "--out", str(folder), "--keep-network"]
         if not (folder / "config.json").exists():
             if status := cli.main(words):
                 raise SystemExit(status)
         elif run_store.read_config(folder).get("status") != "finished":
             cli.main(["resume", str(folder)])
-        own = {label: runs[0] for label, runs in open_collection(folder).runs.items()}
-        histories[Path(name).stem] = own
-        found[Path(name).stem] = {label: gaps(history.folder) for label, history in own.items()}
+        runs[Path(name).stem] = open_collection(folder).runs
     arguments.out.mkdir(parents=True, exist_ok=True)
-    lines = table(histories, found)
+    lines = table(runs)
     stream = io.StringIO()
     writer = csv.DictWriter(stream, lines[0])
     writer.writeheader()
@@ -192,6 +197,8 @@ def main() -> None:
     atomic.write_bytes(arguments.out / "table.csv", stream.getvalue().encode())
     command = run_store.command_line(["python", "-m", "experiments.real2sim", *sys.argv[1:]])
     atomic.write_json(arguments.out / "config.json", run_store.environment() | {"command_line": command})
+    histories = {name: {label: seeds[0] for label, seeds in own.items()} for name, own in runs.items()}
+    found = {name: {label: gaps(run.folder) for label, run in own.items()} for name, own in histories.items()}
     arrays = {
         f"{name}_{label.replace('+', '_')}_{kind}": value
         for name, own in found.items()
