@@ -14,11 +14,11 @@ mujoco = pytest.importorskip("mujoco")
 mjx = pytest.importorskip("mujoco.mjx")
 
 from envs.whip.chain import Chain
-from envs.whip.engine import State, rollout
+from envs.whip.engine import State, reset, rollout
 from envs.whip.engines import pick
 from envs.whip.kinematics import frames
 from envs.whip.mjx_engine import MjxEngine
-from envs.whip.mjx_step import kinematics
+from envs.whip.mjx_step import PARTS, kinematics, solve
 from envs.whip.native import NativeEngine
 from envs.whip.parameters import HIGHEST, WhipParameters, median
 from envs.whip.scene import CUBES, Scene, base_model, compile_model
@@ -149,6 +149,33 @@ def test_no_kernel_computes_a_links_ancestors_anew():
     for scene in (SCENE, Scene(chain=Chain(planar=False))):
         assert 1 < recomputed(program(scene, functools.partial(kinematics, scene))) < 200
     assert recomputed(program(Scene(chain=Chain(elements=3)), mjx.kinematics)) > 2000
+
+
+# -------------------------------------------------------------------------------------------------------- solver
+
+
+def test_the_solver_goes_on_where_single_precision_ends():
+    """With a mass matrix that is as little indefinite as rounding makes it; any other is solved as MJX does."""
+    model = mjx.put_model(base_model(SCENE))
+    start = reset(SCENE, median())
+    data = mjx.make_data(base_model(SCENE)).replace(qpos=start.qpos, ctrl=start.target)
+    data = functools.reduce(lambda data, part: part(model, data), PARTS, kinematics(SCENE, model, data))
+    inertia = np.asarray(data._impl.M, np.float64)
+    scale = 1 / np.sqrt(np.diag(inertia))
+    values, vectors = np.linalg.eigh(scale[:, None] * inertia * scale)
+    least = vectors[:, 0] / scale
+    broken = inertia - (values[0] + 5e-6) * np.outer(least, least)
+    mended = broken + 1e-5 * np.diag(np.diag(inertia))
+    with_inertia = lambda matrix: data.tree_replace({"_impl.M": jnp.asarray(matrix, jnp.float32)})
+
+    theirs, ours = jax.jit(functools.partial(mjx.solve, model)), jax.jit(functools.partial(solve, model))
+    for field in ("qacc", "qfrc_constraint"):
+        np.testing.assert_allclose(getattr(ours(data), field), getattr(theirs(data), field), rtol=1e-5, atol=1e-8)
+    assert not np.isfinite(theirs(with_inertia(broken)).qacc).all()
+    actual = ours(with_inertia(broken)).qacc
+    np.testing.assert_allclose(actual, theirs(with_inertia(mended)).qacc, rtol=1e-4, atol=1e-4)
+    several = jax.vmap(lambda matrix: ours(with_inertia(matrix)).qacc)(jnp.asarray([inertia, broken], jnp.float32))
+    np.testing.assert_allclose(several, [ours(data).qacc, actual], rtol=1e-4, atol=1e-4)
 
 
 # -------------------------------------------------------------------------------------------------------- parity
