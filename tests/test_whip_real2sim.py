@@ -118,15 +118,15 @@ def test_objects_may_be_files_and_unknown_ones_are_refused(tmp_path):
 
 
 def test_length_and_stiffness_are_inferred(problem):
-    """Two rounds are few, but the initial support is ten times as wide as what must be left of it."""
+    """The initial support is 110 mm wide, and 3.9 in ln E (measured for six seeds: at most 1.2 mm and 0.06 off)."""
     settings = SETTINGS.replace(
-        rounds=2, additions=40, attempts=44,
+        rounds=3, additions=40, attempts=44,
         estimator=SETTINGS.estimator.replace(normaliser="asinh", activation="tanh", steps=400, hidden=(32, 32)),
     )  # fmt: skip
     run = jaxlfi.infer(jax.random.key(3), problem, settings=settings, heuristic=jaxlfi.Edge())
     draws = run.sample(jax.random.key(4), 1000)
     error = np.abs(np.median(draws, axis=0) - np.asarray(problem.truth))
-    assert error[0] < 8 and error[1] < 0.5
+    assert error[0] < 5 and error[1] < 0.3
     assert int(np.sum(run.info.failed)) == 0
 
 
