@@ -37,22 +37,28 @@ DRAWS = 10_000
 
 
 def mdn(settings: Settings) -> Settings:
-    """The single-round method with a mixture density network of ten Gaussians in place of the flow."""
+    """The method with mixture networks of ten Gaussians in place of flows: many, for bent posteriors."""
     return settings.replace(estimator=settings.estimator.replace(family="mdn", components=10))
 
 
+def gaussian(settings: Settings) -> Settings:
+    """The method with eight small networks of one Gaussian each, for posteriors in many dimensions."""
+    return settings.replace(
+        estimator=settings.estimator.replace(family="mdn", components=1, members=8, hidden=(32,), activation="tanh")
+    )
+
+
+NETWORKS = {"": lambda settings: settings, "-mdn": mdn, "-gaussian": gaussian}
 VARIANTS = {
-    "npe": METHODS["npe"],
-    "apt": METHODS["apt"],
-    "npe-mdn": lambda settings: mdn(METHODS["npe"](settings)),
-    "apt-mdn": lambda settings: mdn(METHODS["apt"](settings)),
+    method + suffix: (METHODS[method], network) for suffix, network in NETWORKS.items() for method in ("npe", "apt")
 }
 
 
 def settings_of(method: str, simulations: int) -> Settings:
     """A method at a budget; sequential ones divide it by ten rounds."""
     each = simulations // ROUNDS
-    return VARIANTS[method](Settings(estimator=FLOW, rounds=ROUNDS, additions=each, attempts=each)).check()
+    divided, network = VARIANTS[method]
+    return network(divided(Settings(estimator=FLOW, rounds=ROUNDS, additions=each, attempts=each))).check()
 
 
 def posterior_draws(task_name: str, settings: Settings, seed: int) -> dict[str, np.ndarray]:
