@@ -43,9 +43,8 @@ def mdn(settings: Settings) -> Settings:
 
 def gaussian(settings: Settings) -> Settings:
     """The method with eight small networks of one Gaussian each, for posteriors in many dimensions."""
-    return settings.replace(
-        estimator=settings.estimator.replace(family="mdn", components=1, members=8, hidden=(32,), activation="tanh")
-    )
+    one = settings.estimator.replace(family="mdn", components=1, hidden=(32,), activation="tanh")
+    return settings.replace(estimator=one.replace(members=8, learning_rate=2e-3))
 
 
 NETWORKS = {"": lambda settings: settings, "-mdn": mdn, "-gaussian": gaussian}
