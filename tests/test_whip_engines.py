@@ -151,6 +151,14 @@ def test_no_kernel_computes_a_links_ancestors_anew():
     assert recomputed(program(Scene(chain=Chain(elements=3)), mjx.kinematics)) > 2000
 
 
+def test_double_precision_leaves_states_single():
+    with jax.enable_x64(True):
+        scene = Scene(chain=Chain(elements=3))
+        roll = functools.partial(rollout, MjxEngine(scene), median(), jnp.zeros((2, 2)))
+        states = jax.eval_shape(roll)
+    assert states.qpos.dtype == states.qvel.dtype == states.target.dtype == jnp.float32
+
+
 # -------------------------------------------------------------------------------------------------------- solver
 
 

@@ -1,5 +1,6 @@
 """One contract for the physics, whichever simulator computes it."""
 
+import functools
 from typing import Protocol
 
 import jax
@@ -48,7 +49,8 @@ def reset(scene: Scene, parameters: WhipParameters) -> State:
     """The DLO hanging at rest from the gripper at its start, the cubes stacked."""
     qpos = initial_positions(scene, parameters)
     velocities = 2 + scene.chain.elements * scene.chain.freedoms + 6 * 6
-    return State(qpos, jnp.zeros(velocities), jnp.asarray(START), jnp.asarray(False))
+    single = functools.partial(jnp.asarray, dtype=jnp.float32)
+    return State(single(qpos), single(jnp.zeros(velocities)), single(START), jnp.asarray(False))
 
 
 def rollout(engine: Engine, parameters: WhipParameters, targets: Float[Array, "time 2"]) -> State:

@@ -26,7 +26,7 @@ CONTACTS = 96
 
 
 class MjxEngine:
-    """MJX, in the precision that JAX is set to, single as a rule."""
+    """MJX, in the precision that JAX is set to, single as a rule; states between control steps are single anyway."""
 
     def __init__(self, scene: Scene = Scene(), implementation: str = "jax", scenes: int = 4096):
         """An engine.
@@ -58,16 +58,17 @@ class MjxEngine:
         with jax.ensure_compile_time_eval():  # also where a traced function makes the engine
             model = mjx.put_model(compiled, impl=implementation)
             data = mjx.make_data(compiled, impl=implementation, **room)
-            _, unravel = ravel_pytree(zeros)
+            flat, unravel = ravel_pytree(zeros)
         # Tracing takes seconds. So it is done once for all programs, and as the arguments are one vector, once for each
         # kind of batch, whichever of them have the batch's axis.
+        self._kind = flat.dtype
         self._simulate = jax.jit(lambda flat: _simulate(scene, advanced, model, data, *unravel(flat)))
 
     def advance(self, parameters: WhipParameters, state: State, target: Float[Array, "2"]) -> State:
         """One control interval; see `Engine.advance`."""
         with jax.default_matmul_precision("highest"):  # accelerators' 10 bits would not do
             flat, _ = ravel_pytree((parameters, state, target))
-            return settled(state, *self._simulate(flat.astype(jnp.float32)))
+            return settled(state, *self._simulate(flat.astype(self._kind)))
 
 
 def _zeros(scene: Scene):
