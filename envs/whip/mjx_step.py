@@ -34,7 +34,7 @@ def step(scene: Scene, model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """What `mjx.solve` does; where that gives no numbers, once more with joints that are slightly harder to turn.
+    """What `mjx.solve` does; where that gives no numbers, again with joints that are slightly harder to turn.
 
     In single precision the matrix of Newton's method, which has the contacts' stiffness in it, is at times not to be
     told from an indefinite one (scaled to a unit diagonal, its smallest eigenvalue is then some 3e-7), and Cholesky's
