@@ -221,13 +221,13 @@ def agreement() -> dict[str, dict[str, float]]:
     targets = np.stack(list(moves.values())).astype(np.float32)
     nudges = np.random.default_rng(0).normal(size=(12, *targets.shape), scale=1e-5)
 
-    def roll(engine, targets):
-        every = jax.vmap(jax.vmap(functools.partial(rollout, engine), (None, 0)), (0, None))
-        return jax.device_get(jax.jit(every)(scenes, targets))
+    def program(engine):
+        every = jax.jit(jax.vmap(jax.vmap(functools.partial(rollout, engine), (None, 0)), (0, None)))
+        return lambda targets: jax.device_get(every(scenes, targets))
 
-    native, mjx = NativeEngine(SCENE), pick("mjx")
-    reference, others = roll(native, targets), {"mjx": roll(mjx, targets)}
-    others |= {f"native, nudged {i + 1}": roll(native, targets + nudge) for i, nudge in enumerate(nudges)}
+    native, mjx = program(NativeEngine(SCENE)), program(pick("mjx"))
+    reference, others = native(targets), {"mjx": mjx(targets)}
+    others |= {f"native, nudged {i + 1}": native(targets + nudge) for i, nudge in enumerate(nudges)}
     look = jax.jit(jax.vmap(jax.vmap(jax.vmap(functools.partial(frames, SCENE), (None, 0)), (None, 0))))
     first, found = look(scenes, reference.qpos), {}
     lowest = np.asarray(first.dlo)[..., 2].min(axis=(-1, -2))
