@@ -77,7 +77,7 @@ def variants(quick: Settings = QUICK) -> dict[str, Variant]:
     the work, and nothing that an ensemble averages away. EDGE's own readings move nothing else, so that the other
     configurations are left out there.
     """
-    base = quick.replace(estimator=quick.estimator.replace(members=1))
+    base = quick.replace(estimator=quick.estimator.replace(ensemble_size=1))
 
     def estimator(change: str, **fields) -> Variant:
         return Variant(change, base.replace(estimator=base.estimator.replace(**fields)))

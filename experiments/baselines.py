@@ -50,7 +50,9 @@ REFERENCE = "misspecified+edge"
 def in_one_round(settings: Settings) -> Settings:
     """All simulations, and all attempts, in a single round; the training of a round stays what it is."""
     return settings.replace(
-        rounds=1, additions=settings.rounds * settings.additions, attempts=settings.rounds * settings.attempts
+        rounds=1,
+        simulations_per_round=settings.rounds * settings.simulations_per_round,
+        simulation_budget=settings.rounds * settings.simulation_budget,
     )
 
 

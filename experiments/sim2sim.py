@@ -42,7 +42,9 @@ HEURISTICS = {
     "fixed": jaxlfi.Fixed(),
     "edge": jaxlfi.Edge(mass_threshold=jnp.array([0.003, 0.005])),
 }
-SETTINGS = QUICK.replace(rounds=8, additions=60, attempts=75, estimator=QUICK.estimator.replace(batch_size=10))
+SETTINGS = QUICK.replace(
+    rounds=8, simulations_per_round=60, simulation_budget=75, estimator=QUICK.estimator.replace(batch_size=10)
+)
 """`quick` with 480 simulations a run, where the paper has 1,500."""
 DRAWS = 500
 LANES = 14

@@ -14,7 +14,7 @@ from jaxlfi.estimator import Estimator, Network, initialise, normalisers, static
 from jaxlfi.fitting import FitInfo, fit
 from jaxlfi.heuristics import Adaptation, Heuristic
 from jaxlfi.posterior import posterior
-from jaxlfi.simulation import Attempts, simulate, within_budget
+from jaxlfi.simulation import Simulations, simulate, within_budget
 from jaxlfi.support import Support
 from jaxlfi.task import Task
 
@@ -26,8 +26,8 @@ class Settings:
     Attributes:
         estimator: the network and its training.
         rounds: inference iterations N_LFI.
-        additions: simulations added to the dataset each round, at most.
-        attempts: simulations attempted each round, at most, failures included.
+        simulations_per_round: simulations added to the dataset each round, at most.
+        simulation_budget: simulations attempted each round, at most, failures included.
         correction: how q_phi becomes the posterior, "none", "paper" or "importance" (reading A).
         restriction: how draws are kept in the support, "clip" or "reject" (reading E).
         defensive: share of each round's proposals drawn from the prior over the current support instead of the
@@ -37,8 +37,8 @@ class Settings:
     estimator: Estimator = Estimator()
     defensive: Float[Array, "*batch"] | float = 0.0
     rounds: int = static(10)
-    additions: int = static(100)
-    attempts: int = static(125)
+    simulations_per_round: int = static(100)
+    simulation_budget: int = static(125)
     correction: str = static("none")
     restriction: str = static("clip")
 
@@ -48,13 +48,16 @@ class Settings:
         for field, known in {"correction": CORRECTIONS, "restriction": RESTRICTIONS}.items():
             if getattr(self, field) not in known:
                 raise ValueError(f"{field}: expected one of {sorted(known)}, got {getattr(self, field)!r}")
-        if self.rounds < 1 or self.additions < 1:
-            raise ValueError(f"expected at least 1 round and 1 addition, got {self.rounds} and {self.additions}")
+        if self.rounds < 1 or self.simulations_per_round < 1:
+            raise ValueError(
+                f"expected at least 1 round and 1 addition, got {self.rounds} and {self.simulations_per_round}"
+            )
         if isinstance(self.defensive, float | int) and not 0 <= self.defensive <= 1:
             raise ValueError(f"defensive: expected a share in [0, 1], got {self.defensive}")
-        if self.attempts < self.additions:
+        if self.simulation_budget < self.simulations_per_round:
             raise ValueError(
-                f"attempts: expected at least the {self.additions} additions of a round, got {self.attempts}"
+                f"simulation_budget: expected at least the {self.simulations_per_round} simulations of a round, "
+                f"got {self.simulation_budget}"
             )
         return self
 
@@ -83,7 +86,7 @@ class Round:
     """What one round did; `run` stacks these.
 
     Attributes:
-        attempts: the simulations.
+        simulations: what was simulated.
         failed: failures by reason, shape [R].
         proposal: the belief that was drawn from.
         belief: the posterior on the adapted support.
@@ -92,7 +95,7 @@ class Round:
         fit: losses.
     """
 
-    attempts: Attempts
+    simulations: Simulations
     failed: Int[Array, "*batch reason"]
     proposal: Belief
     belief: Belief
@@ -105,11 +108,11 @@ def init(key: jax.Array, task: Task, support: Support, settings: Settings, obser
     """The state before the first round: no data, and nothing believed but the support."""
     chex.assert_rank(observed, 1)
     chex.assert_shape([support.low, support.high], (task.dim,))
-    components = settings.estimator.members * settings.estimator.components
+    components = settings.estimator.ensemble_size * settings.estimator.components
     belief = uninformed(support, components)
     obs = observed.shape[-1]
     feasible = task.feasible.hull(support)
-    nothing = datasets.empty(settings.rounds * settings.additions, task.dim, obs)
+    nothing = datasets.empty(settings.rounds * settings.simulations_per_round, task.dim, obs)
     return State(
         belief=belief,
         proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.rounds, *leaf.shape)), belief),
@@ -129,9 +132,9 @@ def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> F
     support has gained, also where the posterior has locked itself onto a place where it learns nothing more.
     """
     key_prior, key_posterior, key_share = jax.random.split(key, 3)
-    informed = RESTRICTIONS[settings.restriction](key_posterior, belief, settings.attempts)
-    prior = prior_draws(key_prior, task, belief.support, settings.attempts)
-    from_prior = jax.random.bernoulli(key_share, settings.defensive, (settings.attempts, 1)) | ~belief.informed
+    informed = RESTRICTIONS[settings.restriction](key_posterior, belief, settings.simulation_budget)
+    prior = prior_draws(key_prior, task, belief.support, settings.simulation_budget)
+    from_prior = jax.random.bernoulli(key_share, settings.defensive, (settings.simulation_budget, 1)) | ~belief.informed
     return jnp.where(from_prior, prior, informed)
 
 
@@ -154,7 +157,7 @@ def update(
     observed: Float[Array, " obs"],
     state: State,
     round: Int[Array, ""] | int,
-    attempts: Attempts,
+    attempts: Simulations,
 ) -> tuple[State, Round]:
     """All of a round that comes after its simulations (lines 12-20)."""
     dataset = datasets.augment(state.dataset, attempts, round)
@@ -162,7 +165,7 @@ def update(
     network = _started(settings.estimator, state, dataset)
     correction = CORRECTIONS[settings.correction]
     weights = correction.row_weights(task, dataset, proposals, round, settings.defensive)
-    expected = (round + 1) * settings.additions
+    expected = (round + 1) * settings.simulations_per_round
     # An MDN is read off, a flow is drawn from.
     key_fit, key_draw = jax.random.split(key) if settings.estimator.is_flow else (key, None)
     log_prior = None if task.prior is None else task.prior.log_prob(dataset.theta)
@@ -171,7 +174,7 @@ def update(
     mixture, not_positive_definite = correction.change(task, q, state.belief)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     info = Round(
-        attempts=attempts,
+        simulations=attempts,
         failed=attempts.failed(len(task.reasons)),
         proposal=state.belief,
         belief=belief,
@@ -214,7 +217,7 @@ def step(
     key_propose, key_simulate, key_update = jax.random.split(key, 3)
     theta = propose(key_propose, task, settings, state.belief)
     x, failure = simulate(key_simulate, task, theta)
-    attempts = within_budget(theta, x, failure, settings.additions)
+    attempts = within_budget(theta, x, failure, settings.simulations_per_round)
     return update(key_update, task, settings, heuristic, observed, state, round, attempts)
 
 

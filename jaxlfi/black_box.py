@@ -1,8 +1,8 @@
 """Black boxes: inference around a simulator in plain Python or NumPy, outside of the compiled program.
 
 What comes before the simulations of a round (drawing parameters) and after (fitting, adapting) is compiled;
-the simulator is called between, in waves: first for as many parameter vectors as additions are wanted, then
-for as many as failed, until the additions are reached or the attempts are spent. Nothing is simulated that
+the simulator is called between, in waves: first for as many parameter vectors as simulations_per_round are wanted, then
+for as many as failed, until the simulations_per_round are reached or the attempts are spent. Nothing is simulated that
 is not needed.
 """
 
@@ -20,7 +20,7 @@ from jaxlfi.diagnostics import POSTERIOR_SAMPLES, Discrepancy, trajectory_distan
 from jaxlfi.history import record
 from jaxlfi.lanes import Inputs, diagnose_key, round_key, start_one
 from jaxlfi.observation import SimulatorError, numpy_generator
-from jaxlfi.simulation import Attempts, summarised, with_outcome, within_budget
+from jaxlfi.simulation import Simulations, summarised, with_outcome, within_budget
 from jaxlfi.task import Task
 
 
@@ -59,7 +59,7 @@ class BlackBoxEngine:
         theta, keys = self._propose(self._inputs, state, jnp.asarray(index))
         lanes = [
             simulate_within_budget(
-                self._task, key, lane_theta, self._settings.additions, self._inputs.observed.shape[1:]
+                self._task, key, lane_theta, self._settings.simulations_per_round, self._inputs.observed.shape[1:]
             )
             for key, lane_theta in zip(keys, theta, strict=True)
         ]
@@ -88,21 +88,21 @@ class BlackBoxEngine:
     def _propose_one_stacked(self, inputs: Inputs, state: State, index):
         return jax.vmap(self._propose_one, in_axes=(0, 0, None))(inputs, state, index)
 
-    def _update_one(self, lane: Inputs, state: State, index, attempts: Attempts):
+    def _update_one(self, lane: Inputs, state: State, index, attempts: Simulations):
         _, _, key_update = jax.random.split(round_key(lane, index), 3)
         return bayessim.update(key_update, self._task, self._settings, lane.heuristic, lane.x, state, index, attempts)
 
 
 def simulate_within_budget(
-    task: Task, key: jax.Array, theta: jax.Array, additions: int, shape: Sequence[int]
-) -> Attempts:
+    task: Task, key: jax.Array, theta: jax.Array, simulations_per_round: int, shape: Sequence[int]
+) -> Simulations:
     """Simulate parameters in their order until enough have succeeded or all are spent.
 
     Args:
         task: a black box.
         key: seeds the simulator's generator.
         theta: proposals in coordinates, shape [A, D].
-        additions: how many successes are wanted.
+        simulations_per_round: how many successes are wanted.
         shape: of a trajectory.
     """
     natural = np.asarray(task.to_natural(theta))
@@ -111,13 +111,13 @@ def simulate_within_budget(
     outcomes = np.full(budget, 1)  # what was not attempted is no success
     rng = numpy_generator(key)
     done, successes = 0, 0
-    while done < budget and successes < additions:
-        wave = slice(done, min(budget, done + additions - successes))
+    while done < budget and successes < simulations_per_round:
+        wave = slice(done, min(budget, done + simulations_per_round - successes))
         trajectories[wave], outcomes[wave] = call(task, rng, natural[wave], shape)
         x, failure = _summaries(task, jnp.asarray(trajectories), jnp.asarray(outcomes))
         done = wave.stop
         successes = int(np.sum(np.asarray(failure)[:done] == 0))
-    return within_budget(theta, x, failure, additions)
+    return within_budget(theta, x, failure, simulations_per_round)
 
 
 def call(
@@ -186,9 +186,9 @@ def _draw(restriction: str, key: jax.Array, belief) -> tuple[jax.Array, jax.Arra
     return RESTRICTIONS[restriction](key_draw, belief, POSTERIOR_SAMPLES), key_simulate
 
 
-def _empty_attempts(theta_shape: tuple[int, ...], obs: int) -> Attempts:
+def _empty_attempts(theta_shape: tuple[int, ...], obs: int) -> Simulations:
     flags = jnp.zeros(theta_shape[:-1], bool)
-    return Attempts(
+    return Simulations(
         theta=jnp.zeros(theta_shape),
         x=jnp.zeros((*theta_shape[:-1], obs)),
         failure=jnp.zeros(theta_shape[:-1], jnp.int32),

@@ -295,8 +295,10 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
 
     rounds = command.add_argument_group("rounds (default: the preset's)")
     rounds.add_argument("--rounds", type=int, metavar="N", help="inference rounds, N_LFI")
-    rounds.add_argument("--additions", type=int, metavar="N", help="simulations added each round, at most")
-    rounds.add_argument("--attempts", type=int, metavar="N", help="simulations attempted each round, failures included")
+    rounds.add_argument("--simulations-per-round", type=int, metavar="N", help="simulations added each round, at most")
+    rounds.add_argument(
+        "--simulation-budget", type=int, metavar="N", help="simulations attempted each round, failures included"
+    )
     rounds.add_argument(
         "--correction", metavar="NAME", help="from the network to the posterior: none, paper, importance"
     )
@@ -316,7 +318,7 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
     network.add_argument("--activation", metavar="NAME", help="relu, tanh or silu")
     network.add_argument("--components", type=int, metavar="K", help="Gaussians in each network's mixture")
     network.add_argument("--prune", type=float, metavar="X", help="components of less weight than this are dropped")
-    network.add_argument("--members", type=int, metavar="N", help="networks in the ensemble")
+    network.add_argument("--ensemble-size", type=int, metavar="N", help="networks in the ensemble")
     network.add_argument("--normaliser", metavar="NAME", help="what is done to summaries: zscore, asinh, none")
     network.add_argument("--epochs", type=int, metavar="N", help="full passes over the data each round")
     network.add_argument("--steps", type=int, metavar="N", help="gradient steps each round, in place of --epochs")

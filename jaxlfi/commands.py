@@ -320,9 +320,11 @@ def build_settings(arguments: argparse.Namespace, task: Task) -> Settings:
         given["steps"] = 0
     if "hidden" in given:
         given["hidden"] = tuple(given["hidden"])
-    if "attempts" not in given and "additions" in given:
+    if "simulation_budget" not in given and "simulations_per_round" in given:
         # The share of failures that a round can bear stays the preset's.
-        given["attempts"] = -(-given["additions"] * preset.attempts // preset.additions)
+        given["simulation_budget"] = -(
+            -given["simulations_per_round"] * preset.simulation_budget // preset.simulations_per_round
+        )
     settings = with_settings(preset, given)
     for name in ("learning_rate", "weight_decay", "clip_norm"):
         value = getattr(settings.estimator, name)

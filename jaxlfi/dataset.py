@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlfi.simulation import Attempts
+from jaxlfi.simulation import Simulations
 
 
 @struct.dataclass
@@ -39,7 +39,7 @@ def empty(capacity: int, dim: int, obs: int) -> Dataset:
     )
 
 
-def augment(dataset: Dataset, attempts: Attempts, round: Int[Array, ""] | int) -> Dataset:
+def augment(dataset: Dataset, attempts: Simulations, round: Int[Array, ""] | int) -> Dataset:
     """Add the kept attempts behind the rows already filled (Algorithm 1, line 12), as far as there is room."""
     capacity = dataset.theta.shape[0]
     row = dataset.size + jnp.cumsum(attempts.kept) - 1

@@ -72,7 +72,7 @@ class Estimator:
     hidden: tuple[int, ...] = static((1024, 1024, 1024))
     activation: str = static("tanh")
     components: int = static(4)
-    members: int = static(1)
+    ensemble_size: int = static(1)
     epochs: int = static(1000)
     steps: int = static(0)
     batch_size: int = static(100)
@@ -97,7 +97,7 @@ class Estimator:
         for field, known in choices.items():
             if getattr(self, field) not in known:
                 raise ValueError(f"{field}: expected one of {sorted(known)}, got {getattr(self, field)!r}")
-        for field in ("components", "members", "batch_size"):
+        for field in ("components", "ensemble_size", "batch_size"):
             if getattr(self, field) < 1:
                 raise ValueError(f"{field}: expected at least 1, got {getattr(self, field)}")
         if (self.epochs > 0) == (self.steps > 0):
@@ -155,7 +155,7 @@ class Network:
 def initialise(key: jax.Array, estimator: Estimator, dim: int, obs: int) -> dict:
     """Fresh weights for every member."""
     module = estimator.module(dim)
-    return jax.vmap(lambda k: module.init(k, jnp.zeros(obs)))(jax.random.split(key, estimator.members))
+    return jax.vmap(lambda k: module.init(k, jnp.zeros(obs)))(jax.random.split(key, estimator.ensemble_size))
 
 
 def normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tuple[Normaliser, Normaliser | None]:
@@ -187,7 +187,7 @@ def draw(
     """`n` draws of a flow's q_phi(theta | x) in coordinates, from all members in turn; some may leave any support."""
     module = estimator.module(scale.dim)
     x = normalised(estimator.normaliser, network.normaliser, x)
-    keys = jax.random.split(key, estimator.members)
+    keys = jax.random.split(key, estimator.ensemble_size)
     draws = jax.vmap(lambda key, params: module.apply(params, x).sample(key, n))(keys, network.params)
-    turn = jnp.arange(n) % estimator.members
+    turn = jnp.arange(n) % estimator.ensemble_size
     return scale.centre + 0.5 * scale.width * network.to_unit(draws[turn, jnp.arange(n)])

@@ -23,13 +23,13 @@ class FitInfo:
     Attributes:
         loss: mean training loss of each pass, negative log-density of theta scaled to [-1, 1]^D, shape [E, P].
         validation_loss: the same over the held-out simulations after each pass; NaN without any, shape [E, P].
-        chosen_pass: the pass the weights were taken from, shape [E].
+        chosen_epoch: the pass the weights were taken from, shape [E].
         nonfinite: gradient steps skipped because the loss or its gradient was not finite, shape [E].
     """
 
     loss: Float[Array, "*batch passes"]
     validation_loss: Float[Array, "*batch passes"]
-    chosen_pass: Int[Array, "*batch"]
+    chosen_epoch: Int[Array, "*batch"]
     nonfinite: Int[Array, "*batch"]
 
 
@@ -88,7 +88,7 @@ def fit(
     def one(key, params):
         return _fit_member(key, estimator, params, data, dataset.size, expected_size)
 
-    params, info = jax.vmap(one)(jax.random.split(key_fit, estimator.members), network.params)
+    params, info = jax.vmap(one)(jax.random.split(key_fit, estimator.ensemble_size), network.params)
     return network.replace(params=params), info
 
 

@@ -26,12 +26,12 @@ def record(info: Round, seen: Discrepancy) -> dict[str, jax.Array]:
     """One round as named arrays: the rows of history.npz, and all that the ledger is made from."""
     proposal, belief = info.proposal.support, info.belief.support
     return {
-        "theta": info.attempts.theta,
-        "counted": info.attempts.counted,
-        "kept": info.attempts.kept,
-        "failure": info.attempts.failure,
-        "attempted": info.attempts.attempted,
-        "succeeded": info.attempts.succeeded,
+        "theta": info.simulations.theta,
+        "counted": info.simulations.counted,
+        "kept": info.simulations.kept,
+        "failure": info.simulations.failure,
+        "attempted": info.simulations.attempted,
+        "succeeded": info.simulations.succeeded,
         "failed": info.failed,
         "proposal_low": proposal.low,
         "proposal_high": proposal.high,
@@ -45,7 +45,7 @@ def record(info: Round, seen: Discrepancy) -> dict[str, jax.Array]:
         "scale_tril": info.belief.mixture.scale_tril,
         "loss": info.fit.loss,
         "validation_loss": info.fit.validation_loss,
-        "chosen_pass": info.fit.chosen_pass,
+        "chosen_epoch": info.fit.chosen_epoch,
         "nonfinite": info.fit.nonfinite,
         "effective_size": info.correction.effective_size,
         "not_positive_definite": info.correction.not_positive_definite,
@@ -112,7 +112,7 @@ def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, .
         reasons: names of the reasons of failure.
         seconds: wall time of the round, divided by the lanes that were stepped together.
     """
-    members = np.arange(row["chosen_pass"].shape[0])
+    members = np.arange(row["chosen_epoch"].shape[0])
     return {
         "round": index,
         "attempted": int(row["attempted"]),
@@ -122,8 +122,8 @@ def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, .
         "evidence": {name[len(EVIDENCE) :]: value.tolist() for name, value in row.items() if name.startswith(EVIDENCE)},
         "low_shift": row["low_shift"].tolist(),
         "high_shift": row["high_shift"].tolist(),
-        "loss": float(np.mean(row["loss"][members, row["chosen_pass"]])),
-        "validation_loss": float(np.mean(row["validation_loss"][members, row["chosen_pass"]])),
+        "loss": float(np.mean(row["loss"][members, row["chosen_epoch"]])),
+        "validation_loss": float(np.mean(row["validation_loss"][members, row["chosen_epoch"]])),
         "nonfinite_steps": int(np.sum(row["nonfinite"])),
         "effective_size": float(row["effective_size"]),
         "not_positive_definite": int(row["not_positive_definite"]),

@@ -199,7 +199,7 @@ def infer(
         state, info = _run(task, run_keys(key).run, settings, heuristic, x, support)
         run = _as_run(task, key, settings, heuristic, observed, x, state, info)
     if concrete:
-        refuse_hopeless(np.asarray(run.info.attempts.succeeded)[:1], np.asarray(run.info.failed)[0], task)
+        refuse_hopeless(np.asarray(run.info.simulations.succeeded)[:1], np.asarray(run.info.failed)[0], task)
         if isinstance(heuristic, Fixed | Truncate):
             for warning in run.warnings:
                 python_warnings.warn(warning, SupportWarning, stacklevel=2)
@@ -279,7 +279,7 @@ def _infer_black_box(key, task, observation, support, heuristic, settings) -> Ru
     for index in range(settings.rounds):
         state, info = engine.step(state, index)
         infos.append(info)
-        refuse_hopeless(np.asarray(infos[0].attempts.succeeded), np.asarray(infos[0].failed), task)
+        refuse_hopeless(np.asarray(infos[0].simulations.succeeded), np.asarray(infos[0].failed), task)
     state = jax.tree.map(lambda leaf: leaf[0], state)
     info = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *infos)
     return _as_run(task, key, settings, heuristic, observed, x, state, info)

@@ -52,7 +52,7 @@ def posterior(
     draws = draw(key_draw, estimator, network, x, scale, FLOW_DRAWS)
     inside = support.contains(draws)
     weights = jnp.where(jnp.any(inside), inside, True).astype(draws.dtype)
-    mixture, _ = fit_mixture(key_fit, draws, weights, estimator.members * estimator.components)
+    mixture, _ = fit_mixture(key_fit, draws, weights, estimator.ensemble_size * estimator.components)
     return mixture, jnp.mean(inside)
 
 
@@ -161,4 +161,4 @@ def flow_log_prob(
     # Both maps from theta to what the network sees are affine, dimension by dimension.
     width = 0.5 * scale.width
     width = width if network.theta_normaliser is None else width * network.theta_normaliser.scale
-    return jax.nn.logsumexp(members, axis=0) - jnp.log(estimator.members) - jnp.sum(jnp.log(width))
+    return jax.nn.logsumexp(members, axis=0) - jnp.log(estimator.ensemble_size) - jnp.sum(jnp.log(width))

@@ -12,7 +12,7 @@ QUICK = Settings(
     estimator=Estimator(
         hidden=(64, 64),
         activation="tanh",
-        members=4,
+        ensemble_size=4,
         prune=0.1,
         learning_rate=1e-3,
         epochs=0,
@@ -68,11 +68,11 @@ def npe(settings: Settings) -> Settings:
     there is no need to hold back where nothing was simulated: ReLU fits better than tanh where something was.
     """
     return settings.replace(
-        estimator=FLOW.replace(loss="likelihood", activation="relu", members=4),
+        estimator=FLOW.replace(loss="likelihood", activation="relu", ensemble_size=4),
         restriction="reject",
         rounds=1,
-        additions=settings.rounds * settings.additions,
-        attempts=settings.rounds * settings.attempts,
+        simulations_per_round=settings.rounds * settings.simulations_per_round,
+        simulation_budget=settings.rounds * settings.simulation_budget,
     )
 
 

@@ -9,7 +9,7 @@ from jaxlfi.task import Task
 
 
 @struct.dataclass
-class Attempts:
+class Simulations:
     """The simulations of one round, in the order of their attempt.
 
     Attributes:
@@ -82,19 +82,19 @@ def within_budget(
     theta: Float[Array, "attempts dim"],
     x: Float[Array, "attempts obs"],
     failure: Int[Array, " attempts"],
-    additions: Int[Array, ""] | int,
-) -> Attempts:
-    """Keep the first `additions` successes; what was drawn after the last one needed does not count as attempted.
+    simulations_per_round: Int[Array, ""] | int,
+) -> Simulations:
+    """Keep the first successes; what was drawn after the last one needed does not count as attempted.
 
     Args:
         theta: proposals in the order they are attempted, shape [A, D]; A is the budget of attempts.
         x: summaries, shape [A, S].
         failure: failure codes, shape [A].
-        additions: how many simulations a round adds at most.
+        simulations_per_round: how many simulations a round adds at most.
     """
     success = failure == 0
     so_far = jnp.cumsum(success)
-    kept = success & (so_far <= additions)
+    kept = success & (so_far <= simulations_per_round)
     # The attempt after the last needed success would not have been made.
-    counted = so_far - success < additions
-    return Attempts(theta=theta, x=x, failure=failure, counted=counted, kept=kept)
+    counted = so_far - success < simulations_per_round
+    return Simulations(theta=theta, x=x, failure=failure, counted=counted, kept=kept)

@@ -18,14 +18,14 @@ TASK = "envs.gaussian_linear:task"
 SETTINGS = Settings(
     estimator=Estimator(hidden=(16,), learning_rate=1e-3, epochs=0, steps=100, batch_size=20, warm_start=False),
     rounds=2,
-    additions=20,
-    attempts=25,
+    simulations_per_round=20,
+    simulation_budget=25,
 )
 FLAGS = (
     "--hidden 16 --activation tanh --normaliser zscore --learning-rate 1e-3 --steps 100 --batch-size 20 "
-    "--validation 0 --patience 0 --members 1 --components 4 --prune 0 --weight-decay 0 --clip-norm inf "
+    "--validation 0 --patience 0 --ensemble-size 1 --components 4 --prune 0 --weight-decay 0 --clip-norm inf "
     "--schedule constant --no-warm-start --correction none --restriction clip "
-    "--rounds 2 --additions 20 --attempts 25 --no-figures"
+    "--rounds 2 --simulations-per-round 20 --simulation-budget 25 --no-figures"
 ).split()
 """The same on the command line."""
 

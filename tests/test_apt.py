@@ -46,7 +46,9 @@ def test_the_atomic_loss_needs_no_correction_for_its_proposals():
     """Two later rounds of proposals like the posterior: by likelihood they count the data again and more than halve
     the covariance; the atomic loss keeps it. Measured for four seeds: traces of 1.8 to 2.3, by likelihood of 0.9.
     """
-    settings = Settings(estimator=ATOMIC, rounds=3, additions=500, attempts=500, restriction="reject")
+    settings = Settings(
+        estimator=ATOMIC, rounds=3, simulations_per_round=500, simulation_budget=500, restriction="reject"
+    )
     state, info = infer(settings, ("ok",) * 2, (0,) * 2, 1)
     np.testing.assert_allclose(info.correction.inside[:, -1], 1.0, atol=0.02)
     for i in range(2):
@@ -66,7 +68,9 @@ def test_a_prior_of_the_tasks_own_is_the_posteriors():
         feasible=box,
         prior=distrax.MultivariateNormalDiag(jnp.zeros(2), jnp.asarray(prior_scale)),
     )
-    settings = Settings(estimator=ATOMIC, rounds=3, additions=500, attempts=500, restriction="reject")
+    settings = Settings(
+        estimator=ATOMIC, rounds=3, simulations_per_round=500, simulation_budget=500, restriction="reject"
+    )
 
     def one(key):
         return bayessim.run(key, task, settings, Fixed(), X, box)[0].belief.mixture
@@ -87,7 +91,7 @@ def test_a_prior_of_the_tasks_own_is_the_posteriors():
 
 @pytest.fixture(scope="module")
 def flow_run():
-    settings = Settings(estimator=FLOW, rounds=2, additions=30, attempts=30, restriction="reject")
+    settings = Settings(estimator=FLOW, rounds=2, simulations_per_round=30, simulation_budget=30, restriction="reject")
     run = jax.jit(lambda key: bayessim.run(key, TASK, settings, Fixed(), X, TASK.supports["ok"]))
     return run, jax.device_get(run(jax.random.key(0)))
 
@@ -133,7 +137,7 @@ def test_draws_within_are_the_flows_own_cut_to_the_box(flow_run):
 
 
 def test_members_take_turns():
-    estimator = dataclasses.replace(FLOW, members=2)
+    estimator = dataclasses.replace(FLOW, ensemble_size=2)
     scale = Support([-10.0, -10.0], [10.0, 10.0])
     nothing = bayessim.datasets.empty(4, 2, 2)
     network = Network(initialise(jax.random.key(0), estimator, 2, 2), *normalisers(estimator, nothing, scale))
@@ -151,15 +155,23 @@ def test_members_take_turns():
 
 def test_methods_keep_the_budget():
     apt, npe = METHODS["apt"](QUICK), METHODS["npe"](QUICK)
-    assert (apt.rounds, apt.additions) == (QUICK.rounds, QUICK.additions) and apt.estimator.loss == "combined"
-    assert npe.rounds == 1 and npe.additions == QUICK.rounds * QUICK.additions and npe.estimator.loss == "likelihood"
+    assert (apt.rounds, apt.simulations_per_round) == (
+        QUICK.rounds,
+        QUICK.simulations_per_round,
+    ) and apt.estimator.loss == "combined"
+    assert (
+        npe.rounds == 1
+        and npe.simulations_per_round == QUICK.rounds * QUICK.simulations_per_round
+        and npe.estimator.loss == "likelihood"
+    )
     for settings in (apt, npe):
         assert settings.check().estimator.is_flow
     assert METHODS["bayessim"](QUICK) is QUICK
 
 
 SMALL_RUN = (
-    "infer gaussian_linear --method apt --family maf --transforms 1 --hidden 8 8 --epochs 2 --rounds 2 --additions 20 "
+    "infer gaussian_linear --method apt --family maf --transforms 1 --hidden 8 8 --epochs 2 --rounds 2 "
+    "--simulations-per-round 20 "
     "--heuristic edge --no-figures --no-cache --out"
 )
 
@@ -187,7 +199,7 @@ def test_a_run_can_be_sampled(folder, tmp_path):
 
 
 def test_a_library_run_draws_from_the_flow_and_saves_it(tmp_path):
-    settings = Settings(estimator=FLOW, rounds=2, additions=30, attempts=30, restriction="reject")
+    settings = Settings(estimator=FLOW, rounds=2, simulations_per_round=30, simulation_budget=30, restriction="reject")
     run = jaxlfi.infer(jax.random.key(0), TASK, X, support="ok", heuristic=jaxlfi.Edge(), settings=settings)
     draws = np.asarray(run.sample(jax.random.key(0), 300))
     run.save(tmp_path / "run")

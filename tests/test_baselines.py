@@ -14,7 +14,10 @@ from tests.small import SETTINGS, gaussian, whole_runs  # noqa: F401 - a fixture
 def test_every_row_has_the_same_budget():
     for row in baselines.ROWS.values():
         settings = row.settings(SETTINGS).check()
-        assert settings.rounds * settings.additions == 40 and settings.rounds * settings.attempts == 50
+        assert (
+            settings.rounds * settings.simulations_per_round == 40
+            and settings.rounds * settings.simulation_budget == 50
+        )
         assert settings.estimator == SETTINGS.estimator
         assert settings.rounds == (1 if "one round" in row.what else 2)
 

@@ -99,7 +99,7 @@ def test_one_round_learns_the_exact_posterior():
     the network's, which must also learn what the box's edges do to posteriors near them. Measured for three
     seeds: means within 0.11, covariances within 0.37 of the closed form.
     """
-    settings = Settings(estimator=MODEST, rounds=1, additions=4000, attempts=4000)
+    settings = Settings(estimator=MODEST, rounds=1, simulations_per_round=4000, simulation_budget=4000)
     state, _ = infer(settings, ("ok",), (0,), 1)
     assert_exact(lane(state.belief, 0), 0.25, 0.45)
 
@@ -109,7 +109,12 @@ def test_importance_weights_keep_later_rounds_exact():
     less.
     """
     settings = Settings(
-        estimator=MODEST, rounds=3, additions=600, attempts=600, correction="importance", restriction="reject"
+        estimator=MODEST,
+        rounds=3,
+        simulations_per_round=600,
+        simulation_budget=600,
+        correction="importance",
+        restriction="reject",
     )
     state, info = infer(settings, ("ok",), (0,), 1)
     assert_exact(lane(state.belief, 0), 0.5, 0.7)
@@ -169,8 +174,8 @@ def test_edge_moves_the_excluded_bound_only_outwards(sequential):
 TINY = Settings(
     estimator=Estimator(learning_rate=1e-2, hidden=(8,), components=2, epochs=0, steps=40, batch_size=10),
     rounds=3,
-    additions=10,
-    attempts=14,
+    simulations_per_round=10,
+    simulation_budget=14,
 )
 
 
@@ -237,7 +242,7 @@ def test_same_key_same_bits_and_no_second_compilation():
     chex.assert_trees_all_equal(run(0), first())
     other = run(1, rate=5e-3, threshold=0.1)
     assert _run._cache_size() == compiled
-    assert np.abs(other[1].attempts.theta - first()[1].attempts.theta).max() > 0.1
+    assert np.abs(other[1].simulations.theta - first()[1].simulations.theta).max() > 0.1
 
 
 def test_states_and_rounds_are_pytrees():
@@ -250,9 +255,10 @@ def test_states_and_rounds_are_pytrees():
 def test_the_books_balance():
     """What was proposed, kept, failed and stored, round by round."""
     state, info = first()
-    attempts = info.attempts
+    attempts = info.simulations
     assert (attempts.succeeded + info.failed.sum(-1) == attempts.attempted).all()
-    assert (attempts.succeeded <= TINY.additions).all() and (attempts.attempted <= TINY.attempts).all()
+    assert (attempts.succeeded <= TINY.simulations_per_round).all()
+    assert (attempts.attempted <= TINY.simulation_budget).all()
     assert info.failed.shape == (3, 3) and info.failed[:, 1].sum() > 0 == info.failed[:, 2].sum()
     kept = attempts.kept
     size = int(state.dataset.size)
@@ -275,14 +281,14 @@ def test_every_round_draws_from_the_belief_before():
     chex.assert_trees_all_equal(before, after)
     chex.assert_trees_all_equal(state.proposals, info.proposal)
     chex.assert_trees_all_equal(state.belief, lane(info.belief, -1))
-    theta, box = info.attempts.theta, info.proposal.support
+    theta, box = info.simulations.theta, info.proposal.support
     assert ((theta >= box.low[:, None]) & (theta <= box.high[:, None])).all()
-    assert len(np.unique(theta[0, :, 0])) == TINY.attempts
+    assert len(np.unique(theta[0, :, 0])) == TINY.simulation_budget
 
 
 def test_a_warm_network_keeps_the_normaliser_of_its_first_simulations():
     state, info = first()
-    first_round = info.attempts.x[0][info.attempts.kept[0]]
+    first_round = info.simulations.x[0][info.simulations.kept[0]]
     np.testing.assert_allclose(state.network.normaliser.mean, first_round.mean(0), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(state.network.normaliser.scale, first_round.std(0), rtol=1e-4)
 
@@ -301,9 +307,9 @@ def test_a_simulator_that_always_fails_leaves_a_finite_state():
     hopeless = Task(lambda key, theta: (theta * jnp.nan, True), ("a", "b"), TASK.supports, TASK.feasible)
     state, info = run(0, task=hopeless)
     assert int(state.dataset.size) == 0
-    np.testing.assert_array_equal(info.failed, [[0, TINY.attempts]] * 3)
-    chex.assert_tree_all_finite((state.belief, state.network, state.dataset, info.belief, info.attempts))
-    theta, box = info.attempts.theta, info.proposal.support
+    np.testing.assert_array_equal(info.failed, [[0, TINY.simulation_budget]] * 3)
+    chex.assert_tree_all_finite((state.belief, state.network, state.dataset, info.belief, info.simulations))
+    theta, box = info.simulations.theta, info.proposal.support
     assert ((theta >= box.low[:, None]) & (theta <= box.high[:, None])).all()
 
 
@@ -314,7 +320,7 @@ NARROW = Belief(
     BOX,
     jnp.asarray(True),
 )
-MANY = dataclasses.replace(TINY, attempts=4000)
+MANY = dataclasses.replace(TINY, simulation_budget=4000)
 _propose = jax.jit(bayessim.propose, static_argnums=1)
 
 
@@ -361,8 +367,8 @@ def test_a_support_wider_than_phi_widens_it_for_the_run():
         ),
         ({"restriction": "wrap"}, r"^restriction: expected one of \['clip', 'reject'\], got 'wrap'"),
         ({"rounds": 0}, r"^expected at least 1 round and 1 addition, got 0 and 100"),
-        ({"additions": 0}, r"^expected at least 1 round and 1 addition, got 10 and 0"),
-        ({"attempts": 99}, r"^attempts: expected at least the 100 additions of a round, got 99"),
+        ({"simulations_per_round": 0}, r"^expected at least 1 round and 1 addition, got 10 and 0"),
+        ({"simulation_budget": 99}, r"^attempts: expected at least the 100 simulations_per_round of a round, got 99"),
         ({"defensive": 1.5}, r"^defensive: expected a share in \[0, 1\], got 1.5"),
         ({"estimator": Estimator(components=0)}, r"^components: expected at least 1, got 0"),
     ],
@@ -374,5 +380,5 @@ def test_settings_that_cannot_work_are_named(changes, message):
 
 def test_the_defaults_are_the_papers():
     paper = Settings().check()
-    assert (paper.rounds, paper.additions, paper.attempts) == (10, 100, 125)
+    assert (paper.rounds, paper.simulations_per_round, paper.simulation_budget) == (10, 100, 125)
     assert (paper.correction, paper.restriction, paper.defensive) == ("none", "clip", 0.0)

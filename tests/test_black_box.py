@@ -88,8 +88,8 @@ def test_simulations_that_are_not_finite_fail_by_that_name():
 def test_the_posterior_is_the_exact_one():
     settings = dataclasses.replace(
         SETTINGS,
-        additions=300,
-        attempts=300,
+        simulations_per_round=300,
+        simulation_budget=300,
         estimator=dataclasses.replace(SETTINGS.estimator, steps=1500, batch_size=100, learning_rate=1e-2, components=1),
     )
     run = jaxlfi.infer(jax.random.key(3), boxed(), OBSERVED, support="ok", heuristic=Edge(), settings=settings)

@@ -76,7 +76,10 @@ BAD = {
         "expected --support NAME, or",
     ),
     "no rounds": (["infer", TASK, "--rounds", "0"], "at least 1 round"),
-    "few attempts": (["infer", TASK, "--attempts", "5", "--additions", "9"], "attempts: expected at least the 9"),
+    "small budget": (
+        ["infer", TASK, "--simulation-budget", "5", "--simulations-per-round", "9"],
+        "simulation_budget: expected at least the 9",
+    ),
     "correction": (["infer", TASK, "--correction", "x"], "correction: expected one of"),
     "activation": (["infer", TASK, "--activation", "x"], "activation: expected one of"),
     "learning rate": (["infer", TASK, "--learning-rate", "nan"], "learning_rate: expected a number"),

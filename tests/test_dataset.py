@@ -13,10 +13,12 @@ CAPACITY, BUDGET = 8, 5
 augmented = jax.jit(augment)
 
 
-def attempts(failure, first: int, additions: int = 3):
-    """Attempts whose theta and x tell which one they are; those of failures must not be stored."""
+def attempts(failure, first: int, simulations_per_round: int = 3):
+    """Simulations whose theta and x tell which one they are; those of failures must not be stored."""
     place = jnp.arange(first, first + len(failure), dtype=jnp.float32)
-    return within_budget(jnp.stack([place, -place], axis=1), 10 * place[:, None], jnp.asarray(failure), additions)
+    return within_budget(
+        jnp.stack([place, -place], axis=1), 10 * place[:, None], jnp.asarray(failure), simulations_per_round
+    )
 
 
 def test_an_empty_dataset_has_no_valid_rows():

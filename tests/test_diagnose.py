@@ -83,7 +83,7 @@ def pretend(monkeypatch):
 @pytest.fixture(autouse=True)
 def brief(monkeypatch):
     """Classifiers that are trained for a few passes: programs that were not optimised are slow."""
-    monkeypatch.setattr(sys.modules["jaxlfi.diagnostics.c2st"], "MOST_PASSES", 30)
+    monkeypatch.setattr(sys.modules["jaxlfi.diagnostics.c2st"], "MAX_EPOCHS", 30)
 
 
 def results(out) -> dict[str, dict]:
@@ -366,7 +366,7 @@ def check_density(key, log_prob, draws, box: Support, points: int = 120) -> floa
 
 def test_the_density_of_a_flow_is_that_of_its_draws():
     """An ensemble of two perturbed flows, seen through both affine maps, in a box that cuts it."""
-    flow = Estimator(family="maf", hidden=(8, 8), transforms=1, members=2, epochs=1)
+    flow = Estimator(family="maf", hidden=(8, 8), transforms=1, ensemble_size=2, epochs=1)
     scale, box = Support([-10.0, 0.0], [10.0, 4.0]), Support([0.0, 0.5], [4.0, 2.5])
     params = initialise(jax.random.key(0), flow, 2, 3)
     leaves, structure = jax.tree.flatten(params)

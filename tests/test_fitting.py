@@ -22,7 +22,7 @@ SMALL = Estimator(learning_rate=3e-3, hidden=(8,), components=2, epochs=6, batch
 """Five minibatches of eight an epoch. It trains on from the network it is given."""
 COLD = dataclasses.replace(SMALL, warm_start=False)
 VALIDATED = dataclasses.replace(
-    SMALL, learning_rate=2e-2, hidden=(16,), epochs=80, batch_size=10, validation=0.3, members=2
+    SMALL, learning_rate=2e-2, hidden=(16,), epochs=80, batch_size=10, validation=0.3, ensemble_size=2
 )
 """Two members that over-fit 28 rows."""
 PATIENT = dataclasses.replace(VALIDATED, patience=6)
@@ -234,7 +234,7 @@ def overfitted():
 def test_the_weights_of_the_best_pass_are_taken(overfitted):
     """The chosen pass is the argmin; on the same held-out rows its weights have that loss again."""
     _, network, info = overfitted
-    chosen = info.chosen_pass
+    chosen = info.chosen_epoch
     np.testing.assert_array_equal(chosen, info.validation_loss.argmin(axis=1))
     assert (chosen > 0).all() and (chosen < VALIDATED.epochs - 1).all()
     assert (info.loss[:, -1] < info.loss[[0, 1], chosen]).all()
@@ -254,7 +254,7 @@ def test_patience_stops_after_so_many_passes_without_a_better_one(overfitted):
             if index - best == PATIENT.patience:
                 break
         assert index < VALIDATED.epochs - 1
-        assert info.chosen_pass[member] == best
+        assert info.chosen_epoch[member] == best
         np.testing.assert_allclose(info.validation_loss[member, : index + 1], losses[: index + 1], atol=0.02)
         assert np.isnan(info.validation_loss[member, index + 1 :]).all()
         assert np.isnan(info.loss[member, index + 1 :]).all()
@@ -275,12 +275,12 @@ def test_validation_is_the_loss_of_the_held_out_share(overfitted):
     for member in range(2):
         params = jax.tree.map(lambda leaf, m=member: leaf[m : m + 1], network.params)
         one = Network(params, network.normaliser)
-        np.testing.assert_allclose(together[member], mean_loss(change(VALIDATED, members=1), one), rtol=1e-4)
+        np.testing.assert_allclose(together[member], mean_loss(change(VALIDATED, ensemble_size=1), one), rtol=1e-4)
 
 
 def test_without_validation_the_last_weights_are_taken():
     _, info = fitted()
-    assert info.chosen_pass[0] == SMALL.epochs - 1
+    assert info.chosen_epoch[0] == SMALL.epochs - 1
     assert np.isnan(info.validation_loss).all()
 
 
@@ -288,7 +288,7 @@ def test_too_few_rows_to_hold_any_out_still_train(overfitted):
     """Three tenths of three rows are none: the last weights are taken, not the untrained ones."""
     network = overfitted[0]
     result, info = fitted(VALIDATED, toy(0, 3, CAPACITY), network=network)
-    np.testing.assert_array_equal(info.chosen_pass, VALIDATED.epochs - 1)
+    np.testing.assert_array_equal(info.chosen_epoch, VALIDATED.epochs - 1)
     assert distance(result.params, network.params) > 1e-2
 
 
@@ -381,7 +381,7 @@ def test_members_are_trained_apart_and_pooled(overfitted):
     densities = []
     for i in range(2):
         member = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], network.params)
-        one = _condition(change(VALIDATED, members=1), Network(member, network.normaliser), x, SCALE)
+        one = _condition(change(VALIDATED, ensemble_size=1), Network(member, network.normaliser), x, SCALE)
         densities.append(np.exp(one.log_prob(theta)))
     np.testing.assert_allclose(np.exp(pooled.log_prob(theta)), np.mean(densities), rtol=1e-3)
 
@@ -441,7 +441,7 @@ def test_leaves_do_not_recompile():
         ({"normaliser": "log"}, r"^normaliser: expected one of \['asinh', 'none', 'zscore'\], got 'log'"),
         ({"schedule": "linear"}, r"^schedule: expected one of \['constant', 'cosine'\], got 'linear'"),
         ({"components": 0}, r"^components: expected at least 1, got 0"),
-        ({"members": -1}, r"^members: expected at least 1, got -1"),
+        ({"ensemble_size": -1}, r"^members: expected at least 1, got -1"),
         ({"batch_size": 0}, r"^batch_size: expected at least 1, got 0"),
         ({"steps": 10}, r"^expected epochs or steps, one of them above 0, got 1000 and 10"),
         ({"epochs": 0}, r"^expected epochs or steps, one of them above 0, got 0 and 0"),
@@ -459,8 +459,8 @@ def test_settings_that_cannot_work_are_named(changes, message):
 def test_the_defaults_are_the_papers():
     paper = Estimator().check()
     assert (paper.learning_rate, paper.epochs, paper.batch_size) == (1e-5, 1000, 100)
-    assert (paper.hidden, paper.components, paper.members) == ((1024,) * 3, 4, 1)
+    assert (paper.hidden, paper.components, paper.ensemble_size) == ((1024,) * 3, 4, 1)
     assert paper.warm_start and not paper.validation and paper.schedule == "constant"
     leaves = {field.name for field in dataclasses.fields(paper) if field.metadata.get("pytree_node", True)}
     assert {"learning_rate", "weight_decay", "clip_norm"} <= leaves
-    assert not leaves & {"hidden", "components", "members", "epochs", "steps", "batch_size", "warm_start"}
+    assert not leaves & {"hidden", "components", "ensemble_size", "epochs", "steps", "batch_size", "warm_start"}

@@ -15,7 +15,7 @@ from jaxlfi.bayessim import Settings, propose
 from jaxlfi.belief import Belief
 from jaxlfi.heuristics import HEURISTICS, Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate, stretch
 from jaxlfi.heuristics.matching import match
-from jaxlfi.heuristics.truncate import LEAST_WIDTH
+from jaxlfi.heuristics.truncate import MIN_WIDTH
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.support import Support
 from jaxlfi.task import Task
@@ -281,7 +281,7 @@ def truncated(box, phi, weights, means, scales, quantile):
     interval_low, interval_high = (np.array([root(d, sign) for d in range(len(box.low))]) for sign in (1, -1))
     low, high = np.clip(interval_low, box.low, box.high), np.clip(interval_high, box.low, box.high)
     for d in range(len(low)):
-        least = min(LEAST_WIDTH * (phi.high[d] - phi.low[d]), box.high[d] - box.low[d])
+        least = min(MIN_WIDTH * (phi.high[d] - phi.low[d]), box.high[d] - box.low[d])
         if high[d] - low[d] < least:
             middle = np.clip((low[d] + high[d]) / 2, box.low[d] + least / 2, box.high[d] - least / 2)
             low[d], high[d] = middle - least / 2, middle + least / 2
@@ -298,7 +298,7 @@ def test_truncate_is_the_intersection_with_the_posteriors_interval(quantile, see
         Truncate(quantile), cases, expected, ("interval_low", "interval_high"), 0.0, 0.0
     )
     width = cases[0].support.width + high_shift - low_shift
-    sliver = np.isclose(width, LEAST_WIDTH * np.asarray(cases[2].width), rtol=1e-2)
+    sliver = np.isclose(width, MIN_WIDTH * np.asarray(cases[2].width), rtol=1e-2)
     for shift in (low_shift, -high_shift):
         assert 40 < ((shift > 0) & ~sliver).sum() < 560
     if quantile == 0.3:
@@ -358,7 +358,7 @@ def test_truncate_only_shrinks_and_keeps_its_least_width(rule, problem):
     old, feasible = jax.device_get((problem[0].support, problem[2]))
     new = jax.device_get(apply(rule, *problem)[0].support)
     assert (new.low >= old.low).all() and (new.high <= old.high).all()
-    least = np.minimum(LEAST_WIDTH * feasible.width, old.width)
+    least = np.minimum(MIN_WIDTH * feasible.width, old.width)
     assert (new.width >= least - 1e-6).all()
 
 
@@ -389,7 +389,7 @@ def test_after_truncation_proposals_are_uniform_over_the_support(key):
     task = Task(lambda key, theta: theta, ("a", "b"), {"guess": example()[0].support}, example()[2])
     belief, adaptation = apply(Truncate(0.1), *example())
     assert float(adaptation.high_shift[0]) < 0 < float(adaptation.low_shift[1])
-    settings = Settings(additions=2000, attempts=2000)
+    settings = Settings(simulations_per_round=2000, simulation_budget=2000)
     draws = np.asarray(jax.jit(propose, static_argnums=1)(key, task, settings, belief))
     for d in range(2):
         uniform = stats.uniform(belief.support.low[d], belief.support.width[d])

@@ -16,7 +16,7 @@ TRUTH = np.array([1.0, 5.0, 0.2])
 
 def write_queue(folder, configuration, seed, samples):
     """A run of mg1 that ended with these posterior samples."""
-    write_run(folder, configuration=configuration, seed=seed, dim=3, rounds=2, attempts=10, channels=("time",))
+    write_run(folder, configuration=configuration, seed=seed, dim=3, rounds=2, simulation_budget=10, channels=("time",))
     change(folder, "observation.npz", lambda a: a.update(names=np.array(mg1.NAMES), truth=TRUTH))
 
     def last_round(arrays):

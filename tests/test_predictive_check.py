@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from jaxlfi.diagnostics import predictive_check
-from jaxlfi.diagnostics.predictive import LEAST
+from jaxlfi.diagnostics.predictive import MIN_SIMULATIONS
 
 
 def simulations(rng, n: int = 100, size: int = 3) -> np.ndarray:
@@ -81,7 +81,7 @@ def test_a_summary_that_never_varies():
     [
         (np.zeros((30, 2)), np.zeros(3), "expected shapes"),
         (np.zeros((30, 2)), np.array([0.0, np.nan]), "a finite observation"),
-        (np.full((30, 2), np.nan), np.zeros(2), f"at least {LEAST} finite rows, got 0 of 30"),
+        (np.full((30, 2), np.nan), np.zeros(2), f"at least {MIN_SIMULATIONS} finite rows, got 0 of 30"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(simulated, observed, told):

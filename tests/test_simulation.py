@@ -16,11 +16,11 @@ BUDGET = 9
 budget = jax.jit(within_budget)
 
 
-def loop(failures, additions):
+def loop(failures, simulations_per_round):
     """Attempt in order and stop at the last success that is needed."""
     counted, kept, by_reason = [], [], {1: 0, 2: 0, 3: 0}
     for place, failure in enumerate(failures):
-        if len(kept) == additions:
+        if len(kept) == simulations_per_round:
             break
         counted.append(place)
         if failure == 0:
@@ -31,10 +31,10 @@ def loop(failures, additions):
 
 
 @given(st.lists(st.integers(0, 3), min_size=BUDGET, max_size=BUDGET), st.integers(1, BUDGET))
-def test_budget_against_a_loop(failures, additions):
+def test_budget_against_a_loop(failures, simulations_per_round):
     theta, x = jnp.zeros((BUDGET, 2)), jnp.zeros((BUDGET, 1))
-    attempts = budget(theta, x, jnp.asarray(failures), additions)
-    counted, kept, by_reason = loop(failures, additions)
+    attempts = budget(theta, x, jnp.asarray(failures), simulations_per_round)
+    counted, kept, by_reason = loop(failures, simulations_per_round)
     assert np.flatnonzero(attempts.counted).tolist() == counted
     assert np.flatnonzero(attempts.kept).tolist() == kept
     assert int(attempts.attempted) == len(counted)

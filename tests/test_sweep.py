@@ -94,7 +94,7 @@ def test_every_lane_is_the_run_of_its_values_and_seed(finished):
                     "theta_error": errors.sum(1).mean(),
                     "theta_error_by_parameter": errors.mean(0),
                     "trajectory_error": np.nanmean(trajectories),
-                    "success_rate": info.attempts.succeeded.sum() / info.attempts.attempted.sum(),
+                    "success_rate": info.simulations.succeeded.sum() / info.simulations.attempted.sum(),
                     "support_low": info.belief.support.low[-1],
                     "support_high": info.belief.support.high[-1],
                 }

@@ -120,7 +120,7 @@ def test_objects_may_be_files_and_unknown_ones_are_refused(tmp_path):
 def test_length_and_stiffness_are_inferred(problem):
     """The initial support is 110 mm wide, and 3.9 in ln E (measured for six seeds: at most 1.2 mm and 0.06 off)."""
     settings = SETTINGS.replace(
-        rounds=3, additions=40, attempts=44,
+        rounds=3, simulations_per_round=40, simulation_budget=44,
         estimator=SETTINGS.estimator.replace(normaliser="asinh", activation="tanh", steps=400, hidden=(32, 32)),
     )  # fmt: skip
     run = jaxlfi.infer(jax.random.key(3), problem, settings=settings, heuristic=jaxlfi.Edge())
@@ -131,7 +131,8 @@ def test_length_and_stiffness_are_inferred(problem):
 
 
 def test_a_run_from_the_command_line(tmp_path, capsys):
-    flags = "--rounds 1 --additions 6 --attempts 7 --steps 20 --members 1 --hidden 8 --seeds 2".split()
+    flags = "--rounds 1 --simulations-per-round 6 --simulation-budget 7 --steps 20 --ensemble-size 1".split()
+    flags += "--hidden 8 --seeds 2".split()
     words = ["infer", "whip,engine=native", "--object", "dlo-0", *flags, "--out", tmp_path / "run"]
     assert command(*words) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())

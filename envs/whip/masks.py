@@ -9,7 +9,7 @@ from envs.whip.raster import DLO
 
 EVEN = (0.25, 0.5, 0.75, 1.0)
 """Fractions of the visible DLO's length, from the grip, at which it gets its keypoints; those of `keypoints.CLEAN`."""
-FEWEST = 5
+MIN_COUNT = 5
 """Pixels below which nothing counts as seen."""
 SAMPLES, KNOTS = 256, 32
 """Pixels of the DLO that its centreline is made of, and points of that line."""
@@ -62,7 +62,7 @@ def centroids(labels: Int[Array, "size size"]) -> tuple[Float[Array, "6 2"], Boo
     count = in_rows.sum(-1)
     places = (jnp.arange(labels.shape[0]) + 0.5) / labels.shape[0]
     sums = jnp.stack([jnp.sum(in_columns * places, -1), jnp.sum(in_rows * places, -1)], axis=-1)
-    return sums / jnp.maximum(count, 1.0)[:, None], count >= FEWEST
+    return sums / jnp.maximum(count, 1.0)[:, None], count >= MIN_COUNT
 
 
 def centreline(
@@ -92,7 +92,7 @@ def centreline(
         return _smoothed(pixels, place, REACH), place  # up to its ends, the line would turn to corners of the mask
 
     line, place = jax.lax.fori_loop(0, 3, refine, (line, place))
-    return _smoothed(pixels, _projected(pixels, place, line), -0.5 / labels.shape[0]), count >= FEWEST
+    return _smoothed(pixels, _projected(pixels, place, line), -0.5 / labels.shape[0]), count >= MIN_COUNT
 
 
 def _some_pixels(mask: Bool[Array, "size size"]) -> tuple[Float[Array, "samples 2"], Int[Array, ""]]:

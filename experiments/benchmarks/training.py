@@ -70,7 +70,7 @@ def matrix_rate() -> float:
 def our_steps(estimator: Estimator, steps: int) -> Callable[[], object]:
     """A call of so many of our gradient steps, a fit."""
     passes = steps * BATCH // ROWS
-    estimator = estimator.replace(epochs=passes, steps=0, members=1)
+    estimator = estimator.replace(epochs=passes, steps=0, ensemble_size=1)
     task = lotka_volterra()
     key = jax.random.key(0)
     data = dataset.Dataset(
@@ -158,7 +158,7 @@ def run_table() -> None:
 
     @jax.jit
     def update(key, state, i, theta, x, failure):
-        attempts = within_budget(theta, x, failure, settings.additions)
+        attempts = within_budget(theta, x, failure, settings.simulations_per_round)
         return bayessim.update(key, task, settings, heuristic, observed, state, i, attempts)
 
     spent = dict.fromkeys(("proposals", "simulation", "update"), 0.0)

@@ -44,7 +44,7 @@ def mdn(settings: Settings) -> Settings:
 def gaussian(settings: Settings) -> Settings:
     """The method with eight small networks of one Gaussian each, for posteriors in many dimensions."""
     one = settings.estimator.replace(family="mdn", components=1, hidden=(32,), activation="tanh")
-    return settings.replace(estimator=one.replace(members=8, learning_rate=2e-3))
+    return settings.replace(estimator=one.replace(ensemble_size=8, learning_rate=2e-3))
 
 
 NETWORKS = {"": lambda settings: settings, "-mdn": mdn, "-gaussian": gaussian}
@@ -57,7 +57,9 @@ def settings_of(method: str, simulations: int) -> Settings:
     """A method at a budget; sequential ones divide it by ten rounds."""
     each = simulations // ROUNDS
     divided, network = VARIANTS[method]
-    return network(divided(Settings(estimator=FLOW, rounds=ROUNDS, additions=each, attempts=each))).check()
+    return network(
+        divided(Settings(estimator=FLOW, rounds=ROUNDS, simulations_per_round=each, simulation_budget=each))
+    ).check()
 
 
 def posterior_draws(task_name: str, settings: Settings, seed: int) -> dict[str, np.ndarray]:

@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi import diagnostics
-from jaxlfi.diagnose.subject import AGAINST, CLASSIFIER, FEWEST, PREDICTIVE, TIES, Plan, Subject
+from jaxlfi.diagnose.subject import AGAINST, CLASSIFIER, MIN_COUNT, PREDICTIVE, TIES, Plan, Subject
 from jaxlfi.diagnose.truths import simulate
-from jaxlfi.diagnostics.predictive import LEAST
+from jaxlfi.diagnostics.predictive import MIN_SIMULATIONS
 from jaxlfi.normalise import TRANSFORMS
 from jaxlfi.task import Task
 
 PREDICTIVE_DRAWS = 200
 """Posterior draws that are simulated to be compared with the run's own observation."""
-MOST_ROWS = 10_000
+MAX_ROWS = 10_000
 """Most rows that a classifier is given of a sample; the field's reference posteriors have as many."""
 LEVEL = 0.9
 """Level of the credible region whose coverage is told, beside that of the level where it is worst."""
@@ -155,7 +155,7 @@ def predictive(subject: Subject, plan: Plan) -> tuple[Check, dict[str, np.ndarra
     theta = _draws(subject, key_draw, PREDICTIVE_DRAWS)
     _, x, failure = simulate(key_simulate, subject.task, theta, subject.run.observed.shape)
     failed = int(np.sum(failure != 0))
-    if PREDICTIVE_DRAWS - failed < LEAST:
+    if PREDICTIVE_DRAWS - failed < MIN_SIMULATIONS:
         statistic = f"{failed} of {PREDICTIVE_DRAWS} simulations failed"
         return Check(name, statistic, "", math.nan, "misfit: too few simulations succeed", {"failed": failed}), {}
     simulated = np.where(failure[:, None] == 0, x, np.nan)
@@ -187,7 +187,7 @@ def _draws(subject: Subject, key: jax.Array, n: int) -> jax.Array:
 
 def against(subject: Subject, plan: Plan, name: str, reference: np.ndarray) -> Check:
     """Whether the run's posterior can be told from reference samples [n, D] in coordinates."""
-    n = min(len(reference), MOST_ROWS)
+    n = min(len(reference), MAX_ROWS)
     draws = _draws(subject, jax.random.fold_in(plan.key(AGAINST), 0), n)
     accuracy = _accuracy(jax.random.fold_in(plan.key(AGAINST), 1), reference[:n], draws)
     numbers = {"accuracy": accuracy, "rows": n}
@@ -203,7 +203,7 @@ def read_reference(path: Path, task: Task) -> np.ndarray:
         task: for the names, and which are inferred as logarithms.
 
     Raises:
-        ValueError: for files that cannot be read, hold other columns, fewer than `FEWEST` rows, or numbers that are
+        ValueError: for files that cannot be read, hold other columns, fewer than `MIN_COUNT` rows, or numbers that are
             not finite or, for a parameter inferred as its logarithm, not positive.
     """
     try:
@@ -211,9 +211,9 @@ def read_reference(path: Path, task: Task) -> np.ndarray:
     except Exception as error:  # zipfile, csv, numpy and the operating system each have their own
         raise ValueError(f"against: cannot read {str(path)!r}: {error}") from error
     positive = np.all(theta[:, [name in task.log for name in task.names]] > 0)
-    if len(theta) < FEWEST or not np.isfinite(theta).all() or not positive:
+    if len(theta) < MIN_COUNT or not np.isfinite(theta).all() or not positive:
         raise ValueError(
-            f"against: expected at least {FEWEST} rows of finite numbers in {str(path)!r}, positive ones of "
+            f"against: expected at least {MIN_COUNT} rows of finite numbers in {str(path)!r}, positive ones of "
             f"{', '.join(task.log) or 'no parameter'}, got {len(theta)} rows or others"
         )
     return np.asarray(task.to_coordinates(jnp.asarray(theta, jnp.float32)))

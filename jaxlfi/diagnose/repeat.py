@@ -92,7 +92,7 @@ def conditioned(subject: Subject, network: Network, key: jax.Array, x: jax.Array
     """The belief that a run of one round would end with after another observation: its network, told of that one."""
     run = subject.run
     settings, heuristic = run.settings, jax.tree.map(jnp.asarray, subject.heuristic)
-    prior = uninformed(run.support, settings.estimator.members * settings.estimator.components)
+    prior = uninformed(run.support, settings.estimator.ensemble_size * settings.estimator.components)
     fitting = key if settings.estimator.is_flow else None  # an MDN is read off, a flow is drawn from
     q, _ = posterior(fitting, settings.estimator, network, x, run.scale, run.support)
     mixture, _ = CORRECTIONS[settings.correction].change(subject.task, q, prior)

@@ -12,7 +12,7 @@ from jaxlfi.run_store import StoreError
 from jaxlfi.sampling import Finished
 from jaxlfi.task import Task
 
-FEWEST = 20
+MIN_COUNT = 20
 """Fewest truths, and draws for each, that tell anything."""
 STREAM = 0xD1A6
 """What sets the keys apart from those of a run of the same seed."""
@@ -41,8 +41,8 @@ class Plan:
 
     def __post_init__(self):
         for name in ("truths", "draws"):
-            if getattr(self, name) < FEWEST:
-                raise ValueError(f"{name}: expected at least {FEWEST}, got {getattr(self, name)}")
+            if getattr(self, name) < MIN_COUNT:
+                raise ValueError(f"{name}: expected at least {MIN_COUNT}, got {getattr(self, name)}")
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed: expected at least 0 and less than 2^31, got {self.seed}")
 

@@ -17,7 +17,7 @@ WEIGHT_PENALTY = 1e-4
 TOLERANCE = 1e-4
 PATIENCE = 10
 """Training ends after so many passes that did not lower the least loss by more than `TOLERANCE`."""
-LEAST_PASSES, MOST_PASSES = 50, 10_000
+MIN_EPOCHS, MAX_EPOCHS = 50, 10_000
 
 
 @struct.dataclass
@@ -102,7 +102,7 @@ def _train(key: jax.Array, rows: Array, labels: Array) -> list:
         return _Training(params, moments, state.passes + 1, jnp.minimum(loss, state.least), idle)
 
     start = _Training(params, adam.init(params), jnp.asarray(0), jnp.asarray(jnp.inf), jnp.asarray(0))
-    unfinished = lambda s: (s.passes < LEAST_PASSES) | (s.idle <= PATIENCE) & (s.passes < MOST_PASSES)
+    unfinished = lambda s: (s.passes < MIN_EPOCHS) | (s.idle <= PATIENCE) & (s.passes < MAX_EPOCHS)
     return jax.lax.while_loop(unfinished, one_pass, start).params
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Array, Float
 
-LEAST = 20
+MIN_SIMULATIONS = 20
 """Fewest simulations that are compared with."""
 REACH = 2.0
 """Robust deviations, after drawing in the tails, beyond which rows count no more for means and correlations."""
@@ -50,7 +50,8 @@ def predictive_check(
         observed: shape [S].
 
     Raises:
-        ValueError: for shapes that do not fit, an observation that is not finite, or fewer than `LEAST` finite rows.
+        ValueError: for shapes that do not fit, an observation that is not finite, or too few
+            finite rows (`MIN_SIMULATIONS`).
     """
     simulated, observed = np.asarray(simulated, np.float64), np.asarray(observed, np.float64)
     if simulated.ndim != 2 or observed.shape != simulated.shape[1:] or not np.isfinite(observed).all():
@@ -60,8 +61,10 @@ def predictive_check(
         )
     valid = np.isfinite(simulated).all(axis=1)
     used = simulated[valid]
-    if len(used) < LEAST:
-        raise ValueError(f"simulated: expected at least {LEAST} finite rows, got {len(used)} of {len(simulated)}")
+    if len(used) < MIN_SIMULATIONS:
+        raise ValueError(
+            f"simulated: expected at least {MIN_SIMULATIONS} finite rows, got {len(used)} of {len(simulated)}"
+        )
     below, above = np.sum(used <= observed, axis=0), np.sum(used >= observed, axis=0)
     tails = np.minimum(1.0, 2 * (1 + np.minimum(below, above)) / (1 + len(used)))
     distances = _distances(np.concatenate([observed[None], used]))

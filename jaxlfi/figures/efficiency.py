@@ -25,7 +25,7 @@ def quantities(runs: Runs, configuration: str) -> dict[str, np.ndarray]:
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Attempts, success rate and failures so far over iterations; mean over seeds, and its sd as a band.
+    """Simulations, success rate and failures so far over iterations; mean over seeds, and its sd as a band.
 
     Args:
         figure: empty.

@@ -16,7 +16,7 @@ from jaxlfi.figures.history import History
 from jaxlfi.figures.pairs import parameter_key
 from jaxlfi.figures.style import Look, looks, plain, symbol
 
-LEAST, MOST = 3, 20
+MIN_SIMULATIONS, MOST = 3, 20
 """Fewer spokes are no surface, and more cannot be told apart."""
 
 
@@ -28,14 +28,14 @@ def reference(histories: Sequence[History]) -> History:
 def parameter_errors(history: History, unit: History) -> np.ndarray | None:
     """|theta - theta_gt| of the last posterior's samples in widths of a run's first support, shape [N, D], or None."""
     low, high = unit.supports
-    if history.theta_error is None or not LEAST <= history.dim <= MOST:
+    if history.theta_error is None or not MIN_SIMULATIONS <= history.dim <= MOST:
         return None
     return history.theta_error[-1] / (high[0] - low[0])
 
 
 def summary_errors(history: History, unit: History) -> np.ndarray | None:
     """|x - x^r| of the samples' simulations in spreads of a run's first simulations, shape [N, S], or None."""
-    if history.final_x is None or unit.x_scale is None or not LEAST <= len(history.x) <= MOST:
+    if history.final_x is None or unit.x_scale is None or not MIN_SIMULATIONS <= len(history.x) <= MOST:
         return None
     # One that never varied has no unit, and no spoke.
     scale = np.where(unit.x_scale > 0, unit.x_scale, np.nan)

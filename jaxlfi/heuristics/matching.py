@@ -11,7 +11,7 @@ from jaxlfi.heuristics.base import Adaptation, Heuristic
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.support import Support
 
-LARGEST_EXACT = 6
+MAX_EXACT = 6
 """Up to 6! = 720 permutations are tried; more components are matched greedily."""
 
 
@@ -49,7 +49,7 @@ def match(previous: GaussianMixture, posterior: GaussianMixture, support: Suppor
     offset = (previous.means[:, None, :] - posterior.means[None, :, :]) / support.width
     cost = jnp.sum(offset**2, axis=-1)
     components = cost.shape[0]
-    if components <= LARGEST_EXACT:
+    if components <= MAX_EXACT:
         orders = jnp.asarray(list(permutations(range(components))))
         total = jnp.sum(cost[jnp.arange(components), orders], axis=-1)
         return orders[jnp.argmin(total)]

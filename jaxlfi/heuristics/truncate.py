@@ -9,7 +9,7 @@ from jaxlfi.heuristics.base import Adaptation, adapted
 from jaxlfi.mixture import GaussianMixture
 from jaxlfi.support import Support
 
-LEAST_WIDTH = 1e-3
+MIN_WIDTH = 1e-3
 """Share of Phi's width below which no support is truncated."""
 
 
@@ -49,7 +49,7 @@ class Truncate:
         interval_low = posterior.marginal_quantile(self.quantile)
         interval_high = -posterior.mirror().marginal_quantile(self.quantile)
         low, high = jnp.clip(interval_low, box.low, box.high), jnp.clip(interval_high, box.low, box.high)
-        least = jnp.minimum(LEAST_WIDTH * feasible.width, box.width)
+        least = jnp.minimum(MIN_WIDTH * feasible.width, box.width)
         lack = 0.5 * jnp.maximum(least - (high - low), 0.0)
         # The box's own bounds are applied last, so that rounding never grows it.
         support = Support(

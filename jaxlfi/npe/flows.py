@@ -15,13 +15,13 @@ from jaxlfi.mdn import ACTIVATIONS, Dense
 LOG_SCALE_BOUND = 3.0
 """Most one affine step can stretch, in nats. Ten of them take |theta| = 1e3 to 1e16; float32 still holds its square."""
 
-LEAST_BIN = 1e-3
+MIN_BIN = 1e-3
 """Least width of a spline's bin, as a fraction of its range."""
 
-LEAST_SLOPE = 1e-3
+MIN_SLOPE = 1e-3
 """Least slope of a spline at a knot."""
 
-_UNIT_SLOPE = float(np.log(np.expm1(1 - LEAST_SLOPE)))
+_UNIT_SLOPE = float(np.log(np.expm1(1 - MIN_SLOPE)))
 """What softplus turns into a slope of 1, less the least slope."""
 
 
@@ -307,7 +307,7 @@ def spline(
         Values and logarithms of the slope, both shaped as x.
     """
     bins = (raw.shape[1] + 1) // 3
-    least = 2 * tail * LEAST_BIN
+    least = 2 * tail * MIN_BIN
     raw_widths, raw_heights, raw_slopes = raw[:, :bins], raw[:, bins : 2 * bins], raw[:, 2 * bins :]
     widths = least + (2 * tail - bins * least) * jax.nn.softmax(raw_widths, axis=1)
     heights = least + (2 * tail - bins * least) * jax.nn.softmax(raw_heights, axis=1)
@@ -324,8 +324,8 @@ def spline(
     width, height = pick(chosen, widths), pick(chosen, heights)
     left, bottom = pick(complete, widths) - tail, pick(complete, heights) - tail
     # A knot at either end has no raw slope: nothing is picked, and zero means a slope of 1.
-    slope_left = jax.nn.softplus(pick(chosen[:, 1:], raw_slopes) + _UNIT_SLOPE) + LEAST_SLOPE
-    slope_right = jax.nn.softplus(pick(chosen[:, :-1], raw_slopes) + _UNIT_SLOPE) + LEAST_SLOPE
+    slope_left = jax.nn.softplus(pick(chosen[:, 1:], raw_slopes) + _UNIT_SLOPE) + MIN_SLOPE
+    slope_right = jax.nn.softplus(pick(chosen[:, :-1], raw_slopes) + _UNIT_SLOPE) + MIN_SLOPE
 
     mean_slope = height / width
     bend = slope_left + slope_right - 2 * mean_slope
@@ -399,7 +399,7 @@ def _check(module: nn.Module) -> None:
     if module.activation not in ACTIVATIONS:
         raise ValueError(f"activation: expected one of {sorted(ACTIVATIONS)}, got {module.activation!r}")
     if isinstance(module, NSF):
-        if not 1 <= module.bins < 1 / LEAST_BIN:
-            raise ValueError(f"bins: expected 1 to {round(1 / LEAST_BIN) - 1}, got {module.bins}")
+        if not 1 <= module.bins < 1 / MIN_BIN:
+            raise ValueError(f"bins: expected 1 to {round(1 / MIN_BIN) - 1}, got {module.bins}")
         if not module.tail > 0:
             raise ValueError(f"tail: expected a number above 0, got {module.tail}")
