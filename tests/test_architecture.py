@@ -65,11 +65,11 @@ everywhere = pytest.mark.parametrize("path", files(*PACKAGES), ids=identify)
 def test_there_is_something_to_check():
     assert {name_of(path) for path in files(*PACKAGES)} > {
         "jaxlfi",
-        "jaxlfi.bayessim",
+        "jaxlfi.bayessim.algorithm",
         "jaxlfi.heuristics.edge",
         "envs.lynx_hare",
     }
-    assert "jaxlfi.support.Support" in imported(ROOT / "jaxlfi/belief.py")
+    assert "jaxlfi.distributions.support.Support" in imported(ROOT / "jaxlfi/distributions/belief.py")
 
 
 @everywhere
@@ -155,7 +155,7 @@ def test_examples_are_found():
         name_of(path): sum(len(test.examples) for test in finder.find(importlib.import_module(name_of(path))))
         for path in with_examples()
     }
-    assert min(examples.values()) >= 1 and examples["jaxlfi.support"] >= 2
+    assert min(examples.values()) >= 1 and examples["jaxlfi.distributions.support"] >= 2
 
 
 def test_the_library_runs_without_matplotlib():

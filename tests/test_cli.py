@@ -13,11 +13,18 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import atomic, cli, commands, observation, run_store, session, sweep, tasks
-from jaxlfi.bayessim import Settings
-from jaxlfi.estimator import Estimator
+from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.bayessim.presets import PRESETS
+from jaxlfi.cli.parser import commands
+from jaxlfi.cli.parser import parser as cli
+from jaxlfi.estimators.estimator import Estimator
 from jaxlfi.heuristics import HEURISTICS
-from jaxlfi.presets import PRESETS
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import folder as run_store
+from jaxlfi.runs import session
+from jaxlfi.studies import grid as sweep
+from jaxlfi.tasks.registry import observation
+from jaxlfi.tasks.registry import registry as tasks
 from tests import test_black_box
 from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
@@ -32,7 +39,7 @@ def error_line(capsys, *arguments) -> str:
 
 
 def test_help_teaches_and_does_not_wait_for_jax():
-    script = "import sys, jaxlfi.cli as c; c.main(['--help'] if len(sys.argv) < 2 else [sys.argv[1], '--help'])"
+    script = "import sys, jaxlfi.cli.parser as c; c.main(['--help'] if len(sys.argv) < 2 else [sys.argv[1], '--help'])"
     check = "import atexit, sys; atexit.register(lambda: print('jax' in sys.modules)); "
     for name, wanted in (("infer", "delta"), ("compare", "SUPPORT[+HEURISTIC]"), ("grid", "NAME=V,V,...")):
         done = subprocess.run([sys.executable, "-c", check + script, name], capture_output=True, text=True, check=True)

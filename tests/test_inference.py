@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import Support, atomic, inference
+from jaxlfi import Support
 from jaxlfi.heuristics import Edge, Fixed
-from jaxlfi.observation import SimulatorError
-from jaxlfi.run_store import read_belief
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import inference
+from jaxlfi.runs.folder import read_belief
+from jaxlfi.tasks.observation import SimulatorError
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)

@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from jaxlfi import atomic, figures
+from jaxlfi import figures
 from jaxlfi.figures import sensitivity, style
+from jaxlfi.io import files as atomic
 
 NAMES = ("zone_fraction", "mass_threshold", "expansion")
 VALUES = ((0.05, 0.1), (0.001, 0.005, 0.05), (0.1, 0.2, 0.3, 0.4))
@@ -141,7 +142,7 @@ def test_any_number_of_hyperparameters_fits(axes):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A grid's folder as `jaxlfi.sweep` leaves it."""
+    """A grid's folder as `jaxlfi.studies.grid` leaves it."""
     grid = grid_of_noise()
     config = {
         "format": "jaxlfi-grid",

@@ -8,9 +8,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from jaxlfi.belief import RESTRICTIONS, Belief
-from jaxlfi.simulation import summarised, trajectory_and_outcome
-from jaxlfi.task import Task
+from jaxlfi.distributions.belief import RESTRICTIONS, Belief
+from jaxlfi.tasks.simulation import summarised, trajectory_and_outcome
+from jaxlfi.tasks.task import Task
 
 POSTERIOR_SAMPLES = 20
 """Posterior samples a discrepancy is averaged over (section V)."""
@@ -40,7 +40,7 @@ def discrepancy(
 ) -> Discrepancy:
     """Draw from a belief, simulate, and compare (section V).
 
-    Where the posterior is a flow, the belief is the mixture fitted to it (`jaxlfi.posterior.posterior`), and so are the
+    Where the posterior is a flow, the belief is the mixture fitted to it (`jaxlfi.estimators.posterior.posterior`), and so are the
     draws.
 
     Args:

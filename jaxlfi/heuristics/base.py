@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from jaxlfi.belief import Belief
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
 
 
 @struct.dataclass

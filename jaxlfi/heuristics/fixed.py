@@ -2,10 +2,10 @@
 
 from flax import struct
 
-from jaxlfi.belief import Belief
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics.base import Adaptation, adapted
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
 
 
 @struct.dataclass

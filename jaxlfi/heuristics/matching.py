@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Int
 
-from jaxlfi.belief import Belief
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics.base import Adaptation, Heuristic
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
 
 MAX_EXACT = 6
 """Up to 6! = 720 permutations are tried; more components are matched greedily."""

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from jaxlfi.belief import Belief
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics.base import Adaptation, adapted, stretch
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
 
 
 @struct.dataclass
