@@ -15,6 +15,7 @@ _HOMES = {
     "Estimator": "jaxlfi.estimator",
     "Fixed": "jaxlfi.heuristics",
     "GaussianMixture": "jaxlfi.mixture",
+    "Heuristic": "jaxlfi.heuristics",
     "METHODS": "jaxlfi.presets",
     "Matched": "jaxlfi.heuristics",
     "Mode": "jaxlfi.heuristics",
@@ -28,7 +29,9 @@ _HOMES = {
     "SupportWarning": "jaxlfi.inference",
     "Task": "jaxlfi.task",
     "Truncate": "jaxlfi.heuristics",
+    "hyperparameter": "jaxlfi.fields",
     "infer": "jaxlfi.inference",
+    "option": "jaxlfi.fields",
     "stack": "jaxlfi.lanes",
     "with_tails": "jaxlfi.tailed",
 }

@@ -15,7 +15,6 @@ from jaxlfi.bayessim import Settings, State
 from jaxlfi.black_box import BlackBoxEngine
 from jaxlfi.checkpoint import Checkpoint
 from jaxlfi.diagnostics import bound_warnings, edge_mass
-from jaxlfi.heuristics import Fixed, Truncate
 from jaxlfi.history import apart, posterior_draws
 from jaxlfi.inference import observe, refuse_hopeless
 from jaxlfi.keys import run_keys
@@ -280,7 +279,7 @@ def support_warnings(folder: Path, plan: Plan) -> Iterator[str]:
     """
     beliefs = [run_store.read_belief(folder / name) for name in plan.folders()]
     runs = list(zip(plan.lanes, beliefs, strict=True))
-    fixed = [(lane, belief) for lane, belief in runs if isinstance(lane.heuristic, Fixed | Truncate)]
+    fixed = [(lane, belief) for lane, belief in runs if not lane.heuristic.grows]
     for configuration in dict.fromkeys(lane.configuration for lane, _ in fixed):
         own = [belief for lane, belief in fixed if lane.configuration == configuration]
         if len(own) == 1:
