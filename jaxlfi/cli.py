@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import jaxlfi
-from jaxlfi import flags, plugins, source_fields
+from jaxlfi import flags, source_fields
 
 PRESETS = ("quick", "paper")
 METHODS = ("bayessim", "apt", "npe")
@@ -153,7 +153,7 @@ def parser(heuristics: flags.Families | None = None) -> argparse.ArgumentParser:
     )
     infer.add_argument("--support-high", nargs="+", type=float, metavar="X", help="its upper bounds")
     infer.add_argument(
-        "--heuristic", default="edge", metavar="NAME", help=_heuristic_help("how the support is adapted")
+        "--heuristic", default="edge", metavar="NAME", help=_heuristic_help("how the support is adapted", heuristics)
     )
     _add_shared(infer, heuristics, seeds=1)
 
@@ -190,7 +190,7 @@ def parser(heuristics: flags.Families | None = None) -> argparse.ArgumentParser:
     grid.add_argument(
         "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
     )
-    grid.add_argument("--heuristic", default="edge", metavar="NAME", help=_heuristic_help("whose hyperparameters vary"))
+    grid.add_argument("--heuristic", default="edge", metavar="NAME", help=_heuristic_help("whose hyperparameters vary", heuristics))
     grid.add_argument(
         "--lanes-per-chunk",
         type=int,
@@ -303,8 +303,9 @@ def _heuristics_used(arguments: argparse.Namespace) -> set[str]:
     return {name for name in named if name}
 
 
-def _heuristic_help(what: str) -> str:
-    return f"{what}: {', '.join(plugins.names(HEURISTICS))}, or your own as module:Class (default: edge)"
+def _heuristic_help(what: str, heuristics: flags.Families) -> str:
+    registered = ", ".join(name for name in heuristics if ":" not in name)
+    return f"{what}: {registered}, or your own as module:Class (default: edge)"
 
 
 def _add_shared(

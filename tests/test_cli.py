@@ -16,7 +16,7 @@ import jaxlfi
 from jaxlfi import atomic, cli, commands, observation, run_store, session, sweep, tasks
 from jaxlfi.bayessim import Settings
 from jaxlfi.estimator import Estimator
-from jaxlfi.heuristics import HEURISTICS
+from jaxlfi.heuristics import Mode, registry
 from jaxlfi.presets import PRESETS
 from tests import test_black_box
 from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
@@ -45,11 +45,12 @@ def test_every_setting_and_hyperparameter_has_a_documented_flag():
     for name in ("infer", "compare", "grid"):
         documented = {action.dest for action in choices[name]._actions if action.help}
         fields = {field.name for kind in (Settings, Estimator) for field in dataclasses.fields(kind)} - {"estimator"}
-        assert fields | set(commands.hyperparameters()) <= documented
+        rules = [registry.load(rule) for rule in registry.names()]
+        assert fields | {name for rule in rules for name in registry.hyperparameters(rule)} <= documented
 
 
 def test_names_known_without_jax_are_the_real_ones():
-    assert set(cli.PRESETS) == set(PRESETS) and set(cli.HEURISTICS) == set(HEURISTICS)
+    assert set(cli.PRESETS) == set(PRESETS)
 
 
 def test_version(capsys):
@@ -381,7 +382,7 @@ def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line
     np.testing.assert_array_equal(edge.mass_threshold, [0.125, 0.5])
     assert edge.expansion == 0.1
     mode = commands.build_heuristic(parse(), "mode", PRESETS["paper"], task)
-    assert mode == HEURISTICS["mode"]()
+    assert mode == Mode()
 
 
 def test_one_task_is_described(registered, capsys):
