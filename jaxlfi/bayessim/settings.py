@@ -1,17 +1,17 @@
 """Settings: the numbers of one inference run."""
 
-from flax import struct
+import dataclasses
+
 from jaxtyping import Array, Float
 
 from jaxlfi.bayessim.correction import CORRECTIONS
 from jaxlfi.distributions.belief import RESTRICTIONS
 from jaxlfi.estimators.base import Estimator
 from jaxlfi.estimators.mixture_network import MixtureNetwork
-from jaxlfi.fields import check_fields, hyperparameter, option
+from jaxlfi.fields import Checked, check_fields, hyperparameter, option
 
 
-@struct.dataclass
-class Settings:
+class Settings(Checked):
     """The numbers of one inference run. The defaults are the paper's.
 
     Attributes:
@@ -28,14 +28,14 @@ class Settings:
             observation (section V). These simulations are reported in the ledger; inference does not see them.
     """
 
-    estimator: Estimator = MixtureNetwork()
+    estimator: Estimator = dataclasses.field(default=MixtureNetwork())
     rounds: int = option(10, low=1, high=100_000, help="inference rounds, N_LFI")
     simulations_per_round: int = option(100, low=1, high=100_000_000, help="simulations added each round, at most")
     simulation_budget: int = option(
         125, low=1, high=100_000_000, help="simulations attempted each round, at most, failures included"
     )
-    correction: str = option("none", choices=("none", "paper", "importance"), help="from the network to the posterior")
-    restriction: str = option("clip", choices=("clip", "reject"), help="how proposals are kept in the support")
+    correction: str = option("none", choices=tuple(CORRECTIONS), help="from the network to the posterior")
+    restriction: str = option("clip", choices=tuple(RESTRICTIONS), help="how proposals are kept in the support")
     defensive: Float[Array, "*batch"] | float = hyperparameter(
         0.0, low=0.0, high=1.0, help="fraction of proposals drawn from the prior over the support"
     )
@@ -58,6 +58,3 @@ class Settings:
                 "mixtures of Gaussians, got 'paper'"
             )
         return self
-
-
-assert set(CORRECTIONS) == {"none", "paper", "importance"} and set(RESTRICTIONS) == {"clip", "reject"}

@@ -1,6 +1,7 @@
 """Estimators: the settings a family of density estimators has, and the network that is trained by them."""
 
 import abc
+import math
 from typing import ClassVar, Self
 
 import flax.linen as nn
@@ -18,7 +19,7 @@ from jaxlfi.estimators.density import Density, EnsembleDensity
 from jaxlfi.estimators.losses import LOSSES
 from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser
 from jaxlfi.estimators.posterior import Posterior, truncated
-from jaxlfi.fields import check_fields, hyperparameter, option
+from jaxlfi.fields import Checked, check_fields, hyperparameter, option
 
 FIT_DRAWS = 1000
 """Draws of a density to which its mixture of Gaussians is fitted."""
@@ -27,14 +28,14 @@ SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jn
 """The learning rate's factor at a point of progress through the round's fitting, by name."""
 
 
-@struct.dataclass
-class Estimator(abc.ABC):
+class Estimator(Checked, abc.ABC):
     """What all families of density estimators have in common: the ensemble and its training.
 
-    A family is one subclass, a `flax.struct.dataclass` with the settings that it alone has and one method, `module`. Its
-    Flax module maps a normalised summary to a conditional density: a pytree with `log_prob(theta)`, which broadcasts over
-    axes in front, and `sample(key, n)`. Heuristics and proposals see that density as a mixture of Gaussians fitted to its
-    draws. The defaults are the paper's (section III-C).
+    A family is one subclass with the settings that it alone has and one method, `module`; the class is then a frozen
+    dataclass and a pytree, without a decorator. Its Flax module maps a normalised summary to a conditional density: a
+    pytree with `log_prob(theta)`, which broadcasts over axes in front, and `sample(key, n)`. Heuristics and proposals
+    see that density as a mixture of Gaussians fitted to its draws. The defaults are the paper's (section III-C). A
+    package registers its estimators by `[project.entry-points."jaxlfi.estimators"]` in pyproject.toml.
 
     Attributes:
         learning_rate: Adam's step size. A leaf, as are the next two: a grid over them is one vmap.
@@ -58,26 +59,26 @@ class Estimator(abc.ABC):
         ValueError: from `check` for settings that contradict each other.
     """
 
-    learning_rate: Float[Array, "*batch"] | float = hyperparameter(1e-5, low=0.0, help="Adam's step size")
+    learning_rate: Float[Array, "*batch"] | float = hyperparameter(1e-5, above=0.0, help="Adam's step size")
     weight_decay: Float[Array, "*batch"] | float = hyperparameter(0.0, low=0.0, help="decoupled weight decay")
     clip_norm: Float[Array, "*batch"] | float = hyperparameter(
-        float("inf"), low=1e-12, help="norm the gradients are clipped to (inf: not clipped)"
+        math.inf, above=0.0, high=math.inf, help="norm the gradients are clipped to; inf: not clipped"
     )
     components: int = option(4, low=1, help="Gaussians K in each network's mixture")
     ensemble_size: int = option(1, low=1, help="networks in the ensemble")
     epochs: int = option(1000, low=0, help="full passes over the data each round")
     steps: int = option(0, low=0, help="gradient steps each round, in place of epochs")
     batch_size: int = option(100, low=1, help="simulations in a minibatch")
-    schedule: str = option("constant", choices=("constant", "cosine"), help="of the learning rate within a round")
+    schedule: str = option("constant", choices=tuple(SCHEDULES), help="of the learning rate within a round")
     validation: float = option(0.0, low=0.0, high=0.9, help="fraction held out to choose the best weights by")
     patience: int = option(0, low=0, help="epochs without a better validation loss before training stops; 0: no limit")
     warm_start: bool = option(True, help="train on from the last round's weights, or start anew")
     loss: str = option(
         "likelihood",
-        choices=("likelihood", "atomic", "combined"),
+        choices=tuple(LOSSES),
         help="likelihood; atomic, combined: no correction for the proposals needed",
     )
-    normaliser: str = option("zscore", choices=("zscore", "asinh", "none"), help="what is done to the summaries")
+    normaliser: str = option("zscore", choices=tuple(TRANSFORMS), help="what is done to the summaries")
 
     closed_form: ClassVar[bool] = False
     """Whether the density is a mixture of Gaussians, which needs no fit and can be corrected in closed form."""
@@ -204,6 +205,3 @@ def _normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tupl
     if estimator.closed_form:
         return of_x, None
     return of_x, fit_normaliser("zscore", scale.to_unit(dataset.theta), dataset.valid)
-
-
-assert set(TRANSFORMS) == {"zscore", "asinh", "none"} and set(LOSSES) == {"likelihood", "atomic", "combined"}

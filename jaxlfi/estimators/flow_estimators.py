@@ -1,14 +1,13 @@
 """Conditional normalizing flows as estimators (appendix A): masked autoregressive, and neural spline."""
 
 import flax.linen as nn
-from flax import struct
 
 from jaxlfi.estimators.base import Estimator
 from jaxlfi.estimators.flows import MAF, NSF
+from jaxlfi.estimators.mdn import ACTIVATIONS
 from jaxlfi.fields import option
 
 
-@struct.dataclass
 class FlowEstimator(Estimator):
     """What both kinds of flow have in common.
 
@@ -19,7 +18,7 @@ class FlowEstimator(Estimator):
     """
 
     hidden: tuple[int, ...] = option((50, 50), low=1, help="units of each hidden layer")
-    activation: str = option("tanh", choices=("relu", "tanh", "silu"), help="relu, tanh or silu")
+    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="relu, tanh or silu")
     transforms: int = option(5, low=1, help="transforms of a flow")
 
     def check(self) -> "FlowEstimator":
@@ -35,7 +34,6 @@ class FlowEstimator(Estimator):
         return self.hidden[0], len(self.hidden) - 1, self.activation
 
 
-@struct.dataclass
 class MaskedFlow(FlowEstimator):
     """A masked autoregressive flow (Papamakarios, Pavlakou and Murray 2017).
 
@@ -49,7 +47,6 @@ class MaskedFlow(FlowEstimator):
         return MAF(dim, self.transforms, *self.layers)
 
 
-@struct.dataclass
 class SplineFlow(FlowEstimator):
     """A neural spline flow of coupling transforms (Durkan et al. 2019).
 

@@ -4,18 +4,16 @@ from typing import ClassVar
 
 import flax.linen as nn
 import jax
-from flax import struct
 from jaxtyping import Array, Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_algebra import pool
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Estimator, Network
-from jaxlfi.estimators.mdn import MDN
+from jaxlfi.estimators.mdn import ACTIVATIONS, MDN
 from jaxlfi.fields import hyperparameter, option
 
 
-@struct.dataclass
 class MixtureNetwork(Estimator):
     """A mixture density network (Bishop 1994; section III-C of the paper, whose numbers are the defaults).
 
@@ -32,7 +30,7 @@ class MixtureNetwork(Estimator):
     """
 
     hidden: tuple[int, ...] = option((1024, 1024, 1024), low=1, help="units of each hidden layer")
-    activation: str = option("tanh", choices=("relu", "tanh", "silu"), help="relu, tanh or silu")
+    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="relu, tanh or silu")
     prune: Float[Array, "*batch"] | float = hyperparameter(
         0.0, low=0.0, high=0.5, help="components of less weight than this are dropped"
     )
