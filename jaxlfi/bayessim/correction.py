@@ -72,7 +72,7 @@ def times_reference(task: Task, q: GaussianMixture, previous: Belief) -> tuple[G
     posterior, _ = product(q, previous.mixture)
     bad = jnp.asarray(0)
     if task.inference.prior is not None:
-        posterior, info = quotient(posterior, _as_mixture(task.inference.prior), policy="skip")
+        posterior, info = quotient(posterior, gaussian_prior(task.inference.prior), policy="skip")
         bad = info.not_positive_definite
     posterior = reduce(posterior, q.logits.shape[-1])
     posterior = jax.tree.map(lambda new, old: jnp.where(previous.informed, new, old), posterior, q)
@@ -126,7 +126,7 @@ def effective_size(weights: Float[Array, " cap"]) -> Float[Array, ""]:
     return jnp.sum(weights) ** 2 / jnp.maximum(jnp.sum(weights**2), 1e-30)
 
 
-def _as_mixture(prior) -> GaussianMixture:
+def gaussian_prior(prior) -> GaussianMixture:
     """A Gaussian prior as a mixture of one component.
 
     Raises:

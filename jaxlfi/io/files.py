@@ -34,10 +34,29 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(json_safe(value), indent=2, allow_nan=False) + "\n").encode(), durable=True)
 
 
-def write_json_lines(path: Path, values: list[Any]) -> None:
-    """One JSON object a line; NaN becomes null."""
-    lines = [json.dumps(json_safe(value), allow_nan=False) + "\n" for value in values]
-    write_bytes(path, "".join(lines).encode())
+def json_line(value: Any) -> str:
+    """One JSON object as a line; NaN becomes null."""
+    return json.dumps(json_safe(value), allow_nan=False) + "\n"
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line to a file. A process killed meanwhile leaves part of it, which `keep_lines` removes."""
+    with path.open("a", encoding="utf-8") as file:
+        file.write(line)
+
+
+def keep_lines(path: Path, count: int) -> None:
+    """Cut a file of lines down to its first `count`, where it exists.
+
+    Raises:
+        ValueError: where it has fewer whole lines.
+    """
+    content = path.read_bytes() if path.exists() else b""
+    lines = content.splitlines(keepends=True)[:count]
+    if len(lines) < count or (lines and not lines[-1].endswith(b"\n")):
+        raise ValueError(f"{path}: expected at least {count} whole lines, got {len(lines)}")
+    if content:
+        os.truncate(path, sum(map(len, lines)))
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compress: bool = True, durable: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Settings, heuristics and supports as plain JSON values, and back."""
+"""Dataclasses as plain JSON values, and back."""
 
 import dataclasses
 import math
@@ -8,9 +8,6 @@ from typing import Any
 import numpy as np
 
 from jaxlfi import plugins
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.distributions.support import Support
-from jaxlfi.heuristics import Heuristic, registry
 
 NameOf = Callable[[Any], str]
 Load = Callable[[str], type]
@@ -30,6 +27,7 @@ def to_json(value: Any, name_of: NameOf) -> dict[str, Any]:
         ValueError: for a field that holds anything else, a function say.
 
     Example:
+        >>> from jaxlfi.distributions.support import Support
         >>> to_json(Support([0.0], [1.0]), class_name)["hyperparameters"]["low"]
         {'array': [0.0], 'dtype': 'float32'}
     """
@@ -48,7 +46,7 @@ def from_json(description: Mapping[str, Any], load: Load) -> Any:
     """
     if not isinstance(description, Mapping) or set(description) != {"name", "hyperparameters"}:
         raise ValueError(f"expected a description by name and hyperparameters, got {description!r}")
-    return _made(load(description["name"]), description["name"], description["hyperparameters"], load)
+    return made_of(load(description["name"]), description["name"], description["hyperparameters"], load)
 
 
 def fields_to_json(value: Any, name_of: NameOf) -> dict[str, Any]:
@@ -79,49 +77,6 @@ def dataclass_of(reference: str) -> type:
     return kind
 
 
-def settings_to_json(settings: Settings) -> dict[str, Any]:
-    """All settings by name, and the estimator by its class."""
-    return fields_to_json(settings, class_name)
-
-
-def settings_from_json(description: Mapping[str, Any]) -> Settings:
-    """The settings that `settings_to_json` described."""
-    return _made(Settings, "settings", description, dataclass_of)
-
-
-def heuristic_to_json(heuristic: Heuristic) -> dict[str, Any]:
-    """A heuristic's name and hyperparameters; rules that it wraps are described alike.
-
-    Example:
-        >>> from jaxlfi.heuristics import Matched, Mode
-        >>> heuristic_to_json(Matched(Mode()))["hyperparameters"]["rule"]["hyperparameters"]["proximity"]
-        0.4
-    """
-    return to_json(heuristic, _heuristic_name)
-
-
-def heuristic_from_json(description: Mapping[str, Any]) -> Heuristic:
-    """The heuristic that `heuristic_to_json` described.
-
-    Raises:
-        ValueError: for a description of anything else, or of a heuristic that is not installed.
-    """
-    heuristic = from_json(description, lambda name: dataclass_of(name) if ":" in name else registry.load(name))
-    if not isinstance(heuristic, Heuristic):
-        raise ValueError(f"heuristic: expected the description of one, got {description['name']!r}")
-    return heuristic
-
-
-def support_to_json(support: Support) -> dict[str, list[float]]:
-    """A box's bounds."""
-    return {"low": np.asarray(support.low).tolist(), "high": np.asarray(support.high).tolist()}
-
-
-def support_from_json(description: dict[str, list[float]]) -> Support:
-    """The box that `support_to_json` described."""
-    return Support(description["low"], description["high"])
-
-
 def plain_value(value: Any) -> Any:
     """A number, a string, or a list of them, as JSON has it."""
     return _encoded(value, class_name)
@@ -136,11 +91,8 @@ def json_safe(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _heuristic_name(value: Any) -> str:
-    return registry.name_of(value) if isinstance(value, Heuristic) else class_name(value)
-
-
-def _made(kind: type, name: str, values: Any, load: Load) -> Any:
+def made_of(kind: type, name: str, values: Any, load: Load) -> Any:
+    """A dataclass made of the fields that `fields_to_json` wrote."""
     known = {field.name for field in dataclasses.fields(kind)}
     if not isinstance(values, Mapping) or not set(values) <= known:
         raise ValueError(f"{name}: expected values of {', '.join(sorted(known)) or 'nothing'}, got {values!r}")

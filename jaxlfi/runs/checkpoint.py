@@ -1,6 +1,7 @@
 """Checkpoint: what a run that was killed needs to go on, written as each round ends.
 
-A folder of .npz files, each replaced as a whole: `start.npz` with the observations, `round_000.npz` and so on
+A folder of .npz files, each replaced as a whole: `start.npz` with the observations (and the first round's simulations,
+where they were given), `round_000.npz` and so on
 with what each round did, and `state.npz` with the last state, which says how many rounds are done. Only the
 state is rewritten, so that a round costs the same early and late. A round that was written but that the state
 does not count yet is done again, to the same end.
@@ -11,13 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.bayessim.record import FINAL, apart
 from jaxlfi.io import files as atomic
+from jaxlfi.tasks.simulation import Simulations
 
 FOLDER = "checkpoint"
 _DONE = "rounds_done"
+GIVEN = "given/"
+"""Prefix of the arrays of simulations that were given."""
 
 
 class CheckpointError(ValueError):
@@ -25,21 +30,29 @@ class CheckpointError(ValueError):
 
 
 class Checkpoint:
-    """The checkpoint of all lanes of a command, in `folder/checkpoint`."""
+    """The checkpoint of a batch of runs, in `folder/checkpoint`."""
 
     def __init__(self, folder: Path):
         """Nothing is read or written yet."""
         self.folder = folder / FOLDER
 
-    def write_start(self, observed: np.ndarray, x: np.ndarray) -> None:
-        """Keep the lanes' observations, shape [L, T, C], and their summaries, shape [L, S]."""
+    def write_start(self, observed: np.ndarray, x: np.ndarray, first: Simulations | None = None) -> None:
+        """Keep the runs' observations, shape [L, T, C], their summaries, shape [L, S], and given simulations."""
         self.folder.mkdir(parents=True)
-        atomic.write_arrays(self.folder / "start.npz", {"observed": observed, "x": x}, compress=False, durable=True)
+        given = {} if first is None else {GIVEN + name: leaf for name, leaf in vars(first).items()}
+        atomic.write_arrays(
+            self.folder / "start.npz", {"observed": observed, "x": x} | given, compress=False, durable=True
+        )
 
-    def read_start(self) -> tuple[np.ndarray, np.ndarray]:
-        """The lanes' observations and summaries."""
+    def read_start(self) -> tuple[np.ndarray, np.ndarray, Simulations | None]:
+        """The runs' observations and summaries, and the simulations that were given for the first round."""
         start = self._read("start.npz")
-        return self._named(start, "start.npz", "observed"), self._named(start, "start.npz", "x")
+        given = {name.removeprefix(GIVEN): jnp.asarray(leaf) for name, leaf in start.items() if name.startswith(GIVEN)}
+        observed, x = (self._named(start, "start.npz", name) for name in ("observed", "x"))
+        try:
+            return observed, x, Simulations(**given) if given else None
+        except TypeError as error:
+            raise CheckpointError(f"{self.folder / 'start.npz'}: expected whole simulations, got: {error}") from error
 
     def write_round(self, index: int, state: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
         """Keep a round's record and the state after it; of some arrays, only the last round's (`history.apart`)."""

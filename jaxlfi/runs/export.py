@@ -4,11 +4,12 @@ import os
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxlfi.io import files as atomic
-from jaxlfi.runs import folder as run_store
-from jaxlfi.runs.load import posterior_samples, read_run
+from jaxlfi.runs.folder import StoreError, read_config
+from jaxlfi.runs.load import load
 
 
 class MissingLibrary(ValueError):
@@ -20,7 +21,7 @@ def to_inference_data(folder: Path | str, n: int = 1000, seed: int = 0) -> Any:
 
     Groups: `posterior`, n draws in natural units, a variable for each parameter; `observed_data`, the observed
     trajectory; `posterior_predictive`, trajectories of the posterior draws that the run itself simulated at its end
-    (fewer than n, and other draws than those of `posterior`), without the failed ones.
+    (fewer than n, and other draws than those of `posterior`), without the failed ones, where it simulated any.
 
     Args:
         folder: of one finished run.
@@ -32,30 +33,32 @@ def to_inference_data(folder: Path | str, n: int = 1000, seed: int = 0) -> Any:
         ValueError: for a folder that holds no finished run, or fewer than one draw.
     """
     arviz = _arviz()
-    folder = Path(folder)
-    draws, names, _ = posterior_samples(folder, n, seed)
-    config = read_run(folder).config
+    run = load(folder)
+    draws = np.asarray(run.posterior.sample(jax.random.key(seed), n))
+    names, observed = run.space.names, np.asarray(run.observed)
     try:
-        seen = atomic.read_arrays(folder / "observation.npz")
-        history = atomic.read_arrays(folder / "history.npz")
-        observed, times, channels = seen["trajectory"], seen["times"], seen["channels"]
-        simulated, error = history["final_trajectory"], history["sample_trajectory_error"][-1]
+        seen = atomic.read_arrays(Path(folder) / "observation.npz")
+        times, channels = seen["times"], seen["channels"]
     except (ValueError, KeyError) as lacking:
-        raise run_store.StoreError(f"{folder}: expected a whole run, got: {lacking}") from lacking
+        raise StoreError(f"{folder}: expected a whole run, got: {lacking}") from lacking
+    config = read_config(Path(folder))
     dims = ["time", "channel"][: observed.ndim]
     labels = channels if len(channels) == observed.shape[-1] else np.arange(observed.shape[-1])
     coords = {"time": times, "channel": labels}
+    groups = {"observed_data": {"trajectory": observed}}
+    valid = np.isfinite(run.history["sample_trajectory_error"][-1])
+    if valid.any():
+        groups["posterior_predictive"] = {"trajectory": run.history["final_trajectory"][valid][None]}
     data = arviz.from_dict(
         posterior={name: draws[None, :, d] for d, name in enumerate(names)},
-        observed_data={"trajectory": observed},
-        posterior_predictive={"trajectory": simulated[np.isfinite(error)][None]},
         dims={"trajectory": dims},
         coords={name: coords[name] for name in dims},
+        **groups,
     )
     for name, unit in zip(names, config["units"], strict=True):
         data.posterior[name].attrs["units"] = unit
-    told = {"task": config["task"], "configuration": config["configuration"] or "", "seed": str(config["seed"])}
-    data.posterior.attrs.update(told)
+    origin = {"task": config["task_name"], "configuration": config["configuration"], "seed": str(config["seed"])}
+    data.posterior.attrs.update(origin)
     return data
 
 

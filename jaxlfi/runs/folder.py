@@ -23,20 +23,21 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jaxlfi
-from jaxlfi.bayessim.record import ledger_line, own_evidence, stacked_rounds
-from jaxlfi.distributions.belief import Belief
-from jaxlfi.distributions.mixture import GaussianMixture
-from jaxlfi.distributions.support import Support
+from jaxlfi.bayessim.batch import RunSpec
+from jaxlfi.bayessim.record import FINAL, ledger_line
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.io import files as atomic
-from jaxlfi.io import serialise as describe
+from jaxlfi.io.serialise import json_safe
+from jaxlfi.runs import describe
+from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks.task import Task
 
 RUN, RUNS, COMPARE = "jaxlfi-run", "jaxlfi-runs", "jaxlfi-compare"
-VERSION = 1
+VERSION = 2
+"""Of the format of all folders; it rises whenever an older one could be misread."""
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "distrax", "numpy")
 TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")
 
@@ -48,11 +49,7 @@ class StoreError(ValueError):
 def environment() -> dict[str, Any]:
     """What a run was made with: versions, platform and command line."""
     return {
-        "versions": {
-            "python": platform.python_version(),
-            "jaxlfi": jaxlfi.__version__,
-            **{package: importlib.metadata.version(package) for package in PACKAGES},
-        },
+        "versions": versions(),
         "platform": {
             "system": platform.platform(),
             "processor": processor(),
@@ -63,6 +60,17 @@ def environment() -> dict[str, Any]:
         "command_line": command_line(sys.argv),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def as_json(value: Any) -> Any:
+    """A value as it is read back after it was written."""
+    return json.loads(json.dumps(json_safe(value)))
+
+
+def versions() -> dict[str, str]:
+    """Of Python, jaxlfi and the packages it computes with."""
+    packages = {package: importlib.metadata.version(package) for package in PACKAGES}
+    return {"python": platform.python_version(), "jaxlfi": jaxlfi.__version__} | packages
 
 
 def command_line(argv: Sequence[str]) -> str:
@@ -151,80 +159,97 @@ def read_config(folder: Path) -> dict[str, Any]:
     kind = config.get("format") if isinstance(config, dict) else None
     if kind not in (RUN, RUNS, COMPARE):
         known = isinstance(kind, str) and kind.startswith("jaxlfi-")
-        told = f"is of format {kind!r}" if known else "is not of jaxlfi"
-        raise StoreError(f"expected a run folder, got {str(folder)!r} whose config.json {told}")
-    if config.get("version") != VERSION:
-        raise StoreError(f"{path}: expected version {VERSION} of the format, got {config.get('version')}")
+        found = f"is of format {kind!r}" if known else "is not of jaxlfi"
+        raise StoreError(f"expected a run folder, got {str(folder)!r} whose config.json {found}")
+    check_version(path, config)
     return config
 
 
-def write_ledger(
-    folder: Path, rows: Sequence[Mapping[str, np.ndarray]], reasons: Sequence[str], seconds: Sequence[float]
-):
-    """Write ledger.jsonl anew from the records of the rounds so far."""
-    lines = [ledger_line(i, row, tuple(reasons), s) for i, (row, s) in enumerate(zip(rows, seconds, strict=True))]
-    atomic.write_json_lines(folder / "ledger.jsonl", lines)
+def check_version(path: Path, config: Mapping[str, Any]) -> None:
+    """Refuse a folder of another version of the format.
+
+    Raises:
+        StoreError: in one line.
+    """
+    if config.get("version") != VERSION:
+        raise StoreError(
+            f"{path}: expected version {VERSION} of the format, got {config.get('version')}: the folder was written by "
+            f"jaxlfi {config.get('versions', {}).get('jaxlfi', 'of another version')} in another format; run it again"
+        )
 
 
-def write_results(
-    folder: Path,
-    task: Task,
-    rows: Sequence[Mapping[str, np.ndarray]],
-    seconds: Sequence[float],
-    final: Mapping[str, np.ndarray],
-    draws: np.ndarray,
-    dataset: Any,
-    observed: np.ndarray,
-    x: np.ndarray,
-) -> None:
-    """Write everything but config.json of one run.
+def append_ledger(folder: Path, index: int, row: Mapping[str, np.ndarray], reasons: Sequence[str], seconds: float):
+    """Add a round's line to ledger.jsonl."""
+    line = atomic.json_line(ledger_line(index, row, tuple(reasons), seconds))
+    atomic.append_line(folder / "ledger.jsonl", line)
+
+
+def write_run(folder: Path, run: Run, keep_network: bool = False) -> None:
+    """Write the arrays of one finished run into its folder, which exists and has its ledger.
 
     Args:
-        folder: the run's folder, which exists.
-        task: for names and times.
-        rows: the rounds' records of this one lane.
-        seconds: of each round.
-        final: what is kept of the last round only (`jaxlfi.bayessim.record.apart`): the simulations of its posterior samples,
-            shape [N, T, C], and their summaries, shape [N, S].
-        draws: of the last posterior, shape [n, D].
-        dataset: `jaxlfi.estimators.dataset.Dataset` of this one lane.
-        observed: the observed trajectory.
-        x: its summary.
+        folder: of the run.
+        run: one run, with the task.
+        keep_network: save the network also where the posterior can do without.
     """
-    names = np.asarray(task.coordinates)
-    write_ledger(folder, rows, task.reasons, seconds)
-    last = rows[-1]
-    belief = {name: last[name] for name in ("logits", "means", "scale_tril", "support_low", "support_high")}
-    atomic.write_arrays(folder / "posterior.npz", belief | {"draws": draws, "names": names})
-    size = int(dataset.size)
+    task, history = run.task, jax.device_get(run.history)
+    belief, labels = jax.device_get(run.belief), np.asarray(run.space.labels)
     atomic.write_arrays(
-        folder / "dataset.npz",
-        {"theta": dataset.theta[:size], "x": dataset.x[:size], "round": dataset.round[:size], "names": names},
+        folder / "posterior.npz",
+        {
+            "logits": belief.mixture.logits,
+            "means": belief.mixture.means,
+            "scale_tril": belief.mixture.scale_tril,
+            "support_low": belief.support.low,
+            "support_high": belief.support.high,
+            "draws": run.draws(),
+            "parameters": np.asarray(run.space.names),
+            "log": np.asarray(run.space.log),
+            "names": labels,
+        },
     )
-    atomic.write_arrays(
-        folder / "history.npz",
-        stacked_rounds(list(rows))
-        | {
-            "reasons": np.asarray(task.reasons),
-            "names": names,
-            "seconds": np.asarray(seconds, np.float64),
-        }
-        | dict(final),
-    )
+    dataset = jax.device_get(run.dataset)
+    rows = slice(int(dataset.size))
+    columns = {name: getattr(dataset, name)[rows] for name in ("theta", "x", "round", "weight")}
+    atomic.write_arrays(folder / "dataset.npz", columns | {"names": labels})
+    atomic.write_arrays(folder / "history.npz", history | {"reasons": np.asarray(task.reasons), "names": labels})
     unknown = np.full(task.dim, np.nan, np.float32)
     atomic.write_arrays(
         folder / "observation.npz",
         {
-            "trajectory": observed,
-            "x": x,
-            "truth": unknown if task.truth is None else task.truth,
-            "names": names,
-            "summaries": np.asarray(task.named_summaries(len(x)), dtype=str),
+            "trajectory": run.observed,
+            "x": run.x,
+            "truth": unknown if task.truth is None else task.inference.truth,
+            "names": labels,
+            "summaries": np.asarray(task.named_summaries(len(run.x)), dtype=str),
             "channels": np.asarray(task.channels, dtype=str),
-            "times": np.arange(len(observed)) if task.times is None else task.times,
+            "times": np.arange(len(run.observed)) if task.times is None else task.times,
             "record_label": np.asarray(task.record_label or ("record" if task.times is None else "time")),
         },
     )
+    if keep_network or run.amortised or not run.settings.estimator.closed_form:
+        atomic.write_arrays(folder / "network.npz", named_leaves(run.network))
+
+
+def save(run: Run, folder: Path) -> Path:
+    """Write one run into a new folder, complete or not at all."""
+
+    def fill(beside: Path) -> None:
+        for index, seconds in enumerate(np.asarray(run.history["seconds"])):
+            row = {name: value[index] for name, value in run.history.items() if not name.startswith(FINAL)}
+            append_ledger(beside, index, jax.device_get(row), run.task.reasons, seconds)
+        write_run(beside, run)
+
+    if run.task is None:
+        raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
+    create(folder, run_config(run.task, run.origin, run.spec, run.settings), fill)
+    return folder
+
+
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """A pytree as named arrays, by the places of its leaves."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
 
 
 def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
@@ -237,68 +262,28 @@ def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     atomic.write_bytes(path, text.getvalue().encode())
 
 
-def lane_rows(rows: Sequence[Mapping[str, np.ndarray]], lane: int, place: int | None) -> list[dict[str, Any]]:
-    """One lane's records out of those of all lanes."""
-    return [own_evidence({name: value[lane] for name, value in row.items()}, place) for row in rows]
-
-
-def run_config(
-    *,
-    task: Task,
-    reference: str,
-    support_name: str,
-    support: Any,
-    heuristic: Any,
-    preset: str | None,
-    settings: Any,
-    seed: Any,
-    configuration: str | None = None,
-) -> dict[str, Any]:
-    """The config.json of one run.
-
-    Args:
-        task: for names and units.
-        reference: by which the task was found (`jaxlfi.tasks.registry.load`).
-        support_name: of Theta_0.
-        support: Theta_0.
-        heuristic: how it was adapted.
-        preset: the settings were made from.
-        settings: all of them.
-        seed: of the run.
-        configuration: what a comparison calls the run.
-    """
+def run_config(task: Task, origin: Origin, spec: RunSpec, settings: Settings) -> dict[str, Any]:
+    """The config.json of one run."""
+    feasible = task.inference.feasible
     return {
         "format": RUN,
         "version": VERSION,
-        "task": reference,
-        "names": list(task.coordinates),
+        "task": origin.reference,
+        "task_name": task.name,
+        "parameters": list(task.names),
+        "log": list(task.space.log),
+        "names": list(task.space.labels),
         "units": list(task.units),
-        "feasible_low": np.asarray(task.feasible.low).tolist(),
-        "feasible_high": np.asarray(task.feasible.high).tolist(),
-        "configuration": configuration,
-        "support": {"name": support_name} | describe.support_to_json(support),
-        "heuristic": describe.heuristic_to_json(heuristic),
-        "preset": preset,
+        "feasible_low": np.asarray(feasible.low).tolist(),
+        "feasible_high": np.asarray(feasible.high).tolist(),
+        "configuration": spec.configuration,
+        "support": {"name": spec.support_name} | describe.support_to_json(spec.support),
+        "heuristic": describe.heuristic_to_json(spec.heuristic),
+        "preset": origin.preset,
         "settings": describe.settings_to_json(settings),
-        "seed": seed,
+        "seed": spec.seed,
         **environment(),
     }
-
-
-def read_belief(folder: Path) -> Belief:
-    """The posterior of a run folder.
-
-    Raises:
-        StoreError: if it is missing or damaged.
-    """
-    try:
-        arrays = atomic.read_arrays(folder / "posterior.npz")
-        mixture = GaussianMixture(arrays["logits"], arrays["means"], arrays["scale_tril"])
-        # jnp: plain arrays would be checked as a reader's bounds are, and adapted boxes may be degenerate.
-        support = Support(jnp.asarray(arrays["support_low"]), jnp.asarray(arrays["support_high"]))
-    except (ValueError, KeyError) as error:
-        raise StoreError(f"{folder / 'posterior.npz'}: expected a whole posterior, got {error}") from error
-    return Belief(mixture, support, jnp.asarray(True))
 
 
 def read_ledger(folder: Path) -> list[dict[str, Any]]:

@@ -1,7 +1,6 @@
-"""Draws from the posterior of a finished run folder, in the parameters' natural units."""
+"""load: a run folder as the run that `infer` returned."""
 
-import dataclasses
-import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,142 +8,140 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.bayessim.keys import key_of
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
-from jaxlfi.estimators.dataset import empty
-from jaxlfi.estimators.estimator import Network, initialise, normalisers
-from jaxlfi.estimators.posterior import truncated_draws
+from jaxlfi.estimators.base import Network, untrained
+from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.io import files as atomic
-from jaxlfi.io import serialise as describe
-from jaxlfi.runs import folder as run_store
+from jaxlfi.runs import describe
+from jaxlfi.runs import folder as folders
+from jaxlfi.runs.folder import StoreError
+from jaxlfi.runs.run import Origin, Run
+from jaxlfi.tasks import registry
+from jaxlfi.tasks.task import Task
 
-LOG = "ln "
-"""Prefix of the coordinates that are logarithms (`jaxlfi.tasks.task.Task.coordinates`)."""
+LABELS = ("reasons", "names")
+"""Arrays of history.npz that are texts, not records."""
 
 
-def posterior_samples(folder: Path, n: int, seed: int = 0) -> tuple[np.ndarray, list[str], float]:
-    """`n` draws from a run's posterior, truncated to the support it ended with.
-
-    A mixture density network's are drawn from its mixture, a flow's from the flow itself.
+def load(folder: str | Path, task: Task | None = None) -> Run:
+    """Read a finished run back: what `infer`, `run.save` and the command line wrote, of one seed.
 
     Args:
-        folder: of one run: what `infer` wrote, or one seed's folder of several.
-        n: number of draws.
-        seed: of the draws.
-
-    Returns:
-        The draws in natural units, shape [n, D], the parameters' names, and the share of the untruncated posterior
-        that lies in the support.
+        folder: of one run, such as "runs/edge" or "runs/comparison/misspecified+edge/seed_000".
+        task: what was inferred, where it was made in Python and cannot be found by name.
 
     Raises:
-        StoreError: for a folder that holds no finished run, or a damaged one.
-        ValueError: for fewer than one draw.
+        ValueError: for a folder that holds no finished run, or a damaged one, or another task.
+
+    Example:
+        >>> run = load("runs/demo/misspecified+edge/seed_000")  # doctest: +SKIP
+        >>> run.posterior.sample(jax.random.key(0), 1000)  # doctest: +SKIP
     """
-    if n < 1:
-        raise ValueError(f"n: expected at least 1, got {n}")
-    run = read_run(folder)
-    draws, inside = run.draws(jax.random.key(seed), n)
-    natural = np.array(draws, np.float64)
-    names = []
-    for d, name in enumerate(run.config["names"]):
-        if name.startswith(LOG):
-            natural[:, d] = np.exp(natural[:, d])
-        names.append(name.removeprefix(LOG))
-    return natural, names, float(inside)
-
-
-@dataclasses.dataclass(frozen=True)
-class Finished:
-    """A finished run as its folder tells of it.
-
-    Attributes:
-        folder: where it was read from.
-        config: config.json.
-        settings: the numbers of the run.
-        support: Theta_0.
-        scale: the box the network's [-1, 1]^D stands for: Phi, widened by Theta_0.
-        belief: the posterior and the support it ended with.
-        observed: the observed trajectory, shape [T, C] or [T].
-        x: its summary, shape [S].
-    """
-
-    folder: Path
-    config: dict[str, Any]
-    settings: Settings
-    support: Support
-    scale: Support
-    belief: Belief
-    observed: jax.Array
-    x: jax.Array
-
-    @functools.cached_property
-    def network(self) -> Network | None:
-        """Trained weights; None for an MDN's that were not kept.
-
-        Raises:
-            StoreError: where they are damaged, or a flow's are missing.
-        """
-        path = self.folder / "network.npz"
-        if not self.settings.estimator.is_flow and not path.exists():
-            return None
-        return read_network(path, self.settings.estimator, self.scale, self.x.shape[0])
-
-    def draws(self, key: jax.Array, n: int) -> tuple[jax.Array, jax.Array]:
-        """`n` draws of the posterior in coordinates, truncated to its support, and its share in there."""
-        estimator = self.settings.estimator
-        network = self.network if estimator.is_flow else None
-        return truncated_draws(key, estimator, network, self.x, self.scale, self.belief, n)
-
-
-def read_run(folder: Path) -> Finished:
-    """What `infer` left in a folder.
-
-    Raises:
-        StoreError: for a folder that holds no finished run, or a damaged one.
-    """
-    config = run_store.read_config(folder)
-    if config.get("format") != run_store.RUN:
-        one = next((lane["folder"] for lane in config.get("lanes", ())), "seed_000")
-        raise run_store.StoreError(f"{folder}: expected the folder of one run, such as {folder / one}")
+    folder = Path(folder)
+    config = folders.read_config(folder)
+    if config["format"] != folders.RUN:
+        one = next((run["folder"] for run in config.get("runs", ())), "seed_000")
+        raise StoreError(f"{folder}: expected the folder of one run, such as {folder / one}")
     if config.get("status", "finished") != "finished" or not (folder / "posterior.npz").exists():
-        raise run_store.StoreError(f"{folder}: expected a finished run; go on with it by 'jaxlfi resume'")
-    belief = run_store.read_belief(folder)
-    settings = describe.settings_from_json(config["settings"])
-    support = describe.support_from_json(config["support"])
-    scale = Support(config["feasible_low"], config["feasible_high"]).hull(support)
+        raise StoreError(f"{folder}: expected a finished run; go on with it by 'jaxlfi resume'")
     try:
-        seen = atomic.read_arrays(folder / "observation.npz")
-        observed, x = jnp.asarray(seen["trajectory"]), jnp.asarray(seen["x"])
-    except (ValueError, KeyError) as error:
-        raise run_store.StoreError(f"{folder / 'observation.npz'}: expected a whole observation: {error}") from error
-    return Finished(folder, config, settings, support, scale, belief, observed, x)
+        space = Space(tuple(config["parameters"]), tuple(config["log"]))
+        settings = describe.settings_from_json(config["settings"])
+        heuristic = describe.heuristic_from_json(config["heuristic"])
+        support = describe.support_from_json(config["support"])
+        feasible = Support(config["feasible_low"], config["feasible_high"]).hull(support)
+        origin = Origin(config["task"], config["configuration"], config["support"]["name"], config["preset"])
+        key = key_of(config["seed"])
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise StoreError(f"{folder / 'config.json'}: expected a complete description of the run: {error}") from error
+    observation = _arrays(folder / "observation.npz", ("trajectory", "x"))
+    observed, x = jnp.asarray(observation["trajectory"]), jnp.asarray(observation["x"])
+    return Run(
+        belief=_belief(folder / "posterior.npz", space),
+        history={
+            name: value for name, value in _arrays(folder / "history.npz", ("theta",)).items() if name not in LABELS
+        },
+        dataset=_dataset(folder / "dataset.npz", settings),
+        network=_network(folder / "network.npz", settings, x.shape[0], feasible, space),
+        observed=observed,
+        x=x,
+        key=key,
+        support=support,
+        feasible=feasible,
+        heuristic=heuristic,
+        settings=settings,
+        space=space,
+        task=_task(folder, config, task, space),
+        origin=origin,
+    )
 
 
-def network_arrays(network: Network) -> dict[str, Any]:
-    """A network as named arrays, by the places of its leaves."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(network)
-    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
+def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space) -> Task | None:
+    """The task of a run, if it is given or can be found, and is the one the run was made with."""
+    task = given
+    if task is None and config["task"] is not None:
+        try:
+            task = registry.load(config["task"])
+        except ValueError:  # the posterior can be used without it
+            return None
+    if task is not None and (task.space != space or list(task.units) != list(config["units"])):
+        raise StoreError(
+            f"{folder}: expected the task as it was when the run was made, with parameters {list(space.labels)}, "
+            f"got {list(task.space.labels)}"
+        )
+    return task
 
 
-def read_network(path: Path, estimator: Any, scale: Support, obs: int) -> Network:
-    """The network that `network_arrays` told of.
+def _belief(path: Path, space: Space) -> Belief:
+    names = ("logits", "means", "scale_tril", "support_low", "support_high")
+    logits, means, scale_tril, low, high = (jnp.asarray(_arrays(path, names)[name]) for name in names)
+    components, dim = len(logits), space.dim
+    if means.shape != (components, dim) or scale_tril.shape != (components, dim, dim) or low.shape != (dim,):
+        raise StoreError(f"{path}: expected a mixture over {dim} parameters, got means of shape {list(means.shape)}")
+    return Belief(GaussianMixture(logits, means, scale_tril), Support(low, high), jnp.asarray(True))
+
+
+def _dataset(path: Path, settings: Settings) -> Dataset:
+    arrays = _arrays(path, ("theta", "x", "round", "weight"))
+    size = len(arrays["theta"])
+    first = int(np.sum(arrays["round"] == 0))
+    room = max(first, settings.simulations_per_round) + (settings.rounds - 1) * settings.simulations_per_round
+    filled = {
+        name: jnp.asarray(np.concatenate([arrays[name], np.zeros((max(room - size, 0), *arrays[name].shape[1:]))]))
+        for name in ("theta", "x", "weight")
+    }
+    rounds = np.concatenate([arrays["round"], np.zeros(max(room - size, 0), arrays["round"].dtype)])
+    return Dataset(round=jnp.asarray(rounds), size=jnp.asarray(size, jnp.int32), **filled)
+
+
+def _network(path: Path, settings: Settings, obs: int, feasible: Support, space: Space) -> Network | None:
+    """The trained network; None where a mixture density network was not kept.
 
     Raises:
-        StoreError: where it is missing, damaged, or another estimator's.
+        StoreError: where it is damaged or another estimator's, or a flow's is missing.
     """
-    nothing = empty(1, scale.dim, obs)
-    like = Network(initialise(jax.random.key(0), estimator, scale.dim, obs), *normalisers(estimator, nothing, scale))
-    leaves, structure = jax.tree_util.tree_flatten_with_path(like)
+    if not path.exists() and settings.estimator.closed_form:
+        return None
+    make: Callable[[], Network] = lambda: untrained(jax.random.key(0), settings.estimator, obs, feasible, space)
+    template = jax.eval_shape(make)
+    expected = folders.named_leaves(template)
+    arrays = _arrays(path, tuple(expected))
+    for name, leaf in expected.items():
+        if arrays[name].shape != leaf.shape:
+            raise StoreError(f"{path}: expected shape {leaf.shape} at {name}, got {arrays[name].shape}")
+    return jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(arrays[name]) for name in expected])
+
+
+def _arrays(path: Path, needed: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
         arrays = atomic.read_arrays(path)
-        found = [arrays[jax.tree_util.keystr(place)] for place, _ in leaves]
-    except (OSError, ValueError, KeyError) as error:
-        raise run_store.StoreError(f"{path}: expected a whole network, got {error}") from error
-    for (place, leaf), array in zip(leaves, found, strict=True):
-        if leaf.shape != array.shape:
-            raise run_store.StoreError(
-                f"{path}: expected shape {leaf.shape} at {jax.tree_util.keystr(place)}, got {array.shape}"
-            )
-    with jax.ensure_compile_time_eval():  # so that it can be read, and kept, while a function is traced
-        return jax.tree.unflatten(structure, [jnp.asarray(array) for array in found])
+    except ValueError as error:
+        raise StoreError(str(error)) from error
+    if missing := [name for name in needed if name not in arrays]:
+        raise StoreError(f"{path}: expected an array {missing[0]}, got none")
+    return arrays
