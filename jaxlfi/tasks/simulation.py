@@ -108,7 +108,11 @@ def within_budget(
 
 
 def simulate_batch(
-    key: jax.Array, task: Task, theta: Float[Array, "n dim"], shape: Sequence[int]
+    key: jax.Array,
+    task: Task,
+    theta: Float[Array, "n dim"],
+    shape: Sequence[int],
+    wanted: Bool[np.ndarray, " n"] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Simulate every row of theta outside of compiled programs, by a simulator in JAX or on the host.
 
@@ -117,6 +121,7 @@ def simulate_batch(
         task: the task.
         theta: in inference space, shape [N, D].
         shape: of a trajectory.
+        wanted: rows that are needed, shape [N]; all by default. A simulator on the host is called for these only.
 
     Returns:
         Trajectories [N, ...], summaries [N, S] (zero where failed) and failure codes [N], 0 for success.
@@ -125,8 +130,11 @@ def simulate_batch(
         SimulatorError: from a host simulator that breaks its contract.
     """
     if task.on_host:
-        called = task.simulate.batch(key, np.asarray(task.space.to_natural(theta)), shape)
-        return jax.device_get(summarised_batch(task, *called))
+        rows = np.ones(len(theta), bool) if wanted is None else wanted
+        trajectories, outcomes = np.zeros((len(theta), *shape), np.float32), np.ones(len(theta), int)
+        natural = np.asarray(task.space.to_natural(theta))[rows]
+        trajectories[rows], outcomes[rows] = task.simulate.batch(key, natural, shape)
+        return jax.device_get(summarised_batch(task, trajectories, outcomes))
     return jax.device_get(_simulate_batch(task, jax.random.split(key, len(theta)), theta))
 
 

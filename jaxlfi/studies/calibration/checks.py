@@ -14,8 +14,9 @@ import numpy as np
 from jaxlfi import diagnostics
 from jaxlfi.diagnostics.predictive import MIN_SIMULATIONS
 from jaxlfi.estimators.normaliser import TRANSFORMS
-from jaxlfi.studies.calibration.subject import AGAINST, CLASSIFIER, MIN_COUNT, PREDICTIVE, TIES, Plan, Subject
-from jaxlfi.studies.calibration.truths import simulate
+from jaxlfi.runs.run import Run
+from jaxlfi.studies.calibration.plan import AGAINST, CLASSIFIER, MIN_COUNT, PREDICTIVE, TIES, CalibrationPlan
+from jaxlfi.tasks.simulation import simulate_batch
 from jaxlfi.tasks.task import Task
 
 PREDICTIVE_DRAWS = 200
@@ -23,7 +24,7 @@ PREDICTIVE_DRAWS = 200
 MAX_ROWS = 10_000
 """Most rows that a classifier is given of a sample; the field's reference posteriors have as many."""
 LEVEL = 0.9
-"""Level of the credible region whose coverage is told, beside that of the level where it is worst."""
+"""Level of the credible region whose coverage is reported, and that of the level where it is worst."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Check:
         statistic: in words.
         expected: of a calibrated posterior, in words.
         p_value: NaN for what has none.
-        verdict: "ok", or what is wrong; "" for what is only told.
+        verdict: "ok", or what is wrong; "" for what is only reported.
         numbers: for diagnostics.json.
     """
 
@@ -48,15 +49,15 @@ class Check:
 
 
 def calibration(
-    subject: Subject, plan: Plan, truths: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]
+    run: Run, plan: CalibrationPlan, truths: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]
 ) -> tuple[list[Check], dict[str, np.ndarray]]:
     """Compare truths with draws from their posteriors: ranks, coverage, TARP, and a classifier.
 
     Returns:
         The checks, and the arrays that their pictures are drawn from.
     """
-    theta, draws, dim = truths["theta"], found["draws"], subject.task.dim
-    box = subject.task.support(plan.reference)
+    theta, draws, dim = truths["theta"], found["draws"], run.task.dim
+    box = run.task.support(plan.reference)
     log_prob = found["truth_log_prob"], found["log_prob"]
     rank, density, distance = jax.device_get(_all_ranks(plan.key(TIES), theta, draws, *log_prob, box.low, box.high))
     by_parameter = [diagnostics.uniformity(rank[:, d], plan.draws, dim) for d in range(dim)]
@@ -64,13 +65,10 @@ def calibration(
     bars = [diagnostics.histogram(rank[:, d], plan.draws) for d in range(dim)]
     lines = [
         _support_check(theta, found),
-        *(
-            _rank_check(name, rank[:, d], by_parameter[d], plan.draws)
-            for d, name in enumerate(subject.task.coordinates)
-        ),
+        *(_rank_check(name, rank[:, d], by_parameter[d], plan.draws) for d, name in enumerate(run.task.space.labels)),
         _curve_check("coverage of densest regions", coverage, diagnostics.coverage_verdict(coverage)),
         _curve_check("coverage from random points (TARP)", tarp, diagnostics.distance_verdict(tarp)),
-        _classifier_check(subject, plan, truths, draws),
+        _classifier_check(run, plan, truths, draws),
     ]
     arrays = {
         "ranks": rank,
@@ -80,9 +78,9 @@ def calibration(
         "pointwise": coverage.pointwise,
         "simultaneous": coverage.simultaneous,
         "ranks_simultaneous": by_parameter[0].simultaneous,
-        "ranks_share": np.stack([result.share for result in by_parameter]),
-        "coverage_share": coverage.share,
-        "distance_share": tarp.share,
+        "ranks_fraction": np.stack([result.fraction for result in by_parameter]),
+        "coverage_fraction": coverage.fraction,
+        "distance_fraction": tarp.fraction,
         "bin_edges": bars[0].edges,
         "bin_expected": bars[0].expected,
         "bin_band": bars[0].band,
@@ -111,25 +109,31 @@ def _support_check(theta: np.ndarray, found: Mapping[str, np.ndarray]) -> Check:
 
 def _rank_check(name: str, rank: np.ndarray, result: diagnostics.Uniformity, draws: int) -> Check:
     place = (rank + 0.5) / (draws + 1)
-    mean, spread = float(np.mean(place)), float(np.std(place) * math.sqrt(12))
-    numbers = {"mean": mean, "spread": spread, "shift_z": result.shift, "spread_z": result.spread}
-    statistic = f"mean {mean:.2f}, spread {spread:.2f}"
+    mean, deviation = float(np.mean(place)), float(np.std(place) * math.sqrt(12))
+    numbers = {"mean": mean, "sd": deviation, "shift_z": result.shift, "dispersion_z": result.dispersion}
+    statistic = f"mean {mean:.2f}, sd {deviation:.2f}"
     return Check(f"rank of {name}", statistic, "0.5 and 1", result.p_value, diagnostics.ranks_verdict(result), numbers)
 
 
 def _curve_check(name: str, result: diagnostics.Uniformity, verdict: str) -> Check:
     levels = [result.worst, LEVEL]
-    shares = [result.share_at(level) for level in levels]
+    fractions = [result.fraction_at(level) for level in levels]
     bands = [[float(np.interp(level, result.level, side)) for side in result.simultaneous] for level in levels]
-    numbers = {"levels": levels, "shares": shares, "bands": bands, "shift_z": result.shift, "spread_z": result.spread}
-    statistic = ", ".join(f"{level:.0%}: {share:.2f}" for level, share in zip(levels, shares, strict=True))
+    numbers = {
+        "levels": levels,
+        "fractions": fractions,
+        "bands": bands,
+        "shift_z": result.shift,
+        "dispersion_z": result.dispersion,
+    }
+    statistic = ", ".join(f"{level:.0%}: {fraction:.2f}" for level, fraction in zip(levels, fractions, strict=True))
     expected = ", ".join(f"{low:.2f} to {high:.2f}" for low, high in bands)
     return Check(name, statistic, expected, result.p_value, verdict, numbers)
 
 
-def _classifier_check(subject: Subject, plan: Plan, truths: Mapping[str, np.ndarray], draws: np.ndarray) -> Check:
-    """Whether truths can be told from posterior draws, when their simulations are seen as well."""
-    x = np.asarray(TRANSFORMS[subject.run.settings.estimator.normaliser](jnp.asarray(truths["x"])))
+def _classifier_check(run: Run, plan: CalibrationPlan, truths: Mapping[str, np.ndarray], draws: np.ndarray) -> Check:
+    """Whether a classifier that sees the simulations tells truths from posterior draws."""
+    x = np.asarray(TRANSFORMS[run.settings.estimator.normaliser](jnp.asarray(truths["x"])))
     rows = [np.concatenate([theta, x], axis=1) for theta in (truths["theta"], draws[:, 0])]
     accuracy = _accuracy(plan.key(CLASSIFIER), *rows)
     # Held-out rows are nearly independent where there is nothing to learn.
@@ -144,7 +148,7 @@ def _accuracy(key: jax.Array, first: np.ndarray, second: np.ndarray) -> float:
     return float(jax.jit(diagnostics.c2st)(key, jnp.asarray(first), jnp.asarray(second)))
 
 
-def predictive(subject: Subject, plan: Plan) -> tuple[Check, dict[str, np.ndarray]]:
+def predictive(run: Run, plan: CalibrationPlan) -> tuple[Check, dict[str, np.ndarray]]:
     """Compare the run's own observation with simulations of its own posterior.
 
     Returns:
@@ -152,14 +156,14 @@ def predictive(subject: Subject, plan: Plan) -> tuple[Check, dict[str, np.ndarra
     """
     name = "posterior predictive"
     key_draw, key_simulate = jax.random.split(plan.key(PREDICTIVE))
-    theta = _draws(subject, key_draw, PREDICTIVE_DRAWS)
-    _, x, failure = simulate(key_simulate, subject.task, theta, subject.run.observed.shape)
+    theta = _draws(run, key_draw, PREDICTIVE_DRAWS)
+    _, x, failure = simulate_batch(key_simulate, run.task, theta, run.observed.shape)
     failed = int(np.sum(failure != 0))
     if PREDICTIVE_DRAWS - failed < MIN_SIMULATIONS:
         statistic = f"{failed} of {PREDICTIVE_DRAWS} simulations failed"
         return Check(name, statistic, "", math.nan, "misfit: too few simulations succeed", {"failed": failed}), {}
     simulated = np.where(failure[:, None] == 0, x, np.nan)
-    result = diagnostics.predictive_check(simulated, subject.run.x)
+    result = diagnostics.predictive_check(simulated, run.x)
     misfit = "misfit: the observation is unlike the posterior's simulations"
     check = Check(
         name,
@@ -171,7 +175,7 @@ def predictive(subject: Subject, plan: Plan) -> tuple[Check, dict[str, np.ndarra
     )
     arrays = {
         "predictive_x": simulated,
-        "observed_x": np.asarray(subject.run.x),
+        "observed_x": np.asarray(run.x),
         "predictive_tails": result.tails,
         "predictive_distances": result.distances,
         "observed_distance": np.asarray(result.distance),
@@ -180,22 +184,22 @@ def predictive(subject: Subject, plan: Plan) -> tuple[Check, dict[str, np.ndarra
     return check, arrays
 
 
-def _draws(subject: Subject, key: jax.Array, n: int) -> jax.Array:
-    """Draws of the run's own posterior, in coordinates."""
-    return jax.jit(lambda key: subject.run.draws(key, n)[0])(key)
+def _draws(run: Run, key: jax.Array, n: int) -> jax.Array:
+    """Draws of the run's own posterior, in inference space."""
+    return run.posterior.sample(key, n, space="inference")
 
 
-def against(subject: Subject, plan: Plan, name: str, reference: np.ndarray) -> Check:
-    """Whether the run's posterior can be told from reference samples [n, D] in coordinates."""
+def against(run: Run, plan: CalibrationPlan, name: str, reference: np.ndarray) -> Check:
+    """Whether the run's posterior can be told from reference samples [n, D] in inference space."""
     n = min(len(reference), MAX_ROWS)
-    draws = _draws(subject, jax.random.fold_in(plan.key(AGAINST), 0), n)
+    draws = _draws(run, jax.random.fold_in(plan.key(AGAINST), 0), n)
     accuracy = _accuracy(jax.random.fold_in(plan.key(AGAINST), 1), reference[:n], draws)
     numbers = {"accuracy": accuracy, "rows": n}
     return Check(f"classifier, {name}", f"{accuracy:.2f}", "0.5 is best", math.nan, "", numbers)
 
 
 def read_reference(path: Path, task: Task) -> np.ndarray:
-    """Reference samples in coordinates, shape [n, D].
+    """Reference samples in inference space, shape [n, D].
 
     Args:
         path: a .csv with a row of headings, the parameters' names in any order, or an .npz with an array "theta"
@@ -216,11 +220,11 @@ def read_reference(path: Path, task: Task) -> np.ndarray:
             f"against: expected at least {MIN_COUNT} rows of finite numbers in {str(path)!r}, positive ones of "
             f"{', '.join(task.log) or 'no parameter'}, got {len(theta)} rows or others"
         )
-    return np.asarray(task.to_coordinates(jnp.asarray(theta, jnp.float32)))
+    return np.asarray(task.space.to_inference(jnp.asarray(theta, jnp.float32)))
 
 
 def _read_csv(path: Path, task: Task) -> np.ndarray:
-    with path.open(newline="", encoding="utf-8") as file:
+    with path.open(newline="", encoding="utf-8-sig") as file:
         rows = [row for row in csv.reader(file) if row]
     heading = [cell.strip() for cell in rows[0]] if rows else []
     if sorted(heading) != sorted(task.names):

@@ -15,7 +15,6 @@ import hashlib
 import io
 import itertools
 import json
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,14 +24,18 @@ import numpy as np
 from jax.experimental import multihost_utils
 from rich.console import Console
 
+from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.io import files as atomic
-from jaxlfi.io import serialise as describe
+from jaxlfi.io import serialise
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.runs import describe
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.folder import StoreError
-from jaxlfi.studies.grid.chunks import MEASURES, Work, assemble, compiled, prepare, run_chunk
+from jaxlfi.runs.run import Origin
+from jaxlfi.studies.chunk_store import ChunkStore
+from jaxlfi.studies.grid.chunks import MEASURES, Work, arranged, prepare, run_chunk
 from jaxlfi.studies.grid.grid import Axis, Grid, combinations, hyperparameters
-from jaxlfi.tasks.registry import registry as tasks
+from jaxlfi.tasks import registry as tasks
 
 GRID = "jaxlfi-grid"
 """The format of a grid's folder."""
@@ -41,16 +44,9 @@ GRID = "jaxlfi-grid"
 def description(work: Work) -> dict[str, Any]:
     """All that the results depend on, as JSON values."""
     grid = work.grid
-    run = run_store.run_config(
-        task=grid.task,
-        reference=grid.reference or grid.task.name,
-        support_name=grid.support_name,
-        support=grid.support,
-        heuristic=grid.rule,
-        preset=grid.preset,
-        settings=grid.settings,
-        seed=None,
-    )
+    spec = RunSpec("", grid.support_name, grid.support, grid.rule, 0)
+    origin = Origin(grid.reference, "", grid.support_name, grid.preset)
+    run = run_store.run_config(grid.task, origin, spec, grid.settings)
     left_out = ("configuration", "seed", "versions", "platform", "command_line", "started")
     defaults = hyperparameters(grid.rule)
     return {name: value for name, value in run.items() if name not in left_out} | {
@@ -59,21 +55,28 @@ def description(work: Work) -> dict[str, Any]:
             {
                 "name": axis.name,
                 "values": list(axis.values),
-                "default": describe.plain_value(defaults[axis.name]),
+                "default": serialise.plain_value(defaults[axis.name]),
             }
             for axis in grid.axes
         ],
         "seeds": list(grid.seeds),
-        "lanes_per_chunk": work.length,
+        "runs_per_chunk": work.length,
         "observation": _digest(
-            *(np.ascontiguousarray(a) for a in (work.observed, work.x, np.asarray(grid.task.truth, np.float32)))
+            *(
+                np.ascontiguousarray(a)
+                for a in (
+                    work.observed,
+                    work.x,
+                    np.asarray(np.nan if grid.task.truth is None else grid.task.truth, np.float32),
+                )
+            )
         ),
     }
 
 
 def fingerprint(work: Work) -> str:
     """A hash of the description: chunks that bear another belong to another grid."""
-    return _digest(json.dumps(description(work), sort_keys=True).encode())
+    return _digest(json.dumps(run_store.as_json(description(work)), sort_keys=True).encode())
 
 
 def _digest(*parts) -> str:
@@ -83,21 +86,21 @@ def _digest(*parts) -> str:
     return whole.hexdigest()[:32]
 
 
-def begin(folder: Path, grid: Grid, observation: Any = None, lanes_per_chunk: int | None = None) -> Work:
+def begin(folder: Path, grid: Grid, observation: Any = None, runs_per_chunk: int | None = None) -> Work:
     """Check all there is to check, compile, then bring the folder into being; nothing is written before.
 
     Args:
         folder: new or empty.
         grid: what to run.
         observation: see `observations`.
-        lanes_per_chunk: see `prepare`.
+        runs_per_chunk: see `prepare`.
 
     Raises:
         ValueError: for anything that does not fit.
     """
     if jax.process_index() == 0:
         run_store.refuse_occupied(folder)
-        work = prepare(grid, observation, lanes_per_chunk)
+        work = prepare(grid, observation, runs_per_chunk)
         create(folder, work)
     _meet("begun")
     return work if jax.process_index() == 0 else reopen(folder)
@@ -107,7 +110,6 @@ def create(folder: Path, work: Work) -> None:
     """Bring the folder of a prepared work into being."""
 
     def fill(beside: Path) -> None:
-        (beside / "chunks").mkdir()
         atomic.write_arrays(beside / "observation.npz", {"trajectory": work.observed, "x": work.x}, durable=True)
 
     run_store.create(
@@ -142,10 +144,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not is_grid(folder):
         raise StoreError(f"expected the folder of a grid, got {str(folder)!r} whose config.json is not one's")
     config = json.loads((folder / "config.json").read_text())
-    if config.get("version") != run_store.VERSION:
-        raise StoreError(
-            f"{folder / 'config.json'}: expected version {run_store.VERSION} of the format, got {config.get('version')}"
-        )
+    run_store.check_version(folder / "config.json", config)
     return config
 
 
@@ -169,9 +168,9 @@ def reopen(folder: Path) -> Work:
             support_name=config["support"]["name"],
         )
         start = atomic.read_arrays(folder / "observation.npz")
-        work = Work(grid, start["trajectory"], start["x"], config["lanes_per_chunk"])
-        told = json.loads(json.dumps(description(work)))
-        same = fingerprint(work) == config["fingerprint"] and all(config.get(name) == told[name] for name in told)
+        work = Work(grid, start["trajectory"], start["x"], config["runs_per_chunk"])
+        now = run_store.as_json(description(work))
+        same = fingerprint(work) == config["fingerprint"] and all(config.get(name) == now[name] for name in now)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise StoreError(f"{folder}: expected a complete description of a grid, got: {error}") from error
     if not same:
@@ -182,33 +181,9 @@ def reopen(folder: Path) -> Work:
     return work
 
 
-def chunk_path(folder: Path, index: int) -> Path:
-    """Where a chunk's results are kept."""
-    return folder / "chunks" / f"{index:03d}.npz"
-
-
-def write_chunk(folder: Path, work: Work, index: int, arrays: Mapping[str, np.ndarray], seconds: float) -> None:
-    """Keep what came out of a chunk, and whose it is."""
-    label = {"fingerprint": np.asarray(fingerprint(work)), "seconds": np.asarray(seconds)}
-    atomic.write_arrays(chunk_path(folder, index), {**arrays, **label}, durable=True)
-
-
-def read_chunk(folder: Path, work: Work, index: int) -> dict[str, np.ndarray]:
-    """What came out of a chunk.
-
-    Raises:
-        StoreError: for a file that is missing, damaged, incomplete or of another grid; it is left as it is.
-    """
-    path, lanes_there = chunk_path(folder, index), len(work.chunks[index])
-    try:
-        arrays = atomic.read_arrays(path)
-    except ValueError as error:
-        raise StoreError(f"{error}: delete it, and resuming computes it again") from error
-    if str(arrays.get("fingerprint")) != fingerprint(work):
-        raise StoreError(f"{path}: expected a chunk of this grid, got one of another")
-    if not all(name in arrays and len(arrays[name]) == lanes_there for name in MEASURES):
-        raise StoreError(f"{path}: expected {', '.join(MEASURES)} of {lanes_there} lanes, got others")
-    return arrays
+def store_of(folder: Path, work: Work) -> ChunkStore:
+    """The store of a grid's chunks."""
+    return ChunkStore(folder / "chunks", work.grid.size, work.length, fingerprint(work), MEASURES)
 
 
 def advance(folder: Path, work: Work, console: Console) -> dict[str, np.ndarray]:
@@ -226,28 +201,17 @@ def advance(folder: Path, work: Work, console: Console) -> dict[str, np.ndarray]
         StoreError: for a damaged chunk, before anything is computed.
         SimulatorError: for a simulator that fails always.
     """
-    own = range(jax.process_index(), len(work.chunks), jax.process_count())
-    done = [index for index in own if chunk_path(folder, index).exists()]
-    for index in done:
-        read_chunk(folder, work, index)
-    rounds = work.grid.settings.rounds
-    label = f"{work.grid.task.name}: {work.grid.size} runs in {len(work.chunks)} chunks of {work.length}"
+    store, rounds = store_of(folder, work), work.grid.settings.rounds
+    own = range(jax.process_index(), len(store.chunks), jax.process_count())
+    done = [index for index in store.done() if index in own]
+    label = f"{work.grid.task.name}: {work.grid.size} runs in {len(store.chunks)} chunks of {work.length}"
     with RoundProgress(console, rounds * len(own), rounds * len(done), label) as progress:
-        for index in own:
-            if index in done:
-                continue
-            if work.engine is None:
-                began = time.perf_counter()
-                work, _ = compiled(work)
-                progress.compiled(time.perf_counter() - began)
-            began = time.perf_counter()
-            arrays = run_chunk(work, index, progress.advance)
-            write_chunk(folder, work, index, arrays, time.perf_counter() - began)
+        store.compute(lambda places: run_chunk(work, places, progress.advance, progress.compiled), own)
     _meet("chunks done")
-    chunks = [read_chunk(folder, work, index) for index in range(len(work.chunks))]
-    arrays = assemble(work.grid, chunks)
+    results, seconds = store.results()
+    arrays = arranged(work.grid, results)
     if jax.process_index() == 0:
-        finish(folder, work.grid, arrays, float(sum(chunk["seconds"] for chunk in chunks)))
+        finish(folder, work.grid, arrays, seconds)
     _meet("finished")
     return arrays
 

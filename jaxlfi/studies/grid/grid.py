@@ -1,4 +1,4 @@
-"""The grid: hyperparameters, the values they take, and the lanes that make every combination of them."""
+"""The grid: hyperparameters, the values they take, and the runs that make every combination of them."""
 
 import dataclasses
 import itertools
@@ -6,16 +6,15 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim.batch import Lane
-from jaxlfi.bayessim.keys import run_keys
+from jaxlfi.bayessim.batch import RunSpec
+from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics import Heuristic, registry
-from jaxlfi.runs.inference import check_heuristic, observe
+from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.task import Task
 
 
@@ -32,8 +31,8 @@ class Grid:
     """What to run: the product of `axes` and `seeds`.
 
     Attributes:
-        task: a task whose simulator is in JAX.
-        support: Theta_0, in coordinates.
+        task: the task.
+        support: Theta_0, in inference space.
         rule: the heuristic, with the hyperparameters that are on no axis.
         axes: hyperparameters and their values.
         seeds: of the runs; each has one observation in all combinations.
@@ -57,20 +56,16 @@ class Grid:
     axes: tuple[Axis, ...]
     seeds: tuple[int, ...]
     settings: Settings = QUICK
-    reference: str = ""
+    reference: str | None = None
     preset: str | None = None
     support_name: str = "own"
 
     def __post_init__(self):
         check_axes(self.rule, self.axes)
-        check_heuristic(self.rule, self.task)
+        registry.check(self.rule, self.task.dim)
         self.settings.check()
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds: expected at least one, all different, got {self.seeds}")
-        if self.task.black_box:
-            raise ValueError(
-                f"task: expected one whose simulator is in JAX, as a grid is one compiled program, got {self.task.name}"
-            )
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -79,7 +74,7 @@ class Grid:
 
     @property
     def size(self) -> int:
-        """Number of lanes."""
+        """Number of runs."""
         return math.prod(self.shape)
 
 
@@ -123,7 +118,7 @@ def check_axes(rule: Heuristic, axes: Sequence[Axis]) -> None:
                 f"got {axis.name!r}"
             )
         shown = ",".join(f"{value:g}" for value in axis.values)
-        if len(set(np.float32(axis.values).tolist())) < max(len(axis.values), 1):  # lanes hold single precision
+        if len(set(np.float32(axis.values).tolist())) < max(len(axis.values), 1):  # runs hold single precision
             raise ValueError(f"{axis.name}: expected at least one value, each once, got {shown or 'none'}")
         info = registry.hyperparameters(rule)[axis.name].info
         if not np.isfinite(axis.values).all() or not info.contains(axis.values):
@@ -152,11 +147,11 @@ def heuristics(rule: Heuristic, axes: Sequence[Axis]) -> list[Heuristic]:
     return [registry.replaced(rule, values) for values in combinations(axes)]
 
 
-def grid_lanes(grid: Grid) -> list[Lane]:
-    """All lanes in C order of [axis..., seed]."""
+def grid_runs(grid: Grid) -> list[RunSpec]:
+    """All runs in C order of [axis..., seed]."""
     named = zip(combinations(grid.axes), heuristics(grid.rule, grid.axes), strict=True)
     return [
-        Lane(
+        RunSpec(
             " ".join(f"{name}={value:g}" for name, value in values.items()),
             grid.support_name,
             grid.support,
@@ -175,6 +170,6 @@ def observations(grid: Grid, observation: Any = None) -> tuple[np.ndarray, np.nd
         grid: for the task and the seeds.
         observation: one for all seeds; by default the task's, or one simulated at the truth for each.
     """
-    keys = [run_keys(jax.random.key(seed)).observe for seed in grid.seeds]
+    keys = [run_keys(key_of(seed)).observe for seed in grid.seeds]
     pairs = [observe(key, grid.task, observation) for key in keys]
     return tuple(np.stack([np.asarray(pair[i]) for pair in pairs]) for i in range(2))
