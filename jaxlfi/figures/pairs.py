@@ -205,7 +205,7 @@ def _draw_contours(axes: Axes, cloud: Cloud, chosen: list[int], filled: bool) ->
     low, high = cloud.support or (np.full(cloud.dim, -np.inf), np.full(cloud.dim, np.inf))
     x, y, fraction = smoothed(draws, np.stack([low[chosen], high[chosen]]))
     steps = np.append(levels(fraction), 1.0)
-    if not np.all(np.diff(steps) > 0):  # too few distinct draws for contours
+    if not np.all(np.diff(steps) > 0):  # a constant density has no contours
         axes.plot(*draws.T, ".", color=look.colour, markersize=2, gid="draws")
     elif filled:
         axes.contourf(x, y, fraction, steps, colors=[shade(look.colour, amount) for amount in _SHADES], zorder=1)
