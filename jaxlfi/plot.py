@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 __all__ = ["pairs"]
 
 MIN_DRAWS = 20
-"""Rows of samples below which contours mean nothing."""
+"""Smallest number of draws that contours are drawn from."""
 MAX_PARAMETERS = 12
-"""Parameters that a pair plot as wide as a page stays legible with."""
+"""Largest number of parameters that stay legible on the width of a page."""
 MAX_SETS = 8
-"""Sets of samples that can be distinguished when drawn over one another."""
+"""Largest number of sets of samples that can be distinguished when drawn over one another."""
 
 
 def pairs(
@@ -72,7 +72,7 @@ def pairs(
     marked = np.full(dim, np.nan) if truth is None else to_drawn("truth", _vector("truth", truth, dim, unknown=True))
     box = None if support is None else tuple(to_drawn("support", bound) for bound in _bounds(support, dim))
 
-    # Not before the arguments have been checked: without matplotlib they are what is to be mended first.
+    # Imported here so that `import jaxlfi.plot` does not load matplotlib.
     from jaxlfi.figures import style
     from jaxlfi.figures.pairs import Cloud, draw_overlay
 

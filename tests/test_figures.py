@@ -722,6 +722,18 @@ def test_report_of_one_run(tmp_path, options, missing):
     assert "&lt;somewhere&gt;" in paths[0].read_text(encoding="utf-8")
 
 
+def test_legends_fit_into_figures_of_one_column(tmp_path):
+    collection = open_collection(write_run(tmp_path / "run", rounds=2, records=21))
+    for name in ("curves", "predictive", "pairs", "polars"):
+        with style.context():
+            figure, _, _ = reporting.PICTURES[name](collection)
+            figure.draw_without_rendering()
+        width, height = figure.get_size_inches() * figure.dpi
+        assert width == style.COLUMN_WIDTH * figure.dpi
+        box = figure.legends[0].get_window_extent()
+        assert box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height, name
+
+
 def test_report_of_seeds(tmp_path):
     for seed in range(3):
         write_run(tmp_path / f"seed_{seed:03d}", seed=seed, dim=2)

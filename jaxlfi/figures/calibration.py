@@ -136,6 +136,6 @@ def _legend(figure: Figure, drawn: str, unit: str) -> None:
     handles = [
         Line2D([], [], color=COLOUR, label=drawn),
         Patch(color=BAND, alpha=NARROW, linewidth=0, label=f"95 % band of a calibrated method, each {unit}"),
-        Patch(color=BAND, alpha=WIDE, linewidth=0, label="99 % band of the whole curve"),
+        Patch(color=BAND, alpha=WIDE, linewidth=0, label="99 % band of a calibrated method, whole curve"),
     ]
     legend_below(figure, handles, at_most=3 if is_wide(figure) else 1)

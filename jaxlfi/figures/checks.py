@@ -75,8 +75,8 @@ def draw(figure: Figure, arrays: Arrays) -> None:
     left.grid(True, axis="y")
     right.hist(arrays["predictive_distances"], bins=20, color=BAND, alpha=0.6, gid="simulated")
     right.axvline(float(arrays["observed_distance"]), color=COLOUR, gid="observed")
-    right.set(xlabel="Mahalanobis distance", ylabel="number of simulations")
-    right.set_title(f"all summaries: observed (line), p = {float(arrays['predictive_p_value']):.2g}")
+    right.set(xlabel="Mahalanobis distance (line: observed)", ylabel="number of simulations")
+    right.set_title(f"all summaries (p = {float(arrays['predictive_p_value']):.2g})")
 
 
 def _ranks_size(arrays: Arrays) -> tuple[float, float]:

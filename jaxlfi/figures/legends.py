@@ -10,12 +10,12 @@ from jaxlfi.figures.style import Look, grid_shape, is_wide
 
 
 def above(figure: Figure, handles: Sequence[Artist], title: str | None = None, columns: int | None = None) -> None:
-    """A legend above the panels, with a line on what is drawn.
+    """A legend above the panels.
 
     Args:
         figure: to add it to.
         handles: its entries.
-        title: the line.
+        title: a line above the entries.
         columns: of entries; by default all in one row.
     """
     figure.legend(

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxlfi.figures import statistics
 from jaxlfi.figures.collection import Collection
-from jaxlfi.figures.style import Look, looks
+from jaxlfi.figures.style import Look, looks, unit_label
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,7 +143,7 @@ def _facts(collection: Collection) -> str:
         return next((config[name] for config in configs for name in names if config.get(name)), None)
 
     facts = {
-        "Parameters": ", ".join(f"{n} [{u}]" if u else n for n, u in zip(first.names, first.units, strict=True)),
+        "Parameters": ", ".join(_labels(first.names, first.units)),
         "Rounds": first.rounds,
         "Seeds": max(len(histories) for histories in collection.runs.values()),
         **_provenance(get),
@@ -215,9 +215,18 @@ def _table(collection: Collection) -> str:
 
 
 def _swatch(own: Look) -> str:
-    # The label is written for matplotlib, where a dollar sign has a backslash.
-    label = html.escape(own.label.replace(r"\$", "$"))
-    return f'<i class="swatch" style="background:{own.colour}"></i>{label}'
+    return f'<i class="swatch" style="background:{own.colour}"></i>{html.escape(_without_escapes(own.label))}'
+
+
+def _labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
+    """Names of parameters with their units in brackets."""
+    brackets = [_without_escapes(unit_label(names, units, d)) for d in range(len(names))]
+    return [f"{name} {bracket}".strip() for name, bracket in zip(names, brackets, strict=True)]
+
+
+def _without_escapes(label: str) -> str:
+    """A label that was written for matplotlib, where a dollar sign has a backslash."""
+    return label.replace(r"\$", "$")
 
 
 def _figure(name: str, picture: Picture) -> str:

@@ -28,7 +28,7 @@ from jaxlfi.figures.style import (
 )
 
 MAX_PARAMETERS = 6
-"""Parameters that a report's pair plot has room for, as several runs stand side by side."""
+"""Largest number of parameters for pair plots in a report, where those of several runs stand side by side."""
 FRACTIONS = (0.95, 0.8, 0.5)
 """Fractions of the draws that the contours enclose, from the outermost contour on."""
 _SHADES = (0.68, 0.3, -0.2)
@@ -43,7 +43,7 @@ Box = tuple[np.ndarray, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Cloud:
-    """Draws of one distribution over D parameters, and what is marked with them.
+    """Draws of one distribution over D parameters, with their support and true parameters.
 
     Attributes:
         draws: shape [n, D].
@@ -72,7 +72,7 @@ class Cloud:
 
 
 def drawable(history: History) -> bool:
-    """Whether draws of the last posterior were saved, of no more parameters than there is room for."""
+    """Whether finite draws of the last posterior were saved, of at most `MAX_PARAMETERS` parameters."""
     return history.draws is not None and history.dim <= MAX_PARAMETERS and bool(np.isfinite(history.draws).all())
 
 
@@ -227,8 +227,9 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
     clouds = [cloud_of(history, look[history.configuration]) for history in histories]
     titles = or_labels(titles, [cloud.look for cloud in clouds])
     draw_groups(figure, [[cloud] for cloud in clouds], [symbol(d) for d in range(clouds[0].dim)], titles)
-    handles = [*_fraction_handles(clouds, GREY), *_mark_handles(clouds)]
-    below(figure, handles, title=parameter_key(histories[0], figure), handlelength=1.6)
+    handles = [*_fraction_handles(clouds, _colour(clouds)), *_mark_handles(clouds)]
+    key = parameter_key(histories[0], figure)
+    below(figure, handles, at_most=len(handles) if is_wide(figure) else 2, title=key, handlelength=1.6)
 
 
 def draw_overlay(figure: Figure, clouds: Sequence[Cloud], labels: Sequence[str]) -> None:
@@ -289,7 +290,7 @@ def arrangement(count: int, dim: int) -> tuple[int, int]:
 
 
 def parameter_key(history: History, figure: Figure) -> str:
-    """What the symbols of the parameters stand for, in lines of the figure's width."""
+    """Symbols, names and units of the parameters, in lines of the figure's width."""
     names = [parameter_label(history.names, history.units, d, 99).replace("\n", " ") for d in range(history.dim)]
     across = 4 if is_wide(figure) else 2
     return "\n".join(",  ".join(names[i : i + across]) for i in range(0, len(names), across))

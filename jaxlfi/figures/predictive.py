@@ -73,8 +73,8 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
     handles = [
         Line2D([], [], label="observed", **_observed(first)),
         Line2D([], [], color=GREY, label="median of posterior simulations"),
-        Patch(color=GREY, alpha=0.5, linewidth=0, label="25–75 % of simulations"),
-        Patch(color=GREY, alpha=0.2, linewidth=0, label="5–95 % of simulations"),
+        Patch(color=GREY, alpha=0.5, linewidth=0, label="central 50 %"),
+        Patch(color=GREY, alpha=0.2, linewidth=0, label="central 90 %"),
     ]
     below(figure, handles, at_most=4 if is_wide(figure) else 2)
 

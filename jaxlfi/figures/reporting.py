@@ -27,9 +27,9 @@ from jaxlfi.figures.page import Picture
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
 
 COLUMNS = ("ok", "misspecified", "broad", "misspecified+edge")
-"""The configurations to show side by side, where there are more than a picture has room for."""
+"""The configurations to show side by side, where there are more than `MAX_COLUMNS`."""
 MAX_COLUMNS = 4
-"""Configurations that a picture has room for side by side."""
+"""Largest number of configurations side by side in one picture."""
 
 
 def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
