@@ -244,7 +244,7 @@ def test_a_damaged_network_is_told(folder, tmp_path, capsys, damage):
         network.write_bytes(network.read_bytes()[:100])
     elif damage == "foreign":
         config = json.loads((copy / "config.json").read_text())
-        config["settings"]["estimator"]["hidden"] = [9, 9]
+        config["settings"]["estimator"]["hyperparameters"]["hidden"] = [9, 9]
         (copy / "config.json").write_text(json.dumps(config))
     else:
         network.unlink()

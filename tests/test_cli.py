@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim.presets import PRESETS
-from jaxlfi.cli.parser import commands
-from jaxlfi.cli.parser import parser as cli
-from jaxlfi.estimators.estimator import Estimator
-from jaxlfi.heuristics import HEURISTICS
 from jaxlfi.io import files as atomic
+from jaxlfi.cli.parser import parser as cli
+from jaxlfi.cli.parser import commands
+from jaxlfi.tasks.registry import observation
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs import session
 from jaxlfi.studies import grid as sweep
-from jaxlfi.tasks.registry import observation
 from jaxlfi.tasks.registry import registry as tasks
+from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.estimators.estimator import Estimator
+from jaxlfi.heuristics import Mode, registry
+from jaxlfi.bayessim.presets import PRESETS
 from tests import test_black_box
 from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
@@ -52,11 +52,12 @@ def test_every_setting_and_hyperparameter_has_a_documented_flag():
     for name in ("infer", "compare", "grid"):
         documented = {action.dest for action in choices[name]._actions if action.help}
         fields = {field.name for kind in (Settings, Estimator) for field in dataclasses.fields(kind)} - {"estimator"}
-        assert fields | set(commands.hyperparameters()) <= documented
+        rules = [registry.load(rule) for rule in registry.names()]
+        assert fields | {name for rule in rules for name in registry.hyperparameters(rule)} <= documented
 
 
 def test_names_known_without_jax_are_the_real_ones():
-    assert set(cli.PRESETS) == set(PRESETS) and set(cli.HEURISTICS) == set(HEURISTICS)
+    assert set(cli.PRESETS) == set(PRESETS)
 
 
 def test_version(capsys):
@@ -388,7 +389,7 @@ def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line
     np.testing.assert_array_equal(edge.mass_threshold, [0.125, 0.5])
     assert edge.expansion == 0.1
     mode = commands.build_heuristic(parse(), "mode", PRESETS["paper"], task)
-    assert mode == HEURISTICS["mode"]()
+    assert mode == Mode()
 
 
 def test_one_task_is_described(registered, capsys):

@@ -101,7 +101,7 @@ def test_without_an_observation_one_is_simulated_at_the_truth():
         ({"support": "unknown"}, "support: expected one of"),
         ({"support": Support([0.0], [1.0])}, "support: expected bounds for 2 parameters, got 1"),
         ({"support": Support([0.0, 0.0], [1.0, 11.0])}, "inside the feasible domain Phi"),
-        ({"heuristic": "edge"}, "heuristic: expected one such as"),
+        ({"heuristic": "edge"}, "heuristic: expected an instance such as"),
         ({"heuristic": Edge(expansion=np.ones(3))}, r"scalars or 2 values, got shape \(3,\)"),
         ({"settings": settings(simulation_budget=5)}, "attempts: expected at least"),
         (

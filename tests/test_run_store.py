@@ -181,7 +181,7 @@ def test_config_says_what_was_run_and_with_what(folder):
     assert config["task"] == TASK and config["seed"] == 0 and config["names"] == ["first", "second"]
     assert config["support"] == {"name": "misspecified", "low": [-3.0, -3.0], "high": [0.0, 3.0]}
     assert config["heuristic"]["hyperparameters"]["mass_threshold"] == 0.005
-    assert config["settings"]["rounds"] == 2 and config["settings"]["estimator"]["hidden"] == [16]
+    assert config["settings"]["rounds"] == 2 and config["settings"]["estimator"]["hyperparameters"]["hidden"] == [16]
     assert config["versions"]["jax"] == jax.__version__ and config["platform"]["backend"] == "cpu"
 
 

@@ -1,5 +1,8 @@
 """Iterative BayesSim with support adaptation: Algorithm 1, lines 9-20, as init / step / run."""
 
+from collections.abc import Callable
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -7,59 +10,18 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.bayessim.correction import CORRECTIONS, CorrectionInfo, effective_size
+from jaxlfi.bayessim.keys import RoundKeys, init_key, round_keys
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.belief import RESTRICTIONS, Belief, uninformed
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import dataset as datasets
+from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
-from jaxlfi.estimators.estimator import Estimator, Network, initialise, normalisers, static
-from jaxlfi.estimators.posterior import posterior
 from jaxlfi.estimators.training import FitInfo, fit
 from jaxlfi.heuristics import Adaptation, Heuristic
+from jaxlfi.tasks.priors import prior_draws
 from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
 from jaxlfi.tasks.task import Task
-
-
-@struct.dataclass
-class Settings:
-    """The numbers of one inference run. The defaults are the paper's.
-
-    Attributes:
-        estimator: the network and its training.
-        rounds: inference iterations N_LFI.
-        simulations_per_round: simulations added to the dataset each round, at most.
-        simulation_budget: simulations attempted each round, at most, failures included.
-        correction: how q_phi becomes the posterior, "none", "paper" or "importance" (reading A).
-        restriction: how draws are kept in the support, "clip" or "reject" (reading E).
-        defensive: share of each round's proposals drawn from the prior over the current support instead of the
-            posterior. 0 is the paper. A leaf.
-    """
-
-    estimator: Estimator = Estimator()
-    defensive: Float[Array, "*batch"] | float = 0.0
-    rounds: int = static(10)
-    simulations_per_round: int = static(100)
-    simulation_budget: int = static(125)
-    correction: str = static("none")
-    restriction: str = static("clip")
-
-    def check(self) -> "Settings":
-        """Refuse settings that cannot work, by name; returns the settings."""
-        self.estimator.check()
-        for field, known in {"correction": CORRECTIONS, "restriction": RESTRICTIONS}.items():
-            if getattr(self, field) not in known:
-                raise ValueError(f"{field}: expected one of {sorted(known)}, got {getattr(self, field)!r}")
-        if self.rounds < 1 or self.simulations_per_round < 1:
-            raise ValueError(
-                f"expected at least 1 round and 1 addition, got {self.rounds} and {self.simulations_per_round}"
-            )
-        if isinstance(self.defensive, float | int) and not 0 <= self.defensive <= 1:
-            raise ValueError(f"defensive: expected a share in [0, 1], got {self.defensive}")
-        if self.simulation_budget < self.simulations_per_round:
-            raise ValueError(
-                f"simulation_budget: expected at least the {self.simulations_per_round} simulations of a round, "
-                f"got {self.simulation_budget}"
-            )
-        return self
 
 
 @struct.dataclass
@@ -70,15 +32,18 @@ class State:
         belief: the reference prior p_i on its support Theta_i.
         proposals: the beliefs the rounds so far drew from, stacked, with room for all rounds.
         dataset: all simulations so far.
-        network: the density estimator's weights.
-        feasible: Phi. A named support that the task declares wider than Phi widens it for the run.
+        network: the density estimator.
     """
 
     belief: Belief
     proposals: Belief
     dataset: Dataset
     network: Network
-    feasible: Support
+
+    @property
+    def feasible(self) -> Support:
+        """Phi; a named support that the task declares wider than Phi widens it for the run."""
+        return self.network.scale
 
 
 @struct.dataclass
@@ -104,23 +69,35 @@ class Round:
     fit: FitInfo
 
 
-def init(key: jax.Array, task: Task, support: Support, settings: Settings, observed: Float[Array, " obs"]) -> State:
-    """The state before the first round: no data, and nothing believed but the support."""
+def init(
+    key: jax.Array,
+    task: Task,
+    support: Support,
+    settings: Settings,
+    observed: Float[Array, " obs"],
+    first: int | None = None,
+) -> State:
+    """The state before the first round: no data, and nothing believed but the support.
+
+    Args:
+        key: consumed.
+        task: simulator, names and bounds.
+        support: Theta_0, in inference space.
+        settings: the numbers of the run.
+        observed: the real trajectory's summary x^r, shape [S].
+        first: simulations of the first round, where they are given and not made.
+    """
     chex.assert_rank(observed, 1)
     chex.assert_shape([support.low, support.high], (task.dim,))
-    components = settings.estimator.ensemble_size * settings.estimator.components
-    belief = uninformed(support, components)
+    belief = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
     obs = observed.shape[-1]
-    feasible = task.feasible.hull(support)
-    nothing = datasets.empty(settings.rounds * settings.simulations_per_round, task.dim, obs)
+    first = settings.simulations_per_round if first is None else first
+    capacity = first + (settings.rounds - 1) * settings.simulations_per_round
     return State(
         belief=belief,
         proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.rounds, *leaf.shape)), belief),
-        dataset=nothing,
-        network=Network(
-            initialise(key, settings.estimator, task.dim, obs), *normalisers(settings.estimator, nothing, feasible)
-        ),
-        feasible=feasible,
+        dataset=datasets.empty(capacity, task.dim, obs),
+        network=untrained(key, settings.estimator, obs, task.inference.feasible.hull(support), task.space),
     )
 
 
@@ -128,25 +105,16 @@ def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> F
     """Draw theta ~ p_i (line 11): the prior over Theta_0 in the first round, then the restricted posterior.
 
     A belief that is not informed is the prior over its support: so it is in the first round, and always by `Truncate`.
-    A defensive share of the draws stays with the prior over the *current* support: it sees the ground that the
+    A defensive fraction of the draws stays with the prior over the *current* support: it covers the ground that the
     support has gained, also where the posterior has locked itself onto a place where it learns nothing more.
     """
-    key_prior, key_posterior, key_share = jax.random.split(key, 3)
+    key_prior, key_posterior, key_choice = jax.random.split(key, 3)
     informed = RESTRICTIONS[settings.restriction](key_posterior, belief, settings.simulation_budget)
-    prior = prior_draws(key_prior, task, belief.support, settings.simulation_budget)
-    from_prior = jax.random.bernoulli(key_share, settings.defensive, (settings.simulation_budget, 1)) | ~belief.informed
+    prior = prior_draws(key_prior, task.inference.prior, belief.support, settings.simulation_budget)
+    from_prior = (
+        jax.random.bernoulli(key_choice, settings.defensive, (settings.simulation_budget, 1)) | ~belief.informed
+    )
     return jnp.where(from_prior, prior, informed)
-
-
-def prior_draws(key: jax.Array, task: Task, support: Support, n: int) -> Float[Array, "n dim"]:
-    """`n` draws of the task's prior inside the support: uniform unless the task brings a prior of its own."""
-    if task.prior is None:
-        return support.sample(key, n)
-    tries = 32
-    candidates = task.prior.sample(seed=key, sample_shape=(n, tries))
-    inside = support.contains(candidates)
-    first = jnp.take_along_axis(candidates, jnp.argmax(inside, axis=1)[:, None, None], axis=1)[:, 0]
-    return support.clip(first)
 
 
 def update(
@@ -157,42 +125,42 @@ def update(
     observed: Float[Array, " obs"],
     state: State,
     round: Int[Array, ""] | int,
-    attempts: Simulations,
+    simulations: Simulations,
 ) -> tuple[State, Round]:
     """All of a round that comes after its simulations (lines 12-20)."""
-    dataset = datasets.augment(state.dataset, attempts, round)
+    dataset = datasets.augment(state.dataset, simulations, round)
     proposals = jax.tree.map(lambda all_, now: all_.at[round].set(now), state.proposals, state.belief)
-    network = _started(settings.estimator, state, dataset)
     correction = CORRECTIONS[settings.correction]
     weights = correction.row_weights(task, dataset, proposals, round, settings.defensive)
-    expected = (round + 1) * settings.simulations_per_round
-    # An MDN is read off, a flow is drawn from.
-    key_fit, key_draw = jax.random.split(key) if settings.estimator.is_flow else (key, None)
-    log_prior = None if task.prior is None else task.prior.log_prob(dataset.theta)
-    network, fit_info = fit(key_fit, settings.estimator, network, dataset, weights, state.feasible, expected, log_prior)
-    q, inside = posterior(key_draw, settings.estimator, network, observed, state.feasible, state.belief.support)
-    mixture, not_positive_definite = correction.change(task, q, state.belief)
+    prior = task.inference.prior
+    log_prior = None if prior is None else prior.log_prob(dataset.theta)
+    # The rows that the rounds still to come have room for are not there yet.
+    expected = dataset.capacity - (settings.rounds - 1 - round) * settings.simulations_per_round
+    key_fit, key_condition = state.network.estimator.keys(key)
+    network, fit_info = fit(key_fit, _started(state, dataset), dataset, weights, expected, log_prior)
+    posterior = network.condition(observed, state.belief.support, key_condition)
+    mixture, not_positive_definite = correction.change(task, posterior.mixture, state.belief)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     info = Round(
-        simulations=attempts,
-        failed=attempts.failed(len(task.reasons)),
+        simulations=simulations,
+        failed=simulations.failed(len(task.reasons)),
         proposal=state.belief,
         belief=belief,
         adaptation=adaptation,
-        correction=CorrectionInfo(effective_size(weights), not_positive_definite, inside),
+        correction=CorrectionInfo(effective_size(weights), not_positive_definite, posterior.mass_inside),
         fit=fit_info,
     )
-    return State(belief, proposals, dataset, network, state.feasible), info
+    return State(belief, proposals, dataset, network), info
 
 
-def _started(estimator: Estimator, state: State, dataset: Dataset) -> Network:
+def _started(state: State, dataset: Dataset) -> Network:
     """A network that is trained on takes its normalisers from the first round that has simulations."""
-    fresh = Network(state.network.params, *normalisers(estimator, dataset, state.feasible))
+    fresh = state.network.with_normalisers(dataset)
     return jax.tree.map(lambda kept, new: jnp.where(state.dataset.size > 0, kept, new), state.network, fresh)
 
 
 def step(
-    key: jax.Array,
+    keys: RoundKeys,
     task: Task,
     settings: Settings,
     heuristic: Heuristic,
@@ -203,7 +171,7 @@ def step(
     """One round of Algorithm 1 for a simulator in JAX (lines 11-20).
 
     Args:
-        key: consumed.
+        keys: of the round, consumed.
         task: simulator, names and bounds.
         settings: the numbers of the run.
         heuristic: how the support is adapted.
@@ -214,11 +182,10 @@ def step(
     Returns:
         The next state, and what the round did.
     """
-    key_propose, key_simulate, key_update = jax.random.split(key, 3)
-    theta = propose(key_propose, task, settings, state.belief)
-    x, failure = simulate(key_simulate, task, theta)
-    attempts = within_budget(theta, x, failure, settings.simulations_per_round)
-    return update(key_update, task, settings, heuristic, observed, state, round, attempts)
+    theta = propose(keys.propose, task, settings, state.belief)
+    x, failure = simulate(keys.simulate, task, theta)
+    simulations = within_budget(theta, x, failure, settings.simulations_per_round)
+    return update(keys.update, task, settings, heuristic, observed, state, round, simulations)
 
 
 def run(
@@ -228,18 +195,28 @@ def run(
     heuristic: Heuristic,
     observed: Float[Array, " obs"],
     support: Support,
-) -> tuple[State, Round]:
+    look: Callable[[Array, State, Round], Any] = lambda index, state, info: info,
+) -> tuple[State, Any]:
     """The whole inference, as one scan: Algorithm 1, lines 9-20.
 
     Pure: jit it, and vmap it over keys, supports, observations and the leaves of heuristics and settings.
 
-    Returns:
-        The last state, and what every round did, stacked along a leading axis of length `settings.rounds`.
-    """
-    key_init, key_rounds = jax.random.split(key)
-    state = init(key_init, task, support, settings, observed)
+    Args:
+        key: consumed (`RunKeys.run`).
+        task: a task whose simulator is in JAX.
+        settings: the numbers of the run.
+        heuristic: how the support is adapted.
+        observed: the real trajectory's summary x^r, shape [S].
+        support: Theta_0, in inference space.
+        look: what is kept of a round, from its index, the state after it and what it did; all of it by default.
 
-    def body(state, round):
-        return step(jax.random.fold_in(key_rounds, round), task, settings, heuristic, observed, state, round)
+    Returns:
+        The last state, and what was kept of every round, stacked along a leading axis of length `settings.rounds`.
+    """
+    state = init(init_key(key), task, support, settings, observed)
+
+    def body(state, index):
+        state, info = step(round_keys(key, index), task, settings, heuristic, observed, state, index)
+        return state, look(index, state, info)
 
     return jax.lax.scan(body, state, jnp.arange(settings.rounds))

@@ -2,14 +2,15 @@
 
 from collections.abc import Callable
 
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.estimators.estimator import Estimator
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.estimators.flow_estimators import SplineFlow
+from jaxlfi.estimators.mixture_network import MixtureNetwork
 
 PAPER = Settings()
-"""The paper's numbers to the letter (section III-C); they are the defaults of `Settings` and `Estimator`."""
+"""The paper's numbers to the letter (section III-C); they are the defaults of `Settings` and `MixtureNetwork`."""
 
 QUICK = Settings(
-    estimator=Estimator(
+    estimator=MixtureNetwork(
         hidden=(64, 64),
         activation="tanh",
         ensemble_size=4,
@@ -32,8 +33,7 @@ there. Four disagree, and explore.
 PRESETS: dict[str, Settings] = {"quick": QUICK, "paper": PAPER}
 """Presets by the name the command line gives them."""
 
-FLOW = Estimator(
-    family="nsf",
+FLOW = SplineFlow(
     loss="combined",
     hidden=(50, 50),
     activation="tanh",

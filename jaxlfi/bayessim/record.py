@@ -1,25 +1,20 @@
-"""History: what each round did, as named arrays, and the ledger that is derived from them."""
+"""Records: what each round did, as named arrays, and the ledger that is derived from them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
 
-from jaxlfi.bayessim.algorithm import Round, Settings
-from jaxlfi.diagnostics import Discrepancy
-from jaxlfi.distributions.belief import RESTRICTIONS, Belief
-from jaxlfi.distributions.support import Support
-from jaxlfi.estimators.estimator import Network
-from jaxlfi.estimators.posterior import draws_within
+from jaxlfi.bayessim.algorithm import Round
+from jaxlfi.diagnostics.discrepancy import Discrepancy
 
 EVIDENCE = "evidence/"
 """Prefix of the heuristic's evidence among the named arrays."""
 FINAL = "final_"
 """Prefix of the named arrays of which only the last round's are kept."""
-DRAWS = 1000
-"""Draws of the last posterior that are saved."""
+PER_SIMULATION = ("theta", "counted", "kept", "failure")
+"""Named arrays whose first axis is the simulations of a round."""
 
 
 def record(info: Round, seen: Discrepancy) -> dict[str, jax.Array]:
@@ -49,7 +44,8 @@ def record(info: Round, seen: Discrepancy) -> dict[str, jax.Array]:
         "nonfinite": info.fit.nonfinite,
         "effective_size": info.correction.effective_size,
         "not_positive_definite": info.correction.not_positive_definite,
-        "inside": info.correction.inside,
+        "mass_inside": info.correction.mass_inside,
+        "predictive_simulations": seen.simulated,
         "sample_theta": seen.theta,
         "sample_theta_error": seen.theta_error,
         "sample_trajectory_error": seen.trajectory_error,
@@ -64,37 +60,12 @@ def apart(row: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     return {name: value for name, value in row.items() if name not in final}, final
 
 
-def posterior_draws(
-    key: jax.Array,
-    settings: Settings,
-    network: Network,
-    x: Float[Array, " obs"],
-    scale: Support,
-    belief: Belief,
-    n: int = DRAWS,
-) -> Float[Array, "n dim"]:
-    """`n` draws of a run's last posterior, in coordinates: a flow's own, or the mixture's as rounds draw them.
-
-    Args:
-        key: consumed.
-        settings: of the run.
-        network: trained weights.
-        x: the observed summary, shape [S].
-        scale: the box the network's [-1, 1]^D stands for (Phi).
-        belief: the posterior and the support that draws are kept in.
-        n: number of draws.
-    """
-    if settings.estimator.is_flow:
-        return draws_within(key, settings.estimator, network, x, scale, belief.support, n)[0]
-    return RESTRICTIONS[settings.restriction](key, belief, n)
-
-
 def own_evidence(row: Mapping[str, Any], place: int | None) -> dict[str, Any]:
-    """A lane's record without the evidence of the other lanes' heuristics.
+    """A run's record without the evidence of the heuristics that other runs of its batch follow.
 
     Args:
-        row: a record of one lane.
-        place: which rule of a `Choice` the lane follows; None where all lanes follow the same.
+        row: a record of one run.
+        place: which rule of a `Choice` the run follows; None where all runs follow the same.
     """
     if place is None:
         return dict(row)
@@ -104,15 +75,15 @@ def own_evidence(row: Mapping[str, Any], place: int | None) -> dict[str, Any]:
 
 
 def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, ...], seconds: float) -> dict[str, Any]:
-    """What the ledger says of a round.
+    """A round's line of the ledger.
 
     Args:
         index: the round, from 0.
         row: its record.
         reasons: names of the reasons of failure.
-        seconds: wall time of the round, divided by the lanes that were stepped together.
+        seconds: wall time of the round, divided by the runs that were stepped together.
     """
-    members = np.arange(row["chosen_epoch"].shape[0])
+    networks = np.arange(row["chosen_epoch"].shape[0])
     return {
         "round": index,
         "attempted": int(row["attempted"]),
@@ -122,12 +93,13 @@ def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, .
         "evidence": {name[len(EVIDENCE) :]: value.tolist() for name, value in row.items() if name.startswith(EVIDENCE)},
         "low_shift": row["low_shift"].tolist(),
         "high_shift": row["high_shift"].tolist(),
-        "loss": float(np.mean(row["loss"][members, row["chosen_epoch"]])),
-        "validation_loss": float(np.mean(row["validation_loss"][members, row["chosen_epoch"]])),
+        "loss": float(np.mean(row["loss"][networks, row["chosen_epoch"]])),
+        "validation_loss": float(np.mean(row["validation_loss"][networks, row["chosen_epoch"]])),
         "nonfinite_steps": int(np.sum(row["nonfinite"])),
         "effective_size": float(row["effective_size"]),
         "not_positive_definite": int(row["not_positive_definite"]),
-        "inside": float(row["inside"]),
+        "mass_inside": float(row["mass_inside"]),
+        "predictive_simulations": int(row["predictive_simulations"]),
         "theta_error": theta_error(row),
         "trajectory_error": trajectory_error(row),
         "seconds": round(float(seconds), 4),
@@ -145,6 +117,17 @@ def trajectory_error(row: Mapping[str, np.ndarray]) -> float:
     return float(np.mean(valid)) if valid.size else float("nan")
 
 
-def stacked_rounds(rows: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Records of successive rounds, stacked along a new leading axis."""
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+def stacked_rounds(rows: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Records of successive rounds, stacked along a new leading axis.
+
+    Rounds of fewer simulations than others (where those of the first were given) are filled up with some that do not
+    count.
+    """
+    most = max(len(row["theta"]) for row in rows)
+
+    def filled(name: str, array: np.ndarray) -> np.ndarray:
+        if name not in PER_SIMULATION:
+            return array
+        return np.concatenate([array, np.zeros((most - len(array), *array.shape[1:]), array.dtype)])
+
+    return {name: np.stack([filled(name, row[name]) for row in rows]) for name in rows[0]}

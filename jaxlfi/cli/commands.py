@@ -18,12 +18,12 @@ from jaxlfi.bayessim.batch import Lane
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.estimator import Estimator
-from jaxlfi.heuristics import HEURISTICS, Heuristic, Matched, Mode
+from jaxlfi.heuristics import Heuristic, paired, registry
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import export, session
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.checkpoint import CheckpointError
-from jaxlfi.runs.inference import check_heuristic, simulator_shapes
+from jaxlfi.runs.inference import simulator_shapes
 from jaxlfi.runs.load import posterior_samples
 from jaxlfi.runs.session import Plan
 from jaxlfi.studies import calibration as diagnosis
@@ -80,7 +80,7 @@ def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
     settings = build_settings(arguments, task)
     support_name, support = _support(arguments, task)
     heuristic = build_heuristic(arguments, arguments.heuristic, settings, task)
-    _refuse_foreign_hyperparameters(arguments, [arguments.heuristic])
+    registry.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
     configuration = support_name if arguments.heuristic == "none" else f"{support_name}+{arguments.heuristic}"
     lanes = tuple(Lane(configuration, support_name, support, heuristic, seed) for seed in _seeds(arguments))
     kind = run_store.RUN if len(lanes) == 1 else run_store.RUNS
@@ -97,7 +97,7 @@ def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
     if len(set(configurations)) < len(configurations):
         raise ValueError(f"configurations: expected distinct ones, got {configurations}")
     parts = [_configuration(name) for name in configurations]
-    _refuse_foreign_hyperparameters(arguments, [heuristic for _, heuristic in parts])
+    registry.refuse_foreign(arguments.hyperparameters, [heuristic for _, heuristic in parts])
     # Seeds are the slow index, so that every device gets all configurations, fast and slow ones.
     lanes = tuple(
         Lane(name, support, task.support(support), build_heuristic(arguments, heuristic, settings, task), seed)
@@ -114,9 +114,9 @@ def grid(arguments: argparse.Namespace, console: Console) -> Prepared:
     task = task_lookup.load(arguments.task)
     settings = build_settings(arguments, task)
     axes = sweep.parse_axes(arguments.vary)
-    _refuse_foreign_hyperparameters(arguments, [arguments.heuristic])
+    registry.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
     for axis in axes:
-        if getattr(arguments, axis.name, None) is not None:
+        if axis.name in arguments.hyperparameters:
             raise ValueError(f"{axis.name}: expected it on an axis or as a flag of its own, got both")
     name = arguments.support or next(iter(task.supports))
     plan = sweep.Grid(
@@ -348,48 +348,20 @@ def with_settings(settings: Settings, given: Mapping[str, Any]) -> Settings:
 def build_heuristic(arguments: argparse.Namespace, name: str, settings: Settings, task: Task) -> Heuristic:
     """A heuristic with the hyperparameters that were given, or else those that the task asks for.
 
-    MODE compares components by their index; where networks start anew every round they are matched first.
+    Components that it compares are matched first where networks start anew every round.
     """
-    if name not in HEURISTICS:
-        raise ValueError(f"heuristic: expected one of {sorted(HEURISTICS)}, got {name!r}")
-    kind = HEURISTICS[name]
-    values = {}
-    for field in dataclasses.fields(kind):
-        given = getattr(arguments, field.name)
-        if given is None:
-            given = task.hyperparameters.get(name, {}).get(field.name)
-        if given is None:
-            continue
-        given = np.atleast_1d(given).tolist()
-        if len(given) not in (1, task.dim) or not np.isfinite(given).all():
-            raise ValueError(f"{field.name}: expected one finite number or {task.dim}, got {given}")
-        values[field.name] = given[0] if len(given) == 1 else np.asarray(given, np.float32)
-    rule = kind(**values)
-    check_heuristic(rule, task)
-    return Matched(rule) if kind is Mode and not settings.estimator.warm_start else rule
-
-
-def hyperparameters() -> list[str]:
-    """Names of the hyperparameters of all heuristics."""
-    return list(dict.fromkeys(f.name for kind in HEURISTICS.values() for f in dataclasses.fields(kind)))
-
-
-def _refuse_foreign_hyperparameters(arguments: argparse.Namespace, used: Sequence[str]) -> None:
-    """Refuse a hyperparameter that none of the heuristics in use has: it would silently do nothing."""
-    known = {f.name for name in used if name in HEURISTICS for f in dataclasses.fields(HEURISTICS[name])}
-    for name in hyperparameters():
-        if getattr(arguments, name) is not None and name not in known:
-            raise ValueError(
-                f"{name}: expected a hyperparameter of {' or '.join(sorted(set(used)))} "
-                f"({', '.join(sorted(known)) or 'none'}), got one they do not have"
-            )
+    values = {**task.hyperparameters.get(name, {}), **registry.own(name, arguments.hyperparameters)}
+    return paired(registry.build(name, values, task.dim), settings.estimator.warm_start)
 
 
 def _configuration(name: str) -> tuple[str, str]:
     """Support and heuristic of "support" or "support+heuristic"."""
     support, plus, heuristic = name.partition("+")
-    if plus and heuristic not in HEURISTICS:
-        raise ValueError(f"configurations: expected support+heuristic with one of {sorted(HEURISTICS)}, got {name!r}")
+    if plus:
+        try:
+            registry.load(heuristic)
+        except ValueError as error:
+            raise ValueError(f"configurations: expected support+heuristic, got {name!r}: {error}") from error
     return support, heuristic or "none"
 
 

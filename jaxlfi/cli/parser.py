@@ -8,6 +8,7 @@ before jax starts can be set after the arguments are known.
 """
 
 import argparse
+import itertools
 import json
 import math
 import os
@@ -18,23 +19,21 @@ from pathlib import Path
 from typing import NoReturn
 
 import jaxlfi
+from jaxlfi import flags, source_fields
 
 PRESETS = ("quick", "paper")
 METHODS = ("bayessim", "apt", "npe")
+HEURISTICS = "jaxlfi.heuristics"
+"""The entry-point group of heuristics."""
 FILE_WIDTH = 120
 """Characters a line where the output is no terminal."""
-HEURISTICS = ("none", "edge", "mode", "centre", "truncate")
 
 GLOSSARY = """\
 names and symbols:
   support         Theta, the box the parameters are drawn from; it is what the heuristics adapt
   feasible        Phi, the limits that no adapted support leaves
-  zone_fraction   delta, the zone along a bound, as a fraction of the support's width
-  mass_threshold  tau, the posterior mass in a zone (edge) or in moving modes (mode) that moves a bound
-  expansion       eta, how far a bound moves, as a fraction of the width
-  shift_threshold nu_TH, how far a mode must have moved since the last round
-  proximity       rho, how near a bound a mode must be, as a fraction of the width
 """
+"""What `--help` explains before the heuristics' hyperparameters."""
 
 MAIN_EXAMPLES = """\
 examples:
@@ -113,8 +112,15 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
+def parser(heuristics: flags.Families | None = None) -> argparse.ArgumentParser:
+    """The whole command line.
+
+    Args:
+        heuristics: those whose hyperparameters have flags; by default all that are installed.
+    """
+    if heuristics is None:
+        heuristics = {name: source.fields for name, source in source_fields.of_group(HEURISTICS).items()}
+    glossary = GLOSSARY + flags.glossary(heuristics)
     formatter = argparse.RawDescriptionHelpFormatter
     top = OneLineParser(
         prog="jaxlfi",
@@ -132,7 +138,7 @@ def parser() -> argparse.ArgumentParser:
         "infer",
         help="infer a task's parameters",
         description="Infer a task's parameters from one observed trajectory, adapting the support.",
-        epilog=INFER_EXAMPLES + GLOSSARY,
+        epilog=INFER_EXAMPLES + glossary,
         formatter_class=formatter,
     )
     infer.add_argument(
@@ -147,15 +153,15 @@ def parser() -> argparse.ArgumentParser:
     )
     infer.add_argument("--support-high", nargs="+", type=float, metavar="X", help="its upper bounds")
     infer.add_argument(
-        "--heuristic", default="edge", metavar="NAME", help="none, edge, mode, centre or truncate (default: edge)"
+        "--heuristic", default="edge", metavar="NAME", help=_heuristic_help("how the support is adapted", heuristics)
     )
-    _add_shared(infer, seeds=1)
+    _add_shared(infer, heuristics, seeds=1)
 
     compare = commands.add_parser(
         "compare",
         help="run supports and heuristics side by side",
         description="Run supports and heuristics side by side, over several seeds, and tabulate the errors.",
-        epilog=COMPARE_EXAMPLES + GLOSSARY,
+        epilog=COMPARE_EXAMPLES + glossary,
         formatter_class=formatter,
     )
     compare.add_argument(
@@ -164,13 +170,13 @@ def parser() -> argparse.ArgumentParser:
         metavar="SUPPORT[+HEURISTIC]",
         help="what to compare (default: ok, misspecified, broad, and misspecified with edge, mode, centre)",
     )
-    _add_shared(compare, seeds=4)
+    _add_shared(compare, heuristics, seeds=4)
 
     grid = commands.add_parser(
         "grid",
         help="run a heuristic over a grid of its hyperparameters",
         description="Run a heuristic over a grid of its hyperparameters, to see how sensitive it is to them.",
-        epilog=GRID_EXAMPLES + GLOSSARY,
+        epilog=GRID_EXAMPLES + glossary,
         formatter_class=formatter,
     )
     grid.add_argument(
@@ -184,14 +190,16 @@ def parser() -> argparse.ArgumentParser:
     grid.add_argument(
         "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
     )
-    grid.add_argument("--heuristic", default="edge", metavar="NAME", help="edge, mode or truncate (default: edge)")
+    grid.add_argument(
+        "--heuristic", default="edge", metavar="NAME", help=_heuristic_help("whose hyperparameters vary", heuristics)
+    )
     grid.add_argument(
         "--lanes-per-chunk",
         type=int,
         metavar="N",
         help="runs computed and saved together (default: as many as there is memory for)",
     )
-    _add_shared(grid, seeds=4, networks=False)
+    _add_shared(grid, heuristics, seeds=4, networks=False)
 
     resume = commands.add_parser(
         "resume",
@@ -260,7 +268,51 @@ def foreign_commands() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group="jaxlfi.commands")}
 
 
-def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = True) -> None:
+def heuristics_of(words: Sequence[str]) -> dict[str, source_fields.Source]:
+    """All installed heuristics, and those that the words name by `module:Class`, as their sources describe them."""
+    named = [after for word, after in itertools.pairwise([*words, ""]) if word == "--heuristic"]
+    named += [word.removeprefix("--heuristic=") for word in words if word.startswith("--heuristic=")]
+    named += [word.partition("+")[2] for word in words]
+    own = {name: source_fields.of_class(name) for name in named if ":" in name}
+    return source_fields.of_group(HEURISTICS) | own
+
+
+def parse(words: Sequence[str]) -> argparse.Namespace:
+    """The arguments.
+
+    Where the source of a heuristic does not show all its hyperparameters, and there are flags that nothing else knows,
+    the heuristic is imported, and jax with it.
+
+    Raises:
+        ValueError: if that fails.
+    """
+    sources = heuristics_of(words)
+    fields = {name: source.fields for name, source in sources.items()}
+    arguments, unknown = parser(fields).parse_known_args(words)
+    used = _heuristics_used(arguments)
+    if unknown and any(not source.complete for name, source in sources.items() if name in used):
+        prepare_jax(arguments)
+        from jaxlfi.heuristics import registry
+
+        fields |= {name: registry.hyperparameters(registry.load(name)) for name in used}
+    return parser(fields).parse_args(words) if unknown else arguments
+
+
+def _heuristics_used(arguments: argparse.Namespace) -> set[str]:
+    """Names of the heuristics that a command is going to use, right or wrong."""
+    configured = getattr(arguments, "configurations", None) or ()
+    named = [getattr(arguments, "heuristic", None), *(word.partition("+")[2] for word in configured)]
+    return {name for name in named if name}
+
+
+def _heuristic_help(what: str, heuristics: flags.Families) -> str:
+    registered = ", ".join(name for name in heuristics if ":" not in name)
+    return f"{what}: {registered}, or your own as module:Class (default: edge)"
+
+
+def _add_shared(
+    command: argparse.ArgumentParser, heuristics: flags.Families, seeds: int, networks: bool = True
+) -> None:
     """Arguments that `infer`, `compare` and `grid` have in common; `grid` saves no networks."""
     command.add_argument(
         "task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory; NAME,key=value sets options"
@@ -340,19 +392,9 @@ def _add_shared(command: argparse.ArgumentParser, seeds: int, networks: bool = T
         help="train on from the last round's weights, or start anew (then mode matches components first)",
     )
 
-    hyper = command.add_argument_group("heuristics (one number, or one a parameter; default: the paper's)")
-    for flag, symbol, text in (
-        ("zone-fraction", "delta", "edge: the zone along a bound, as a fraction of the width"),
-        ("zone-width", "delta", "edge: an absolute width added to the zone"),
-        ("tail", "", "edge: share of the mass beyond the bound that counts, 0 to 1"),
-        ("mass-threshold", "tau", "edge, mode: the posterior mass that moves a bound"),
-        ("expansion", "eta", "edge, mode: how far a bound moves, as a fraction of the width"),
-        ("shift-threshold", "nu_TH", "mode: how far a mode must have moved"),
-        ("proximity", "rho", "mode: how near a bound a mode must be, as a fraction of the width"),
-        ("quantile", "", "truncate: posterior mass given up beyond each bound, 0 to 0.5"),
-    ):
-        shown = f"{text} ({symbol})" if symbol else text
-        hyper.add_argument(f"--{flag}", type=float, nargs="+", metavar="X", help=shown)
+    hyper = command.add_argument_group("heuristics (one number, or one a parameter)")
+    flags.add(hyper, heuristics, into="hyperparameters", several=True)
+    command.set_defaults(hyperparameters={})
 
 
 def _add_machine(command: argparse.ArgumentParser) -> None:
@@ -419,7 +461,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     if words and (foreign := foreign_commands().get(words[0])):
         return foreign.load()(words[1:])
-    arguments = parser().parse_args(words)
+    try:
+        arguments = parse(words)
+    except ValueError as error:
+        return _refuse(error)
     if getattr(arguments, "object", None) is not None:
         arguments.task = f"{arguments.task},object={arguments.object}"
     prepare_jax(arguments)

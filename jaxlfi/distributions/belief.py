@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.truncation import rejection_sample
 
 
 @struct.dataclass
@@ -17,7 +18,7 @@ class Belief:
         mixture: the posterior as a mixture of Gaussians (unbounded).
         support: the box Theta its draws are kept in.
         informed: whether the next proposals are drawn from the mixture, or else from the prior over the support. False
-            before the first round, when there is no posterior yet and the mixture is a stand-in of the right shape,
+            before the first round, when there is no posterior yet and the mixture only has the right shape,
             and under a heuristic that always proposes from the prior (`Truncate`), whose mixture is the posterior.
             Heuristics that compare two posteriors (MODE) do so only where it is true.
     """
@@ -49,19 +50,10 @@ def clipped(key: jax.Array, belief: Belief, n: int) -> Array:
     return belief.support.clip(belief.mixture.sample(key, n))
 
 
-def rejected(key: jax.Array, belief: Belief, n: int, tries: int = 32) -> Array:
-    """`n` draws of the mixture truncated to the support, by rejection with a bounded number of tries.
-
-    Every draw has its own `tries` candidates and takes the first inside the box. Where none is (a mixture almost
-    wholly outside its support), it is a uniform draw over the support, so that the time is bounded and the box is
-    always respected.
-    """
-    key_candidates, key_fallback = jax.random.split(key)
-    candidates = belief.mixture.sample(key_candidates, n * tries).reshape(n, tries, -1)
-    inside = belief.support.contains(candidates)
-    first = jnp.take_along_axis(candidates, jnp.argmax(inside, axis=1)[:, None, None], axis=1)[:, 0]
-    return jnp.where(jnp.any(inside, axis=1)[:, None], first, belief.support.sample(key_fallback, n))
+def rejected(key: jax.Array, belief: Belief, n: int) -> Array:
+    """`n` draws of the mixture truncated to the support (`jaxlfi.distributions.truncation.rejection_sample`)."""
+    return rejection_sample(key, belief.mixture.sample, belief.support, n)
 
 
 RESTRICTIONS = {"clip": clipped, "reject": rejected}
-"""Ways to keep draws inside the support, by name (reading E)."""
+"""Ways to keep *proposals* inside the support, by name (reading E). Draws of a posterior are never clipped."""

@@ -16,7 +16,8 @@ class Support:
     run starts (`check_within`).
 
     Attributes:
-        low: lower bounds theta_min, shape [D], in the task's inference coordinates.
+        low: lower bounds theta_min, shape [D]. In natural units where a user writes them, in inference
+            space inside the library.
         high: upper bounds theta_max, shape [D].
 
     Raises:

@@ -1,4 +1,4 @@
-"""Losses of sequential neural posterior estimation by APT, and a density kept in a box (Greenberg et al. 2019)."""
+"""Losses of sequential neural posterior estimation by APT (Greenberg et al. 2019)."""
 
 from collections.abc import Callable
 
@@ -111,109 +111,6 @@ def atomic(
     present = jnp.concatenate([jnp.ones_like(own, bool), contrasts.present])
     named = log_ratio[0] - jax.nn.logsumexp(jnp.where(present, log_ratio, -jnp.inf), axis=0)
     return nll(named + combined * log_q[0], weights)
-
-
-@struct.dataclass
-class Within:
-    """Draws kept in a box.
-
-    Attributes:
-        theta: shape [N, D], all in the box.
-        missing: how many are not draws of the truncated density but draws outside moved to the nearest point of the
-            box, because too few were found inside. They come last.
-        acceptance: share of all draws that fell inside the box.
-    """
-
-    theta: Float[Array, "*batch n dim"]
-    missing: Int[Array, "*batch"]
-    acceptance: Float[Array, "*batch"]
-
-
-def sample_within(
-    key: jax.Array,
-    sample_fn: Callable[[jax.Array, int], Float[Array, "n dim"]],
-    low: Float[Array, " dim"],
-    high: Float[Array, " dim"],
-    n: int,
-    tries: int = 32,
-) -> Within:
-    """`n` draws of a density truncated to a box, by rejection in bounded time.
-
-    `tries` times n draws are made, and the first n inside the box are kept.
-
-    Args:
-        key: consumed.
-        sample_fn: draws of the density, `sample_fn(key, n) -> [n, D]`, such as `module.apply(params, x).sample`.
-        low: lower bounds of the box, shape [D].
-        high: upper bounds, shape [D].
-        n: number of draws.
-        tries: batches of n draws.
-
-    Raises:
-        ValueError: for tries or n below 1.
-    """
-    if n < 1 or tries < 1:
-        raise ValueError(f"n, tries: expected at least 1 of each, got {n} and {tries}")
-
-    def one_try(carry, index):
-        kept, found, _ = carry
-        theta = sample_fn(jax.random.fold_in(key, index), n)
-        inside = _contains(theta, low, high)
-        # Places past the end are dropped.
-        place = jnp.where(inside, found + jnp.cumsum(inside) - 1, n)
-        kept = kept.at[place].set(theta, mode="drop")
-        return (kept, found + jnp.sum(inside), theta), None
-
-    nothing = jnp.zeros((n, low.shape[0]), jnp.result_type(low, float))
-    start = (nothing, jnp.asarray(0), nothing)
-    (kept, found, last), _ = jax.lax.scan(one_try, start, jnp.arange(tries))
-    filled = (jnp.arange(n) < found)[:, None]
-    # If too few were found, the last batch has draws outside; those that are inside are in `kept` already.
-    outside_first = jnp.argsort(_contains(last, low, high), stable=True)
-    # Counted from the end: the last place takes the first draw outside, and there are enough for all missing places.
-    spare = jnp.clip(last[outside_first], low, high)[n - 1 - jnp.arange(n)]
-    return Within(jnp.where(filled, kept, spare), jnp.maximum(n - found, 0), found / (n * tries))
-
-
-def acceptance(
-    key: jax.Array,
-    sample_fn: Callable[[jax.Array, int], Float[Array, "n dim"]],
-    low: Float[Array, " dim"],
-    high: Float[Array, " dim"],
-    n: int,
-) -> Float[Array, ""]:
-    """Share of `n` draws that fall inside the box: an estimate of the density's mass there.
-
-    Its standard error is sqrt(a (1 - a) / n) at a mass of a.
-    """
-    return jnp.mean(_contains(sample_fn(key, n), low, high))
-
-
-def log_prob_truncated(
-    log_prob: Float[Array, "*n"],
-    theta: Float[Array, "*n dim"],
-    low: Float[Array, " dim"],
-    high: Float[Array, " dim"],
-    acceptance: Float[Array, ""],
-    least: float = 1e-6,
-) -> Float[Array, "*n"]:
-    """Log-density of a density truncated to a box: log q - log acceptance inside, -inf outside.
-
-    Args:
-        log_prob: log q(theta | x), shape [...].
-        theta: shape [..., D].
-        low: lower bounds of the box, shape [D].
-        high: upper bounds, shape [D].
-        acceptance: q's mass in the box, as `acceptance` or `sample_within` estimate it.
-        least: masses below this count as this much, so that where no draw was inside the result is finite: a lower
-            limit of the log-density.
-    """
-    return jnp.where(_contains(theta, low, high), log_prob - jnp.log(jnp.maximum(acceptance, least)), -jnp.inf)
-
-
-def _contains(theta: Array, low: Array, high: Array) -> Array:
-    """Whether each parameter vector lies in the box, bounds included; false where it is not a number."""
-    return jnp.all((theta >= low) & (theta <= high), axis=-1)
 
 
 def _weighted_mean(values: Float[Array, " batch"], weights: Float[Array, " batch"]) -> Float[Array, ""]:

@@ -1,4 +1,4 @@
-"""Normalisers: the network's view of summaries, from the simulations at hand."""
+"""Normalisers: raw summaries as a network sees them, from the simulations at hand."""
 
 from collections.abc import Callable
 
@@ -9,15 +9,21 @@ from jaxtyping import Array, Bool, Float
 
 @struct.dataclass
 class Normaliser:
-    """Centre and scale of each summary after a fixed elementwise transform.
+    """A fixed elementwise transform, then centre and scale of each summary.
 
     Attributes:
-        mean: shape [S].
+        mean: of the transformed summaries, shape [S].
         scale: shape [S], positive.
+        name: of the transform (`TRANSFORMS`).
     """
 
     mean: Float[Array, "*batch obs"]
     scale: Float[Array, "*batch obs"]
+    name: str = struct.field(pytree_node=False)
+
+    def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n obs"]:
+        """Raw summaries as a network sees them."""
+        return (TRANSFORMS[self.name](x) - self.mean) / self.scale
 
 
 def untouched(x: Array) -> Array:
@@ -39,15 +45,10 @@ def fit_normaliser(name: str, x: Float[Array, "cap obs"], valid: Bool[Array, " c
     A summary that does not vary is centred only.
     """
     if name == "none":
-        return Normaliser(jnp.zeros(x.shape[-1]), jnp.ones(x.shape[-1]))
+        return Normaliser(jnp.zeros(x.shape[-1]), jnp.ones(x.shape[-1]), name)
     values = TRANSFORMS[name](x)
     count = jnp.maximum(jnp.sum(valid), 1)
     mean = jnp.sum(values, axis=0, where=valid[:, None]) / count
     variance = jnp.sum((values - mean) ** 2, axis=0, where=valid[:, None]) / count
     scale = jnp.sqrt(variance)
-    return Normaliser(mean, jnp.where(scale > 1e-6 * (1 + jnp.abs(mean)), scale, 1.0))
-
-
-def normalised(name: str, normaliser: Normaliser, x: Float[Array, "*n obs"]) -> Float[Array, "*n obs"]:
-    """Apply a normaliser."""
-    return (TRANSFORMS[name](x) - normaliser.mean) / normaliser.scale
+    return Normaliser(mean, jnp.where(scale > 1e-6 * (1 + jnp.abs(mean)), scale, 1.0), name)

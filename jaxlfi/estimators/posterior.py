@@ -1,164 +1,133 @@
-"""From the trained network to the posterior, a mixture of Gaussians (Algorithm 1, line 14)."""
+"""Posterior: q_phi(theta | x^r) truncated to a support, for mixture density networks and flows alike."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
+import optax
+from flax import struct
 from jaxtyping import Array, Float
 
-from jaxlfi.distributions.belief import Belief, rejected
+from jaxlfi.distributions.arguments import require_count, require_key
 from jaxlfi.distributions.mixture import GaussianMixture
-from jaxlfi.distributions.mixture_fit import fit_mixture
+from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support
-from jaxlfi.estimators.atomic_loss import log_prob_truncated, sample_within
-from jaxlfi.estimators.estimator import Estimator, Network, condition, draw
-from jaxlfi.estimators.normaliser import normalised
+from jaxlfi.distributions.truncated_mixture import truncated_mixture_draws
+from jaxlfi.distributions.truncation import MASS_DRAWS, mass_inside, rejection_sample, truncated_log_prob
+from jaxlfi.estimators.density import Density
 
-FLOW_DRAWS = 1000
-"""Draws of a flow to which its mixture is fitted."""
-LEAK_DRAWS = 512
-"""Draws by which the mass of a mixture inside the support is estimated."""
-MASS_DRAWS = 10_000
-"""Draws by which it is where a density is divided by it: to 1 % of itself where it is a half."""
+MAP_STARTS = 16
+"""Draws of the highest density from which the mode is looked for."""
+MAP_STEPS = 300
+"""Steps of Adam from each."""
+MAP_RATE = 0.02
+"""Their length at first, as a fraction of half the support's width; it falls to zero by the last."""
 
 
-def posterior(
-    key: jax.Array | None,
-    estimator: Estimator,
-    network: Network,
-    x: Float[Array, " obs"],
-    scale: Support,
-    support: Support,
-) -> tuple[GaussianMixture, Float[Array, ""]]:
-    """q_phi(theta | x) as a mixture of Gaussians, and how much of it lies in the support.
+@struct.dataclass
+class Posterior:
+    """What an observation says of the parameters: a density on a box. A pytree.
 
-    An MDN is the mixture. A flow has one fitted to its draws, so that heuristics and proposals need not know of it:
-    to those inside the support, as a flow trained by the atomic loss may leak any amount of mass to where no
-    simulation was.
+    It is always the density truncated to the support. Draws are rejected until they lie inside, never moved there; where
+    next to no mass is inside, they are those of the mixture, truncated (`truncated_mixture_draws`).
+    Arguments and results are in natural units, or in inference space (logarithms of log parameters) where
+    `space="inference"` is passed.
 
-    Args:
-        key: consumed; an MDN needs none.
-        estimator: the settings the network was made with.
-        network: trained weights.
-        x: the observed summary, shape [S].
-        scale: the box the network's [-1, 1]^D stands for (Phi, reading D).
-        support: the box the simulations were drawn from.
-
-    Returns:
-        The mixture of members * K components, and the share of q's mass inside the support.
+    Attributes:
+        density: q before truncation, over inference space: a `GaussianMixture`, or a flow's density.
+        mixture: the same as a mixture of Gaussians, which heuristics and proposals see: itself, or fitted to draws.
+        support: the box, in inference space.
+        mass_inside: of q in the support; the rest has leaked. Shape [].
+        space: the map between natural units and inference space.
     """
-    if not estimator.is_flow:
-        q = condition(estimator, network, x, scale)
-        return q, jnp.mean(support.contains(q.sample(jax.random.key(0), LEAK_DRAWS)))
-    key_draw, key_fit = jax.random.split(key)
-    draws = draw(key_draw, estimator, network, x, scale, FLOW_DRAWS)
-    inside = support.contains(draws)
-    weights = jnp.where(jnp.any(inside), inside, True).astype(draws.dtype)
-    mixture, _ = fit_mixture(key_fit, draws, weights, estimator.ensemble_size * estimator.components)
-    return mixture, jnp.mean(inside)
+
+    density: Density
+    mixture: GaussianMixture
+    support: Support
+    mass_inside: Float[Array, "*batch"]
+    space: Space = struct.field(pytree_node=False)
+
+    def sample(self, key: jax.Array, n: int, space: SpaceName = "natural") -> Float[Array, "n dim"]:
+        """`n` independent draws, shape [n, D].
+
+        Raises:
+            ValueError: for what is no key, or a number that is not whole and at least 1.
+        """
+        require_count(n, "n")
+        draws = _sample(require_key(key), self, int(n))
+        return self.space.to_natural(draws) if is_natural(space) else draws
+
+    def log_prob(self, theta: Float[Array, "*n dim"], space: SpaceName = "natural") -> Float[Array, "*n"]:
+        """Log-density at theta, shape [..., D]; -inf outside the support.
+
+        Raises:
+            ValueError: for another number of parameters.
+        """
+        theta = jnp.asarray(theta, jnp.float32)
+        if theta.ndim == 0 or theta.shape[-1] != self.space.dim:
+            raise ValueError(f"theta: expected shape [..., {self.space.dim}], got {list(theta.shape)}")
+        if not is_natural(space):
+            return self._log_prob(theta)
+        inner = self.space.to_inference(theta)
+        finite = jnp.all(jnp.isfinite(inner), axis=-1)
+        inner = jnp.where(finite[..., None], inner, self.support.centre)
+        return jnp.where(finite, self._log_prob(inner) - self.space.log_jacobian(inner), -jnp.inf)
+
+    def mean(self, space: SpaceName = "natural") -> Float[Array, " dim"]:
+        """The mean, over `MASS_DRAWS` draws that are the same each time, shape [D]."""
+        return jnp.mean(self.sample(jax.random.key(0), MASS_DRAWS, space), axis=0)
+
+    def map(self, space: SpaceName = "natural") -> Float[Array, " dim"]:
+        """The point of the highest density inside the support (maximum a posteriori), shape [D].
+
+        Found by gradient ascent from the draws of the highest density. The density over natural units and that over
+        inference space have different maxima where a parameter is inferred as its logarithm: `space` chooses the
+        density, and the units of the result.
+        """
+        point = _maximum(self, is_natural(space))
+        return self.space.to_natural(point) if is_natural(space) else point
+
+    def on(self, support: Support) -> "Posterior":
+        """The same density truncated to another support, in inference space."""
+        return truncated(self.density, self.mixture, support, self.space)
+
+    def _log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
+        return truncated_log_prob(self.density.log_prob(theta), theta, self.support, self.mass_inside)
 
 
-def draws_within(
-    key: jax.Array,
-    estimator: Estimator,
-    network: Network,
-    x: Float[Array, " obs"],
-    scale: Support,
-    support: Support,
-    n: int,
-    tries: int = 20,
-) -> tuple[Float[Array, "n dim"], Float[Array, ""]]:
-    """`n` draws of a flow's posterior truncated to the support, in bounded time (`jaxlfi.estimators.atomic_loss.sample_within`).
-
-    Returns:
-        The draws, and the share of n * tries candidates that were inside.
-    """
-    kept = sample_within(
-        key, lambda key, n: draw(key, estimator, network, x, scale, n), support.low, support.high, n, tries
-    )
-    return kept.theta, kept.acceptance
+def truncated(density: Density, mixture: GaussianMixture, support: Support, space: Space) -> Posterior:
+    """A density truncated to a support, with the mass it has in there."""
+    return Posterior(density, mixture, support, mass_inside(density.sample, support), space)
 
 
-def truncated_draws(
-    key: jax.Array,
-    estimator: Estimator,
-    network: Network | None,
-    x: Float[Array, " obs"],
-    scale: Support,
-    belief: Belief,
-    n: int,
-) -> tuple[Float[Array, "n dim"], Float[Array, ""]]:
-    """`n` draws of a posterior truncated to its support: a mixture's by rejection, a flow's from the flow itself.
-
-    Args:
-        key: consumed.
-        estimator: the settings the network was made with.
-        network: trained weights; a mixture needs none.
-        x: the observed summary, shape [S].
-        scale: the box the network's [-1, 1]^D stands for.
-        belief: the mixture, and the support.
-        n: number of draws.
-
-    Returns:
-        The draws, and the share of the untruncated posterior that lies in the support.
-    """
-    if estimator.is_flow:
-        return draws_within(key, estimator, network, x, scale, belief.support, n)
-    return rejected(key, belief, n), mixture_mass(belief)
+@functools.partial(jax.jit, static_argnums=2)
+def _sample(key: jax.Array, posterior: Posterior, n: int) -> Array:
+    box = posterior.support
+    fallback = lambda key, n: truncated_mixture_draws(key, posterior.mixture, box, n)
+    return rejection_sample(key, posterior.density.sample, box, n, fallback)
 
 
-def truncated_log_prob(
-    estimator: Estimator,
-    network: Network | None,
-    x: Float[Array, " obs"],
-    scale: Support,
-    belief: Belief,
-    theta: Float[Array, "*n dim"],
-    inside: Float[Array, ""] | None = None,
-) -> Float[Array, "*n"]:
-    """Log-density of what `truncated_draws` draws from, -inf outside the support.
+@functools.partial(jax.jit, static_argnums=1)
+def _maximum(posterior: Posterior, natural: bool) -> Array:
+    """The maximum in inference space, of the density over natural units or over inference space."""
+    box = posterior.support
 
-    Args:
-        estimator: the settings the network was made with.
-        network: trained weights; a mixture needs none.
-        x: the observed summary, shape [S].
-        scale: the box the network's [-1, 1]^D stands for.
-        belief: the mixture, and the support.
-        theta: in coordinates, shape [..., D].
-        inside: the posterior's mass in the support; by default estimated from `MASS_DRAWS` draws, always the same.
-    """
-    box = belief.support
-    if estimator.is_flow:
-        log_prob = flow_log_prob(estimator, network, x, scale, theta)
-        if inside is None:
-            draws = draw(jax.random.key(0), estimator, network, x, scale, MASS_DRAWS)
-            inside = jnp.mean(box.contains(draws))
-    else:
-        log_prob = belief.mixture.log_prob(theta)
-        inside = mixture_mass(belief) if inside is None else inside
-    return log_prob_truncated(log_prob, theta, box.low, box.high, inside)
+    def objective(unit: Array) -> Array:
+        theta = box.centre + 0.5 * box.width * unit
+        return posterior.density.log_prob(theta) - (posterior.space.log_jacobian(theta) if natural else 0.0)
 
+    draws = box.to_unit(_sample(jax.random.key(0), posterior, 1000))
+    _, best = jax.lax.top_k(jax.vmap(objective)(draws), MAP_STARTS)
+    adam = optax.adam(optax.cosine_decay_schedule(MAP_RATE, MAP_STEPS))
 
-def mixture_mass(belief: Belief) -> Float[Array, ""]:
-    """Mass of a belief's mixture in its support, estimated from `MASS_DRAWS` draws that are always the same."""
-    return jnp.mean(belief.support.contains(belief.mixture.sample(jax.random.key(0), MASS_DRAWS)))
+    def ascend(start: Array) -> tuple[Array, Array]:
+        def step(carry, _):
+            unit, moments = carry
+            updates, moments = adam.update(-jax.grad(objective)(unit), moments)
+            return (jnp.clip(unit + updates, -1.0, 1.0), moments), None
 
+        (unit, _), _ = jax.lax.scan(step, (start, adam.init(start)), length=MAP_STEPS)
+        return unit, objective(unit)
 
-def flow_log_prob(
-    estimator: Estimator, network: Network, x: Float[Array, " obs"], scale: Support, theta: Float[Array, "*n dim"]
-) -> Float[Array, "*n"]:
-    """Log-density of a flow's q_phi(theta | x) in coordinates, not truncated: the mean density of all members.
-
-    Args:
-        estimator: the settings the network was made with.
-        network: trained weights.
-        x: the observed summary, shape [S].
-        scale: the box the network's [-1, 1]^D stands for.
-        theta: in coordinates, shape [..., D].
-    """
-    module = estimator.module(scale.dim)
-    x = normalised(estimator.normaliser, network.normaliser, x)
-    inner = network.to_network(scale.to_unit(theta))
-    members = jax.vmap(lambda params: module.apply(params, x).log_prob(inner))(network.params)
-    # Both maps from theta to what the network sees are affine, dimension by dimension.
-    width = 0.5 * scale.width
-    width = width if network.theta_normaliser is None else width * network.theta_normaliser.scale
-    return jax.nn.logsumexp(members, axis=0) - jnp.log(estimator.ensemble_size) - jnp.sum(jnp.log(width))
+    units, heights = jax.vmap(ascend)(draws[best])
+    return box.clip(box.centre + 0.5 * box.width * units[jnp.argmax(heights)])

@@ -1,4 +1,4 @@
-"""Fitting q_phi to a masked dataset by Adam, as one loop over passes."""
+"""Fitting q_phi to a masked dataset by Adam, as one loop over epochs."""
 
 import jax
 import jax.numpy as jnp
@@ -6,29 +6,27 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.base import SCHEDULES, Network
 from jaxlfi.estimators.dataset import Dataset
-from jaxlfi.estimators.estimator import SCHEDULES, Estimator, Network, initialise, normalisers
 from jaxlfi.estimators.losses import LOSSES, Rows
-from jaxlfi.estimators.normaliser import normalised
 
-STEPS_PER_PASS = 50
-"""Where gradient steps are counted, how many make a pass at most (after which the validation loss is looked at)."""
+STEPS_PER_EPOCH = 50
+"""Gradient steps in an epoch at most, where steps are counted; the validation loss is computed after each epoch."""
 
 
 @struct.dataclass
 class FitInfo:
-    """What happened while fitting; P passes, E ensemble members.
+    """What happened while fitting; P epochs, E networks in the ensemble.
 
     Attributes:
-        loss: mean training loss of each pass, negative log-density of theta scaled to [-1, 1]^D, shape [E, P].
-        validation_loss: the same over the held-out simulations after each pass; NaN without any, shape [E, P].
-        chosen_epoch: the pass the weights were taken from, shape [E].
+        loss: mean training loss of each epoch, negative log-density of theta scaled to [-1, 1]^D, shape [E, P].
+        validation_loss: the same over the held-out simulations after each epoch; NaN without any, shape [E, P].
+        chosen_epoch: the epoch the weights were taken from, shape [E].
         nonfinite: gradient steps skipped because the loss or its gradient was not finite, shape [E].
     """
 
-    loss: Float[Array, "*batch passes"]
-    validation_loss: Float[Array, "*batch passes"]
+    loss: Float[Array, "*batch epochs"]
+    validation_loss: Float[Array, "*batch epochs"]
     chosen_epoch: Int[Array, "*batch"]
     nonfinite: Int[Array, "*batch"]
 
@@ -49,11 +47,9 @@ class _Best:
 
 def fit(
     key: jax.Array,
-    estimator: Estimator,
     network: Network,
     dataset: Dataset,
     weights: Float[Array, " cap"],
-    scale: Support,
     expected_size: Int[Array, ""] | int,
     log_prior: Float[Array, " cap"] | None = None,
 ) -> tuple[Network, FitInfo]:
@@ -61,51 +57,48 @@ def fit(
 
     Args:
         key: consumed.
-        estimator: settings.
-        network: the last round's network; its weights are the start under `warm_start`, else replaced by fresh ones.
-            Its normaliser is replaced where the network starts anew.
+        network: the last round's; its weights are the start under `warm_start`, else replaced by fresh ones. Its
+            normalisers are replaced where the network starts anew.
         dataset: simulations; only the filled rows are used.
         weights: weight of each row in the loss, shape [C]; all ones without importance correction.
-        scale: the box that is scaled to [-1, 1]^D (Phi).
         expected_size: filled rows if no simulation had failed. It sets the number of minibatches of an epoch and,
-            unlike the size itself, is the same for all lanes of a vmap, which then step together.
+            unlike the size itself, is the same for all runs of a batch, which then step together.
         log_prior: log-density of the prior at each row, up to a constant, shape [C]; None for a uniform one. Only
             the atomic losses ask for it.
 
     Returns:
         The trained network and what happened.
     """
+    estimator = network.estimator
     key_init, key_fit = jax.random.split(key)
     if not estimator.warm_start:
-        network = Network(
-            initialise(key_init, estimator, scale.dim, dataset.x.shape[-1]), *normalisers(estimator, dataset, scale)
-        )
-    x = normalised(estimator.normaliser, network.normaliser, dataset.x)
-    theta = network.to_network(scale.to_unit(dataset.theta))
+        network = network.restarted(key_init, dataset)
+    x = network.normaliser(dataset.x)
+    theta = network.to_network(dataset.theta)
     log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
     data = Rows(theta, x, weights, log_prior, from_prior=(dataset.round == 0).astype(weights.dtype))
 
     def one(key, params):
-        return _fit_member(key, estimator, params, data, dataset.size, expected_size)
+        return _fit_one(key, estimator, params, data, dataset.size, expected_size)
 
     params, info = jax.vmap(one)(jax.random.split(key_fit, estimator.ensemble_size), network.params)
     return network.replace(params=params), info
 
 
-def _fit_member(key, estimator, params, data, size, expected_size):
-    """One member's training: passes over the data, each a loop over minibatches."""
+def _fit_one(key, estimator, params, data, size, expected_size):
+    """Training of one network: epochs over the data, each a loop over minibatches."""
     capacity, dim = data.theta.shape
     module = estimator.module(dim)
     objective = LOSSES[estimator.loss]
-    passes = estimator.epochs or -(-estimator.steps // STEPS_PER_PASS)
-    batches = -(-expected_size // estimator.batch_size) if estimator.epochs else -(-estimator.steps // passes)
+    epochs = estimator.epochs or -(-estimator.steps // STEPS_PER_EPOCH)
+    batches = -(-expected_size // estimator.batch_size) if estimator.epochs else -(-estimator.steps // epochs)
 
     def rate(count):
-        return estimator.learning_rate * SCHEDULES[estimator.schedule](count / (passes * batches))
+        return estimator.learning_rate * SCHEDULES[estimator.schedule](count / (epochs * batches))
 
     adam = optax.adamw(rate, weight_decay=estimator.weight_decay)
 
-    key_split, key_passes = jax.random.split(key)
+    key_split, key_epochs = jax.random.split(key)
     rows = _shuffled(key_split, jnp.arange(capacity), size)
     held_out = jnp.floor(estimator.validation * size).astype(jnp.int32)
     training = jnp.maximum(size - held_out, 1)
@@ -116,7 +109,7 @@ def _fit_member(key, estimator, params, data, size, expected_size):
     held_out_data = data.take(held_out_rows)
     held_out_data = held_out_data.replace(weights=jnp.where(held_out_places < held_out, held_out_data.weights, 0.0))
 
-    key_loss, key_held_out = jax.random.fold_in(key_passes, passes), jax.random.fold_in(key_passes, passes + 1)
+    key_loss, key_held_out = jax.random.fold_in(key_epochs, epochs), jax.random.fold_in(key_epochs, epochs + 1)
 
     def loss_of(params, key, batch):
         return objective.training(key, module.apply(params, batch.x), batch)
@@ -125,7 +118,7 @@ def _fit_member(key, estimator, params, data, size, expected_size):
         loss, gradient = jax.value_and_grad(loss_of)(state.params, key, batch)
         norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(loss) & jnp.isfinite(norm)
-        # A factor, where optax divides each entry: one pass fewer over the gradient.
+        # A factor, where optax divides each entry: the gradient is gone through once less.
         factor = jnp.minimum(1.0, estimator.clip_norm / norm)
         gradient = jax.tree.map(lambda g: jnp.where(finite, factor * g, 0.0), gradient)
         updates, moments = adam.update(gradient, state.moments, state.params)
@@ -134,7 +127,7 @@ def _fit_member(key, estimator, params, data, size, expected_size):
         params = optax.apply_updates(state.params, updates)
         return _Training(params, moments, state.nonfinite + ~finite), jnp.where(finite, loss, 0.0), finite
 
-    def one_pass(carry, index, order):
+    def one_epoch(carry, index, order):
         state, best = carry
 
         def minibatch(b, loop):
@@ -145,11 +138,11 @@ def _fit_member(key, estimator, params, data, size, expected_size):
             return state, total + loss, count + finite
 
         state, total, count = jax.lax.fori_loop(0, batches, minibatch, (state, 0.0, 0))
-        loss = total / count  # NaN where no step of the pass was finite
+        loss = total / count  # NaN where no step of the epoch was finite
         if not estimator.validation:
             return (state, best), (loss, jnp.nan)
         nothing_held_out = jnp.sum(held_out_data.weights) == 0
-        # The same key for all passes: their losses are compared.
+        # The same key for all epochs: their losses are compared.
         q = module.apply(state.params, held_out_data.x)
         validation = objective.held_out(jax.random.clone(key_held_out), q, held_out_data)
         validation = jnp.where(nothing_held_out, jnp.nan, validation)
@@ -159,22 +152,22 @@ def _fit_member(key, estimator, params, data, size, expected_size):
 
     def running(carry):
         index, (_, best), _ = carry
-        unfinished = index < passes
+        unfinished = index < epochs
         return unfinished & (index - best.at <= estimator.patience) if estimator.patience else unfinished
 
     def body(carry):
         index, training_state, curves = carry
-        order = _shuffled(jax.random.fold_in(key_passes, index), rows, training)
-        training_state, seen = one_pass(training_state, index, order)
+        order = _shuffled(jax.random.fold_in(key_epochs, index), rows, training)
+        training_state, seen = one_epoch(training_state, index, order)
         return index + 1, training_state, jax.tree.map(lambda curve, now: curve.at[index].set(now), curves, seen)
 
     state = _Training(params, adam.init(params), jnp.asarray(0))
     best = _Best(params, jnp.asarray(jnp.inf), jnp.asarray(0)) if estimator.validation else None
-    unseen = jnp.full(passes, jnp.nan)
+    unseen = jnp.full(epochs, jnp.nan)
     start = jnp.asarray(0), (state, best), (unseen, unseen)
     _, (state, best), (training_losses, validation_losses) = jax.lax.while_loop(running, body, start)
     if best is None:
-        best = _Best(state.params, jnp.asarray(jnp.inf), jnp.asarray(passes - 1))
+        best = _Best(state.params, jnp.asarray(jnp.inf), jnp.asarray(epochs - 1))
     return best.params, FitInfo(training_losses, validation_losses, best.at, state.nonfinite)
 
 

@@ -2,48 +2,114 @@
 
 import dataclasses
 import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
+from jaxlfi import plugins
 from jaxlfi.bayessim.algorithm import Settings
 from jaxlfi.distributions.support import Support
-from jaxlfi.estimators.estimator import Estimator
-from jaxlfi.heuristics import HEURISTICS, Heuristic, Matched
+from jaxlfi.heuristics import Heuristic, registry
+
+NameOf = Callable[[Any], str]
+Load = Callable[[str], type]
+
+
+def to_json(value: Any, name_of: NameOf) -> dict[str, Any]:
+    """A dataclass by its name and the values of its fields; dataclasses among them are written alike.
+
+    Tuples and lists become lists; an array keeps its type, {"array": [...], "dtype": "float32"}, but for a single
+    number; numbers that JSON does not have are written as {"float": "inf"}.
+
+    Args:
+        value: a dataclass's instance.
+        name_of: what the class of an instance is called, registered or "module:Class".
+
+    Raises:
+        ValueError: for a field that holds anything else, a function say.
+
+    Example:
+        >>> to_json(Support([0.0], [1.0]), class_name)["hyperparameters"]["low"]
+        {'array': [0.0], 'dtype': 'float32'}
+    """
+    return {"name": name_of(value), "hyperparameters": fields_to_json(value, name_of)}
+
+
+def from_json(description: Mapping[str, Any], load: Load) -> Any:
+    """What `to_json` described.
+
+    Args:
+        description: its result.
+        load: the class of that name; raises ValueError where there is none.
+
+    Raises:
+        ValueError: for what is no description, or not of this class.
+    """
+    if not isinstance(description, Mapping) or set(description) != {"name", "hyperparameters"}:
+        raise ValueError(f"expected a description by name and hyperparameters, got {description!r}")
+    return _made(load(description["name"]), description["name"], description["hyperparameters"], load)
+
+
+def fields_to_json(value: Any, name_of: NameOf) -> dict[str, Any]:
+    """The fields of a dataclass by name."""
+    described = {}
+    for field in dataclasses.fields(value):
+        try:
+            described[field.name] = _encoded(getattr(value, field.name), name_of)
+        except TypeError as error:
+            raise ValueError(f"{field.name}: expected a value that can be written as JSON, got {error}") from error
+    return described
+
+
+def class_name(value: Any) -> str:
+    """The class of an instance as "module:Class", for those that are not registered."""
+    return f"{type(value).__module__}:{type(value).__qualname__}"
+
+
+def dataclass_of(reference: str) -> type:
+    """The dataclass of "module:Class".
+
+    Raises:
+        ValueError: if there is none.
+    """
+    kind = plugins.named("description", reference)
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        raise ValueError(f"description: expected {reference!r} to be a dataclass, got {kind!r}")
+    return kind
 
 
 def settings_to_json(settings: Settings) -> dict[str, Any]:
-    """All settings by name, the estimator's in a dictionary of their own."""
-    plain = {field.name: plain_value(getattr(settings, field.name)) for field in _other_fields(settings)}
-    estimator = {f.name: plain_value(getattr(settings.estimator, f.name)) for f in dataclasses.fields(Estimator)}
-    return plain | {"estimator": estimator}
+    """All settings by name, and the estimator by its class."""
+    return fields_to_json(settings, class_name)
 
 
-def settings_from_json(description: dict[str, Any]) -> Settings:
+def settings_from_json(description: Mapping[str, Any]) -> Settings:
     """The settings that `settings_to_json` described."""
-    estimator = {name: _restored(value) for name, value in description["estimator"].items()}
-    others = {name: value for name, value in description.items() if name != "estimator"}
-    return Settings(estimator=Estimator(**estimator), **others)
+    return _made(Settings, "settings", description, dataclass_of)
 
 
 def heuristic_to_json(heuristic: Heuristic) -> dict[str, Any]:
-    """A heuristic's name and hyperparameters; `matched` where its components are paired first.
+    """A heuristic's name and hyperparameters; rules that it wraps are described alike.
 
-    A reader's own heuristic goes by the name of its class.
+    Example:
+        >>> from jaxlfi.heuristics import Matched, Mode
+        >>> heuristic_to_json(Matched(Mode()))["hyperparameters"]["rule"]["hyperparameters"]["proximity"]
+        0.4
     """
-    matched = isinstance(heuristic, Matched)
-    rule = heuristic.rule if matched else heuristic
-    known = {kind: name for name, kind in HEURISTICS.items()}
-    values = {f.name: plain_value(getattr(rule, f.name)) for f in dataclasses.fields(rule)}
-    return {"name": known.get(type(rule), type(rule).__name__), "matched": matched, "hyperparameters": values}
+    return to_json(heuristic, _heuristic_name)
 
 
-def heuristic_from_json(description: dict[str, Any]) -> Heuristic:
-    """The heuristic that `heuristic_to_json` described."""
-    if description["name"] not in HEURISTICS:
-        raise ValueError(f"heuristic: expected one of {sorted(HEURISTICS)}, got {description['name']!r}")
-    rule = HEURISTICS[description["name"]](**{k: _restored(v) for k, v in description["hyperparameters"].items()})
-    return Matched(rule) if description["matched"] else rule
+def heuristic_from_json(description: Mapping[str, Any]) -> Heuristic:
+    """The heuristic that `heuristic_to_json` described.
+
+    Raises:
+        ValueError: for a description of anything else, or of a heuristic that is not installed.
+    """
+    heuristic = from_json(description, lambda name: dataclass_of(name) if ":" in name else registry.load(name))
+    if not isinstance(heuristic, Heuristic):
+        raise ValueError(f"heuristic: expected the description of one, got {description['name']!r}")
+    return heuristic
 
 
 def support_to_json(support: Support) -> dict[str, list[float]]:
@@ -57,16 +123,8 @@ def support_from_json(description: dict[str, list[float]]) -> Support:
 
 
 def plain_value(value: Any) -> Any:
-    """Numbers, strings and lists; numbers that JSON does not know are written as words."""
-    if isinstance(value, str | bool | int | None):
-        return value
-    if isinstance(value, tuple | list):
-        return [plain_value(item) for item in value]
-    array = np.asarray(value)
-    if array.ndim:
-        return [plain_value(item) for item in array.tolist()]
-    number = array.item()
-    return number if isinstance(number, int) or math.isfinite(number) else str(number)
+    """A number, a string, or a list of them, as JSON has it."""
+    return _encoded(value, class_name)
 
 
 def json_safe(value: Any) -> Any:
@@ -78,12 +136,51 @@ def json_safe(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _restored(value: Any) -> Any:
-    """A value as a constructor takes it: tuples of integers (layers), vectors, and infinity from its word."""
+def _heuristic_name(value: Any) -> str:
+    return registry.name_of(value) if isinstance(value, Heuristic) else class_name(value)
+
+
+def _made(kind: type, name: str, values: Any, load: Load) -> Any:
+    known = {field.name for field in dataclasses.fields(kind)}
+    if not isinstance(values, Mapping) or not set(values) <= known:
+        raise ValueError(f"{name}: expected values of {', '.join(sorted(known)) or 'nothing'}, got {values!r}")
+    try:
+        return kind(**{field: _decoded(value, load) for field, value in values.items()})
+    except TypeError as error:
+        raise ValueError(f"{name}: cannot be made of its description: {error}") from error
+
+
+def _encoded(value: Any, name_of: NameOf) -> Any:
+    if isinstance(value, str | bool | int | None):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else {"float": str(value)}
+    if isinstance(value, tuple | list):
+        return [_encoded(item, name_of) for item in value]
+    if isinstance(value, Mapping):
+        return {"mapping": [[_encoded(name, name_of), _encoded(item, name_of)] for name, item in value.items()]}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return to_json(value, name_of)
+    if not hasattr(value, "dtype"):
+        raise TypeError(f"a {type(value).__name__}")
+    array = np.asarray(value)
+    if array.dtype == object:
+        raise TypeError(f"a {type(value).__name__}")
+    numbers = array.tolist()
+    if array.ndim == 0:
+        return _encoded(numbers, name_of)
+    return {"array": _encoded(numbers, name_of), "dtype": array.dtype.name}
+
+
+def _decoded(value: Any, load: Load) -> Any:
     if isinstance(value, list):
-        return tuple(value) if all(isinstance(item, int) for item in value) else np.asarray(value, np.float32)
-    return float(value) if value in ("inf", "-inf", "nan") else value
-
-
-def _other_fields(settings: Settings) -> list[dataclasses.Field]:
-    return [field for field in dataclasses.fields(settings) if field.name != "estimator"]
+        return tuple(_decoded(item, load) for item in value)
+    if not isinstance(value, dict):
+        return value
+    if set(value) == {"float"}:
+        return float(value["float"])
+    if set(value) == {"mapping"}:
+        return {_decoded(name, load): _decoded(item, load) for name, item in value["mapping"]}
+    if set(value) == {"array", "dtype"}:
+        return np.array(_decoded(value["array"], load), value["dtype"])
+    return from_json(value, load)

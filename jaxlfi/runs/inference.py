@@ -25,7 +25,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.estimator import Network
 from jaxlfi.estimators.posterior import truncated_log_prob
-from jaxlfi.heuristics import Edge, Fixed, Heuristic, Truncate
+from jaxlfi.heuristics import Edge, Heuristic, registry
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.load import network_arrays
@@ -203,7 +203,7 @@ def infer(
         run = _as_run(task, key, settings, heuristic, observed, x, state, info)
     if concrete:
         refuse_hopeless(np.asarray(run.info.simulations.succeeded)[:1], np.asarray(run.info.failed)[0], task)
-        if isinstance(heuristic, Fixed | Truncate):
+        if not heuristic.grows:
             for warning in run.warnings:
                 python_warnings.warn(warning, SupportWarning, stacklevel=2)
     return run
@@ -241,18 +241,8 @@ simulator_shapes = functools.lru_cache(maxsize=64)(observations.simulator_shapes
 
 
 def check_heuristic(heuristic: Heuristic, task: Task) -> None:
-    """Refuse hyperparameters that are neither scalars nor one value a dimension.
-
-    Raises:
-        ValueError: naming the shape.
-    """
-    if not isinstance(heuristic, Heuristic):
-        raise ValueError(f"heuristic: expected one such as jaxlfi.Edge(), got {heuristic!r}")
-    for leaf in jax.tree.leaves(heuristic):
-        if np.shape(leaf) not in ((), (task.dim,)):
-            raise ValueError(
-                f"heuristic: expected hyperparameters that are scalars or {task.dim} values, got shape {np.shape(leaf)}"
-            )
+    """Refuse what is no heuristic for this task (`registry.check`)."""
+    registry.check(heuristic, task.dim)
 
 
 def refuse_hopeless(succeeded: np.ndarray, failed: np.ndarray, task: Task) -> None:

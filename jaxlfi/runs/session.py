@@ -16,7 +16,6 @@ from jaxlfi.bayessim.host import BlackBoxEngine
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.bayessim.record import apart, posterior_draws
 from jaxlfi.diagnostics import bound_warnings, edge_mass
-from jaxlfi.heuristics import Fixed, Truncate
 from jaxlfi.io import files as atomic
 from jaxlfi.io import serialise as describe
 from jaxlfi.io.progress import RoundProgress
@@ -283,7 +282,7 @@ def support_warnings(folder: Path, plan: Plan) -> Iterator[str]:
     """
     beliefs = [run_store.read_belief(folder / name) for name in plan.folders()]
     runs = list(zip(plan.lanes, beliefs, strict=True))
-    fixed = [(lane, belief) for lane, belief in runs if isinstance(lane.heuristic, Fixed | Truncate)]
+    fixed = [(lane, belief) for lane, belief in runs if not lane.heuristic.grows]
     for configuration in dict.fromkeys(lane.configuration for lane, _ in fixed):
         own = [belief for lane, belief in fixed if lane.configuration == configuration]
         if len(own) == 1:

@@ -1,23 +1,23 @@
 """The observed trajectory x^r: read from a file, checked against the simulator, or simulated at the truth."""
 
+import csv
 import dataclasses
+import functools
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlfi.tasks.host import SimulatorError
 from jaxlfi.tasks.simulation import trajectory_and_outcome, with_outcome
 from jaxlfi.tasks.task import Task
 
 TRIES = 16
 """Simulations at the truth that may fail before a task counts as unable to simulate its own truth."""
-TIME_COLUMNS = ("time", "t", "year", "step")
-"""Headings of a first column that is not a channel."""
-
-
-class SimulatorError(ValueError):
-    """A simulator that breaks its contract, or fails always."""
+TIME_COLUMNS = ("time", "t", "seconds", "s", "year", "step", "index", "")
+"""Headings, without a unit in brackets, of a first column that is not a channel. pandas' index has an empty one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Shapes:
     summary: int
 
 
+@functools.lru_cache(maxsize=64)
 def simulator_shapes(task: Task) -> Shapes:
     """Trace a JAX simulator and its summary without running them.
 
@@ -47,7 +48,7 @@ def simulator_shapes(task: Task) -> Shapes:
         result = jax.eval_shape(task.simulate, key, theta)
     except Exception as error:
         raise SimulatorError(
-            f"simulate: expected a function JAX can trace (declare a NumPy simulator with black_box=True), "
+            f"simulate: expected a function JAX can trace (wrap a NumPy simulator in jaxlfi.HostSimulator), "
             f"got {type(error).__name__}: {_first_line(error)}"
         ) from error
     trajectory, outcome = result if isinstance(result, tuple) and len(result) == 2 else (result, None)
@@ -61,7 +62,7 @@ def simulator_shapes(task: Task) -> Shapes:
 
 
 def observed_shapes(task: Task, observation: np.ndarray) -> Shapes:
-    """The shapes of a black box, which only its observation tells before it has run."""
+    """The shapes of a host simulator, which only its observation shows before it has run."""
     if observation.ndim == 0:
         raise ValueError("observation: expected a trajectory [T] or [T, C], got a single number")
     return Shapes(observation.shape, _summary_size(task, observation.shape))
@@ -116,23 +117,44 @@ def trace_observation(key: jax.Array, task: Task) -> jax.Array:
     """As `simulate_observation`, inside a traced function: the first try, whatever comes of it."""
     if task.truth is None:
         raise ValueError("observation: expected one, as the task has neither an observation nor a known truth")
-    return trajectory_and_outcome(task, jax.random.fold_in(key, 0), task.truth)[0]
+    return trajectory_and_outcome(task, jax.random.fold_in(key, 0), task.inference.truth)[0]
 
 
 def _at_truth(key: jax.Array, task: Task):
-    if not task.black_box:
-        return _simulate_jit(task, key, task.truth)
-    result = task.simulate(numpy_generator(key), np.asarray(task.to_natural(task.truth))[None])
-    trajectory, outcome = result if isinstance(result, tuple) else (result, np.zeros(1, int))
-    return with_outcome(task, jnp.asarray(trajectory)[0], jnp.asarray(outcome)[0])
+    truth = task.inference.truth
+    if not task.on_host:
+        return _simulate_jit(task, key, truth)
+    trajectory, outcome = task.simulate(key, np.asarray(task.space.to_natural(truth)))
+    return with_outcome(task, jnp.asarray(trajectory), jnp.asarray(outcome))
 
 
 _simulate_jit = jax.jit(trajectory_and_outcome, static_argnums=0)
 
 
-def numpy_generator(key: jax.Array) -> np.random.Generator:
-    """A NumPy generator seeded by a JAX key."""
-    return np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
+def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True) -> tuple[jax.Array, jax.Array]:
+    """The observed trajectory, checked, and its summary.
+
+    Args:
+        key: simulates it, where none is given and the task has none.
+        task: for the simulator's shapes, and for the default.
+        observation: what was given, or None.
+        concrete: false inside a traced function.
+
+    Raises:
+        ValueError: for an observation that does not fit the simulator, or whose summary is not finite.
+    """
+    if observation is None:
+        observation = task.observation
+    if observation is None:
+        simulate = simulate_observation if concrete else trace_observation
+        observation = simulate(key, task)
+    shapes = observed_shapes(task, np.asarray(observation)) if task.on_host else simulator_shapes(task)
+    observed = checked(observation, shapes)
+    x = jnp.asarray(task.summary(observed), jnp.float32)
+    if not isinstance(x, jax.core.Tracer) and not np.isfinite(np.asarray(x)).all():
+        raise ValueError(f"observation: expected a finite summary, got {np.asarray(x).tolist()}")
+    task.named_summaries(x.shape[-1])  # refuses names that are not the summary's
+    return observed, x
 
 
 def read(path: str | Path) -> np.ndarray:
@@ -140,7 +162,7 @@ def read(path: str | Path) -> np.ndarray:
 
     Args:
         path: a .csv with one row a record and one column a channel (a row of headings is allowed, and a first
-            column headed time, t, year or step is left out), or an .npz with an array "trajectory" or one
+            column of times or indices is left out: `TIME_COLUMNS`), or an .npz with an array "trajectory" or one
             array only.
 
     Returns:
@@ -151,38 +173,56 @@ def read(path: str | Path) -> np.ndarray:
     """
     path = Path(path)
     readers = {".csv": _read_csv, ".npz": _read_npz}
-    if path.suffix not in readers:
+    if path.suffix.lower() not in readers:
         raise ValueError(f"observation: expected a .csv or .npz file, got {str(path)!r}")
     try:
-        return readers[path.suffix](path)
+        return readers[path.suffix.lower()](path)
     except Exception as error:  # zipfile, numpy and the operating system each have their own
         raise ValueError(f"observation: cannot read {str(path)!r}: {_first_line(error)}") from error
 
 
-def fitted(trajectory: np.ndarray, shapes: Shapes) -> np.ndarray:
-    """Drop or add an axis of length one where that is all that keeps a file from the simulator's shape."""
-    squeezed = tuple(n for n in trajectory.shape if n != 1)
-    wanted = tuple(n for n in shapes.trajectory if n != 1)
-    return trajectory.reshape(shapes.trajectory) if squeezed == wanted else trajectory
+def read_for(task: Task, path: str | Path) -> np.ndarray:
+    """A trajectory from a file, in the shape of the task's simulator where that is known before it has run."""
+    trajectory = read(path)
+    if task.on_host:
+        return trajectory
+    shape = simulator_shapes(task).trajectory
+    long = lambda lengths: [length for length in lengths if length != 1]
+    return trajectory.reshape(shape) if long(trajectory.shape) == long(shape) else trajectory
 
 
 def _read_csv(path: Path) -> np.ndarray:
-    rows = [line.strip() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    with path.open(newline="", encoding="utf-8-sig") as file:  # a byte-order mark is no part of the first cell
+        lines = [line for line in file if not line.startswith("#")]
+        rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(cell.strip() for cell in row)]
     if not rows:
         raise ValueError("expected at least one row of numbers, got none")
-    heading = [cell.strip().strip('"').lower() for cell in rows[0].split(",")]
-    has_heading = not all(_is_number(cell) for cell in heading)
-    table = np.array([[float(cell) for cell in row.split(",")] for row in rows[has_heading:]], np.float32)
-    return table[:, 1:] if has_heading and heading[0] in TIME_COLUMNS and table.shape[1] > 1 else table
+    numbers_in_first = [_is_number(cell) for cell in rows[0]]
+    has_heading = not any(numbers_in_first)
+    if not has_heading and not all(numbers_in_first):
+        raise ValueError(f"expected a row of headings or a row of numbers first, got {','.join(rows[0])!r}")
+    width = len(rows[0])
+    for number, row in enumerate(rows[has_heading:], start=1 + has_heading):
+        if len(row) != width or not all(map(_is_number, row)):
+            raise ValueError(f"expected {width} numbers in row {number}, got {','.join(row)!r}")
+    if has_heading and len(rows) == 1:
+        raise ValueError("expected at least one row of numbers, got headings only")
+    table = np.array([[float(cell) for cell in row] for row in rows[has_heading:]], np.float32)
+    return table[:, 1:] if has_heading and _is_time(rows[0][0]) and width > 1 else table
 
 
 def _read_npz(path: Path) -> np.ndarray:
     with np.load(path, allow_pickle=False) as arrays:
-        if "trajectory" in arrays:
-            return np.asarray(arrays["trajectory"], np.float32)
-        if len(arrays.files) == 1:
-            return np.asarray(arrays[arrays.files[0]], np.float32)
-        raise ValueError(f"expected an array called 'trajectory', got {arrays.files}")
+        if "trajectory" not in arrays and len(arrays.files) != 1:
+            raise ValueError(f"expected an array called 'trajectory', got {arrays.files}")
+        array = arrays["trajectory" if "trajectory" in arrays else arrays.files[0]]
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"expected real numbers, got an array of type {array.dtype}")
+    return np.asarray(array, np.float32)
+
+
+def _is_time(heading: str) -> bool:
+    return heading.partition("(")[0].partition("[")[0].strip().lower() in TIME_COLUMNS
 
 
 def _is_number(cell: str) -> bool:

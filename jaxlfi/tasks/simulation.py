@@ -1,10 +1,15 @@
 """Simulating a batch of parameters, with every failure counted by its reason."""
 
+import functools
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlfi.tasks.host import numpy_generator
 from jaxlfi.tasks.task import Task
 
 
@@ -13,11 +18,12 @@ class Simulations:
     """The simulations of one round, in the order of their attempt.
 
     Attributes:
-        theta: parameters in coordinates, shape [A, D].
+        theta: parameters in inference space, shape [A, D].
         x: summaries, shape [A, S]; zero where failed.
         failure: 0 for success, else the code of the reason (`Task.reasons`), shape [A].
         counted: which simulations count as attempted, shape [A]: those up to the last one needed.
         kept: which are added to the dataset, shape [A].
+        weight: of each in the loss, shape [A]: 1 for simulations drawn by the run itself.
     """
 
     theta: Float[Array, "*batch attempts dim"]
@@ -25,6 +31,7 @@ class Simulations:
     failure: Int[Array, "*batch attempts"]
     counted: Bool[Array, "*batch attempts"]
     kept: Bool[Array, "*batch attempts"]
+    weight: Float[Array, "*batch attempts"]
 
     @property
     def attempted(self) -> Int[Array, "*batch"]:
@@ -43,8 +50,8 @@ class Simulations:
 
 
 def trajectory_and_outcome(task: Task, key: jax.Array, theta: Float[Array, " dim"]) -> tuple[Array, Int[Array, ""]]:
-    """One simulation at coordinates theta: its trajectory and 0, or the code of the reason it failed for."""
-    result = task.simulate(key, task.to_natural(theta))
+    """One simulation at theta [D] in inference space: its trajectory and 0, or the code of the reason it failed for."""
+    result = task.simulate(key, task.space.to_natural(theta))
     trajectory, outcome = result if isinstance(result, tuple) else (result, jnp.asarray(0))
     return with_outcome(task, jnp.asarray(trajectory), jnp.asarray(outcome))
 
@@ -70,7 +77,7 @@ def summarised(task: Task, trajectory: Array, failure: Int[Array, ""]) -> tuple[
 def simulate(
     key: jax.Array, task: Task, theta: Float[Array, "attempts dim"]
 ) -> tuple[Float[Array, "attempts obs"], Int[Array, " attempts"]]:
-    """Simulate every row of theta: summaries [A, S] and failure codes [A]."""
+    """Simulate every row of theta inside a compiled program: summaries [A, S] and failure codes [A]."""
 
     def one(key, theta):
         return summarised(task, *trajectory_and_outcome(task, key, theta))
@@ -97,4 +104,72 @@ def within_budget(
     kept = success & (so_far <= simulations_per_round)
     # The attempt after the last needed success would not have been made.
     counted = so_far - success < simulations_per_round
-    return Simulations(theta=theta, x=x, failure=failure, counted=counted, kept=kept)
+    return Simulations(theta, x, failure, counted, kept, weight=jnp.ones(theta.shape[0]))
+
+
+def simulate_batch(
+    key: jax.Array, task: Task, theta: Float[Array, "n dim"], shape: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Simulate every row of theta outside of compiled programs, by a simulator in JAX or on the host.
+
+    Args:
+        key: consumed.
+        task: the task.
+        theta: in inference space, shape [N, D].
+        shape: of a trajectory.
+
+    Returns:
+        Trajectories [N, ...], summaries [N, S] (zero where failed) and failure codes [N], 0 for success.
+
+    Raises:
+        SimulatorError: from a host simulator that breaks its contract.
+    """
+    if task.on_host:
+        called = task.simulate.batch(key, np.asarray(task.space.to_natural(theta)), shape)
+        return jax.device_get(summarised_batch(task, *called))
+    return jax.device_get(_simulate_batch(task, jax.random.split(key, len(theta)), theta))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _simulate_batch(task: Task, keys: jax.Array, theta: Array):
+    return jax.vmap(lambda key, theta: _with_summary(task, *trajectory_and_outcome(task, key, theta)))(keys, theta)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def summarised_batch(task: Task, trajectories: Array, outcomes: Array) -> tuple[Array, Array, Array]:
+    """What a host simulator gave, as trajectories [N, ...], summaries [N, S] and failure codes [N]."""
+    return jax.vmap(lambda *one: _with_summary(task, *with_outcome(task, *one)))(trajectories, outcomes)
+
+
+def _with_summary(task: Task, trajectory: Array, failure: Array):
+    return trajectory, *summarised(task, trajectory, failure)
+
+
+def simulate_in_waves(
+    key: jax.Array, task: Task, theta: Float[Array, "attempts dim"], wanted: int, shape: Sequence[int]
+) -> Simulations:
+    """Simulate on the host, in the order of theta, until enough have succeeded or all are spent.
+
+    The simulator is called for as many parameter vectors as are wanted, then for as many as failed, and so on: nothing
+    is simulated that is not needed.
+
+    Args:
+        key: seeds the simulator's generator.
+        task: one whose simulator runs on the host.
+        theta: proposals in inference space, shape [A, D].
+        wanted: how many successes.
+        shape: of a trajectory.
+    """
+    natural = np.asarray(task.space.to_natural(theta))
+    budget = len(natural)
+    trajectories = np.zeros((budget, *shape), np.float32)
+    outcomes = np.full(budget, 1)  # what was not attempted is no success
+    rng = numpy_generator(key)
+    done, successes = 0, 0
+    while done < budget and successes < wanted:
+        wave = slice(done, min(budget, done + wanted - successes))
+        trajectories[wave], outcomes[wave] = task.simulate.batch(rng, natural[wave], shape)
+        _, x, failure = summarised_batch(task, trajectories, outcomes)
+        done = wave.stop
+        successes = int(np.sum(np.asarray(failure)[:done] == 0))
+    return within_budget(jnp.asarray(theta), x, failure, wanted)

@@ -1,6 +1,8 @@
 """Task: a simulator with its parameters named, bounded and, where known, observed."""
 
 import dataclasses
+import functools
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -8,26 +10,48 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support, check_within
-from jaxlfi.tasks.registry import summaries
+from jaxlfi.tasks import priors, summaries
+from jaxlfi.tasks.host import HostSimulator
 
 Simulate = Callable[..., Any]
+
+LABEL = re.compile(r"\w[\w .-]*")
+"""What a support may be called: it names folders of a comparison, where "+" joins it with a heuristic."""
+
+
+@dataclasses.dataclass(frozen=True)
+class InferenceView:
+    """What a task declares in natural units, in inference space.
+
+    Attributes:
+        feasible: Phi.
+        supports: boxes Theta_0 by name.
+        truth: theta_gt, shape [D], or None.
+        prior: `sample(seed=key, sample_shape=n)` and `log_prob` over inference space, or None for a uniform prior.
+    """
+
+    feasible: Support
+    supports: Mapping[str, Support]
+    truth: jax.Array | None
+    prior: Any
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Task:
     """A likelihood-free inference problem.
 
-    Everything about parameters is declared in natural units. Inference works in *coordinates*: the natural logarithm
-    for the parameters named in `log`, the parameter itself otherwise. After construction `supports`, `feasible` and
-    `truth` are in coordinates, and so is every theta inside the library; `to_natural` leads back.
+    Everything about parameters is declared in natural units. Inference works with the logarithms of the parameters
+    named in `log` and with the others as they are: `space` leads there and back, `inference` holds the declared boxes,
+    truth and prior there. Tasks of equal content are equal, so that a task that was made again (in a notebook's cell,
+    by `dataclasses.replace`) finds the programs compiled for the first one.
 
     Attributes:
         simulate: one simulation, `simulate(key, theta[D]) -> trajectory` or `-> (trajectory, outcome)`, in JAX and
             pure. `outcome` is a boolean (true: valid) or an integer (0: valid, i: failed for the reason
-            `failures[i - 1]`; any other integer counts as the first of them).
-            For a black box, `simulate(rng, theta[N, D])` with a `numpy.random.Generator` and N parameter vectors,
-            returning the same with a leading axis N.
+            `failures[i - 1]`; any other integer counts as the first of them). A simulator that JAX cannot trace is
+            wrapped in `jaxlfi.HostSimulator`.
         names: one name for each of the D parameters.
         supports: boxes Theta_0 by name; the first is the default. One that is wider than Phi, like the paper's
             "broadest", is allowed here and widens Phi for its own run.
@@ -38,29 +62,30 @@ class Task:
         truth: the parameters of the observation, where they are known, shape [D].
         observation: a fixed observed trajectory, where the task has one (real data).
         log: names of the parameters inferred as logarithms.
-        prior: a distrax distribution over coordinates to draw the first round from, instead of the uniform one over
-            the support; its draws are kept in the support like all others.
+        prior: a distrax distribution to draw the first round from, truncated to the support, instead of the uniform
+            one over it.
+        prior_space: whether the prior's variables are parameters in "natural" units or those of "inference" space: a
+            normal prior over the latter is log-normal in a log parameter.
         failures: names of the reasons for which a simulation can fail.
-        black_box: true for a Python or NumPy simulator that JAX cannot trace.
         summary_names: names of the summary's numbers, for plots; by default x_1 to x_S.
         channels: names of the columns of a trajectory, for plots.
         times: times of the rows of a trajectory, shape [T], for plots.
         record_label: what the rows of a trajectory are counted by, for plots; by default "time" where there are
             `times`, else "record".
-        settings: numbers of a run, by the names of `jaxlfi.bayessim.algorithm.Settings` and `jaxlfi.estimators.estimator.Estimator`, that
-            the command line takes for this task in place of the preset's.
+        settings: numbers of a run, by the names of `jaxlfi.Settings` and of its estimator's settings, that the command
+            line takes for this task in place of the preset's.
         hyperparameters: of heuristics, by the heuristic's name, that it takes in place of their defaults.
         name: what the task is called in files and figures.
 
     Raises:
         ValueError: for numbers of names, units and bounds that do not agree, reversed bounds, unknown names in `log`,
-            or bounds or a truth of a log parameter that are not positive.
+            bounds or a truth of a log parameter that are not positive, or a prior that is not one over D parameters.
 
     Example:
         >>> spring = Task(lambda key, theta: theta[:1] / theta[1:], names=("force", "stiffness"), units=("N", "N/m"),
         ...               supports={"guess": Support([1.0, 0.5], [2.0, 50.0])},
         ...               feasible=Support([0.1, 0.1], [10.0, 100.0]), log=("stiffness",))
-        >>> spring.coordinates
+        >>> spring.space.labels
         ('force', 'ln stiffness')
     """
 
@@ -74,8 +99,8 @@ class Task:
     observation: Any = None
     log: Sequence[str] = ()
     prior: Any = None
+    prior_space: SpaceName = "natural"
     failures: Sequence[str] = ("failed",)
-    black_box: bool = False
     summary_names: Sequence[str] = ()
     channels: Sequence[str] = ()
     times: Any = None
@@ -86,32 +111,40 @@ class Task:
 
     def __post_init__(self):
         store = lambda field, value: object.__setattr__(self, field, value)
-        names = tuple(self.names)
-        store("names", names)
+        for field in ("names", "log", "failures", "summary_names", "channels"):
+            value = getattr(self, field)
+            if isinstance(value, str):
+                raise ValueError(f"{field}: expected a sequence of names, got the string {value!r}")
+            store(field, tuple(value))
+        names = self.names
         store("units", tuple(self.units) if self.units is not None else ("",) * len(names))
-        store("failures", tuple(self.failures))
-        store("log", tuple(self.log))
-        store("summary_names", tuple(self.summary_names))
+        if not callable(self.simulate):
+            raise ValueError(f"simulate: expected a function, got {type(self.simulate).__name__}")
         if len(self.units) != len(names):
             raise ValueError(f"units: expected one for each of the {len(names)} parameters, got {len(self.units)}")
-        if len(set(names)) != len(names):
-            raise ValueError(f"names: expected distinct names, got {names}")
+        if len(set(names)) != len(names) or not names:
+            raise ValueError(f"names: expected at least one name, each once, got {names}")
         if unknown := set(self.log) - set(names):
             raise ValueError(f"log: expected names among {names}, got {sorted(unknown)}")
         if not self.supports:
             raise ValueError("supports: expected at least one named support, got none")
-        store("feasible", self._box_to_coordinates(self.feasible, "feasible"))
-        store(
-            "supports",
-            {label: self._box_to_coordinates(box, f"supports[{label!r}]") for label, box in self.supports.items()},
-        )
+        for label in self.supports:
+            if not LABEL.fullmatch(label):
+                raise ValueError(
+                    f"supports: expected names of letters, digits, '_', '.', '-' and spaces, got {label!r}"
+                )
+        for label, box in [("feasible", self.feasible), *self.supports.items()]:
+            self.check_box(box, label if box is self.feasible else f"supports[{label!r}]")
         if self.truth is not None:
             truth = _vector(self.truth, len(names), "truth")
-            if bool(np.any(np.asarray(truth)[self._is_log] <= 0)):
+            if bool(np.any(truth[np.asarray(self.space.log)] <= 0)):
                 raise ValueError(f"truth: expected positive values of the log parameters {self.log}, got {truth}")
-            store("truth", self.to_coordinates(truth))
+            store("truth", truth)
         if isinstance(self.summary, str):
             store("summary", summaries.named(self.summary))
+        if self.prior is not None:
+            priors.check_prior(self.prior, len(names))
+        is_natural(self.prior_space)
 
     @property
     def dim(self) -> int:
@@ -119,9 +152,26 @@ class Task:
         return len(self.names)
 
     @property
-    def coordinates(self) -> tuple[str, ...]:
-        """What theta is called inside the library: "ln name" for the parameters inferred as logarithms."""
-        return tuple(f"ln {name}" if name in self.log else name for name in self.names)
+    def on_host(self) -> bool:
+        """Whether the simulator runs outside of compiled programs (`jaxlfi.HostSimulator`)."""
+        return isinstance(self.simulate, HostSimulator)
+
+    @functools.cached_property
+    def space(self) -> Space:
+        """The map between natural units and inference space."""
+        return Space(self.names, tuple(name in self.log for name in self.names))
+
+    @functools.cached_property
+    def inference(self) -> InferenceView:
+        """Phi, supports, truth and prior in inference space."""
+        with jax.ensure_compile_time_eval():  # it is kept, so it must not be made of tracers
+            boxes = {label: self.space.box_to_inference(box) for label, box in self.supports.items()}
+            truth = None if self.truth is None else self.space.to_inference(jnp.asarray(self.truth))
+            feasible = self.space.box_to_inference(self.feasible)
+        prior = self.prior
+        if prior is not None and is_natural(self.prior_space) and any(self.space.log):
+            prior = priors.InferencePrior(prior, self.space)
+        return InferenceView(feasible, boxes, truth, prior)
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -140,45 +190,79 @@ class Task:
             )
         return self.summary_names or tuple(f"x_{i + 1}" for i in range(count))
 
-    @property
-    def _is_log(self) -> np.ndarray:
-        return np.array([name in self.log for name in self.names])
+    def support(self, choice: str | Support | None = None, space: SpaceName = "natural") -> Support:
+        """A box Theta_0 in inference space, checked.
 
-    def to_natural(self, theta: jax.Array) -> jax.Array:
-        """From inference coordinates to natural units, shape [..., D]."""
-        if not self.log:
-            return theta
-        return jnp.where(self._is_log, jnp.exp(jnp.where(self._is_log, theta, 0.0)), theta)
+        Args:
+            choice: a name among `supports`, None for the first of them, or a box of the reader's own.
+            space: in which the reader's own box is given.
 
-    def to_coordinates(self, theta: jax.Array) -> jax.Array:
-        """From natural units to inference coordinates, shape [..., D]."""
-        if not self.log:
-            return theta
-        return jnp.where(self._is_log, jnp.log(jnp.where(self._is_log, theta, 1.0)), theta)
-
-    def support(self, choice: str | Support | None = None) -> Support:
-        """A support by name, the default one for None, or the reader's own box (in coordinates), checked."""
+        Raises:
+            ValueError: for an unknown name, or a box that is reversed, not finite or outside of Phi.
+        """
         if isinstance(choice, Support):
-            return check_within(choice, self.feasible)
+            if is_natural(space):
+                self.check_box(choice, "support")
+                choice = self.space.box_to_inference(choice)
+            return check_within(choice, self.inference.feasible)
         if choice is None:
-            return next(iter(self.supports.values()))
-        if choice not in self.supports:
-            raise ValueError(f"support: expected one of {sorted(self.supports)}, got {choice!r}")
-        return self.supports[choice]
+            return next(iter(self.inference.supports.values()))
+        if not isinstance(choice, str) or choice not in self.supports:
+            raise ValueError(
+                f"support: expected one of {sorted(self.supports)} or a box such as jaxlfi.Support([...], [...]), "
+                f"got {choice!r}"
+            )
+        return self.inference.supports[choice]
 
-    def _box_to_coordinates(self, box: Support, label: str) -> Support:
+    def check_box(self, box: Support, label: str) -> None:
+        """Refuse a box in natural units that is reversed, not finite, of another dimension or has no logarithm.
+
+        Raises:
+            ValueError: naming the box by its label.
+        """
+        if not isinstance(box, Support):
+            raise ValueError(f"{label}: expected a jaxlfi.Support, got {type(box).__name__}")
         if box.dim != self.dim:
             raise ValueError(f"{label}: expected bounds for {self.dim} parameters, got {box.dim}")
         check_within(box, box, label)
-        if not self.log:
-            return box
-        if bool(np.any(np.asarray(box.low)[self._is_log] <= 0)):
+        if bool(np.any(np.asarray(box.low)[np.asarray(self.space.log)] <= 0)):
             raise ValueError(f"{label}: expected positive bounds for the log parameters {self.log}, got {box.low}")
-        return Support(self.to_coordinates(box.low), self.to_coordinates(box.high))
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all fields are the same, arrays by their values and functions by identity."""
+        if self is other:
+            return True
+        if not isinstance(other, Task):
+            return NotImplemented
+        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self))
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.names, self.log, self.failures))
 
 
-def _vector(value: Any, length: int, name: str) -> jax.Array:
-    vector = jnp.asarray(value, jnp.float32)
-    if vector.shape != (length,):
-        raise ValueError(f"{name}: expected {length} numbers, got shape {vector.shape}")
+def _same(a: Any, b: Any) -> bool:
+    """Whether two values of a field are the same."""
+    if a is b:
+        return True
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, Mapping):
+        return list(a) == list(b) and all(_same(a[name], b[name]) for name in a)
+    if isinstance(a, functools.partial):
+        return a.func == b.func and _same(a.args, b.args) and _same(a.keywords, b.keywords)
+    if isinstance(a, tuple | list):
+        return len(a) == len(b) and all(map(_same, a, b))
+    if isinstance(a, np.ndarray | jax.Array):
+        return a.shape == b.shape and a.dtype == b.dtype and np.array_equal(np.asarray(a), np.asarray(b))
+    leaves, structure = jax.tree.flatten(a)
+    others, other_structure = jax.tree.flatten(b)
+    if len(leaves) == 1 and leaves[0] is a:
+        return bool(a == b)
+    return structure == other_structure and all(map(_same, leaves, others))
+
+
+def _vector(value: Any, length: int, name: str) -> np.ndarray:
+    vector = np.asarray(value, np.float32)
+    if vector.shape != (length,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name}: expected {length} finite numbers, got shape {vector.shape}")
     return vector

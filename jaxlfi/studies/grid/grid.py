@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -14,21 +14,9 @@ from jaxlfi.bayessim.batch import Lane
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.distributions.support import Support
-from jaxlfi.heuristics import Heuristic, Matched
+from jaxlfi.heuristics import Heuristic, registry
 from jaxlfi.runs.inference import check_heuristic, observe
 from jaxlfi.tasks.task import Task
-
-RANGES = {
-    "zone_fraction": (0.0, 1.0),
-    "zone_width": (0.0, math.inf),
-    "tail": (0.0, 1.0),
-    "mass_threshold": (0.0, 1.0),
-    "expansion": (0.0, math.inf),
-    "shift_threshold": (0.0, math.inf),
-    "proximity": (0.0, 1.0),
-    "quantile": (0.0, float(np.nextafter(np.float32(0.5), np.float32(0)))),
-}
-"""What each hyperparameter can be, bounds included: fractions and masses lie in [0, 1], lengths are not negative."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,8 +103,7 @@ def _parse_axis(text: str) -> Axis:
 
 def hyperparameters(rule: Heuristic) -> dict[str, Any]:
     """A heuristic's hyperparameters and their default values, which are the paper's."""
-    kind = type(rule.rule if isinstance(rule, Matched) else rule)
-    return {field.name: field.default for field in dataclasses.fields(kind)}
+    return {name: field.default for name, field in registry.hyperparameters(rule).items() if not field.static}
 
 
 def check_axes(rule: Heuristic, axes: Sequence[Axis]) -> None:
@@ -138,9 +125,9 @@ def check_axes(rule: Heuristic, axes: Sequence[Axis]) -> None:
         shown = ",".join(f"{value:g}" for value in axis.values)
         if len(set(np.float32(axis.values).tolist())) < max(len(axis.values), 1):  # lanes hold single precision
             raise ValueError(f"{axis.name}: expected at least one value, each once, got {shown or 'none'}")
-        low, high = RANGES.get(axis.name, (-math.inf, math.inf))
-        if not all(math.isfinite(value) and low <= value <= high for value in axis.values):
-            raise ValueError(f"{axis.name}: expected finite numbers in [{low:g}, {high:g}], got {shown}")
+        info = registry.hyperparameters(rule)[axis.name].info
+        if not np.isfinite(axis.values).all() or not info.contains(axis.values):
+            raise ValueError(f"{axis.name}: expected finite numbers in {info.interval}, got {shown}")
 
 
 def combinations(axes: Sequence[Axis]) -> list[dict[str, float]]:
@@ -162,13 +149,7 @@ def heuristics(rule: Heuristic, axes: Sequence[Axis]) -> list[Heuristic]:
         >>> [edge.tail for edge in heuristics(Edge(), [Axis("tail", (0.0, 1.0))])]
         [0.0, 1.0]
     """
-    return [_with_values(rule, values) for values in combinations(axes)]
-
-
-def _with_values(rule: Heuristic, values: Mapping[str, float]) -> Heuristic:
-    if isinstance(rule, Matched):
-        return Matched(dataclasses.replace(rule.rule, **values))
-    return dataclasses.replace(rule, **values)
+    return [registry.replaced(rule, values) for values in combinations(axes)]
 
 
 def grid_lanes(grid: Grid) -> list[Lane]:
