@@ -40,11 +40,16 @@ _HOMES = {
     "with_tails": "jaxlfi.tasks.priors",
 }
 
+_MODULES = ("plot",)
+"""Modules that are found as `jaxlfi.NAME` without an import of their own."""
+
 __all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str):
     """Load a public name from the module it lives in."""
+    if name in _MODULES:
+        return importlib.import_module(f"jaxlfi.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'jaxlfi' has no attribute {name!r}")
     value = getattr(importlib.import_module(_HOMES[name]), name)
@@ -53,4 +58,4 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted({*globals(), *__all__, *_MODULES})

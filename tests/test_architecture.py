@@ -85,6 +85,18 @@ def test_heuristics_see_beliefs_and_no_network(path):
     assert not {name for name in imported(path) if within(name, "flax.linen") or within(name, "optax")}
 
 
+FIGURES_READ = ("jaxlfi.figures",)
+"""What of jaxlfi figures may import: one another. They read config.json and .npz files themselves, with NumPy."""
+
+
+@pytest.mark.parametrize("path", files("jaxlfi/figures"), ids=identify)
+def test_figures_know_no_task(path):
+    """A figure is a function of saved arrays: no task, simulator or network, and no JAX to bring one in."""
+    own = {name for name in imported(path) if within(name, "jaxlfi")} - {"jaxlfi"}
+    assert not {name for name in own if not any(within(name, module) for module in FIGURES_READ)}
+    assert not {name for name in imported(path) for library in ("jax", "flax", "envs") if within(name, library)}
+
+
 @everywhere
 def test_who_may_import_which_library(path):
     """Plots are drawn by jaxlfi.figures, physics is envs.whip's; experiments may do both."""
