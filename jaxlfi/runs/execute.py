@@ -330,6 +330,6 @@ def results(plan: BatchPlan, runs: Sequence[Run]) -> list[dict[str, Any]]:
     return lines
 
 
-def any_round(folder: Path) -> bool:
-    """Whether a round was done."""
-    return Checkpoint(folder).rounds_done() > 0
+def rounds_done(folder: Path) -> int:
+    """How many rounds a folder has behind it."""
+    return Checkpoint(folder).rounds_done()
