@@ -190,7 +190,9 @@ def parser(heuristics: flags.Families | None = None) -> argparse.ArgumentParser:
     grid.add_argument(
         "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
     )
-    grid.add_argument("--heuristic", default="edge", metavar="NAME", help=_heuristic_help("whose hyperparameters vary", heuristics))
+    grid.add_argument(
+        "--heuristic", default="edge", metavar="NAME", help=_heuristic_help("whose hyperparameters vary", heuristics)
+    )
     grid.add_argument(
         "--lanes-per-chunk",
         type=int,

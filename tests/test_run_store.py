@@ -13,7 +13,7 @@ from envs import lotka_volterra, lynx_hare, mg1
 from jaxlfi import atomic, bayessim, run_store
 from jaxlfi.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.describe import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json
-from jaxlfi.heuristics import Centre, Edge, Fixed, Matched, Mode
+from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
 from jaxlfi.history import posterior_draws
 from jaxlfi.inference import observe
 from jaxlfi.posterior import draws_within
@@ -196,6 +196,7 @@ def test_settings_survive_their_description(preset):
         Edge(),
         Edge(expansion=np.array([0.1, 0.3], np.float32)),
         Matched(Mode(proximity=0.3)),
+        Choice(1, (Edge(), Matched(Mode()), Centre())),
         Centre(),
     ],
 )
