@@ -19,6 +19,7 @@ from jaxlfi.fields import Checked, hyperparameter, option
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate, registry
 from jaxlfi.presets import PRESETS
 from jaxlfi.support import Support
+from tests import small
 
 OWN = {"centre": Centre, "edge": Edge, "mode": Mode, "none": Fixed, "truncate": Truncate}
 
@@ -466,3 +467,11 @@ def test_settings_hold_their_estimator_by_name(preset):
 
 def test_name_of_a_class_leads_back_to_it():
     assert plugins.named("class", plugins.name_of("jaxlfi.heuristics", jaxlfi.Support)) is jaxlfi.Support
+
+
+def test_a_run_with_a_choice_is_saved_and_says_what_it_was_run_with(tmp_path):
+    rule = Choice(1, (Edge(), Matched(Mode(expansion=np.array([0.1, 0.3], np.float32))), Truncate()))
+    run = jaxlfi.infer(jax.random.key(0), small.gaussian(), heuristic=rule, settings=small.settings(rounds=1))
+    config = json.loads((run.save(tmp_path / "run") / "config.json").read_text())
+    assert identical(describe.heuristic_from_json(config["heuristic"]), rule)
+    assert identical(describe.settings_from_json(config["settings"]), small.settings(rounds=1))
