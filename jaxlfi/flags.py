@@ -21,7 +21,7 @@ WIDTH = 120
 def add(group: argparse._ArgumentGroup, families: Families, into: str, several: bool = False) -> None:
     """Add a flag for every field, one for all classes that have a field of that name.
 
-    A flag that the parser has already, for something else, begins with `into` without its last letter:
+    Where the parser already has a flag of that name, the new one begins with the singular of `into`:
     `--hyperparameter-steps`.
 
     Args:
@@ -56,7 +56,7 @@ def by_field(families: Families) -> dict[str, dict[str, Declared]]:
 def glossary(families: Families) -> str:
     """A line for every field that has a symbol."""
     lines = [
-        f"  {name:<15} {next(iter(owners.values())).info.symbol}, {_told(owners)}"
+        f"  {name:<15} {next(iter(owners.values())).info.symbol}, {_described(owners)}"
         for name, owners in by_field(families).items()
         if all(field.info.symbol for field in owners.values())
     ]
@@ -106,10 +106,10 @@ def _help(owners: Mapping[str, Declared]) -> str:
         facts.append(f"default: {next(iter(defaults.values()))}")
     else:
         facts.append("default: " + ", ".join(f"{value} ({family})" for family, value in defaults.items()))
-    return f"{_told(owners, always=True)} ({'; '.join(facts)})".replace("%", "%%")
+    return f"{_described(owners, always=True)} ({'; '.join(facts)})".replace("%", "%%")
 
 
-def _told(owners: Mapping[str, Declared], always: bool = False) -> str:
+def _described(owners: Mapping[str, Declared], always: bool = False) -> str:
     """The help texts, each after the classes that it is of; without these where there is one text, unless `always`."""
     texts: dict[str, list[str]] = {}
     for family, field in owners.items():

@@ -1,5 +1,6 @@
 """Declared fields: what they refuse, what the source shows of them without being run, and rules of other packages."""
 
+import argparse
 import dataclasses
 import json
 import math
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import cli, describe, fields, plugins, source_fields
+from jaxlfi import cli, describe, fields, flags, plugins, source_fields
 from jaxlfi.estimator import Estimator
 from jaxlfi.fields import Checked, hyperparameter, option
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate, registry
@@ -295,6 +296,19 @@ def test_flags_that_the_source_does_not_show_work_all_the_same(path):
     )
     del sys.modules["hidden.rule"]
     assert cli.parse(words).hyperparameters == {"gain": [0.25]}
+
+
+def test_flags_read_values_of_the_type_of_the_default():
+    parser = argparse.ArgumentParser()
+    families = {"everything": fields.declared(Everything)}
+    flags.add(parser.add_argument_group("all"), families, into="settings")
+    words = "--rate 0.5 --norm inf --count 5 --layers 3 4 --switch no --kind b --word no --fraction 0".split()
+    given = parser.parse_args(words).settings
+    expected = Everything(
+        rate=0.5, norm=math.inf, count=5, layers=(3, 4), switch=False, kind="b", word="no", fraction=0.0
+    )  # fmt: skip
+    assert identical(Everything(**given | {"layers": tuple(given["layers"])}), expected)
+    assert "everything: whether (default: yes)" in " ".join(parser.format_help().split())
 
 
 @pytest.mark.parametrize(
