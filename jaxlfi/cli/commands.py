@@ -516,3 +516,16 @@ def _say(console: Console, text: str) -> None:
 
 def _warn(console: Console, text: str) -> None:
     console.print(escape(f"warning: {text}"), style="yellow", soft_wrap=True, highlight=False)
+
+
+COMMANDS = {
+    "tasks": tasks,
+    "infer": infer,
+    "compare": compare,
+    "grid": grid_command,
+    "resume": resume,
+    "sample": sample,
+    "diagnose": diagnose,
+    "report": report,
+}
+"""What prepares or does a command, by its name."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxlfi.figures import statistics
 from jaxlfi.figures.collection import Collection
+from jaxlfi.figures.history import heuristic_name
 from jaxlfi.figures.style import Look, looks, unit_label
 
 
@@ -101,7 +102,7 @@ def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
         config: the grid's config.json.
         pictures: in their order on the page.
     """
-    heuristic = config["heuristic"]["name"]
+    heuristic = heuristic_name(config["heuristic"])
     title = f"{_short(config['task'])}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
     varied = [f"{axis['name']}: {', '.join(f'{v:g}' for v in axis['values'])}" for axis in config["axes"]]
     facts = {
