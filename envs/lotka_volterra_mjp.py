@@ -35,7 +35,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Key
 
 from jaxlfi import counter_rng
-from jaxlfi.tasks.registry import summaries
+from jaxlfi.tasks import summaries
 
 SUCCESS = 0
 TOO_MANY_EVENTS = 1

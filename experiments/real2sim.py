@@ -24,7 +24,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs.whip.episode import OBSERVATION
-from jaxlfi.cli.parser import parser as cli
+from jaxlfi.cli import parser as cli
 from jaxlfi.figures import History, open_collection, samples, style
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import folder as run_store

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from jaxlfi.figures import style
 from jaxlfi.io import files as atomic
-from jaxlfi.tasks.registry import registry as tasks
+from jaxlfi.tasks import registry as tasks
 from jaxlfi.tasks.task import Task
 
 SEEDS = 3

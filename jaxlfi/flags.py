@@ -68,13 +68,13 @@ def glossary(families: Families) -> str:
 class _Collect(argparse.Action):
     """Put the value into a dictionary of the arguments, under the field's name."""
 
-    def __init__(self, *args: Any, into: str, **kwargs: Any):
+    def __init__(self, *args: Any, into: str, kind: Callable[[Any], Any] = lambda values: values, **kwargs: Any):
         super().__init__(*args, default=argparse.SUPPRESS, **kwargs)
-        self.into = into
+        self.into, self.kind = into, kind
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
         collected = getattr(namespace, self.into, None) or {}
-        setattr(namespace, self.into, collected | {self.dest: values})
+        setattr(namespace, self.into, collected | {self.dest: self.kind(values)})
 
 
 class _Switch(_Collect):
@@ -95,7 +95,7 @@ def _reading(field: Declared, several: bool) -> dict[str, Any]:
         return reading | ({"nargs": "+"} if several else {})
     example = field.default[0] if isinstance(field.default, tuple) and field.default else field.default
     reading = {"type": _reader(example), "metavar": {bool: "yes|no", int: "N", float: "X"}.get(type(example), "NAME")}
-    return reading | ({"nargs": "+"} if isinstance(field.default, tuple) else {})
+    return reading | ({"nargs": "+", "kind": tuple} if isinstance(field.default, tuple) else {})
 
 
 def _reader(example: Any) -> Callable[[str], Any]:

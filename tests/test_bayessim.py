@@ -12,7 +12,7 @@ from scipy import stats
 
 from envs import gaussian_linear
 from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.diagnostics import bound_warnings, edge_mass
 from jaxlfi.distributions.belief import Belief, rejected
 from jaxlfi.distributions.mixture import GaussianMixture

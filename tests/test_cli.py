@@ -14,13 +14,13 @@ import pytest
 
 import jaxlfi
 from jaxlfi.io import files as atomic
-from jaxlfi.cli.parser import parser as cli
-from jaxlfi.cli.parser import commands
-from jaxlfi.tasks.registry import observation
+from jaxlfi.cli import parser as cli
+from jaxlfi.cli import commands
+from jaxlfi.tasks import observation
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs import session
 from jaxlfi.studies import grid as sweep
-from jaxlfi.tasks.registry import registry as tasks
+from jaxlfi.tasks import registry as tasks
 from jaxlfi.bayessim.algorithm import Settings
 from jaxlfi.estimators.estimator import Estimator
 from jaxlfi.heuristics import Mode, registry

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxlfi.bayessim.algorithm import host as black_box
+from jaxlfi.bayessim import host as black_box
 from jaxlfi.diagnostics import bound_warnings, discrepancy, edge_mass, trajectory_distance
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from envs.lotka_volterra_mjp import lotka_volterra_nine
 from envs.lotka_volterra_ode import NOISES, gaussian_noise, lognormal_noise, populations, task
-from jaxlfi.tasks.registry import registry as tasks
+from jaxlfi.tasks import registry as tasks
 from jaxlfi.tasks.simulation import simulate
 
 RATES = [(0.01, 0.1, 0.1, 0.02), (0.03, 0.15, 0.12, 0.011), (0.004, 0.31, 0.22, 0.006)]

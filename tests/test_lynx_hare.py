@@ -16,7 +16,7 @@ from scipy import stats
 from envs import lynx_hare
 from envs.lotka_volterra_ode import populations
 from envs.lynx_hare import Nuisance
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.distributions.belief import rejected

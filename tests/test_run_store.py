@@ -11,7 +11,7 @@ import pytest
 
 from envs import lotka_volterra, lynx_hare, mg1
 from jaxlfi.io import files as atomic
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.io.serialise import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json

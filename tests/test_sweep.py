@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 
 from envs import gaussian_linear
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.diagnostics import discrepancy
 from jaxlfi.heuristics import Centre, Edge, Matched, Mode

@@ -23,7 +23,7 @@ from envs.whip.real2sim import CHANNELS, DATA, NUISANCES, recorded, task, whip_t
 from envs.whip.rollout import trajectory
 from envs.whip.scene import Scene
 from jaxlfi.distributions.support import check_within
-from jaxlfi.tasks.registry import registry as tasks
+from jaxlfi.tasks import registry as tasks
 from jaxlfi.tasks.simulation import trajectory_and_outcome
 from tests.small import SETTINGS, command
 

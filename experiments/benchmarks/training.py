@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.lotka_volterra import task as lotka_volterra
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.presets import PRESETS
 from jaxlfi.estimators import dataset
 from jaxlfi.estimators.estimator import Estimator, Network, initialise
@@ -204,7 +204,7 @@ from jaxlfi.io import compile_cache
 compile_cache.enable()
 import jax, jax.numpy as jnp
 from envs.lotka_volterra import task as factory
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.heuristics import Edge
 from jaxlfi.bayessim.presets import QUICK
 task = factory()

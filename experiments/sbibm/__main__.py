@@ -22,7 +22,7 @@ from rich.console import Console
 from experiments.sbibm.c2st import c2st
 from experiments.sbibm.tasks import TASKS, observation, reference
 from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.presets import FLOW, METHODS
 from jaxlfi.distributions.belief import rejected
 from jaxlfi.estimators.posterior import draws_within

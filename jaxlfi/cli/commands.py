@@ -19,7 +19,7 @@ from jaxlfi import diagnostics
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.diagnostics.bounds import bound_warnings
+from jaxlfi.diagnostics.bounds import bound_summary
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import TRIES
 from jaxlfi.estimators import registry as estimators
@@ -318,7 +318,7 @@ def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
         own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
         if not own[0].heuristic.grows:
             beliefs = [run.belief for run in own]
-            found = bound_warnings(plan.task.space.labels, beliefs, own[0].feasible)
+            found = bound_summary(plan.task.space.labels, beliefs, own[0].feasible)
             warnings += [f"{configuration}: {text}" for text in found]
     return warnings
 
