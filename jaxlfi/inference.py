@@ -32,7 +32,7 @@ from jaxlfi.task import Task
 
 
 class SupportWarning(UserWarning):
-    """Posterior mass is piled on a bound of a support that cannot grow."""
+    """The posterior lies beyond a bound of a support that cannot grow."""
 
 
 @struct.dataclass
@@ -70,8 +70,8 @@ class Run:
 
     @property
     def warnings(self) -> list[str]:
-        """In words, where posterior mass is piled on a bound of the last support, and what to do."""
-        return bound_warnings(self.task, self.belief)
+        """In words, which bounds of the last support the posterior lies beyond, and what to do."""
+        return bound_warnings(self.task.coordinates, self.belief, self.task.feasible)
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` draws of the posterior inside the support, in coordinates (`task.to_natural` leads back).

@@ -12,9 +12,10 @@ from rich.console import Console
 
 from jaxlfi import atomic, describe, run_store, tasks
 from jaxlfi.bayessim import Settings, State
+from jaxlfi.belief import Belief
 from jaxlfi.black_box import BlackBoxEngine
 from jaxlfi.checkpoint import Checkpoint
-from jaxlfi.diagnostics import bound_warnings, edge_mass
+from jaxlfi.diagnostics import bound_summary
 from jaxlfi.heuristics import Fixed, Truncate
 from jaxlfi.history import apart, posterior_draws
 from jaxlfi.inference import observe, refuse_hopeless
@@ -23,9 +24,6 @@ from jaxlfi.lanes import Inputs, Lane, LaneEngine, diagnose_key, stack_inputs
 from jaxlfi.progress import RoundProgress
 from jaxlfi.sampling import network_arrays
 from jaxlfi.task import Task
-
-WARNING_MASS = 0.2
-"""Mass in a tenth of the width along a bound that is worth a warning: twice what a uniform posterior has."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -274,30 +272,14 @@ def results(folder: Path, plan: Plan) -> list[dict[str, Any]]:
 
 
 def support_warnings(folder: Path, plan: Plan) -> Iterator[str]:
-    """In words, where runs whose support cannot grow ended with posterior mass piled on a bound.
+    """In words, which bounds the posterior lies beyond in the runs whose support cannot grow.
 
-    One run is told of in full; of several, in how many of them.
+    A single run of a configuration is described in full; of several, the text says in how many of them.
     """
-    beliefs = [run_store.read_belief(folder / name) for name in plan.folders()]
-    runs = list(zip(plan.lanes, beliefs, strict=True))
-    fixed = [(lane, belief) for lane, belief in runs if isinstance(lane.heuristic, Fixed | Truncate)]
-    for configuration in dict.fromkeys(lane.configuration for lane, _ in fixed):
-        own = [belief for lane, belief in fixed if lane.configuration == configuration]
-        if len(own) == 1:
-            yield from (f"{configuration}: {text}" for text in bound_warnings(plan.task, own[0], WARNING_MASS))
-            continue
-        masses = np.stack([np.stack(_edge_mass(belief)) for belief in own])  # [seed, side, D]
-        bounds = own[0].support.low, own[0].support.high
-        places = [
-            f"{plan.task.coordinates[d]} {('lower', 'upper')[side]} {float(bounds[side][d]):.4g} "
-            f"({np.sum(masses[:, side, d] > WARNING_MASS)} of {len(own)} seeds)"
-            for side, d in np.argwhere(np.any(masses > WARNING_MASS, axis=0))
-        ]
-        if places:
-            yield (
-                f"{configuration}: more than {WARNING_MASS} of the posterior mass lies along a bound: "
-                f"{', '.join(places)}. Widen the support there, or adapt it with --heuristic edge."
-            )
-
-
-_edge_mass = jax.jit(edge_mass)
+    fixed: dict[str, list[Belief]] = {}
+    for lane, name in zip(plan.lanes, plan.folders(), strict=True):
+        if isinstance(lane.heuristic, Fixed | Truncate):
+            fixed.setdefault(lane.configuration, []).append(run_store.read_belief(folder / name))
+    for configuration, beliefs in fixed.items():
+        texts = bound_summary(plan.task.coordinates, beliefs, plan.task.feasible)
+        yield from (f"{configuration}: {text}" for text in texts)

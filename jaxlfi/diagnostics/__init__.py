@@ -1,5 +1,6 @@
-"""Diagnostics: how far a posterior is from the truth, whether it is calibrated, and where it piles up on a bound."""
+"""Diagnostics: how far a posterior is from the truth, whether it is calibrated, and whether a bound looks wrong."""
 
+from jaxlfi.diagnostics.bounds import MASS_BEYOND, bound_evidence, bound_summary, bound_warnings, edge_mass
 from jaxlfi.diagnostics.c2st import c2st
 from jaxlfi.diagnostics.calibration import (
     OK,
@@ -18,14 +19,13 @@ from jaxlfi.diagnostics.calibration import (
 from jaxlfi.diagnostics.discrepancy import (
     POSTERIOR_SAMPLES,
     Discrepancy,
-    bound_warnings,
     discrepancy,
-    edge_mass,
     trajectory_distance,
 )
 from jaxlfi.diagnostics.predictive import PredictiveCheck, predictive_check
 
 __all__ = [
+    "MASS_BEYOND",
     "OK",
     "POSTERIOR_SAMPLES",
     "SIGNIFICANCE",
@@ -33,6 +33,8 @@ __all__ = [
     "Histogram",
     "PredictiveCheck",
     "Uniformity",
+    "bound_evidence",
+    "bound_summary",
     "bound_warnings",
     "c2st",
     "coverage_verdict",
