@@ -127,12 +127,18 @@ def test_a_posterior_along_a_bound_that_falls_towards_it_does_not_warn(at):
 
 
 def test_a_few_components_beyond_are_outvoted():
-    """Of ten components, two lie beyond the upper bound: a fifth of the mass, which is below the threshold."""
-    means = [[2.0, 2.0]] * 8 + [[5.0, 2.0]] * 2
+    """Of ten components, one lies beyond the upper bound: a tenth of the mass, which is below the threshold."""
+    means = [[2.0, 2.0]] * 9 + [[5.0, 2.0]]
     belief = believed(means, np.full((10, 2), 0.1))
-    np.testing.assert_allclose(evidence(belief)[1][0], 0.2, atol=1e-3)
+    np.testing.assert_allclose(evidence(belief)[1][0], 0.1, atol=1e-3)
     assert warnings(belief) == []
-    assert len(warnings(belief, threshold=0.15)) == 1
+    assert len(warnings(belief, threshold=0.05)) == 1
+
+
+def test_one_network_of_four_beyond_is_enough():
+    """It sees no way to explain the observation from inside."""
+    (warning,) = warnings(believed([[2.0, 2.0]] * 3 + [[5.0, 2.0]], np.full((4, 2), 0.1)))
+    assert warning.startswith("mass: 0.25 of the posterior mass lies beyond the upper bound 4")
 
 
 def test_a_marginal_that_fills_the_box_and_ends_with_it_does_not_warn():
