@@ -1,4 +1,4 @@
-"""The study of wrong bounds: which are wrong, what is counted, and that its saved table follows from its saved arrays."""
+"""The study of wrong bounds: which are wrong, what is counted, and that its table follows from its saved arrays."""
 
 import json
 

@@ -18,9 +18,9 @@ from jaxlfi.support import Support
 MASS_BEYOND = 0.2
 """Marginal posterior mass beyond a bound above which a warning names it.
 
-On a wrong support the networks of an ensemble extrapolate to places of their own, each with little width: the mass beyond
-is near a multiple of 1 / ensemble size. This is enough for one network of the usual four. Hits and false alarms of this
-number and others: experiments/README.md.
+On a wrong support the networks of an ensemble extrapolate, each to a place of its own and with little width, so that
+the mass beyond is near a multiple of 1 / ensemble size: this is enough for one of the usual four. Hits and false alarms
+of this number and of others: experiments/README.md.
 """
 
 SIDES = ("lower", "upper")
