@@ -206,10 +206,10 @@ def test_a_seed_has_one_observation_in_all_configurations(comparison):
     assert not np.array_equal(seen[0], seen[2])
 
 
-def test_compare_tells_of_mass_on_the_bounds_of_fixed_supports(comparison):
+def test_compare_warns_of_posteriors_beyond_the_bounds_of_fixed_supports(comparison):
     plan = session.plan_of(run_store.read_config(comparison))
     told = list(session.support_warnings(comparison, plan))
-    assert any(text.startswith("misspecified:") and "first upper 0 (2 of 2 seeds)" in text for text in told)
+    assert any(text.startswith("misspecified:") and "first upper 0 (2 of 2 runs" in text for text in told)
     assert not any(text.startswith("misspecified+edge") for text in told)
 
 
