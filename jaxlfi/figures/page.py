@@ -105,7 +105,8 @@ def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
         pictures: in their order on the page.
     """
     heuristic = heuristic_name(config["heuristic"])
-    title = f"{_short(config['task'] or config['task_name'])}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
+    task = _short(config["task"] or config["task_name"])
+    title = f"{task}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
     varied = [f"{axis['name']}: {', '.join(f'{v:g}' for v in axis['values'])}" for axis in config["axes"]]
     facts = {
         "Hyperparameters": "; ".join(varied),

@@ -128,8 +128,8 @@ def _require_memory(plan: BatchPlan, given: Observed) -> None:
     needed, free = len(plan.specs) * state_bytes(state), budget() * jax.local_device_count()
     if needed > free:
         raise ValueError(
-            f"settings: expected runs that fit into the memory, got {len(plan.specs)} of {needed / 2**30:.3g} GiB in all, "
-            f"where {free / 2**30:.3g} GiB are free: lower simulations_per_round, rounds, seeds or the network's size"
+            f"settings: expected runs that fit into the memory, got {len(plan.specs)} of "
+            f"{needed / 2**30:.3g} GiB in all, where {free / 2**30:.3g} GiB are free: lower simulations_per_round, rounds, seeds or the network's size"
         )
 
 
