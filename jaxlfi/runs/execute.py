@@ -129,7 +129,8 @@ def _require_memory(plan: BatchPlan, given: Observed) -> None:
     if needed > free:
         raise ValueError(
             f"settings: expected runs that fit into the memory, got {len(plan.specs)} of "
-            f"{needed / 2**30:.3g} GiB in all, where {free / 2**30:.3g} GiB are free: lower simulations_per_round, rounds, seeds or the network's size"
+            f"{needed / 2**30:.3g} GiB in all, where {free / 2**30:.3g} GiB are free: lower simulations_per_round, rounds, "
+            "seeds or the network's size"
         )
 
 
