@@ -304,8 +304,8 @@ def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
         if broken:
             steps = int(np.max([np.max(run.history["nonfinite"]) for run in own]))
             warnings.append(
-                f"{configuration}: up to {steps} gradient steps of a round were not finite and were left out, in {broken} "
-                f"of {len(own)} runs: lower learning_rate ({settings.learning_rate:g}) or clip_norm "
+                f"{configuration}: up to {steps} gradient steps of a round were not finite and were left out, in "
+                f"{broken} of {len(own)} runs: lower learning_rate ({settings.learning_rate:g}) or clip_norm "
                 f"({settings.clip_norm:g})."
             )
     return warnings

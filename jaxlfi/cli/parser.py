@@ -204,8 +204,8 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
         "--simulations",
         type=Path,
         metavar="FILE",
-        help="an .npz of simulations made before, in place of the first round's: theta [N, D] in natural units, trajectory "
-        "[N, ...] or summaries x [N, S], and where they were not drawn uniformly log_density [N]",
+        help="an .npz of simulations made before, in place of the first round's: theta [N, D] in natural units, "
+        "trajectory [N, ...] or summaries x [N, S], and where they were not drawn uniformly log_density [N]",
     )
     infer.add_argument(
         "--heuristic",

@@ -28,8 +28,8 @@ MAP_RATE = 0.02
 class Posterior:
     """What an observation says of the parameters: a density on a box. A pytree.
 
-    It is always the density truncated to the support. Draws are rejected until they lie inside, never moved there; where
-    next to no mass is inside, they are those of the mixture, truncated (`truncated_mixture_draws`).
+    It is always the density truncated to the support. Draws are rejected until they lie inside, never moved there;
+    where next to no mass is inside, they are those of the mixture, truncated (`truncated_mixture_draws`).
     Arguments and results are in natural units, or in inference space (logarithms of log parameters) where
     `space="inference"` is passed.
 

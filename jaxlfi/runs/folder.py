@@ -74,9 +74,9 @@ def versions() -> dict[str, str]:
 
 
 def command_line(argv: Sequence[str]) -> str:
-    """A command as its results tell of it: without the folders of the machine it ran on.
+    """A command as it is recorded with its results: without the folders of the machine it ran on.
 
-    An absolute path is told from the working folder on where it lies below it, and by its name alone elsewhere.
+    An absolute path is written relative to the working folder where it lies below it, and by its name alone elsewhere.
 
     Example:
         >>> command_line(["/usr/bin/jaxlfi", "report", "/elsewhere/runs/edge"])
@@ -95,7 +95,7 @@ def command_line(argv: Sequence[str]) -> str:
 
 
 def processor() -> str:
-    """The processor's name as the system tells it."""
+    """The processor's name as the system reports it."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text().splitlines():
@@ -110,6 +110,8 @@ def refuse_occupied(folder: Path) -> None:
     Raises:
         StoreError: if the folder exists and is not empty, or is a file.
     """
+    if folder.is_symlink() and not folder.exists():
+        raise StoreError(f"out: expected a new folder, got {str(folder)!r}, a link that leads nowhere")
     if not folder.exists():
         return
     if not folder.is_dir() or any(folder.iterdir()):
