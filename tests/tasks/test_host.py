@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -83,7 +84,7 @@ def test_parameters_reach_it_in_natural_units():
 
     box = Support([0.5, -3.0], [3.0, 3.0])
     task = hosted(simulate, supports={"ok": box}, feasible=box, log=("first",))
-    inner = np.array([[0.0, 1.0], [1.0, 2.0]], np.float32)
+    inner = jnp.array([[0.0, 1.0], [1.0, 2.0]])
     simulate_in_waves(jax.random.key(0), task, inner, 2, (2,))
     np.testing.assert_allclose(np.concatenate(seen), [[1.0, 1.0], [np.e, 2.0]], rtol=1e-6)
 
