@@ -1,7 +1,10 @@
-"""What all tests share: strict JAX, quick compiling, one deterministic hypothesis profile, one key a test."""
+"""What all tests share: strict JAX, quick compiling, bounded memory, deterministic hypothesis, one key a test."""
 
+import ctypes
+import gc
 import os
 import zlib
+from pathlib import Path
 
 import hypothesis
 import jax
@@ -28,6 +31,9 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("jaxlfi")
 
+MEMORY = int(os.environ.get("MEM", 1000)) * 2**20
+"""Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory."""
+
 
 @pytest.fixture
 def key(request: pytest.FixtureRequest) -> jax.Array:
@@ -37,5 +43,16 @@ def key(request: pytest.FixtureRequest) -> jax.Array:
 
 @pytest.fixture(autouse=True, scope="module")
 def compiling(request: pytest.FixtureRequest):
-    """Compile without most optimisations, but for modules that set `OPTIMISED`."""
+    """Compile without most optimisations, but for modules that set `OPTIMISED`; forget the programs if they are many."""
     jax.config.update("jax_disable_most_optimizations", not getattr(request.module, "OPTIMISED", False))
+    yield
+    if resident() > MEMORY:
+        jax.clear_caches()
+        gc.collect()
+        getattr(ctypes.CDLL(None), "malloc_trim", int)(0)  # glibc keeps what is freed between blocks still in use
+
+
+def resident() -> int:
+    """Bytes of memory that this process occupies; 0 where the system does not say."""
+    pages = Path("/proc/self/statm")
+    return int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if pages.exists() else 0
