@@ -144,7 +144,7 @@ def verdicts(scale: float, shift: float = 0.0, seed: int = 7) -> tuple[list[str]
 
 
 def test_the_exact_posterior_passes():
-    """But for one set of draws in a hundred, of each of three kinds; more than five of 25 happen in three runs of 10 000."""
+    """But for one set of draws in a hundred, of each of three kinds: more than five of 25 have a chance of 3e-4."""
     found = [verdicts(1.0, seed=seed) for seed in range(25)]
     assert sum(one != ([OK, OK], OK, OK) for one in found) <= 5
 

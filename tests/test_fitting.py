@@ -201,8 +201,8 @@ def test_number_of_gradient_steps(estimator, expected_size, steps, passes):
 
 def mean_loss(estimator: Estimator, network: Network, rows=slice(0, SIZE)) -> float:
     """Mean negative log-density of some rows of DATA, in the scaled coordinates."""
-    q = jax.vmap(lambda x: condition(estimator, network, x, SCALE))(DATA.x[rows])
-    log_prob = jax.vmap(lambda mixture, theta: mixture.log_prob(theta))(q, DATA.theta[rows])
+    one = lambda x, theta: condition(estimator, network, x, SCALE).log_prob(theta)
+    log_prob = jax.jit(jax.vmap(one))(DATA.x[rows], DATA.theta[rows])
     return float(-jnp.mean(log_prob) - jnp.sum(jnp.log(SCALE.width / 2)))
 
 

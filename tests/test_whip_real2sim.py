@@ -53,8 +53,8 @@ def test_a_simulation_is_the_trajectory_of_its_parameters(problem, key):
     found, failure = jax.jit(lambda k, t: trajectory_and_outcome(problem, k, t))(key, theta)
     scene = median(0.270, 4e3)
     clean = DETECTORS["clean"]
-    other = jax.random.key(0)  # a clean detector has no use for it
-    expected, valid = trajectory(other, NATIVE, clean, side_camera(scene), scene, exploratory_actions())
+    directly = jax.jit(lambda key: trajectory(key, NATIVE, clean, side_camera(scene), scene, exploratory_actions()))
+    expected, valid = directly(jax.random.key(0))  # a clean detector has no use for it
     assert failure == 0 and valid
     assert found.shape == (16, 30) == (16, len(CHANNELS))
     np.testing.assert_allclose(found, expected, atol=2e-4)  # parameters went through a logarithm
@@ -84,14 +84,15 @@ def test_unstable_simulations_are_told_of(key):
     shaky = NativeEngine(Scene(chain=Chain(elements=16, retardation=0.0, viscosity=0.0), timestep=0.005))
     made = whip_task(shaky, DETECTORS["clean"], NUISANCES["fixed"], exploratory_actions(), truth=(0.23, 8e3))
     stiff = made.to_coordinates(jnp.array([[100.0, 5e5], [120.0, 4e5]]))
-    _, failure = jax.vmap(lambda t: trajectory_and_outcome(made, key, t))(stiff)
+    _, failure = jax.jit(jax.vmap(lambda t: trajectory_and_outcome(made, key, t)))(stiff)
     assert failure.tolist() == [1, 1] and made.reasons[0] == "unstable"
 
 
 def test_random_nuisances_differ_from_key_to_key(key):
     made = task(detector="clean", nuisances="random", engine="native")
     theta = made.to_coordinates(jnp.array([250.0, 5e3]))
-    found, _ = jax.vmap(lambda k: trajectory_and_outcome(made, k, theta))(jax.random.split(key, 3))
+    simulate = jax.jit(jax.vmap(lambda k: trajectory_and_outcome(made, k, theta)))
+    found, _ = simulate(jax.random.split(key, 3))
     assert len(np.unique(np.asarray(found[:, 0, 20]))) == 3  # the top cube, seen from elsewhere
 
 
