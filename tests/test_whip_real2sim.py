@@ -119,16 +119,23 @@ def test_objects_may_be_files_and_unknown_ones_are_refused(tmp_path):
 
 
 def test_length_and_stiffness_are_inferred(problem):
-    """The initial support is 110 mm wide, and 3.9 in ln E (measured for six seeds: at most 1.2 mm and 0.06 off)."""
+    """The initial support is 110 mm wide, and 3.9 in ln E.
+
+    The middle one of three runs: measured for ten seeds, the errors of one by itself are mostly below 1 mm and 0.03,
+    but one in ten is 2 to 3 mm.
+    """
     settings = SETTINGS.replace(
-        rounds=3, simulations_per_round=40, simulation_budget=44,
-        estimator=SETTINGS.estimator.replace(normaliser="asinh", activation="tanh", steps=400, hidden=(32, 32)),
+        rounds=3, simulations_per_round=80, simulation_budget=88,
+        estimator=SETTINGS.estimator.replace(normaliser="asinh", activation="tanh", steps=800, hidden=(32, 32)),
     )  # fmt: skip
-    run = jaxlfi.infer(jax.random.key(3), problem, settings=settings, heuristic=jaxlfi.Edge())
-    draws = run.sample(jax.random.key(4), 1000)
-    error = np.abs(np.median(draws, axis=0) - np.asarray(problem.truth))
-    assert error[0] < 5 and error[1] < 0.3
-    assert int(np.sum(run.info.failed)) == 0
+    errors = []
+    for seed in range(3):
+        run = jaxlfi.infer(jax.random.key(seed), problem, settings=settings, heuristic=jaxlfi.Edge())
+        assert int(np.sum(run.info.failed)) == 0
+        draws = run.sample(jax.random.key(100 + seed), 1000)
+        errors.append(np.abs(np.median(draws, axis=0) - np.asarray(problem.truth)))
+    length, stiffness = np.median(errors, axis=0)
+    assert length < 5 and stiffness < 0.3
 
 
 def test_a_run_from_the_command_line(tmp_path, capsys):
