@@ -134,17 +134,21 @@ def test_importance_weights_keep_later_rounds_exact():
 
 @pytest.fixture(scope="module")
 def sequential():
-    """The paper's p-hat = q over five rounds of 100: the wrong support kept, and adapted; and the right one."""
-    estimator = dataclasses.replace(MODEST, steps=450, batch_size=100)
-    return infer(Settings(estimator=estimator, rounds=5), ("misspecified", "misspecified", "ok"), (0, 1, 0), 1)
+    """The paper's p-hat = q over five rounds: the wrong support kept, and adapted; and five runs on the right one."""
+    estimator = dataclasses.replace(MODEST, steps=600, batch_size=100)
+    settings = Settings(estimator=estimator, rounds=5, simulations_per_round=300, simulation_budget=300)
+    return infer(settings, ("misspecified",) * 2 + ("ok",) * 5, (0, 1) + (0,) * 5, 1)
 
 
 def test_without_correction_the_mean_is_right_and_the_spread_too_small(sequential):
-    """Pooled proposals count the data again: a p~ like the posterior halves the covariance."""
-    mean, covariance = whitened(lane(sequential[0].belief.mixture, 2))
-    np.testing.assert_allclose(mean, 0, atol=0.5)
+    """Pooled proposals count the data again: a p~ like the posterior halves the covariance.
+
+    Measured for six keys: traces of 0.7 to 0.84, and one of 4.4, where the exact one is 2.
+    """
+    mean, covariance = middle(jax.tree.map(lambda leaf: leaf[2:], sequential[0].belief.mixture))
+    np.testing.assert_allclose(mean, 0, atol=0.4)
     eigenvalues = np.linalg.eigvalsh(covariance)
-    assert 0.05 < eigenvalues.min() and eigenvalues.max() < 1.0
+    assert 0.05 < eigenvalues.min() and eigenvalues.max() < 0.8
 
 
 def test_a_fixed_support_piles_mass_on_the_bound_that_excludes_the_truth(sequential):
@@ -160,7 +164,8 @@ def test_edge_recovers_from_the_wrong_support(sequential):
     belief = lane(sequential[0].belief, 1)
     assert bool(belief.support.contains(TASK.truth)) and float(belief.support.high[0]) > 1.0
     mean, _ = whitened(belief.mixture)
-    # In five rounds, two of which the truth was outside; a support that stays put is 2.3 to 2.9 off.
+    # In five rounds, two of which the truth was outside (measured for six keys: at most 1.04); a support that stays put
+    # is 2.3 to 2.9 off.
     np.testing.assert_allclose(mean, 0, atol=1.6)
     assert bound_warnings(TASK, belief) == []
 
@@ -376,7 +381,7 @@ def test_a_support_wider_than_phi_widens_it_for_the_run():
         ({"restriction": "wrap"}, r"^restriction: expected one of \['clip', 'reject'\], got 'wrap'"),
         ({"rounds": 0}, r"^expected at least 1 round and 1 addition, got 0 and 100"),
         ({"simulations_per_round": 0}, r"^expected at least 1 round and 1 addition, got 10 and 0"),
-        ({"simulation_budget": 99}, r"^attempts: expected at least the 100 simulations_per_round of a round, got 99"),
+        ({"simulation_budget": 99}, r"^simulation_budget: expected at least the 100 simulations of a round, got 99"),
         ({"defensive": 1.5}, r"^defensive: expected a share in \[0, 1\], got 1.5"),
         ({"estimator": Estimator(components=0)}, r"^components: expected at least 1, got 0"),
     ],
