@@ -665,8 +665,9 @@ def test_matching_undoes_any_relabelling(components, data):
     previous = Belief(before, box, jnp.asarray(True))
     feasible = Support([-9.0, -9.0], [99.0, 99.0])
     relabelled = now.permute(jnp.asarray(data.draw(st.permutations(range(components)))))
-    chex.assert_trees_all_equal(
-        apply(Matched(Mode()), previous, relabelled, feasible), apply(Mode(), previous, now, feasible)
+    assume(decided(Mode(), previous, now, feasible))  # the two programs may round differently
+    chex.assert_trees_all_close(
+        apply(Matched(Mode()), previous, relabelled, feasible), apply(Mode(), previous, now, feasible), atol=1e-5
     )
 
 
