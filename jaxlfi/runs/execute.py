@@ -129,8 +129,8 @@ def _require_memory(plan: BatchPlan, given: Observed) -> None:
     if needed > free:
         raise ValueError(
             f"settings: expected runs that fit into the memory, got {len(plan.specs)} of "
-            f"{needed / 2**30:.3g} GiB in all, where {free / 2**30:.3g} GiB are free: lower simulations_per_round, rounds, "
-            "seeds or the network's size"
+            f"{needed / 2**30:.3g} GiB in all, where {free / 2**30:.3g} GiB are free: lower simulations_per_round, "
+            "rounds, seeds or the network's size"
         )
 
 
@@ -146,7 +146,7 @@ def execute(
     Args:
         plan: what to run.
         observed: of `prepare`.
-        folder: made by `begin`, at whatever point it was left; None to keep everything in memory.
+        folder: made by `begin`, finished or not; None to keep everything in memory.
         on_round: called as each round ends, with its index and its record.
         on_compiled: called with the seconds that compiling took.
 
@@ -244,19 +244,19 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed) -> None:
     shared = {name: value for name, value in runs[0].items() if name not in OWN}
     config = runs[0] | status if plan.kind == RUN else shared | {"format": plan.kind} | status
 
-    def fill(beside: Path) -> None:
-        Checkpoint(beside).write_start(observed.trajectory, observed.x, observed.first)
+    def fill(staging: Path) -> None:
+        Checkpoint(staging).write_start(observed.trajectory, observed.x, observed.first)
         if plan.kind == RUN:
             return
         for name, run in zip(plan.folders(), runs, strict=True):
-            (beside / name).mkdir(parents=True)
-            atomic.write_json(beside / name / "config.json", run)
+            (staging / name).mkdir(parents=True)
+            atomic.write_json(staging / name / "config.json", run)
 
     folders.create(folder, config, fill)
 
 
 def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]:
-    """The plan of a folder and what its runs observe, at whatever point it was left.
+    """The plan of a folder and what its runs observe, finished or not.
 
     Args:
         folder: made by `begin`.

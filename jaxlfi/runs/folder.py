@@ -127,21 +127,21 @@ def create(folder: Path, config: Mapping[str, Any], fill) -> None:
     Args:
         folder: where; it must not exist or be empty.
         config: written as config.json.
-        fill: called with the folder's temporary path, to write what a resume needs besides.
+        fill: called with the folder's temporary path, to write what a resume needs stagings.
     """
     refuse_occupied(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        staging = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     except OSError as error:
         raise StoreError(f"out: expected a folder that can be written, got {str(folder)!r}: {error}") from error
     try:
-        beside.chmod(0o755)
-        fill(beside)
-        atomic.write_json(beside / "config.json", config)
-        beside.rename(folder)
+        staging.chmod(0o755)
+        fill(staging)
+        atomic.write_json(staging / "config.json", config)
+        staging.rename(folder)
     except BaseException:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(staging, ignore_errors=True)
         raise
 
 
@@ -236,11 +236,11 @@ def write_run(folder: Path, run: Run, keep_network: bool = False) -> None:
 def save(run: Run, folder: Path) -> Path:
     """Write one run into a new folder, complete or not at all."""
 
-    def fill(beside: Path) -> None:
+    def fill(staging: Path) -> None:
         for index, seconds in enumerate(np.asarray(run.history["seconds"])):
             row = {name: value[index] for name, value in run.history.items() if not name.startswith(FINAL)}
-            append_ledger(beside, index, jax.device_get(row), run.task.reasons, seconds)
-        write_run(beside, run)
+            append_ledger(staging, index, jax.device_get(row), run.task.reasons, seconds)
+        write_run(staging, run)
 
     if run.task is None:
         raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
