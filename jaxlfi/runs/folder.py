@@ -176,7 +176,7 @@ def check_version(path: Path, config: Mapping[str, Any]) -> None:
     if config.get("version") != VERSION:
         raise StoreError(
             f"{path}: expected version {VERSION} of the format, got {config.get('version')}: the folder was written by "
-            f"jaxlfi {config.get('versions', {}).get('jaxlfi', 'of another version')} in another format; run it again"
+            "another version of jaxlfi; run its command again"
         )
 
 
