@@ -3,8 +3,8 @@
 import numpy as np
 
 from envs.lotka_volterra_mjp import SUMMARY_NAMES, JumpProcess, lotka_volterra_nine, make_simulator
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.task import Task
 
 NAMES = ("ln predator birth", "ln predator death", "ln prey birth", "ln prey death")
 """theta_1..theta_4 of the paper, natural logarithms of rates."""

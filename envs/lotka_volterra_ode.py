@@ -11,8 +11,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from envs.lotka_volterra_mjp import SUMMARY_NAMES, lotka_volterra_nine
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.task import Task
 
 NAMES = ("predator birth", "predator death", "prey birth", "prey death")
 """theta_1..theta_4 of the paper."""

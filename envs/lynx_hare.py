@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from envs.lotka_volterra_ode import lognormal_noise, populations
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.task import Task
 
 SUBSTEPS = 25
 """Integration steps a year."""

@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs import mg1
-from jaxlfi import atomic
-from jaxlfi.commands import bootstrap_interval
+from jaxlfi.cli.commands import bootstrap_interval
 from jaxlfi.figures import History, density, open_collection, style
+from jaxlfi.io import files as atomic
 
 SEEDS = 3
 """Simulations shown of the truth."""

@@ -27,11 +27,12 @@ import jaxlfi
 from envs.whip.chain import elasto_gravity
 from envs.whip.parameters import MEDIAN
 from envs.whip.real2sim import task
-from jaxlfi import atomic, run_store
-from jaxlfi.belief import RESTRICTIONS
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.distributions.belief import RESTRICTIONS
 from jaxlfi.figures import style
-from jaxlfi.presets import QUICK
-from jaxlfi.simulation import trajectory_and_outcome
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import folder as run_store
+from jaxlfi.tasks.simulation import trajectory_and_outcome
 
 INSIDE = 20
 OUTSIDE = np.array(

@@ -22,8 +22,8 @@ from envs.whip.standin.objects import TABLE, Object
 from envs.whip.standin.observation import in_every_frame, look, record
 from envs.whip.standin.scene import SIMULATOR
 from envs.whip.standin.simulation import StandIn
-from jaxlfi import atomic
 from jaxlfi.figures import style
+from jaxlfi.io import files as atomic
 
 HOW = (
     "young is such that the soft body, clamped horizontally at an elasto-gravity number of about 5, sags as much as "

@@ -23,8 +23,8 @@ from envs.whip import planner
 from envs.whip.engines import pick
 from envs.whip.frames import COLOURS
 from envs.whip.parameters import median
-from jaxlfi import atomic
 from jaxlfi.figures import style
+from jaxlfi.io import files as atomic
 
 LENGTHS = (0.05, 0.12, 0.20, 0.25, 0.29, 0.35)
 """In m."""

@@ -7,7 +7,7 @@ import pytest
 
 from envs import lotka_volterra
 from envs.lotka_volterra_mjp import JumpProcess, lotka_volterra_nine
-from jaxlfi.simulation import simulate, trajectory_and_outcome
+from jaxlfi.tasks.simulation import simulate, trajectory_and_outcome
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,11 @@ from scipy import stats
 from envs import lynx_hare
 from envs.lotka_volterra_ode import populations
 from envs.lynx_hare import Nuisance
-from jaxlfi import bayessim
-from jaxlfi.belief import rejected
+from jaxlfi.bayessim import algorithm as bayessim
+from jaxlfi.bayessim.keys import run_keys
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.distributions.belief import rejected
 from jaxlfi.heuristics import Choice, Edge, Fixed
-from jaxlfi.keys import run_keys
-from jaxlfi.presets import QUICK
 
 SETTINGS = QUICK.replace(rounds=8)
 """Of the acceptance test."""

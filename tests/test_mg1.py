@@ -26,7 +26,7 @@ from envs.mg1 import (
     zscore,
 )
 from jaxlfi.diagnostics import trajectory_distance
-from jaxlfi.simulation import simulate
+from jaxlfi.tasks.simulation import simulate
 
 TRUTH = np.array([1.0, 5.0, 0.2])
 

@@ -22,9 +22,9 @@ from envs.whip.parameters import median
 from envs.whip.real2sim import CHANNELS, DATA, NUISANCES, recorded, task, whip_task
 from envs.whip.rollout import trajectory
 from envs.whip.scene import Scene
-from jaxlfi import tasks
-from jaxlfi.simulation import trajectory_and_outcome
-from jaxlfi.support import check_within
+from jaxlfi.distributions.support import check_within
+from jaxlfi.tasks import registry as tasks
+from jaxlfi.tasks.simulation import trajectory_and_outcome
 from tests.small import SETTINGS, command
 
 NATIVE = NativeEngine()

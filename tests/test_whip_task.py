@@ -19,7 +19,7 @@ from envs.whip.kinematics import initial_positions
 from envs.whip.native import NativeEngine
 from envs.whip.parameters import median, randomised
 from envs.whip.scene import Scene
-from jaxlfi.summaries import cross_correlation
+from jaxlfi.tasks.summaries import cross_correlation
 
 
 class Puppet:

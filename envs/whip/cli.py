@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxlfi.cli import OneLineParser
+from jaxlfi.cli.parser import OneLineParser
 
 EXAMPLES = """\
 examples:
@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = parser().parse_args(argv)
     try:
-        from jaxlfi import compile_cache
+        from jaxlfi.io import compile_cache
 
         compile_cache.enable()
         from envs.whip import commands

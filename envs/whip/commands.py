@@ -20,8 +20,8 @@ from envs.whip.frames import COLOURS
 from envs.whip.keypoints import DETECTORS
 from envs.whip.parameters import WhipParameters, check, median
 from envs.whip.scene import Scene
-from jaxlfi import atomic
-from jaxlfi.progress import RoundProgress
+from jaxlfi.io import files as atomic
+from jaxlfi.io.progress import RoundProgress
 
 POLICIES = ("explore", "random", "plan")
 

@@ -19,9 +19,9 @@ from envs.whip.frames import COLOURS
 from envs.whip.keypoints import DETECTORS, Detector
 from envs.whip.parameters import WhipParameters, median, randomised
 from envs.whip.rollout import trajectory
-from jaxlfi.summaries import cross_correlation
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.summaries import cross_correlation
+from jaxlfi.tasks.task import Task
 
 TRUTH = (0.23, 8e3)
 """Length (m) and Young's modulus (Pa) of the simulated DLO that is observed where no object is named."""

@@ -43,7 +43,7 @@ from envs.whip.camera import Camera
 from envs.whip.frames import COLOURS
 from envs.whip.keypoints import KEYPOINTS, ON_DLO
 from envs.whip.rules import ACTION_LIMIT, HIT_DISTANCE, STEPS
-from jaxlfi import atomic
+from jaxlfi.io import files as atomic
 
 SCHEMA, VERSION = "jaxlfi.whip.recording", 1
 SOURCES = ("stand-in", "real")

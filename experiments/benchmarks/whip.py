@@ -47,8 +47,8 @@ from envs.whip.native import NativeEngine
 from envs.whip.parameters import FEASIBLE, INITIAL, WhipParameters, median
 from envs.whip.scene import CUBES, START, Scene
 from experiments.whip_physics.rollouts import random_scene, random_targets
-from jaxlfi import atomic
-from jaxlfi.run_store import command_line, environment
+from jaxlfi.io import files as atomic
+from jaxlfi.runs.folder import command_line, environment
 
 SCENE = Scene()
 EPISODE = rules.STEPS * SCENE.substeps
@@ -150,7 +150,7 @@ def _line(name: str, batch: int, rate: float, more: str = "") -> None:
 
 _COMPILE_AN_EPISODE = """
 import time
-from jaxlfi import compile_cache
+from jaxlfi.io import compile_cache
 compile_cache.enable()
 import jax
 from envs.whip.engine import rollout

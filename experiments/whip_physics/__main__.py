@@ -22,9 +22,9 @@ from envs.whip.engines import pick
 from envs.whip.scene import Scene
 from experiments.whip_physics import figures, measure, rollouts
 from experiments.whip_physics.models import KINDS
-from jaxlfi import atomic
 from jaxlfi.figures import style
-from jaxlfi.run_store import command_line, environment
+from jaxlfi.io import files as atomic
+from jaxlfi.runs.folder import command_line, environment
 
 CHAINS = {"ball joints": Chain(planar=False), "planar hinges": Chain()}
 """Those that can be in a scene, by their kind."""

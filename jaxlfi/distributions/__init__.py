@@ -1,0 +1,1 @@
+"""Boxes, spaces, mixtures of Gaussians, beliefs, and truncation to a box."""

@@ -1,0 +1,155 @@
+"""Flags of the command line and the glossary, made from what classes declare of their fields.
+
+Values that are given are collected by name in one dictionary of the parsed arguments, so that a field that a package
+adds cannot be taken for another argument.
+"""
+
+import argparse
+import math
+import textwrap
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from jaxlfi.fields import Declared
+
+Families = Mapping[str, Mapping[str, Declared]]
+"""Fields by the name of the class that declares them, and by their own name."""
+WIDTH = 120
+"""Characters of a line of the glossary."""
+
+
+def add(
+    group: argparse._ArgumentGroup, families: Families, into: str, several: bool = False, defaults: bool = True
+) -> None:
+    """Add a flag for every field, one for all classes that have a field of that name.
+
+    Where the parser already has a flag of that name, the new one begins with the singular of `into`:
+    `--hyperparameter-steps`.
+
+    Args:
+        group: to add the flags to.
+        families: classes and their fields.
+        into: the argument that collects the values; make it an empty dictionary by `set_defaults`.
+        several: whether a number can be given for each parameter of the task.
+        defaults: whether the fields' own defaults are those of the command line, and shown.
+    """
+    for name, owners in by_field(families).items():
+        flag = f"--{name.replace('_', '-')}"
+        if flag in group._option_string_actions:
+            flag = f"--{into.removesuffix('s')}-{flag[2:]}"
+        some = next(iter(owners.values()))
+        if some.static and isinstance(some.default, bool):
+            reading = {"action": _Switch, "no": f"--no-{flag[2:]}"}
+            names = (flag, f"--no-{flag[2:]}")
+        else:
+            reading, names = {"action": _Collect} | _reading(some, several), (flag,)
+        group.add_argument(*names, dest=name, into=into, help=_help(owners, defaults), **reading)
+
+
+def by_field(families: Families) -> dict[str, dict[str, Declared]]:
+    """The same fields by their own name, and by the name of the class."""
+    found: dict[str, dict[str, Declared]] = {}
+    for family, fields in families.items():
+        for name, field in fields.items():
+            found.setdefault(name, {})[family] = field
+    return found
+
+
+def glossary(families: Families) -> str:
+    """A line for every field that has a symbol."""
+    lines = [
+        f"  {name:<15} {next(iter(owners.values())).info.symbol}, {_described(owners)}"
+        for name, owners in by_field(families).items()
+        if all(field.info.symbol for field in owners.values())
+    ]
+    return "".join(f"{textwrap.fill(line, WIDTH, subsequent_indent=' ' * 18)}\n" for line in lines)
+
+
+class _Collect(argparse.Action):
+    """Put the value into a dictionary of the arguments, under the field's name."""
+
+    def __init__(self, *args: Any, into: str, kind: Callable[[Any], Any] = lambda values: values, **kwargs: Any):
+        super().__init__(*args, default=argparse.SUPPRESS, **kwargs)
+        self.into, self.kind = into, kind
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        collected = getattr(namespace, self.into, None) or {}
+        setattr(namespace, self.into, collected | {self.dest: self.kind(values)})
+
+
+class _Switch(_Collect):
+    """Collect True for a flag, and False for the one that begins with "no"."""
+
+    def __init__(self, *args: Any, no: str, **kwargs: Any):
+        super().__init__(*args, nargs=0, **kwargs)
+        self.no = no
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        super().__call__(parser, namespace, option_string != self.no)
+
+
+def _reading(field: Declared, several: bool) -> dict[str, Any]:
+    """How argparse reads a field's values: by the type of its default."""
+    if not field.static:
+        reading = {"type": int if type(field.default) is int and not several else float, "metavar": "X"}
+        return reading | ({"nargs": "+"} if several else {})
+    example = field.default[0] if isinstance(field.default, tuple) and field.default else field.default
+    reading = {"type": _reader(example), "metavar": {bool: "yes|no", int: "N", float: "X"}.get(type(example), "NAME")}
+    return reading | ({"nargs": "+", "kind": tuple} if isinstance(field.default, tuple) else {})
+
+
+def _reader(example: Any) -> Callable[[str], Any]:
+    return _truth if isinstance(example, bool) else type(example) if isinstance(example, int | float) else str
+
+
+def _truth(text: str) -> bool:
+    if text not in ("yes", "no"):
+        raise argparse.ArgumentTypeError(f"expected yes or no, got {text!r}")
+    return text == "yes"
+
+
+def _help(owners: Mapping[str, Declared], with_defaults: bool) -> str:
+    """Whose field it is, what it is, its symbol, range and default."""
+    some = next(iter(owners.values())).info
+    facts = [some.symbol] if some.symbol else []
+    ranges = dict.fromkeys(_range(field) for field in owners.values())
+    facts += [word for word in ranges if word] if len(ranges) == 1 else []
+    defaults = {family: _shown(field.default) for family, field in owners.items()}
+    if not with_defaults:
+        pass
+    elif len(set(defaults.values())) == 1:
+        facts.append(f"default: {next(iter(defaults.values()))}")
+    else:
+        facts.append("default: " + ", ".join(f"{value} ({family})" for family, value in defaults.items()))
+    text = _described(owners, always=with_defaults)
+    return (f"{text} ({'; '.join(facts)})" if facts else text).replace("%", "%%")
+
+
+def _described(owners: Mapping[str, Declared], always: bool = False) -> str:
+    """The help texts, each after the classes that it is of; without these where there is one text, unless `always`."""
+    texts: dict[str, list[str]] = {}
+    for family, field in owners.items():
+        texts.setdefault(field.info.help, []).append(family)
+    if len(texts) == 1 and not always:
+        return next(iter(texts))
+    return "; ".join(f"{', '.join(own)}: {text}" for text, own in texts.items())
+
+
+def _range(field: Declared) -> str:
+    info = field.info
+    if info.choices is not None:
+        return ", ".join(map(str, info.choices))
+    limited = [limit for limit in (info.low, info.high, info.above, info.below) if limit is not None]
+    return info.interval if limited and not all(map(math.isinf, limited)) else ""
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, tuple):
+        return " ".join(map(_shown, value)) or "none"
+    return (
+        {True: "yes", False: "no"}[value]
+        if isinstance(value, bool)
+        else f"{value:g}"
+        if isinstance(value, float)
+        else str(value)
+    )

@@ -1,0 +1,1 @@
+"""Files, serialisation, progress and the compile cache."""

@@ -1,0 +1,1 @@
+"""Inference runs: executed, saved, resumed and loaded."""

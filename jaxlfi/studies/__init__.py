@@ -1,0 +1,1 @@
+"""Studies of many runs: grids of hyperparameters, and calibration."""

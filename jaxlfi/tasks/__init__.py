@@ -1,0 +1,1 @@
+"""Tasks: simulators with named, bounded parameters, their priors, summaries and observations."""

@@ -1,0 +1,80 @@
+"""Named summaries: what the network sees of a trajectory."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+Summary = Callable[[Array], Array]
+
+
+def identity(trajectory: Float[Array, "..."]) -> Float[Array, " obs"]:
+    """The trajectory itself, flattened."""
+    return jnp.ravel(trajectory)
+
+
+def series(trajectory: Float[Array, "time channels"]) -> Float[Array, " obs"]:
+    """Means, variances and correlations of a time series, shape [4 C + C (C - 1) / 2]: nine numbers for two channels.
+
+    In this order: the means; log(variance + 1), the variances with divisor T - 1; for each channel its autocorrelations
+    at lags 1 and 2; the correlations of each pair of channels. Lagged products of the standardised series are summed
+    and divided by T - 1. These are the summaries that Papamakarios and Murray (2016) use for predators and prey.
+
+    A channel that never changes has undefined correlations. They are 0: it says nothing about the others or its own
+    future, and the simulation is a valid one that inference must be able to use.
+
+    Args:
+        trajectory: shape [T, C], T >= 3.
+    """
+    count, channels = trajectory.shape
+    mean = jnp.mean(trajectory, axis=0)
+    centred = trajectory - mean
+    variance = jnp.sum(centred**2, axis=0) / (count - 1)
+    constant = jnp.all(trajectory == trajectory[0], axis=0)
+    variance = jnp.where(constant, 0.0, variance)
+    standardised = centred * jnp.where(constant, 0.0, jax.lax.rsqrt(jnp.where(constant, 1.0, variance)))
+    memory = [jnp.sum(standardised[lag:] * standardised[:-lag], axis=0) / (count - 1) for lag in (1, 2)]
+    first, second = np.triu_indices(channels, 1)
+    coupling = jnp.sum(standardised[:, first] * standardised[:, second], axis=0) / (count - 1)
+    return jnp.concatenate([mean, jnp.log1p(variance), jnp.stack(memory, axis=-1).ravel(), coupling])
+
+
+def cross_correlation(trajectory: Float[Array, "time columns"], actions: int) -> Float[Array, " obs"]:
+    """Products of states and actions, moments of states: psi of section VI-F, shape [Ds Da + 2 Ds].
+
+    In this order: the dot products <S_i, A_j> over time, j fastest; the means of the states; their standard deviations
+    (reading L: what the paper writes as Var).
+
+    Args:
+        trajectory: states [T, Ds] followed by actions [T, Da], shape [T, Ds + Da].
+        actions: Da, the number of columns at the end that are actions.
+
+    Raises:
+        ValueError: if that leaves no states or no actions.
+
+    Example:
+        >>> cross_correlation(jnp.array([[1.0, 2.0, 1.0], [3.0, 2.0, -1.0]]), actions=1).tolist()
+        [-2.0, 0.0, 2.0, 2.0, 1.0, 0.0]
+    """
+    if not 0 < actions < trajectory.shape[-1]:
+        raise ValueError(f"actions: expected some of the {trajectory.shape[-1]} columns, got {actions}")
+    states, applied = jnp.split(trajectory, [trajectory.shape[-1] - actions], axis=-1)
+    products = jnp.einsum("ti,tj->ij", states, applied)
+    return jnp.concatenate([products.ravel(), jnp.mean(states, axis=0), jnp.std(states, axis=0)])
+
+
+SUMMARIES: dict[str, Summary] = {"identity": identity, "series": series}
+"""Summaries by name; each maps one trajectory to a vector [S]."""
+
+
+def named(name: str) -> Summary:
+    """The summary of that name.
+
+    Raises:
+        ValueError: for a name that is not in `SUMMARIES`.
+    """
+    if name not in SUMMARIES:
+        raise ValueError(f"summary: expected one of {sorted(SUMMARIES)}, got {name!r}")
+    return SUMMARIES[name]
