@@ -54,8 +54,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture
 def key(request: pytest.FixtureRequest) -> jax.Array:
-    """A typed key of the test's own: the same in every run, another in every test."""
-    return jax.random.key(zlib.crc32(request.node.nodeid.encode()))
+    """A typed key of the test's own: the same in every run and folder, another in every test."""
+    test = request.node.nodeid.partition("::")[2]
+    return jax.random.key(zlib.crc32(f"tests/{request.path.name}::{test}".encode()))
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -76,6 +77,9 @@ def compiling(request: pytest.FixtureRequest):
     jax.config.update("jax_disable_most_optimizations", not getattr(request.module, "OPTIMISED", False))
     yield
     if resident() > MEMORY:
+        from jaxlfi.bayessim import programs  # late, so that shapes are checked from its first import on
+
+        programs.forget()
         jax.clear_caches()
         gc.collect()
         getattr(ctypes.CDLL(None), "malloc_trim", int)(0)  # glibc keeps what is freed between blocks still in use
