@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs.lotka_volterra_ode import lognormal_noise, populations
+from jaxlfi.envs.lotka_volterra.ode import lognormal_noise, populations
 from jaxlfi.support import Support
 from jaxlfi.task import Task
 
@@ -45,7 +45,7 @@ def reference_log_rates() -> tuple[np.ndarray, np.ndarray]:
 
 def load() -> tuple[np.ndarray, np.ndarray]:
     """Years [21], and thousands of pelts of lynx and hare, shape [21, 2]."""
-    with resources.files("envs").joinpath("data/lynx_hare.csv").open() as file:
+    with resources.files("jaxlfi.envs").joinpath("data/lynx_hare.csv").open() as file:
         table = np.loadtxt(file, delimiter=",", skiprows=1, dtype=np.float32)
     return table[:, 0], table[:, 1:]
 

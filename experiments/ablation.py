@@ -24,10 +24,10 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.bayessim import Settings
 from jaxlfi.commands import bootstrap_interval
 from jaxlfi.describe import heuristic_to_json, settings_to_json
+from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Matched, Mode
 from jaxlfi.history import theta_error, trajectory_error
 from jaxlfi.keys import run_keys

@@ -25,11 +25,11 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from envs.lotka_volterra import task as lotka_volterra
 from jaxlfi import atomic
 from jaxlfi.bayessim import Settings
 from jaxlfi.commands import bootstrap_interval
 from jaxlfi.describe import heuristic_to_json, settings_to_json
+from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.figures import seeds as strips
 from jaxlfi.figures import style
 from jaxlfi.heuristics import Edge, Fixed, Heuristic, Truncate

@@ -3,7 +3,7 @@
     jaxlfi compare mg1 --out runs/mg1
     python -m experiments.mg1 runs/mg1 --out experiments/results/mg1
 
-(1, 5, 0.2) and (5, 1, 0.2) are the same queue (`envs.mg1.task`), and a posterior may put its mass on either or on both.
+(1, 5, 0.2) and (5, 1, 0.2) are the same queue (`jaxlfi.envs.mg1.task`), and a posterior may put its mass on either or on both.
 The errors of a run's table count the second as wrong. Here the two bounds of the service time are sorted first.
 """
 
@@ -15,9 +15,9 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from envs import mg1
 from jaxlfi import atomic
 from jaxlfi.commands import bootstrap_interval
+from jaxlfi.envs import mg1
 from jaxlfi.figures import History, density, open_collection, style
 
 SEEDS = 3

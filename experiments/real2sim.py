@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from envs.whip.episode import OBSERVATION
 from jaxlfi import atomic, cli, run_store
+from jaxlfi.envs.whip.episode import OBSERVATION
 from jaxlfi.figures import History, open_collection, samples, style
 
 OBJECTS = ("dlo-0", "dlo-1", "dlo-2", "dlo-3")

@@ -24,11 +24,11 @@ from rich.progress import track
 from rich.table import Table
 
 import jaxlfi
-from envs.whip.chain import elasto_gravity
-from envs.whip.parameters import MEDIAN
-from envs.whip.real2sim import task
 from jaxlfi import atomic, run_store
 from jaxlfi.belief import RESTRICTIONS
+from jaxlfi.envs.whip.parameters import MEDIAN
+from jaxlfi.envs.whip.physics.chain import elasto_gravity
+from jaxlfi.envs.whip.real2sim import task
 from jaxlfi.figures import style
 from jaxlfi.presets import QUICK
 from jaxlfi.simulation import trajectory_and_outcome

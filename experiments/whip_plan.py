@@ -2,7 +2,7 @@
 
     python -m experiments.whip_plan --out experiments/results/whip-plan
 
-For every DLO the cross-entropy method (`envs.whip.planner`) looks for actions of the greatest return on average over
+For every DLO the cross-entropy method (`jaxlfi.envs.whip.planner`) looks for actions of the greatest return on average over
 places of the stack, and ends early where they hit hardly anything but the top cube. What it has found is then tried on
 places in between, of which it knew nothing.
 """
@@ -19,11 +19,11 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from envs.whip import planner
-from envs.whip.engines import pick
-from envs.whip.frames import COLOURS
-from envs.whip.parameters import median
 from jaxlfi import atomic
+from jaxlfi.envs.whip import planner
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.parameters import median
+from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.figures import style
 
 LENGTHS = (0.05, 0.12, 0.20, 0.25, 0.29, 0.35)

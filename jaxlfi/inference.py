@@ -181,7 +181,7 @@ def infer(
         SimulatorError: for a simulator that breaks its contract or fails always.
 
     Example:
-        >>> from envs.gaussian_linear import task  # doctest: +SKIP
+        >>> from jaxlfi.envs.gaussian_linear import task  # doctest: +SKIP
         >>> run = infer(jax.random.key(0), task(), support="misspecified", heuristic=Edge())  # doctest: +SKIP
         >>> run.save("runs/gaussian")  # doctest: +SKIP
     """

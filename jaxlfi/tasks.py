@@ -30,7 +30,7 @@ def load(reference: str) -> Task:
             things that are no tasks.
 
     Example:
-        >>> load("envs.gaussian_linear:task").name
+        >>> load("jaxlfi.envs.gaussian_linear:task").name
         'gaussian_linear'
     """
     name, options = parse(reference)

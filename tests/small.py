@@ -7,12 +7,12 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from envs import gaussian_linear
 from jaxlfi import lanes
 from jaxlfi.bayessim import Settings
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimator import Estimator
 
-TASK = "envs.gaussian_linear:task"
+TASK = "jaxlfi.envs.gaussian_linear:task"
 # Few and small steps: training amplifies rounding, and runs that ought to be equal are compared to a
 # tolerance.
 SETTINGS = Settings(

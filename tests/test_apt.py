@@ -15,9 +15,9 @@ from scipy.stats import ks_2samp
 from test_bayessim import EXACT, MODEST, TASK, X, infer, lane, whitened
 
 import jaxlfi
-from envs import gaussian_linear
 from jaxlfi import bayessim, cli, run_store
 from jaxlfi.bayessim import Settings
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimator import Estimator, Network, draw, initialise, normalisers
 from jaxlfi.heuristics import Fixed
 from jaxlfi.posterior import draws_within, posterior

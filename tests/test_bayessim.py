@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from envs import gaussian_linear
 from jaxlfi import bayessim
 from jaxlfi.bayessim import Settings
 from jaxlfi.belief import Belief, rejected
 from jaxlfi.diagnostics import bound_warnings, edge_mass
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimator import Estimator
 from jaxlfi.heuristics import Choice, Edge, Fixed
 from jaxlfi.mixture import GaussianMixture

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import gaussian_linear
 from jaxlfi import atomic, bayessim, cli, diagnose, run_store, sweep, tasks
 from jaxlfi.belief import Belief, uninformed
 from jaxlfi.diagnose import Plan, Subject, repeat
 from jaxlfi.diagnose import subject as subjects
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimator import Estimator, Network, initialise
 from jaxlfi.figures import calibration, checks, style
 from jaxlfi.heuristics import Edge, Fixed

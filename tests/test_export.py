@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from envs import gaussian_linear
 from jaxlfi import atomic, run_store
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.export import MissingLibrary, to_inference_data
 from jaxlfi.heuristics import Fixed
 from jaxlfi.sampling import posterior_samples

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import lotka_volterra, lynx_hare, mg1
 from jaxlfi import atomic, bayessim, run_store
 from jaxlfi.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.describe import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json
+from jaxlfi.envs import lotka_volterra, lynx_hare, mg1
 from jaxlfi.heuristics import Centre, Edge, Fixed, Matched, Mode
 from jaxlfi.history import posterior_draws
 from jaxlfi.inference import observe

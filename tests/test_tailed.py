@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from envs import gaussian_linear
 from jaxlfi.bayessim import prior_draws
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.observation import simulate_observation
 from jaxlfi.support import Support
 from jaxlfi.tailed import TailedUniform, with_tails

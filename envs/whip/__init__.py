@@ -5,7 +5,7 @@ Needs the extra `whip` (MuJoCo and MJX).
 
 
 def task(object: str | None = None, detector: str = "mask", nuisances: str = "fixed", engine: str = "auto"):
-    """The Real2Sim task; its options are those of `envs.whip.real2sim.task`.
+    """The Real2Sim task; its options are those of `jaxlfi.envs.whip.real2sim.task`.
 
     Raises:
         ImportError: where MuJoCo is not installed, with what to install.
@@ -14,6 +14,6 @@ def task(object: str | None = None, detector: str = "mask", nuisances: str = "fi
         import mujoco  # noqa: F401
     except ImportError as error:
         raise ImportError("the whipping task needs MuJoCo and MJX: pip install 'jaxlfi[whip]'") from error
-    from envs.whip.real2sim import task as make
+    from jaxlfi.envs.whip.real2sim import task as make
 
     return make(object=object, detector=detector, nuisances=nuisances, engine=engine)

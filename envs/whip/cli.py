@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from jaxlfi import compile_cache
 
         compile_cache.enable()
-        from envs.whip import commands
+        from jaxlfi.envs.whip import commands
 
         getattr(commands, arguments.command)(arguments)
     except (ValueError, OSError, ImportError) as error:

@@ -1,4 +1,4 @@
-"""What the commands of the whipping task do; `envs.whip.cli` parses, this module works."""
+"""What the commands of the whipping task do; `jaxlfi.envs.whip.cli` parses, this module works."""
 
 import argparse
 import functools
@@ -10,17 +10,17 @@ import numpy as np
 from jaxtyping import Array, Float
 from rich.console import Console
 
-from envs.whip import planner, rules
-from envs.whip import render as drawing
-from envs.whip.engine import Engine
-from envs.whip.engines import pick
-from envs.whip.episode import Whip
-from envs.whip.exploration import exploratory_actions
-from envs.whip.frames import COLOURS
-from envs.whip.keypoints import DETECTORS
-from envs.whip.parameters import WhipParameters, check, median
-from envs.whip.scene import Scene
 from jaxlfi import atomic
+from jaxlfi.envs.whip import planner, rules
+from jaxlfi.envs.whip import render as drawing
+from jaxlfi.envs.whip.episode import Whip
+from jaxlfi.envs.whip.exploration import exploratory_actions
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.parameters import WhipParameters, check, median
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.physics.scene import Scene
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.progress import RoundProgress
 
 POLICIES = ("explore", "random", "plan")

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from envs.whip import engine as physics
-from envs.whip import rules
-from envs.whip.camera import side_camera
-from envs.whip.engine import Engine, State
-from envs.whip.frames import Frames
-from envs.whip.keypoints import DETECTORS, Detector, Tracking, begin, measured, track
-from envs.whip.kinematics import frames
-from envs.whip.parameters import WhipParameters
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.frames import Frames
+from jaxlfi.envs.whip.parameters import WhipParameters
+from jaxlfi.envs.whip.physics import engine as physics
+from jaxlfi.envs.whip.physics.engine import Engine, State
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.vision.camera import side_camera
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS, Detector, Tracking, begin, measured, track
 
 OBSERVATION = 28
 """Numbers in an observation."""
@@ -75,8 +75,8 @@ class Whip:
 
     Example:
         >>> import jax
-        >>> from envs.whip.native import NativeEngine
-        >>> from envs.whip.parameters import median
+        >>> from jaxlfi.envs.whip.physics.native import NativeEngine
+        >>> from jaxlfi.envs.whip.parameters import median
         >>> whip = Whip(NativeEngine())
         >>> episode, observation = whip.reset(jax.random.key(0), median(length=0.25, young=2.5e4))
         >>> observation.shape

@@ -1,7 +1,7 @@
 """The whipping task for other people's learners: a gymnasium environment, and a vector of them stepped by one engine.
 
-    gymnasium.make("envs.whip.gym:jaxlfi/Whip-v0")
-    gymnasium.make_vec("envs.whip.gym:jaxlfi/Whip-v0", num_envs=12, vectorization_mode="vector_entry_point")
+    gymnasium.make("jaxlfi.envs.whip.gym:jaxlfi/Whip-v0")
+    gymnasium.make_vec("jaxlfi.envs.whip.gym:jaxlfi/Whip-v0", num_envs=12, vectorization_mode="vector_entry_point")
 
 Actions are in metres; `gymnasium.wrappers.RescaleAction` brings them to [-1, 1].
 """
@@ -13,15 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.whip import rules
-from envs.whip.camera import side_camera
-from envs.whip.engine import Engine
-from envs.whip.engines import pick
-from envs.whip.episode import OBSERVATION, Episode, Step, Whip
-from envs.whip.keypoints import DETECTORS, Detector
-from envs.whip.parameters import INITIAL, WhipParameters, check, median, randomised
-from envs.whip.raster import segmentation
-from envs.whip.render import PALETTE
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.episode import OBSERVATION, Episode, Step, Whip
+from jaxlfi.envs.whip.parameters import INITIAL, WhipParameters, check, median, randomised
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.render import PALETTE
+from jaxlfi.envs.whip.vision.camera import side_camera
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS, Detector
+from jaxlfi.envs.whip.vision.raster import segmentation
 
 try:
     import gymnasium
@@ -29,7 +29,7 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise ImportError("envs.whip.gym needs gymnasium: pip install 'jaxlfi[whip]'") from error
+    raise ImportError("jaxlfi.envs.whip.gym needs gymnasium: pip install 'jaxlfi[whip]'") from error
 
 Domain = Callable[[jax.Array], WhipParameters]
 """Draws a scene with a key."""
@@ -343,4 +343,6 @@ def _many(info: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {**info, **{f"_{name}": np.ones(len(value), bool) for name, value in info.items()}}
 
 
-gymnasium.register("jaxlfi/Whip-v0", entry_point="envs.whip.gym:WhipGym", vector_entry_point="envs.whip.gym:WhipVector")
+gymnasium.register(
+    "jaxlfi/Whip-v0", entry_point="jaxlfi.envs.whip.gym:WhipGym", vector_entry_point="jaxlfi.envs.whip.gym:WhipVector"
+)

@@ -8,13 +8,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from envs.whip import engine as physics
-from envs.whip import rules
-from envs.whip.camera import project, side_camera
-from envs.whip.engine import Engine
-from envs.whip.kinematics import frames
-from envs.whip.parameters import HIGHEST, WhipParameters
-from envs.whip.scene import START
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.parameters import HIGHEST, WhipParameters
+from jaxlfi.envs.whip.physics import engine as physics
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.physics.scene import START
+from jaxlfi.envs.whip.vision.camera import project, side_camera
 
 MARGIN = 0.005
 """How far plans keep the set-point from the limits of the workspace, in m: the DLO pulls the gripper off it."""
@@ -112,8 +112,8 @@ def plan(key: jax.Array, engine: Engine, parameters: WhipParameters, method: Cro
 
     Example:
         >>> import jax
-        >>> from envs.whip.native import NativeEngine
-        >>> from envs.whip.parameters import median
+        >>> from jaxlfi.envs.whip.physics.native import NativeEngine
+        >>> from jaxlfi.envs.whip.parameters import median
         >>> method = CrossEntropy(population=4, elites=2, iterations=1, stacks=1)
         >>> plan(jax.random.key(0), NativeEngine(), median(length=0.3), method).actions.shape
         (16, 2)

@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs.whip import parameters as ranges
-from envs.whip import recording as recordings
-from envs.whip.camera import side_camera
-from envs.whip.engine import Engine
-from envs.whip.engines import pick
-from envs.whip.exploration import exploratory_actions
-from envs.whip.frames import COLOURS
-from envs.whip.keypoints import DETECTORS, Detector
-from envs.whip.parameters import WhipParameters, median, randomised
-from envs.whip.rollout import trajectory
+from jaxlfi.envs.whip import parameters as ranges
+from jaxlfi.envs.whip import recording as recordings
+from jaxlfi.envs.whip.exploration import exploratory_actions
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.parameters import WhipParameters, median, randomised
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.trajectory import trajectory
+from jaxlfi.envs.whip.vision.camera import side_camera
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS, Detector
 from jaxlfi.summaries import cross_correlation
 from jaxlfi.support import Support
 from jaxlfi.task import Task
@@ -64,9 +64,9 @@ def task(
 
     Args:
         object: what is observed: a stand-in for a real object by name ("dlo-0" to "dlo-3"), or the path of a recorded
-            rollout's .npz (`envs.whip.recording`). The simulator applies its actions and looks from where its camera
+            rollout's .npz (`jaxlfi.envs.whip.recording`). The simulator applies its actions and looks from where its camera
             stood. Without one, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory actions.
-        detector: how simulated keypoints err (`envs.whip.keypoints.DETECTORS`): "clean", "mask", "noisy" or
+        detector: how simulated keypoints err (`jaxlfi.envs.whip.vision.keypoints.DETECTORS`): "clean", "mask", "noisy" or
             "transporter". It ought to be like the detector that made the observation; the stand-ins' is "mask".
         nuisances: "fixed": density, cubes and placement are as in mu; "random": only their ranges are known.
         engine: "native", "mjx" or "auto", the one that suits the platform.

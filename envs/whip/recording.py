@@ -21,7 +21,7 @@ A recording NAME is two files. NAME.npz has the arrays, NAME.json says what they
 | `control_interval` | between two actions, in s                                                                     |
 | `units`            | of each array, as above                                                                       |
 | `keypoints`        | their names in order: "dlo 1" to "dlo 4", then the cubes' colours, bottom-up                  |
-| `camera`           | `position` in m, `turn` as in `envs.whip.camera`, `field_of_view` in degrees, `image_size` in |
+| `camera`           | `position` in m, `turn` as in `vision.camera`, `field_of_view` in degrees, `image_size` in pixels  |
 |                    | pixels                                                                                        |
 | `colours`          | of what is seen, as "#RRGGBB", by name                                                        |
 | `facts`            | what is known of the object, for people to read: inference does not use it                    |
@@ -39,11 +39,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from envs.whip.camera import Camera
-from envs.whip.frames import COLOURS
-from envs.whip.keypoints import KEYPOINTS, ON_DLO
-from envs.whip.rules import ACTION_LIMIT, HIT_DISTANCE, STEPS
 from jaxlfi import atomic
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.rules import ACTION_LIMIT, HIT_DISTANCE, STEPS
+from jaxlfi.envs.whip.vision.camera import Camera
+from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS, ON_DLO
 
 SCHEMA, VERSION = "jaxlfi.whip.recording", 1
 SOURCES = ("stand-in", "real")

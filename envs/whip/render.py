@@ -10,16 +10,16 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from envs.whip import rules
-from envs.whip.camera import Camera, project, side_camera
-from envs.whip.engine import Engine, State
-from envs.whip.episode import Step, Whip
-from envs.whip.frames import COLOURS, Frames
-from envs.whip.keypoints import KEYPOINTS, ON_DLO
-from envs.whip.kinematics import frames
-from envs.whip.parameters import WhipParameters
-from envs.whip.raster import segmentation
-from envs.whip.scene import RGBA
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.episode import Step, Whip
+from jaxlfi.envs.whip.frames import COLOURS, Frames
+from jaxlfi.envs.whip.parameters import WhipParameters
+from jaxlfi.envs.whip.physics.engine import Engine, State
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.physics.scene import RGBA
+from jaxlfi.envs.whip.vision.camera import Camera, project, side_camera
+from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS, ON_DLO
+from jaxlfi.envs.whip.vision.raster import segmentation
 
 BACKGROUND = (1.0, 1.0, 1.0)
 PALETTE = np.array([BACKGROUND, *(RGBA[name][:3] for name in (*COLOURS, "dlo"))], np.float32)
@@ -155,7 +155,7 @@ def save_pictures(folder: Path, engine: Engine, rollout: Rollout, title: Sequenc
     Returns:
         What was written.
     """
-    from jaxlfi.figures import whip as figures
+    from jaxlfi.envs.whip import figures
 
     labels, places, still = jax.device_get(_shoot(engine, rollout))
     at = np.arange(len(labels))

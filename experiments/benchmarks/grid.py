@@ -18,8 +18,8 @@ if "XLA_FLAGS" not in os.environ:  # read once, when jax starts
 
 import jax
 
-from envs.lotka_volterra import task as lotka_volterra
 from jaxlfi import QUICK, infer
+from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.heuristics import Edge
 from jaxlfi.sweep import Axis, Grid, grid_lanes, prepare, run_chunk
 

@@ -26,7 +26,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
-from envs import lotka_volterra_mjp as lv  # noqa: E402
+from jaxlfi.envs.lotka_volterra import jump_process as lv  # noqa: E402
 
 TRUTH = np.log([0.01, 0.5, 1.0, 0.01]).astype(np.float32)
 PRIOR_BOUNDS = (-5.0, 2.0)

@@ -26,8 +26,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.lotka_volterra import task as lotka_volterra
 from jaxlfi import bayessim, dataset
+from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.estimator import Estimator, Network, initialise
 from jaxlfi.fitting import fit
 from jaxlfi.heuristics import Edge
@@ -202,7 +202,7 @@ import time
 from jaxlfi import compile_cache
 compile_cache.enable()
 import jax, jax.numpy as jnp
-from envs.lotka_volterra import task as factory
+from jaxlfi.envs.lotka_volterra import task as factory
 from jaxlfi import bayessim
 from jaxlfi.heuristics import Edge
 from jaxlfi.presets import QUICK

@@ -36,18 +36,18 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from envs.whip import rules
-from envs.whip.chain import Chain
-from envs.whip.edits import edited_model
-from envs.whip.engine import Engine, State, ramp, rollout
-from envs.whip.engines import NAMES, pick
-from envs.whip.exploration import exploratory_actions
-from envs.whip.kinematics import frames
-from envs.whip.native import NativeEngine
-from envs.whip.parameters import FEASIBLE, INITIAL, WhipParameters, median
-from envs.whip.scene import CUBES, START, Scene
 from experiments.whip_physics.rollouts import random_scene, random_targets
 from jaxlfi import atomic
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.exploration import exploratory_actions
+from jaxlfi.envs.whip.parameters import FEASIBLE, INITIAL, WhipParameters, median
+from jaxlfi.envs.whip.physics.chain import Chain
+from jaxlfi.envs.whip.physics.edits import edited_model
+from jaxlfi.envs.whip.physics.engine import Engine, State, ramp, rollout
+from jaxlfi.envs.whip.physics.engines import NAMES, pick
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.physics.native import NativeEngine
+from jaxlfi.envs.whip.physics.scene import CUBES, START, Scene
 from jaxlfi.run_store import command_line, environment
 
 SCENE = Scene()
@@ -153,8 +153,8 @@ import time
 from jaxlfi import compile_cache
 compile_cache.enable()
 import jax
-from envs.whip.engine import rollout
-from envs.whip.engines import NAMES, pick
+from jaxlfi.envs.whip.physics.engine import rollout
+from jaxlfi.envs.whip.physics.engines import NAMES, pick
 from experiments.benchmarks.whip import random_batch
 engine = pick("mjx")
 scenes, targets = random_batch(12)

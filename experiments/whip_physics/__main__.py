@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from envs.whip.chain import Chain
-from envs.whip.engines import pick
-from envs.whip.scene import Scene
 from experiments.whip_physics import figures, measure, rollouts
 from experiments.whip_physics.models import KINDS
 from jaxlfi import atomic
+from jaxlfi.envs.whip.physics.chain import Chain
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.figures import style
 from jaxlfi.run_store import command_line, environment
 

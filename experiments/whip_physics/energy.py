@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from envs.whip.chain import GRAVITY
 from experiments.whip_physics import statics
+from jaxlfi.envs.whip.physics.chain import GRAVITY
 
 
 def swing(model: mujoco.MjModel, timestep: float, seconds: float = 2.0, runge_kutta: bool = False) -> np.ndarray:

@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 
-from envs.whip.chain import GRAVITY, SECOND_MOMENT, SECTION, Chain
-from envs.whip.engine import Engine
-from envs.whip.parameters import MEDIAN, WhipParameters, median
-from envs.whip.scene import Scene
 from experiments.whip_physics import beam, energy, models, rollouts, statics
+from jaxlfi.envs.whip.parameters import MEDIAN, WhipParameters, median
+from jaxlfi.envs.whip.physics.chain import GRAVITY, SECOND_MOMENT, SECTION, Chain
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.scene import Scene
 
 ELEMENTS = (8, 10, 12, 16, 24)
 """N."""

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs.whip import rules
-from envs.whip.chain import SECTION
-from envs.whip.engine import Engine, State, reset, rollout
-from envs.whip.kinematics import frames
-from envs.whip.parameters import FEASIBLE, WhipParameters, randomised
-from envs.whip.scene import CUBES, START
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.parameters import FEASIBLE, WhipParameters, randomised
+from jaxlfi.envs.whip.physics.chain import SECTION
+from jaxlfi.envs.whip.physics.engine import Engine, State, reset, rollout
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.physics.scene import CUBES, START
 
 BATCH = 100
 """Scenes that are simulated together."""
