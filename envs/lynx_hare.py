@@ -13,22 +13,22 @@ from jaxlfi.support import Support
 from jaxlfi.task import Task
 
 SUBSTEPS = 25
-"""Integration steps a year."""
+"""Integration steps per year."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Nuisance:
-    """What is drawn anew in every simulation, because it is unknown and not of interest.
+    """Distributions of what is drawn anew in every simulation, because it is unknown and not inferred.
 
     Attributes:
-        initial_spread: the populations of 1900 are the first record times a log-normal of this scale.
-        noise: median scale of the log-normal measurement error, drawn for each species.
-        noise_spread: log-normal scale of that scale itself.
+        initial_sd: standard deviation of the logarithm of the initial populations, about that of the first record.
+        noise: median scale of the log-normal measurement error, which is drawn for each species.
+        noise_sd: standard deviation of the logarithm of that scale.
     """
 
-    initial_spread: float = 0.25
+    initial_sd: float = 0.25
     noise: float = 0.25
-    noise_spread: float = 0.3
+    noise_sd: float = 0.3
 
 
 REFERENCE_MEAN = np.array([0.024, 0.800, 0.545, 0.028])
@@ -51,7 +51,7 @@ def load() -> tuple[np.ndarray, np.ndarray]:
 
 
 def growth(trajectory: Float[Array, "years 2"]) -> Float[Array, "12"]:
-    """Twelve summaries: how each species' growth depends on the other, and its level, spread and memory.
+    """Twelve summaries: how the growth of each species depends on the other, its level, variation and autocorrelation.
 
     Integrated over a year, the equations are linear in the rates: the logarithm of X grows by theta_1 times the mean
     of Y, less theta_2, and that of Y by theta_3, less theta_4 times the mean of X. Slope and intercept of these two
@@ -89,8 +89,8 @@ def task(nuisance: Nuisance = Nuisance()) -> Task:
 
     def simulate(key: jax.Array, log_rates: Float[Array, "4"]) -> Float[Array, "years 2"]:
         key_initial, key_scale, key_noise = jax.random.split(key, 3)
-        initial = pelts[0] * jnp.exp(nuisance.initial_spread * jax.random.normal(key_initial, (2,)))
-        scale = nuisance.noise * jnp.exp(nuisance.noise_spread * jax.random.normal(key_scale, (2,)))
+        initial = pelts[0] * jnp.exp(nuisance.initial_sd * jax.random.normal(key_initial, (2,)))
+        scale = nuisance.noise * jnp.exp(nuisance.noise_sd * jax.random.normal(key_scale, (2,)))
         clean = populations(jnp.exp(log_rates), initial, interval=1.0, records=len(years), substeps=SUBSTEPS)
         return lognormal_noise(key_noise, clean, scale)
 

@@ -18,10 +18,10 @@ from jaxlfi import atomic
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.reference_objects.calibration import Calibration, calibrated
-from jaxlfi.envs.whip.reference_objects.objects import TABLE, Object
+from jaxlfi.envs.whip.reference_objects.objects import TABLE, ReferenceObject
 from jaxlfi.envs.whip.reference_objects.observation import in_every_frame, look, record
 from jaxlfi.envs.whip.reference_objects.scene import SIMULATOR
-from jaxlfi.envs.whip.reference_objects.simulation import StandIn
+from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig
 from jaxlfi.envs.whip.vision.keypoints import ON_DLO
 from jaxlfi.figures import style
 
@@ -31,13 +31,13 @@ HOW = (
     "alike; hanging_length is at 9.81 m/s^2. Units: m, kg, s, Pa; sag and reach are fractions of length."
 )
 COLUMNS = {
-    "object": lambda thing, _: thing.name,
-    "Shore": lambda thing, _: thing.hardness,
-    "length (mm)": lambda thing, _: f"{1e3 * thing.length:.0f}",
-    "mass (g)": lambda thing, _: f"{1e3 * thing.mass:.2f}",
-    "modulus of the material (Pa)": lambda thing, _: f"{thing.young:.4g}",
+    "object": lambda dlo, _: dlo.name,
+    "Shore": lambda dlo, _: dlo.hardness,
+    "length (mm)": lambda dlo, _: f"{1e3 * dlo.length:.0f}",
+    "mass (g)": lambda dlo, _: f"{1e3 * dlo.mass:.2f}",
+    "modulus of the material (Pa)": lambda dlo, _: f"{dlo.young:.4g}",
     "effective modulus (Pa)": lambda _, found: f"{found.effective_young:.4g}",
-    "the same at 75 kg/m^3 (Pa)": lambda thing, _: f"{thing.light_young:.4g}",
+    "the same at 75 kg/m^3 (Pa)": lambda dlo, _: f"{dlo.light_young:.4g}",
     "sag / length": lambda _, found: f"{found.sag:.4f}",
     "reach / length": lambda _, found: f"{found.reach:.4f}",
     "beam's reach / length": lambda _, found: f"{found.beam_reach:.4f}",
@@ -46,16 +46,16 @@ COLUMNS = {
 """Of the table of the calibration."""
 
 
-def described(thing: Object, found: Calibration) -> dict:
+def described(dlo: ReferenceObject, found: Calibration) -> dict:
     """All that objects.json has of one object."""
     return {
-        **dataclasses.asdict(thing),
-        "light_young": round(thing.light_young),
+        **dataclasses.asdict(dlo),
+        "light_young": round(dlo.light_young),
         "measured": {name: float(f"{value:.6g}") for name, value in dataclasses.asdict(found).items()},
     }
 
 
-def table(calibrations: list[tuple[Object, Calibration]]) -> str:
+def table(calibrations: list[tuple[ReferenceObject, Calibration]]) -> str:
     """The calibration in Markdown."""
     rows = [list(COLUMNS), ["---"] * len(COLUMNS)]
     rows += [[column(*pair) for column in COLUMNS.values()] for pair in calibrations]
@@ -98,32 +98,32 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the recordings and objects.json")
     given = parser.parse_args(arguments)
     objects = given.data / "objects.json"
-    for path in (objects, *(given.data / f"{thing.name}.npz" for thing in TABLE)):
+    for path in (objects, *(given.data / f"{dlo.name}.npz" for dlo in TABLE)):
         if path.exists():
             parser.error(f"--data: expected a folder without {path.name}, got {given.data}")
     for folder in (given.out, given.data):
         folder.mkdir(parents=True, exist_ok=True)
-    calibrations = [calibrated(thing) for thing in TABLE]
+    calibrations = [calibrated(dlo) for dlo in TABLE]
     (given.out / "table.md").write_text(table(calibrations))
     atomic.write_json(
         objects,
         {
             "how": HOW,
             "simulator": SIMULATOR,
-            "objects": {thing.name: described(thing, found) for thing, found in calibrations},
+            "objects": {dlo.name: described(dlo, found) for dlo, found in calibrations},
         },
     )
-    for i, (thing, _) in enumerate(calibrations):
+    for i, (dlo, _) in enumerate(calibrations):
         key = jax.random.key(i)
-        rig = StandIn(thing)
+        rig = ReferenceRig(dlo)
         recording, frames = record(key, rig, exploratory_actions())
-        recordings.write(given.data / f"{thing.name}.npz", recording)
+        recordings.write(given.data / f"{dlo.name}.npz", recording)
         labels = in_every_frame(look, key, recording.camera, frames, rig.place.cube_side)
         with style.context():
             figure = style.new_figure(style.TEXT_WIDTH, 4.0)
             draw(figure, recording, labels)
-            style.save(figure, given.out / f"{thing.name}.png", 200)
-        print(f"wrote {given.data / thing.name}.npz")
+            style.save(figure, given.out / f"{dlo.name}.png", 200)
+        print(f"wrote {given.data / dlo.name}.npz")
 
 
 if __name__ == "__main__":

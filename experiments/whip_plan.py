@@ -2,9 +2,9 @@
 
     python -m experiments.whip_plan --out experiments/results/whip-plan
 
-For every DLO the cross-entropy method (`jaxlfi.envs.whip.planner`) looks for actions of the greatest return on average over
-places of the stack, and ends early where they hit hardly anything but the top cube. What it has found is then tried on
-places in between, of which it knew nothing.
+For every DLO the cross-entropy method (`jaxlfi.envs.whip.planner`) searches for actions of the greatest mean return over
+positions of the stack, and ends early once they hit hardly anything but the top cube. The plan is then tested at
+positions in between, which the search did not use.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Lotka-Volterra as a Markov jump process: the task of sections III to V."""
+"""Lotka-Volterra: the Markov jump process of sections III to V, and as differential equations (`ode`)."""
 
 import numpy as np
 
@@ -37,7 +37,7 @@ def task(process: JumpProcess = JumpProcess()) -> Task:
     `process.max_events` events.
 
     Args:
-        process: initial populations, duration, recording and cap on events; the paper's by default.
+        process: initial populations, duration, recording and maximum number of events; by default the paper's.
     """
     return Task(
         make_simulator(process),

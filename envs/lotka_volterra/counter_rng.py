@@ -2,14 +2,14 @@
 
 `jax.random` runs threefry with twenty rounds, which is two thirds of the cost of a Gillespie step.
 Here a `Seed` of 64 bits, itself drawn by threefry from a typed key, turns a 32-bit counter into a
-32-bit word by three multiplications. There is no state to carry: word `c` of a seed can be asked
-for in any order, so that a loop over events needs the event's number only. It is not cryptographic,
+32-bit word by three multiplications. There is no state: the words of a seed can be
+computed in any order, so that a loop over events needs the number of the event only. It is not cryptographic,
 and a seed holds 2**32 words.
 
 The mixing function is an xor-shift-multiply finaliser in the manner of MurmurHash3 (A. Appleby,
 2011, whose two multipliers are used) and of the counter-based generators of Salmon, Moraes, Dror,
-Shaw (2011), "Parallel random
-numbers: as easy as 1, 2, 3". `tests/test_lotka_volterra_mjp.py` holds its statistical tests.
+Shaw (2011), "Parallel random numbers: as easy as 1, 2, 3". Statistical tests are in
+`tests/envs/lotka_volterra/test_jump_process.py`.
 """
 
 from typing import NamedTuple
@@ -39,8 +39,8 @@ def random_word(seed: Seed, counter: jax.Array) -> jax.Array:
     """Returns word number `counter` (uint32) of the stream `seed`, broadcasting the two.
 
     `seed.low` shifts the counter and `seed.high` enters between the multiplications: with the shift
-    alone two lanes whose low words lie close together would replay each other's stream a few events
-    later.
+    alone, two simulations whose low words lie close together would replay each other's stream a few
+    events later.
     """
     word = counter * _GOLDEN_STEP + seed.low
     word = (word ^ (word >> 16)) * _MULTIPLIERS[0] + seed.high

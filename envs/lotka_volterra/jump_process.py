@@ -1,4 +1,4 @@
-"""Exact simulation of the Lotka-Volterra Markov jump process, many lanes at a time.
+"""Exact simulation of the Lotka-Volterra Markov jump process, many simulations at a time.
 
 The process and its nine summaries are those of Papamakarios and Murray (2016), "Fast epsilon-free
 inference of simulation models with Bayesian conditional density estimation"; the algorithm is
@@ -8,19 +8,19 @@ Gillespie's direct method (1977).
     trajectory, failure = simulate(jax.random.key(0), jnp.log(jnp.array([0.01, 0.5, 1.0, 0.01])))
     x = lotka_volterra_nine(trajectory)
 
-How it is made fast, in short (measured by `python -m experiments.benchmarks.lotka_volterra`):
+Why it is fast, in short (measured by `python -m experiments.benchmarks.lotka_volterra`):
 
-* `simulate` is written for one lane; under `jax.vmap`, nested or not, its batching rule gathers all
-  lanes into one queue. A fixed number of lanes works the queue off in phases of a fixed number of
-  events; at the end of a phase a lane that has finished takes the next simulation. Nobody waits for
-  the slowest lane.
+* `simulate` is written for one simulation; under `jax.vmap`, nested or not, its batching rule puts all
+  simulations into one queue. A fixed number of slots processes the queue in phases of a fixed number of
+  events; at the end of a phase, slots whose simulation has finished take the next one from the queue.
+  No simulation waits for the slowest.
 * The jump chain does not depend on time. The only sequential loop is one small fused kernel per
-  event, which draws the reaction and moves the state, packed into one 32-bit word. Waiting times
+  event, which draws the reaction and updates the state, packed into one 32-bit word. Waiting times
   are drawn afterwards for the whole phase, and the states at the grid times are found by bisection
   of the phase's event times.
-* Random numbers are a hash of (lane's seed, event number), see `jaxlfi.envs.lotka_volterra.counter_rng`.
+* Random numbers are a hash of (seed of the simulation, event number), see `counter_rng`.
 
-A lane's result depends on its own key and rates only, bit for bit, whatever batch it runs in.
+The result of a simulation depends on its own key and rates only, bit for bit, and not on its batch.
 """
 
 import dataclasses
@@ -98,31 +98,30 @@ class JumpProcess:
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
-    """How the queue is worked off: a matter of speed, not of results.
+    """How the queue is processed: this affects speed, not results.
 
     Attributes:
-        lanes: simulations in progress at a time, per device. They are there even when the batch is
-            smaller: loops of one fixed width round alike whatever the batch, and a phase of few
-            lanes takes hardly less time.
-        phase: events between two looks at which lanes have finished. Event times are summed up
-            within a phase, so that another length may round the last bit of a time differently.
+        slots: simulations in progress at a time, per device. Smaller batches use the same number: loops
+            of a fixed width round alike for every batch, and a phase of few slots takes hardly less time.
+        phase: events between two checks of which slots have finished. Event times are summed within a
+            phase, so that another length may round the last bit of a time differently.
         records: grid records extracted at a time at the end of a phase.
     """
 
-    lanes: int = 192
+    slots: int = 192
     phase: int = 128
     records: int = 512
 
 
 class Simulations(NamedTuple):
-    """What the queue of N simulations gives: public results and what the benchmark looks at.
+    """The results of a queue of N simulations, and the work they took.
 
     Attributes:
         trajectory: predators and prey at the grid times, [N, records, 2] float32.
         failure: `SUCCESS` or `TOO_MANY_EVENTS`, [N] int32.
-        steps: lane-steps each simulation needed, [N] int32: its events and, if it froze, the
-            endless wait after.
-        phases: phases executed, [] int32; each is `Schedule.lanes * Schedule.phase` lane-steps.
+        steps: slot-steps that each simulation needed, [N] int32: its events and, if it froze, the
+            endless wait after them.
+        phases: phases executed, [] int32; each is `Schedule.slots * Schedule.phase` slot-steps.
     """
 
     trajectory: Float[Array, "batch records 2"]
@@ -131,16 +130,16 @@ class Simulations(NamedTuple):
     phases: Int[Array, ""]
 
 
-class _Lanes(NamedTuple):
-    """The simulations in progress, one element a lane.
+class _Slots(NamedTuple):
+    """The simulations in progress, one element per slot.
 
-    Time is kept as the grid cell the lane is in and the time since that cell's start in units of
+    Time is kept as the grid cell the slot is in and the time since that cell's start in units of
     the interval. The fraction stays below one between phases, so its rounding error (6e-8 of an
     interval) does not grow with time, which a float32 clock running to 30 would not give; grid
     times are whole numbers, exactly.
     """
 
-    simulation: jax.Array  # index into the queue; its length when the lane has nothing left to do
+    simulation: jax.Array  # index into the queue; the queue's length if the slot is idle
     seed: counter_rng.Seed
     rates: jax.Array  # [4, W], per interval
     state: jax.Array  # packed populations
@@ -150,9 +149,9 @@ class _Lanes(NamedTuple):
 
 
 class _Queue(NamedTuple):
-    """Everything the outer loop carries."""
+    """State of the outer loop."""
 
-    lanes: _Lanes
+    slots: _Slots
     next_simulation: jax.Array
     records: jax.Array  # [N, records] packed
     failure: jax.Array
@@ -186,86 +185,88 @@ def _react(state: jax.Array, rates: jax.Array, word: jax.Array) -> jax.Array:
     return state + change.astype(jnp.uint32)
 
 
-def _phase_events(lanes: _Lanes, phase: int, intervals: int) -> tuple[jax.Array, jax.Array]:
-    """Runs `phase` events of every lane.
+def _phase_events(slots: _Slots, phase: int, intervals: int) -> tuple[jax.Array, jax.Array]:
+    """Runs `phase` events of every slot.
 
     Returns the states [phase + 1, W], from the one before the first event on, and the event times
-    [phase, W] in intervals since the start of the lane's cell. Waiting times are cut at the whole
+    [phase, W] in intervals since the start of the slot's cell. Waiting times are cut at the whole
     duration, which stands for infinity where the total rate is zero.
     """
     numbers = jnp.arange(phase, dtype=jnp.uint32)
 
     def react(state, number):
-        word = counter_rng.random_word(lanes.seed, 2 * (lanes.events + number) + 1)
-        state = _react(state, lanes.rates, word)
+        word = counter_rng.random_word(slots.seed, 2 * (slots.events + number) + 1)
+        state = _react(state, slots.rates, word)
         return state, state
 
     # Not unrolled: XLA's fusion on CPU then recomputes a step for each of its consumers, and the
     # whole takes fifteen times as long.
-    _, after = lax.scan(react, lanes.state, numbers)
-    states = jnp.concatenate([lanes.state[None], after])
+    _, after = lax.scan(react, slots.state, numbers)
+    states = jnp.concatenate([slots.state[None], after])
 
-    words = counter_rng.random_word(lanes.seed, 2 * (lanes.events + numbers[:, None]))
-    total = _cumulative_rates(states[:-1], lanes.rates[:, None])[3]
+    words = counter_rng.random_word(slots.seed, 2 * (slots.events + numbers[:, None]))
+    total = _cumulative_rates(states[:-1], slots.rates[:, None])[3]
     waits = jnp.minimum(counter_rng.exponential(words) / total, np.float32(intervals + 1))
 
     def advance(time, wait):
         time = time + wait
         return time, time
 
-    _, times = lax.scan(advance, lanes.fraction, waits)
+    _, times = lax.scan(advance, slots.fraction, waits)
     return states, times
 
 
-def _count_earlier(times: jax.Array, lane: jax.Array, target: jax.Array) -> jax.Array:
-    """Number of events of `lane` before `target`, by bisection of the sorted times [phase, W]."""
+def _count_earlier(times: jax.Array, slot: jax.Array, target: jax.Array) -> jax.Array:
+    """Number of events of `slot` before `target`, by bisection of the sorted times [phase, W]."""
     phase = times.shape[0]
-    # A loop: unrolled, each step would be a kernel that recomputes the steps before it.
+    # A loop: if it is unrolled, each step becomes a kernel that recomputes the steps before it.
     steps = jnp.asarray([2**power for power in reversed(range(phase.bit_length()))])
 
     def bisect(count, step):
         trial = count + step
-        earlier = (trial <= phase) & (times[jnp.minimum(trial, phase) - 1, lane] < target)
+        earlier = (trial <= phase) & (times[jnp.minimum(trial, phase) - 1, slot] < target)
         return jnp.where(earlier, trial, count), None
 
-    return lax.scan(bisect, jnp.zeros_like(lane), steps)[0]
+    return lax.scan(bisect, jnp.zeros_like(slot), steps)[0]
 
 
-def _work_off(process: JumpProcess, schedule: Schedule, seeds: counter_rng.Seed, log_rates: jax.Array) -> Simulations:
+def _process_queue(
+    process: JumpProcess, schedule: Schedule, seeds: counter_rng.Seed, log_rates: jax.Array
+) -> Simulations:
     """Runs N queued simulations, seeds [N] and log_rates [N, 4]."""
     simulations = log_rates.shape[0]
-    width, phase, intervals = schedule.lanes, schedule.phase, process.intervals
+    width, phase, intervals = schedule.slots, schedule.phase, process.intervals
     initial = np.uint32(process.predators * _PREDATOR + process.prey * _PREY)
     unusable = jnp.any(jnp.isnan(log_rates), axis=1)
     rates = jnp.exp(jnp.minimum(log_rates, _MAX_LOG_RATE)) * np.float32(process.interval)
     rates = jnp.where(unusable[:, None], 0.0, rates).T
 
-    def refill(lanes: _Lanes, finished: jax.Array, next_simulation: jax.Array) -> _Lanes:
+    def refill(slots: _Slots, finished: jax.Array, next_simulation: jax.Array) -> _Slots:
         place = next_simulation + jnp.cumsum(finished) - 1
-        simulation = jnp.where(finished, jnp.minimum(place, simulations), lanes.simulation)
+        simulation = jnp.where(finished, jnp.minimum(place, simulations), slots.simulation)
         source = jnp.minimum(simulation, simulations - 1)
-        return _Lanes(
+        return _Slots(
             simulation=simulation,
-            seed=jax.tree.map(lambda queue, lane: jnp.where(finished, queue[source], lane), seeds, lanes.seed),
-            rates=jnp.where(finished, rates[:, source], lanes.rates),
-            state=jnp.where(finished, initial, lanes.state),
-            cell=jnp.where(finished, 0, lanes.cell),
-            fraction=jnp.where(finished, 0.0, lanes.fraction),
-            events=jnp.where(finished, 0, lanes.events),
+            seed=jax.tree.map(lambda queue, slot: jnp.where(finished, queue[source], slot), seeds, slots.seed),
+            rates=jnp.where(finished, rates[:, source], slots.rates),
+            state=jnp.where(finished, initial, slots.state),
+            cell=jnp.where(finished, 0, slots.cell),
+            fraction=jnp.where(finished, 0.0, slots.fraction),
+            events=jnp.where(finished, 0, slots.events),
         )
 
     def step(queue: _Queue) -> _Queue:
-        lanes = queue.lanes
-        busy = lanes.simulation < simulations
-        states, times = _phase_events(lanes, phase, intervals)
+        slots = queue.slots
+        busy = slots.simulation < simulations
+        states, times = _phase_events(slots, phase, intervals)
         # The last event of the phase that max_events allows.
-        last = jnp.minimum(process.max_events - 1 - lanes.events.astype(jnp.int32), phase - 1)
+        last = jnp.minimum(process.max_events - 1 - slots.events.astype(jnp.int32), phase - 1)
         time = times[last, jnp.arange(width)]
-        left = intervals - lanes.cell
+        left = intervals - slots.cell
         state = states[last + 1, jnp.arange(width)]
-        frozen = _cumulative_rates(state, lanes.rates)[3] == 0
+        frozen = _cumulative_rates(state, slots.rates)[3] == 0
         arrived = (time >= left) | frozen
-        exhausted = lanes.events + phase >= process.max_events
+        exhausted = slots.events + phase >= process.max_events
         finished = busy & (arrived | exhausted)
         cells = jnp.floor(time)
         # One that freezes or fails fills the rest of its trajectory with its last state.
@@ -275,20 +276,20 @@ def _work_off(process: JumpProcess, schedule: Schedule, seeds: counter_rng.Seed,
         starts = ends - new_records
 
         def extract(carry):
-            """Takes the next `schedule.records` of all lanes' new records, laid end to end."""
+            """Takes the next `schedule.records` of all slots' new records, laid end to end."""
             begin, records, steps = carry
             number = begin + jnp.arange(schedule.records)
-            lane = jnp.searchsorted(ends, number, side="right", method="scan")
-            lane = jnp.minimum(lane, width - 1)
-            target = number - starts[lane] + 1
-            before = _count_earlier(times, lane, target.astype(jnp.float32))
-            after = jnp.minimum(before + 1, last[lane] + 1)
+            slot = jnp.searchsorted(ends, number, side="right", method="scan")
+            slot = jnp.minimum(slot, width - 1)
+            target = number - starts[slot] + 1
+            before = _count_earlier(times, slot, target.astype(jnp.float32))
+            after = jnp.minimum(before + 1, last[slot] + 1)
             event = after if process.record == "after" else jnp.minimum(before, after)
-            row = jnp.where(number < ends[-1], lanes.simulation[lane], simulations)
-            column = lanes.cell[lane] + target
-            records = records.at[row, column].set(states[event, lane], mode="drop")
+            row = jnp.where(number < ends[-1], slots.simulation[slot], simulations)
+            column = slots.cell[slot] + target
+            records = records.at[row, column].set(states[event, slot], mode="drop")
             final = jnp.where(column == intervals, row, simulations)
-            total_steps = lanes.events[lane].astype(jnp.int32) + after
+            total_steps = slots.events[slot].astype(jnp.int32) + after
             steps = steps.at[final].set(total_steps, mode="drop")
             return begin + schedule.records, records, steps
 
@@ -297,16 +298,16 @@ def _work_off(process: JumpProcess, schedule: Schedule, seeds: counter_rng.Seed,
             extract,
             (jnp.zeros_like(ends[0]), queue.records, queue.steps),
         )
-        row = jnp.where(finished, lanes.simulation, simulations)
+        row = jnp.where(finished, slots.simulation, simulations)
         failure = jnp.where(arrived, SUCCESS, TOO_MANY_EVENTS)
-        moved = lanes._replace(
+        moved = slots._replace(
             state=states[-1],
-            cell=lanes.cell + cells.astype(jnp.int32),
+            cell=slots.cell + cells.astype(jnp.int32),
             fraction=time - cells,
-            events=lanes.events + phase,
+            events=slots.events + phase,
         )
         return _Queue(
-            lanes=refill(moved, finished, queue.next_simulation),
+            slots=refill(moved, finished, queue.next_simulation),
             next_simulation=queue.next_simulation + jnp.sum(finished),
             records=records,
             failure=queue.failure.at[row].set(failure, mode="drop"),
@@ -316,25 +317,25 @@ def _work_off(process: JumpProcess, schedule: Schedule, seeds: counter_rng.Seed,
 
     # Zeros made from the input vary over devices as it does: the loop can run in jax.shard_map.
     zero = jnp.zeros_like(seeds.low, dtype=jnp.int32)
-    lane_zero = jnp.zeros(width, jnp.int32) + zero[0]
-    none = _Lanes(
-        simulation=lane_zero,
+    slot_zero = jnp.zeros(width, jnp.int32) + zero[0]
+    none = _Slots(
+        simulation=slot_zero,
         seed=jax.tree.map(lambda words: jnp.zeros(width, jnp.uint32) + 0 * words[0], seeds),
         rates=jnp.zeros((4, width)) + 0 * rates[0, 0],
-        state=lane_zero.astype(jnp.uint32),
-        cell=lane_zero,
-        fraction=lane_zero.astype(jnp.float32),
-        events=lane_zero.astype(jnp.uint32),
+        state=slot_zero.astype(jnp.uint32),
+        cell=slot_zero,
+        fraction=slot_zero.astype(jnp.float32),
+        events=slot_zero.astype(jnp.uint32),
     )
     queue = _Queue(
-        lanes=refill(none, lane_zero == 0, zero[0]),
+        slots=refill(none, slot_zero == 0, zero[0]),
         next_simulation=zero[0] + width,
         records=jnp.full((simulations, intervals + 1), initial) + zero.astype(jnp.uint32)[:, None],
         failure=zero,
         steps=zero,
         phases=zero[0],
     )
-    queue = lax.while_loop(lambda q: jnp.any(q.lanes.simulation < simulations), step, queue)
+    queue = lax.while_loop(lambda q: jnp.any(q.slots.simulation < simulations), step, queue)
     predators = (queue.records >> 16).astype(jnp.float32)
     prey = (queue.records & _POPULATION_LIMIT).astype(jnp.float32)
     return Simulations(
@@ -348,13 +349,13 @@ def _work_off(process: JumpProcess, schedule: Schedule, seeds: counter_rng.Seed,
 def make_batch_simulator(
     process: JumpProcess = JumpProcess(), schedule: Schedule = Schedule()
 ) -> Callable[[Key[Array, " batch"], Float[Array, "batch 4"]], Simulations]:
-    """Returns the queue itself, with its inner account of the work done.
+    """Returns the simulator of a batch, which also reports the work done.
 
     The function returned takes typed keys [N] and natural logarithms of the rates [N, 4], N >= 1.
     """
 
     def simulate_batch(keys: Key[Array, " batch"], log_rates: Float[Array, "batch 4"]) -> Simulations:
-        return _work_off(process, schedule, jax.vmap(counter_rng.seed_from_key)(keys), log_rates)
+        return _process_queue(process, schedule, jax.vmap(counter_rng.seed_from_key)(keys), log_rates)
 
     return simulate_batch
 
@@ -369,7 +370,7 @@ def make_simulator(process: JumpProcess = JumpProcess(), schedule: Schedule = Sc
 
     Args:
         process: what is simulated and recorded.
-        schedule: how a batch is worked off.
+        schedule: how a batch is processed.
 
     Returns:
         A pure function of a typed key, which it consumes, and of log_rates [4], the natural
@@ -378,11 +379,11 @@ def make_simulator(process: JumpProcess = JumpProcess(), schedule: Schedule = Sc
         failure the trajectory is finite and otherwise unspecified.
     """
     # Calls outside a jit of the caller's would compile the loops anew each time.
-    work_off = jax.jit(functools.partial(_work_off, process, schedule))
+    process_queue = jax.jit(functools.partial(_process_queue, process, schedule))
 
     @jax.custom_batching.custom_vmap
     def simulate_queue(seeds, log_rates):
-        result = work_off(seeds, log_rates)
+        result = process_queue(seeds, log_rates)
         return result.trajectory, result.failure
 
     @simulate_queue.def_vmap

@@ -1,8 +1,9 @@
-"""The Lotka-Volterra equations, solved deterministically and seen through noise."""
+"""The Lotka-Volterra equations, solved deterministically and observed with noise."""
 
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -73,13 +74,13 @@ NOISES: dict[str, Noise] = {"gaussian": gaussian_noise, "lognormal": lognormal_n
 """Measurement noise by name."""
 
 
-def task(noise: str = "gaussian", duration: float = 200.0, interval: float = 0.1) -> Task:
+def task(noise: Literal["gaussian", "lognormal"] = "gaussian", duration: float = 200.0, interval: float = 0.1) -> Task:
     """The noisy ODE of appendix A: X = 9 predators and Y = 40 prey at first, rates in natural units.
 
     Args:
         noise: "gaussian" or "lognormal".
-        duration: simulated time; 200 is the tutorial's that the appendix follows (`short` is the appendix to the
-            letter).
+        duration: simulated time; by default that of the tutorial that the appendix follows (`short` follows the
+            appendix to the letter).
         interval: time between records.
 
     Raises:
@@ -113,7 +114,7 @@ def task(noise: str = "gaussian", duration: float = 200.0, interval: float = 0.1
     )
 
 
-def short(noise: str = "gaussian") -> Task:
+def short(noise: Literal["gaussian", "lognormal"] = "gaussian") -> Task:
     """The appendix to the letter: 200 steps of 0.1, a duration of 20, a quarter of a cycle at the truth.
 
     The tutorial that it follows simulates a duration of 200 in steps of 0.1, which is what `task` does.

@@ -1,4 +1,4 @@
-"""Rollouts of the whipping task: a sheet of instants and an animation, from segmentation labels and keypoints."""
+"""Pictures of rollouts: a sheet of frames and an animation, from segmentation labels and keypoints."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -13,11 +13,11 @@ from PIL import Image
 from jaxlfi.figures import style
 
 COLUMNS = 6
-"""Of the sheet."""
+"""Number of columns of a sheet."""
 OVER = 0.35
-"""Opacity of what happens after the end of the episode."""
+"""Opacity of frames after the end of the episode."""
 FOUND, REMEMBERED = "#FFFFFF", "#FF9C9C"
-"""Colours of keypoints on the DLO."""
+"""Colours of keypoints on the DLO: found in this frame, or kept from an earlier one."""
 LINES = {
     "table": {"color": "#B5A48C", "linewidth": 1.0},
     "workspace of the gripper": {"color": "#999999", "linewidth": 0.6, "linestyle": (0, (3, 2))},
@@ -26,8 +26,8 @@ LINES = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Instants:
-    """What is seen at T instants, all places in normalised pixels.
+class Film:
+    """What is seen in T frames, all positions in normalised pixels.
 
     Attributes:
         labels: segmentation images, indices into `palette`, 0 the background, shape [T, size, size].
@@ -35,10 +35,10 @@ class Instants:
         cubes: keypoints of the cubes, shape [T, 6, 2].
         seen: keypoints of the DLO that are found rather than remembered, shape [T, 4].
         gripper: where it is, shape [T, 2].
-        captions: a line for each instant, shape [T].
+        captions: a line for each frame, shape [T].
         over: whether the episode is over by then, shape [T].
         palette: colours of the labels, RGB from 0 to 1, shape [L, 3].
-        lines: polylines that are the same at all instants, by a name in `LINES`, shape [N, 2] each.
+        lines: polylines that are the same in all frames, by a name in `LINES`, shape [N, 2] each.
     """
 
     labels: np.ndarray
@@ -51,33 +51,33 @@ class Instants:
     palette: np.ndarray
     lines: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
-    def every(self, n: int) -> "Instants":
-        """Every n-th instant, beginning with the first."""
+    def every(self, n: int) -> "Film":
+        """Every n-th frame, beginning with the first."""
         own = ("labels", "dlo", "cubes", "seen", "gripper", "captions", "over")
         return dataclasses.replace(self, **{name: getattr(self, name)[::n] for name in own})
 
 
-def draw_sheet(figure: Figure, instants: Instants, title: str) -> None:
-    """All instants in rows, and what the markers are.
+def draw_sheet(figure: Figure, film: Film, title: str) -> None:
+    """All frames in rows, and a legend of the markers.
 
     Args:
-        figure: empty, of a page's width and the height that `sheet_height` tells.
-        instants: what is seen.
-        title: above all.
+        figure: empty, of a page's width and the height `sheet_height`.
+        film: the frames.
+        title: above all frames.
     """
-    panels = figure.subplots(_rows(len(instants.labels)), COLUMNS).ravel()
+    panels = figure.subplots(_rows(len(film.labels)), COLUMNS).ravel()
     for t, axes in enumerate(panels):
-        if t < len(instants.labels):
-            _Picture(axes, instants).show(t)
+        if t < len(film.labels):
+            _Picture(axes, film).show(t)
         else:
             axes.axis("off")
-    legend = panels[-1].legend(handles=_legend(instants), loc="center", fontsize=5.5, handlelength=1.2)
+    legend = panels[-1].legend(handles=_legend(film), loc="center", fontsize=5.5, handlelength=1.2)
     legend.set_in_layout(False)  # it may be a little wider than its panel
     figure.suptitle(title, fontsize=7.5)
 
 
 def sheet_height(count: int) -> float:
-    """The height of a sheet of so many instants as wide as a page, in inches."""
+    """The height of a sheet of `count` frames that is as wide as a page, in inches."""
     return 0.3 + _rows(count) * (style.TEXT_WIDTH / COLUMNS + 0.13)
 
 
@@ -85,25 +85,25 @@ def _rows(count: int) -> int:
     return -(-(count + 1) // COLUMNS)
 
 
-def save_sheet(path: Path, instants: Instants, title: str) -> Path:
-    """Write a sheet of all instants as png; see `draw_sheet`."""
+def save_sheet(path: Path, film: Film, title: str) -> Path:
+    """Write a sheet of all frames as png; see `draw_sheet`."""
     with style.context():
-        figure = style.new_figure(style.TEXT_WIDTH, sheet_height(len(instants.labels)))
-        draw_sheet(figure, instants, title)
+        figure = style.new_figure(style.TEXT_WIDTH, sheet_height(len(film.labels)))
+        draw_sheet(figure, film, title)
         return style.save(figure, path, 200)
 
 
-def save_animation(path: Path, instants: Instants, title: str, interval: float, freshness: np.ndarray) -> Path:
+def save_animation(path: Path, film: Film, title: str, interval: float, freshness: np.ndarray) -> Path:
     """Write an animated gif, in which a pixel of the labels is a pixel.
 
     Args:
-        path: where to, .gif.
-        instants: its frames.
-        title: above all; two lines fit.
-        interval: between frames, in s; the format knows hundredths.
-        freshness: opacity of the keypoints in each frame, shape [T]: 1 for those of that instant, less for older ones.
+        path: of the .gif file.
+        film: the frames.
+        title: above the frames; two lines fit.
+        interval: between frames, in s; the format resolves hundredths.
+        freshness: opacity of the keypoints in each frame, shape [T]: 1 for those detected in it, less for older ones.
     """
-    size, margin, head = instants.labels.shape[-1], 6, 52
+    size, margin, head = film.labels.shape[-1], 6, 52
     width, height = size + 2 * margin, size + margin + head
     frames = []
     with style.context():
@@ -111,7 +111,7 @@ def save_animation(path: Path, instants: Instants, title: str, interval: float, 
         figure.set_layout_engine("none")
         axes = figure.add_axes((margin / width, margin / height, size / width, size / height))
         figure.suptitle(title, fontsize=7.5, y=1 - 3 / height, va="top")
-        picture = _Picture(axes, instants, scale=2.5)
+        picture = _Picture(axes, film, scale=2.5)
         for t, fresh in enumerate(freshness):
             picture.show(t, fresh)
             figure.canvas.draw()
@@ -124,13 +124,13 @@ def save_animation(path: Path, instants: Instants, title: str, interval: float, 
 
 
 class _Picture:
-    """One instant on axes, which can be changed to another."""
+    """One frame on axes, which can be replaced by another."""
 
-    def __init__(self, axes: Axes, instants: Instants, scale: float = 1.0):
-        self._instants = instants
-        for name, line in instants.lines.items():
+    def __init__(self, axes: Axes, film: Film, scale: float = 1.0):
+        self._film = film
+        for name, line in film.lines.items():
             axes.plot(*line.T, **LINES[name], zorder=1)
-        size = instants.labels.shape[-1]
+        size = film.labels.shape[-1]
         self._image = axes.imshow(np.ones((size, size, 4)), extent=(0, 1, 1, 0), zorder=2)
         axes.set(xlim=(0, 1), ylim=(1, 0), xticks=[], yticks=[], aspect="equal")
         (self._gripper,) = axes.plot([], [], **_gripper(scale), zorder=3)
@@ -138,22 +138,22 @@ class _Picture:
         self._dlo = axes.scatter([], [], s=13 * scale**2, linewidths=0.4 * scale, edgecolors="black", zorder=5)
         self._numbers = [
             axes.text(0, 0, i + 1, fontsize=3.5 * scale, ha="center", va="center_baseline", zorder=6)
-            for i in range(instants.dlo.shape[1])
+            for i in range(film.dlo.shape[1])
         ]
         self._caption = axes.set_title("", fontsize=5.5 + scale**0.5)
 
     def show(self, t: int, fresh: float = 1.0) -> None:
-        """Show the instant t, with keypoints of some opacity."""
-        instants, strength = self._instants, OVER if self._instants.over[t] else 1.0
-        labels = instants.labels[t]
-        self._image.set_data(np.concatenate([instants.palette[labels], strength * (labels > 0)[..., None]], axis=-1))
-        self._gripper.set_data(*instants.gripper[t][:, None])
-        self._cubes.set_data(*instants.cubes[t].T)
-        self._dlo.set_offsets(instants.dlo[t])
-        self._dlo.set_facecolor([FOUND if seen else REMEMBERED for seen in instants.seen[t]])
-        for number, place in zip(self._numbers, instants.dlo[t], strict=True):
+        """Show frame t, its keypoints with an opacity."""
+        film, strength = self._film, OVER if self._film.over[t] else 1.0
+        labels = film.labels[t]
+        self._image.set_data(np.concatenate([film.palette[labels], strength * (labels > 0)[..., None]], axis=-1))
+        self._gripper.set_data(*film.gripper[t][:, None])
+        self._cubes.set_data(*film.cubes[t].T)
+        self._dlo.set_offsets(film.dlo[t])
+        self._dlo.set_facecolor([FOUND if seen else REMEMBERED for seen in film.seen[t]])
+        for number, place in zip(self._numbers, film.dlo[t], strict=True):
             number.set_position(place)
-        self._caption.set_text(instants.captions[t])
+        self._caption.set_text(film.captions[t])
         for artist in (self._gripper, self._caption):
             artist.set_alpha(strength)
         for artist in (self._cubes, self._dlo, *self._numbers):
@@ -169,14 +169,14 @@ def _on_cubes(scale: float) -> dict:
     return {**cross, "markersize": 2.5 * scale, "markeredgewidth": 0.4 * scale}
 
 
-def _legend(instants: Instants) -> list[Line2D]:
+def _legend(film: Film) -> list[Line2D]:
     dot = {"marker": "o", "markersize": 4, "markeredgecolor": "black", "markeredgewidth": 0.4, "linestyle": "none"}
     handles = [
         Line2D([], [], color=FOUND, label="keypoint on the DLO", **dot),
         Line2D([], [], label="keypoint of a cube", **_on_cubes(1.5)),
         Line2D([], [], label="gripper", **_gripper(1.0)),
-        *(Line2D([], [], label=name, **LINES[name]) for name in instants.lines),
+        *(Line2D([], [], label=name, **LINES[name]) for name in film.lines),
     ]
-    if not instants.seen.all():
+    if not film.seen.all():
         handles.insert(1, Line2D([], [], color=REMEMBERED, label="not found: the last", **dot))
     return handles

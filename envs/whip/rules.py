@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jaxtyping import Array, Bool, Float
 
 STEPS = 16
@@ -36,7 +37,7 @@ def hits(
     Args:
         before: cubes hit before.
         start: the cubes' keypoints at the start of the episode, in normalised pixels.
-        cubes: and now.
+        cubes: the cubes' keypoints now.
     """
     return before | (jnp.linalg.norm(cubes - start, axis=-1) > HIT_DISTANCE)
 
@@ -44,11 +45,48 @@ def hits(
 def reward(hit: Bool[Array, "*batch 6"], out: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
     """The reward of one step (section VI-G).
 
-    2 where the top cube has been hit, less a penalty for each of the others that has been, whichever came first and
-    again at every step; -1 for leaving the workspace.
+    2 if the top cube has been hit, minus a penalty for each other cube that has been hit, in whichever order, at every
+    step; -1 for leaving the workspace.
 
     Args:
         hit: cubes hit so far in the episode, bottom-up.
         out: whether the gripper is outside of its workspace.
     """
     return jnp.where(out, -1.0, 2.0 * hit[..., TOP] - hit[..., :TOP] @ jnp.asarray(PENALTIES))
+
+
+@struct.dataclass
+class Verdict:
+    """What the rules make of one step.
+
+    Attributes:
+        hit: cubes hit so far, bottom-up, shape [6].
+        outside: whether the gripper has left its workspace.
+        reward: see `reward`; 0 where the simulation has become unstable.
+        over: whether the episode ends: the top cube is hit, the gripper is outside, or the simulation is unstable.
+    """
+
+    hit: Bool[Array, "*batch 6"]
+    outside: Bool[Array, "*batch"]
+    reward: Float[Array, "*batch"]
+    over: Bool[Array, "*batch"]
+
+
+def judge(
+    before: Bool[Array, "6"],
+    start: Float[Array, "6 2"],
+    cubes: Float[Array, "6 2"],
+    gripper: Float[Array, "2"],
+    failed: Bool[Array, ""],
+) -> Verdict:
+    """Apply all rules to the state after a step.
+
+    Args:
+        before: cubes hit before the step.
+        start: the cubes' keypoints at the start of the episode, in normalised pixels.
+        cubes: the cubes' keypoints after the step.
+        gripper: its x and z after the step, in m.
+        failed: whether the simulation has become unstable.
+    """
+    hit, out = hits(before, start, cubes), outside(gripper)
+    return Verdict(hit, out, reward=jnp.where(failed, 0.0, reward(hit, out)), over=hit[TOP] | out | failed)

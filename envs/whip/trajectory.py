@@ -1,4 +1,6 @@
-"""Open-loop rollouts: what inference compares, a trajectory of states and actions."""
+"""Trajectories of states and actions, open loop: what inference compares."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -18,14 +20,13 @@ from jaxlfi.envs.whip.vision.keypoints import ON_DLO, Detector, detect, measured
 def seen(engine: Engine, parameters: WhipParameters, actions: Float[Array, "time 2"]) -> tuple[Frames, Bool[Array, ""]]:
     """What there is to see of one scene before each action and after the last, T + 1 frames.
 
-    The actions are applied to their end, whatever is hit and wherever the gripper goes.
+    All actions are applied, even after a hit or outside of the workspace.
 
     Returns:
-        The frames, and whether the simulation has broken down.
+        The frames, and whether the simulation has become unstable.
     """
-    start = jnp.asarray(physics.START)
-    targets = start + jnp.cumsum(jnp.clip(actions, -rules.ACTION_LIMIT, rules.ACTION_LIMIT), axis=0)
-    states = physics.rollout(engine, parameters, targets)
+    act = functools.partial(physics.act, engine, parameters)
+    states = physics.scan_states(act, physics.reset(engine.scene, parameters), actions)
     view = jax.vmap(lambda qpos: frames(engine.scene, parameters, qpos))(states.qpos)
     return view, states.failed[-1]
 
@@ -50,12 +51,12 @@ def trajectory(
     parameters: WhipParameters,
     actions: Float[Array, "time 2"],
 ) -> tuple[Float[Array, "time 30"], Bool[Array, ""]]:
-    """One trajectory x = (S, A): the state before each action beside the action (section VI-F).
+    """One trajectory x = (S, A): the state before each action, and the action (section VI-F).
 
     Returns:
         The trajectory, and whether the simulation is valid.
     """
-    # The last action has its effect after the last state.
+    # The last action takes effect after the last state.
     view, failed = seen(engine, parameters, actions[:-1])
     key_keypoints, key_gripper = jax.random.split(key)
     keypoints, _ = detect(key_keypoints, detector, camera, view)

@@ -47,7 +47,8 @@ from jaxlfi.envs.whip.physics.engine import Engine, State, ramp, rollout
 from jaxlfi.envs.whip.physics.engines import NAMES, pick
 from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.physics.native import NativeEngine
-from jaxlfi.envs.whip.physics.scene import CUBES, START, Scene
+from jaxlfi.envs.whip.physics.scene import CUBES, Scene
+from jaxlfi.envs.whip.rig import START
 from jaxlfi.run_store import command_line, environment
 
 SCENE = Scene()

@@ -40,7 +40,7 @@ def statistics(scenes: Mapping[str, np.ndarray]) -> dict[str, float]:
     return {
         "rollouts": len(failed),
         "failed": int(failed.sum()),
-        "failed_share": float(failed.mean()),
+        "failed_fraction": float(failed.mean()),
         "failed_saturated": int((failed & scenes["saturated"]).sum()),
         "wild": int((wild & ~failed).sum()),
         "fastest_cube": float(scenes["cube"][~failed].max(initial=0.0)),

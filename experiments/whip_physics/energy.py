@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from experiments.whip_physics import statics
-from jaxlfi.envs.whip.physics.chain import GRAVITY
+from jaxlfi.envs.whip.rig import GRAVITY
 
 
 def swing(model: mujoco.MjModel, timestep: float, seconds: float = 2.0, runge_kutta: bool = False) -> np.ndarray:

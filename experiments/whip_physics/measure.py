@@ -5,9 +5,10 @@ import numpy as np
 
 from experiments.whip_physics import beam, energy, models, rollouts, statics
 from jaxlfi.envs.whip.parameters import MEDIAN, WhipParameters, median
-from jaxlfi.envs.whip.physics.chain import GRAVITY, SECOND_MOMENT, SECTION, Chain
+from jaxlfi.envs.whip.physics.chain import SECOND_MOMENT, Chain
 from jaxlfi.envs.whip.physics.engine import Engine
 from jaxlfi.envs.whip.physics.scene import Scene
+from jaxlfi.envs.whip.rig import GRAVITY, SECTION
 
 ELEMENTS = (8, 10, 12, 16, 24)
 """N."""

@@ -4,8 +4,9 @@ import mujoco
 import numpy as np
 
 from jaxlfi.envs.whip.parameters import WhipParameters
-from jaxlfi.envs.whip.physics.chain import SECTION, Chain, elasto_gravity
+from jaxlfi.envs.whip.physics.chain import Chain, elasto_gravity
 from jaxlfi.envs.whip.physics.scene import Scene, build, cube_names
+from jaxlfi.envs.whip.rig import SECTION
 
 KINDS = ("plain cable", "ball joints", "planar hinges")
 

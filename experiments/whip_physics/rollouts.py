@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.parameters import FEASIBLE, WhipParameters, randomised
-from jaxlfi.envs.whip.physics.chain import SECTION
 from jaxlfi.envs.whip.physics.engine import Engine, State, reset, rollout
 from jaxlfi.envs.whip.physics.kinematics import frames
-from jaxlfi.envs.whip.physics.scene import CUBES, START
+from jaxlfi.envs.whip.physics.scene import CUBES
+from jaxlfi.envs.whip.rig import SECTION, START
 
 BATCH = 100
 """Scenes that are simulated together."""

@@ -27,7 +27,7 @@ SETTINGS = QUICK.replace(rounds=8)
 SEED = 0
 DEATH = 1
 """theta_2, which the support "misspecified" excludes."""
-EXACT = Nuisance(initial_spread=0.0, noise=0.0, noise_spread=0.0)
+EXACT = Nuisance(initial_sd=0.0, noise=0.0, noise_sd=0.0)
 REFERENCE, REFERENCE_SD = lynx_hare.reference_log_rates()
 
 
@@ -85,9 +85,9 @@ def test_the_table():
 def test_the_reference_is_that_of_log_normal_rates():
     """Against the exact logarithmic moments of log-normal rates with the published means and deviations."""
     relative = lynx_hare.REFERENCE_SD / lynx_hare.REFERENCE_MEAN
-    spread = np.sqrt(np.log1p(relative**2))
-    np.testing.assert_allclose(REFERENCE_SD, spread, rtol=0.01)
-    np.testing.assert_allclose(REFERENCE, np.log(lynx_hare.REFERENCE_MEAN) - 0.5 * spread**2, atol=1e-3)
+    sd = np.sqrt(np.log1p(relative**2))
+    np.testing.assert_allclose(REFERENCE_SD, sd, rtol=0.01)
+    np.testing.assert_allclose(REFERENCE, np.log(lynx_hare.REFERENCE_MEAN) - 0.5 * sd**2, atol=1e-3)
     assert np.argmax(REFERENCE) == DEATH
 
 
@@ -101,14 +101,14 @@ def test_the_reference_explains_the_data():
     """Within the published measurement error of a quarter; with rates in any other order it would not."""
     _, pelts = lynx_hare.load()
     with np.errstate(all="ignore"):  # in another order populations may run away
-        spread = {
+        error = {
             order: np.log(pelts / clean(tuple(lynx_hare.REFERENCE_MEAN[list(order)]))).std()
             for order in itertools.permutations(range(4))
         }
-    assert spread.pop((0, 1, 2, 3)) < 0.25
+    assert error.pop((0, 1, 2, 3)) < 0.25
     # theta_1 and theta_4 are nearly the same number.
-    assert spread.pop((3, 1, 2, 0)) > 0.27
-    assert all(not other < 0.7 for other in spread.values())
+    assert error.pop((3, 1, 2, 0)) > 0.27
+    assert all(not other < 0.7 for other in error.values())
 
 
 # ------------------------------------------------------------------------------------------------ simulator
@@ -143,7 +143,7 @@ NOTHING_HAPPENS = np.full(4, -20.0)
 
 def test_the_measurement_error_has_a_scale_of_its_own_for_each_species():
     """Where nothing happens, years differ by the error alone; its scale is log-normal about its median."""
-    nuisance = Nuisance(initial_spread=0.4, noise=0.2, noise_spread=0.3)
+    nuisance = Nuisance(initial_sd=0.4, noise=0.2, noise_sd=0.3)
     logs = np.log(draw(nuisance, NOTHING_HAPPENS, 1500))
     scales = np.log(logs.std(axis=1, ddof=1))  # over 21 years: known to a factor of 1 / sqrt(40)
     np.testing.assert_allclose(np.median(scales, axis=0), np.log(0.2), atol=0.06)
@@ -152,7 +152,7 @@ def test_the_measurement_error_has_a_scale_of_its_own_for_each_species():
 
 
 def test_the_initial_populations_are_drawn_about_the_first_record():
-    logs = np.log(draw(Nuisance(initial_spread=0.4, noise=0.01, noise_spread=0.0), NOTHING_HAPPENS, 1500)).mean(axis=1)
+    logs = np.log(draw(Nuisance(initial_sd=0.4, noise=0.01, noise_sd=0.0), NOTHING_HAPPENS, 1500)).mean(axis=1)
     for column, first in zip(logs.T, lynx_hare.load()[1][0], strict=True):
         assert stats.kstest((column - np.log(first)) / 0.4, "norm").pvalue > 1e-3
     assert abs(np.corrcoef(logs.T)[0, 1]) < 5 / np.sqrt(1500)

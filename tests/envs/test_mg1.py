@@ -167,13 +167,13 @@ def test_a_saturated_queue_in_the_long_run(theta, key):
 
 def test_exponential_service(key):
     """M/M/1: a wait is 0 with probability 1 - rho, else exponential with rate mu - lambda; departures are Poisson."""
-    arrivals, services, lanes = 0.5, 1.0, 3000
+    arrivals, services, replicas = 0.5, 1.0, 3000
     key_service, key_gaps = jax.random.split(key)
-    service = jax.random.exponential(key_service, (lanes, 200)) / services
-    gaps = jax.random.exponential(key_gaps, (lanes, 200)) / arrivals
+    service = jax.random.exponential(key_service, (replicas, 200)) / services
+    gaps = jax.random.exponential(key_gaps, (replicas, 200)) / arrivals
     waits = np.asarray(jax.jit(jax.vmap(waiting_times))(service, gaps))[:, -1]
     idts = np.asarray(jax.jit(jax.vmap(interdeparture_times))(service, gaps))[:, -1]
-    assert stats.binomtest(int(np.sum(waits == 0)), lanes, 1 - arrivals / services).pvalue > 1e-3
+    assert stats.binomtest(int(np.sum(waits == 0)), replicas, 1 - arrivals / services).pvalue > 1e-3
     assert stats.kstest(waits[waits > 0], stats.expon(scale=1 / (services - arrivals)).cdf).pvalue > 1e-3
     assert stats.kstest(idts, stats.expon(scale=1 / arrivals).cdf).pvalue > 1e-3
 
@@ -193,7 +193,7 @@ def test_pilot_means_of_papamakarios_and_murray(key):
     each of 100 pilots. The published means, one more pilot, must lie in the central 95 % of them.
     """
     split, block = 1 / 300, 20_000
-    share, replicates = 3 * split, 100
+    fraction, replicates = 3 * split, 100
     run = batched(50, floor=1e-12)
 
     def percentiles(key, low, high, blocks):
@@ -208,10 +208,10 @@ def test_pilot_means_of_papamakarios_and_murray(key):
 
     key_bulk, key_tail, key_normal = jax.random.split(key, 3)
     bulk = percentiles(key_bulk, split, 1 / 3, 3)
-    tail = percentiles(key_tail, 0.0, split, 5).reshape(replicates, round(1e5 * share), 5)
+    tail = percentiles(key_tail, 0.0, split, 5).reshape(replicates, round(1e5 * fraction), 5)
     normal = np.asarray(jax.random.normal(key_normal, (replicates, 5)), np.float64)
-    spread = np.linalg.cholesky(np.cov(bulk.T) / (1e5 * (1 - share)))
-    pilots = (1 - share) * (bulk.mean(axis=0) + normal @ spread.T) + share * tail.mean(axis=1)
+    deviation = np.linalg.cholesky(np.cov(bulk.T) / (1e5 * (1 - fraction)))
+    pilots = (1 - fraction) * (bulk.mean(axis=0) + normal @ deviation.T) + fraction * tail.mean(axis=1)
     low, high = np.percentile(pilots, [2.5, 97.5], axis=0)
     assert ((low < PUBLISHED) & (high > PUBLISHED)).all(), (low, high)
     # From below the band is tight: the tail can only add.
@@ -378,7 +378,7 @@ def test_many_at_once_are_one_by_one(key):
     keys, theta = jax.random.split(key, 6), jnp.asarray(np.float32(LOADS))
     together = jax.jit(jax.vmap(problem.simulate))(jax.random.clone(keys), theta)
     compiled = jax.jit(problem.simulate)
-    alone = jnp.stack([compiled(*lane) for lane in zip(jax.random.clone(keys), theta, strict=True)])
+    alone = jnp.stack([compiled(*one) for one in zip(jax.random.clone(keys), theta, strict=True)])
     np.testing.assert_allclose(together, alone, rtol=2e-6)
     np.testing.assert_allclose(problem.simulate(keys[0], theta[0]), alone[0], rtol=2e-6)
     assert together.shape == (6, 50)

@@ -10,26 +10,22 @@ import dataclasses
 
 import numpy as np
 
-SECTION = 0.015
-"""Width and height of the DLO, a, in m (section VI-C)."""
+from jaxlfi.envs.whip.rig import GRAVITY, SECTION
 
 SECOND_MOMENT = SECTION**4 / 12
-"""Of its cross-section, I = a^4 / 12, in m^4."""
-
-GRAVITY = 9.81
-"""In m/s^2."""
+"""Second moment of area of the DLO's section, I = a^4 / 12, in m^4."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Chain:
-    """How the DLO is cut into links.
+    """How the DLO is divided into links.
 
     Attributes:
-        elements: N.
-        planar: whether links turn about y only (hinges) or in space (the ball joints of MuJoCo's cable composite).
-        retardation: Kelvin-Voigt's tau in s, viscosity over modulus.
-        viscosity: floor of the viscosity that does not depend on the modulus, eta_0, in Pa s. Without it the softest
-            DLOs are hardly damped, and whip themselves to pieces.
+        elements: number of elements N.
+        planar: whether links rotate about y only (hinges) or in space (the ball joints of MuJoCo's cable composite).
+        retardation: time tau of the Kelvin-Voigt model, the ratio of viscosity to modulus, in s.
+        viscosity: part eta_0 of the viscosity that does not depend on the modulus, in Pa s. Without it the softest DLOs
+            are hardly damped and become unstable.
     """
 
     elements: int = 12
@@ -43,7 +39,7 @@ class Chain:
         return self.elements + 1
 
     @property
-    def freedoms(self) -> int:
+    def dofs(self) -> int:
         """Degrees of freedom of a joint."""
         return 1 if self.planar else 3
 
@@ -55,11 +51,11 @@ class Chain:
         return fractions
 
     def stiffness(self, length, young):
-        """Of a joint, E I / h, in N m / rad."""
+        """Stiffness of a joint, E I / h, in N m / rad."""
         return young * SECOND_MOMENT * self.elements / length
 
     def damping(self, length, young):
-        """Of a joint, (tau E + eta_0) I / h, in N m s / rad."""
+        """Damping of a joint, (tau E + eta_0) I / h, in N m s / rad."""
         return self.stiffness(length, self.retardation * young + self.viscosity)
 
 
@@ -69,11 +65,11 @@ def link_masses(lengths, density):
 
 
 def link_inertias(lengths, density):
-    """Their inertia along the link and across it, those of a box, in kg m^2."""
+    """Moments of inertia of links about their axis and across it, those of a box, in kg m^2."""
     mass = link_masses(lengths, density)
     return mass * SECTION**2 / 6, mass * (SECTION**2 + lengths**2) / 12
 
 
 def elasto_gravity(length, young, density):
-    """The number rho g A l^3 / (E I), weight against stiffness: at 1,000 a DLO hangs like a rope, at 1 it is a rod."""
+    """The elasto-gravity number rho g A l^3 / (E I): at 1,000 a DLO hangs like a rope, at 1 it is stiff as a rod."""
     return density * GRAVITY * SECTION**2 * length**3 / (young * SECOND_MOMENT)

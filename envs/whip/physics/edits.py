@@ -1,6 +1,6 @@
-"""How parameters change a compiled model: the same edits for MuJoCo's models and for those of MJX.
+"""Edits that write parameters into a compiled model, the same for models of MuJoCo and of MJX.
 
-What MuJoCo derives from these fields when it compiles a model (`mj_setConst`) is not among them.
+The fields that MuJoCo derives from these when it compiles a model (`mj_setConst`) are not among them.
 """
 
 from collections.abc import Iterable, Iterator
@@ -10,18 +10,19 @@ import mujoco
 import numpy as np
 
 from jaxlfi.envs.whip.parameters import WhipParameters
-from jaxlfi.envs.whip.physics.chain import SECTION, link_inertias, link_masses
+from jaxlfi.envs.whip.physics.chain import link_inertias, link_masses
 from jaxlfi.envs.whip.physics.scene import Scene, base_model, cube_names, cube_positions, link_names
+from jaxlfi.envs.whip.rig import SECTION
 
 Edit = tuple[str, Any, Any]
-"""A field of the model, an index into it, and the values that belong there."""
+"""A field of the model, an index into it, and its values there."""
 
 
 def edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
-    """Everything that parameters decide of a model, as they are declared in `scene.build`.
+    """All fields of a model that depend on parameters, as declared in `scene.build`.
 
     Args:
-        scene: what the model was compiled from.
+        scene: the scene that the model was compiled from.
         parameters: of one scene; NumPy's numbers for `xp=numpy`, JAX's for `xp=jax.numpy`.
         xp: the array library.
     """
@@ -30,12 +31,12 @@ def edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
 
 
 def dlo_edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
-    """What they decide of the DLO."""
+    """The fields of the DLO that depend on parameters."""
     model, chain = base_model(scene), scene.chain
     bodies = np.array([model.body(name).id for name in link_names(chain)])
     geoms = np.array([model.geom(name).id for name in link_names(chain)])
     joints = np.array([model.joint(f"joint{i}").id for i in range(1, chain.links)])
-    freedoms = np.concatenate([model.jnt_dofadr[j] + np.arange(chain.freedoms) for j in joints])
+    dofs = np.concatenate([model.jnt_dofadr[j] + np.arange(chain.dofs) for j in joints])
     lengths = chain.fractions * parameters.length
     along, across = link_inertias(lengths, parameters.density)
     radius, half = SECTION / 2, lengths / 2
@@ -48,11 +49,11 @@ def dlo_edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]
     yield "geom_rbound", geoms, radius + half
     yield "geom_aabb", (geoms, 5), radius + half  # a capsule lies along its own z
     yield "jnt_stiffness", joints, chain.stiffness(parameters.length, parameters.young)
-    yield "dof_damping", freedoms, chain.damping(parameters.length, parameters.young)
+    yield "dof_damping", dofs, chain.damping(parameters.length, parameters.young)
 
 
 def cube_edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
-    """What they decide of the cubes."""
+    """The fields of the cubes that depend on parameters."""
     model = base_model(scene)
     side, density = parameters.cube_side, parameters.cube_density
     bodies = np.array([model.body(name).id for name in cube_names()])
@@ -75,7 +76,7 @@ def edited_model(scene: Scene, parameters: WhipParameters) -> mujoco.MjModel:
 
 
 def edited(model: mujoco.MjModel, changes: Iterable[Edit]) -> mujoco.MjModel:
-    """A copy of a model with fields changed, and what MuJoCo derives from them."""
+    """A copy of a model with fields changed, and those that MuJoCo derives from them."""
     model = model.__copy__()
     for field, index, values in changes:
         getattr(model, field)[index] = values

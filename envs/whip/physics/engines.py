@@ -10,21 +10,20 @@ from jaxlfi.envs.whip.physics.engine import Engine
 from jaxlfi.envs.whip.physics.scene import Scene
 
 NAMES = ("auto", "native", "mjx", "warp")
-"""What `pick` takes."""
+"""Names that `pick` accepts."""
 
 
 def pick(name: str = "auto", scene: Scene = Scene()) -> Engine:
     """The engine of a name.
 
     Args:
-        name: "native" is MuJoCo on the processor's cores, the fastest there is without an accelerator; "mjx" is MuJoCo
-            in JAX, "warp" its kernels in Warp; "auto" is native where JAX's default platform is the processor, and
-            mjx elsewhere.
-        scene: what all its scenes have in common.
+        name: "native" is MuJoCo on the processor's cores, the fastest without an accelerator; "mjx" is MuJoCo
+            in JAX, "warp" its kernels in Warp; "auto" is native if JAX's default platform is the processor, else mjx.
+        scene: settings that all scenes of the engine share.
 
     Raises:
-        ValueError: for another name.
-        ImportError: where what an engine needs is not installed.
+        ValueError: for an unknown name.
+        ImportError: if a library that the engine needs is not installed.
 
     Example:
         >>> type(pick("native")).__name__
@@ -37,7 +36,7 @@ def pick(name: str = "auto", scene: Scene = Scene()) -> Engine:
     return _made(name, scene)
 
 
-@functools.lru_cache(maxsize=16)  # programs are compiled for an engine, and one is as good as another
+@functools.lru_cache(maxsize=16)  # programs are compiled for an engine object
 def _made(name: str, scene: Scene) -> Engine:
     if name == "native":
         from jaxlfi.envs.whip.physics.native import NativeEngine

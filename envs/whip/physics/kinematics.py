@@ -1,4 +1,4 @@
-"""Where everything is, from the joints' positions."""
+"""Forward kinematics: frames from joint positions."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,9 @@ from jaxtyping import Array, Float
 from jaxlfi.envs.whip.frames import Frames
 from jaxlfi.envs.whip.parameters import WhipParameters
 from jaxlfi.envs.whip.physics.chain import Chain
-from jaxlfi.envs.whip.physics.scene import CUBES, START, Scene, cube_positions
+from jaxlfi.envs.whip.physics.scene import CUBES, Scene, cube_positions
+from jaxlfi.envs.whip.quaternions import product, rotation
+from jaxlfi.envs.whip.rig import START
 
 
 def initial_positions(scene: Scene, parameters: WhipParameters) -> Float[Array, " nq"]:
@@ -25,10 +27,10 @@ def initial_positions(scene: Scene, parameters: WhipParameters) -> Float[Array, 
 
 
 def frames(scene: Scene, parameters: WhipParameters, qpos: Float[Array, " nq"]) -> Frames:
-    """What there is to see of one scene at an instant.
+    """The frame of one scene.
 
     Args:
-        scene: whose model the positions are of.
+        scene: the scene whose model has these joints.
         parameters: of the scene.
         qpos: joint positions as in `initial_positions`.
     """
@@ -37,7 +39,7 @@ def frames(scene: Scene, parameters: WhipParameters, qpos: Float[Array, " nq"]) 
     steps = scene.chain.fractions[:, None] * parameters.length * _directions(scene.chain, joints)
     grip = jnp.stack([gripper[0], jnp.zeros_like(gripper[0]), gripper[1]])
     nodes = grip + jnp.concatenate([jnp.zeros((1, 3)), jnp.cumsum(steps, axis=0)])
-    return Frames(gripper=gripper, dlo=nodes, cubes=cubes[:, :3], turns=cubes[:, 3:])
+    return Frames(gripper=gripper, dlo=nodes, cubes=cubes[:, :3], orientations=cubes[:, 3:])
 
 
 def _directions(chain: Chain, joints: Float[Array, " positions"]) -> Float[Array, "links 3"]:
@@ -46,23 +48,11 @@ def _directions(chain: Chain, joints: Float[Array, " positions"]) -> Float[Array
     if chain.planar:
         angles = jnp.cumsum(joints)
         return jnp.concatenate([down, jnp.stack([-jnp.sin(angles), 0 * angles, -jnp.cos(angles)], axis=-1)])
-    grip = jnp.array([0.5, 0.0, 0.5, 0.0]) * 2**0.5  # turns the cable's x axis downwards
+    grip = jnp.array([0.5, 0.0, 0.5, 0.0]) * 2**0.5  # points the cable's x axis downwards
 
-    def turn(orientation, joint):
-        orientation = _product(orientation, joint)
-        return orientation, _first_axis(orientation)
+    def bend(orientation, joint):
+        orientation = product(orientation, joint)
+        return orientation, orientation
 
-    _, directions = jax.lax.scan(turn, grip, joints.reshape(chain.elements, 4))
-    return jnp.concatenate([down, directions])
-
-
-def _product(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
-    """Of quaternions."""
-    scalar = a[0] * b[0] - a[1:] @ b[1:]
-    return jnp.concatenate([scalar[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])
-
-
-def _first_axis(quaternion: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Where a rotation takes the x axis."""
-    w, x, y, z = quaternion
-    return jnp.stack([w**2 + x**2 - y**2 - z**2, 2 * (x * y + w * z), 2 * (x * z - w * y)])
+    _, orientations = jax.lax.scan(bend, grip, joints.reshape(chain.elements, 4))
+    return jnp.concatenate([down, rotation(orientations)[..., 0]])

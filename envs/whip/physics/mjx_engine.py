@@ -20,24 +20,24 @@ from jaxlfi.envs.whip.physics.mjx_step import step
 from jaxlfi.envs.whip.physics.scene import Scene, base_model
 
 IMPLEMENTATIONS = ("jax", "warp")
-"""Of MJX: its own, and kernels in Warp for NVIDIA's accelerators."""
+"""Implementations of MJX: its own in JAX, and kernels in Warp for NVIDIA's accelerators."""
 CONTACTS = 96
-"""Of a scene, for which there is room with Warp: twice what a stack of cubes and a DLO on the table have."""
+"""Maximum number of contacts per scene with Warp: twice that of a stack of cubes and a DLO on the table."""
 
 
 class MjxEngine:
-    """MJX, in the precision that JAX is set to, single as a rule; states between control steps are single anyway."""
+    """MJX in the precision of JAX, single by default; states between control steps are always single."""
 
     def __init__(self, scene: Scene = Scene(), implementation: str = "jax", scenes: int = 4096):
         """An engine.
 
         Args:
-            scene: what all its scenes have in common.
+            scene: settings that all scenes of the engine share.
             implementation: "jax" or "warp".
-            scenes: the most in a batch, of Warp, where they share the room for contacts.
+            scenes: maximum size of a batch with Warp, whose scenes share the memory for contacts.
 
         Raises:
-            ValueError: for another implementation.
+            ValueError: for an unknown implementation.
             ImportError: where Warp is not installed, with what to install.
         """
         if implementation not in IMPLEMENTATIONS:
@@ -51,7 +51,7 @@ class MjxEngine:
             compiled.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
             room, advanced = {}, functools.partial(step, scene)
         else:
-            # Warp never resets, and refuses to be told not to.
+            # Warp never resets, and does not accept the flag that disables it.
             compiled.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
             room, advanced = {"naconmax": CONTACTS * scenes, "njmax": 4 * CONTACTS}, mjx.step
         zeros = _zeros(scene)
@@ -72,7 +72,7 @@ class MjxEngine:
 
 
 def _zeros(scene: Scene):
-    """Arguments of `advance`, to tell their shapes."""
+    """Zeros with the shapes of the arguments of `advance`."""
     kinds = jax.eval_shape(lambda: (median(), reset(scene, median()), jnp.zeros(2)))
     return jax.tree.map(lambda kind: np.zeros(kind.shape, kind.dtype), kinds)
 
@@ -86,17 +86,17 @@ def _simulate(
     state: State,
     target,
 ):
-    """Positions and velocities after a control interval, the target, and whether the simulation has broken down."""
+    """Positions and velocities after a control interval, the target, and whether the simulation is unstable."""
     model = apply_parameters(scene, model, parameters)
     kind = data.qpos.dtype
     rest = (initial_positions(scene, parameters).astype(kind), jnp.zeros(model.nv, kind), jnp.zeros(model.nv, kind))
-    # What has broken down goes on from rest, as the solver's iterations on it would hold up the whole batch.
+    # Unstable scenes continue from rest, as the solver's iterations on them would delay the whole batch.
     calmed = lambda failed, moving: jax.tree.map(lambda calm, now: jnp.where(failed, calm, now), rest, moving)
 
     def substep(carry, control):
         (qpos, qvel, warm), failed = carry
         now = advanced(model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=control))
-        # Where MuJoCo gives up, though the numbers may become reasonable again.
+        # MuJoCo's own criterion, though the numbers may become reasonable again.
         failed |= ~(jnp.max(jnp.abs(jnp.concatenate([now.qpos, now.qvel, now.qacc]))) < mujoco.mjMAXVAL)
         return (calmed(failed, (now.qpos, now.qvel, now.qacc_warmstart)), failed), None
 

@@ -7,7 +7,7 @@ from mujoco import mjx
 
 from jaxlfi.envs.whip.physics.chain import Chain
 from jaxlfi.envs.whip.physics.scene import CUBES, Scene
-from jaxlfi.envs.whip.vision.camera import rotation
+from jaxlfi.envs.whip.quaternions import normalised, product, rotation
 
 PARTS = (
     mjx.com_pos,
@@ -22,7 +22,7 @@ PARTS = (
 )
 """Of a step between kinematics and solver: those of `mjx.step` that the scene has a use for, in their order."""
 HEAVIER = (0.0, 1e-5, 1e-3)
-"""By which shares the diagonal of the mass matrix is made greater in the solver's attempts."""
+"""By which fractions the diagonal of the mass matrix is increased in the solver's attempts."""
 
 
 def step(scene: Scene, model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -34,11 +34,11 @@ def step(scene: Scene, model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """What `mjx.solve` does; where that gives no numbers, again with joints that are slightly harder to turn.
+    """What `mjx.solve` does; where that gives no numbers, again with joints that have slightly more inertia.
 
-    In single precision the matrix of Newton's method, which has the contacts' stiffness in it, is at times not to be
-    told from an indefinite one (scaled to a unit diagonal, its smallest eigenvalue is then some 3e-7), and Cholesky's
-    method stops: in one of 100,000 steps of random episodes.
+    In single precision the matrix of Newton's method, which contains the stiffness of the contacts, is at times
+    indistinguishable from an indefinite one (scaled to a unit diagonal, its smallest eigenvalue is about 3e-7), and
+    Cholesky's method stops: in one of 100,000 steps of random episodes.
     """
     inertia = data._impl.M
 
@@ -64,17 +64,17 @@ def kinematics(scene: Scene, model: mjx.Model, data: mjx.Data) -> mjx.Data:
     thousand instructions to compile.
     """
     slides, joints, cubes = jnp.split(data.qpos, [2, scene.first_cube])
-    joints, turns = _links(scene.chain, joints)
+    joints, orientations = _links(scene.chain, joints)
     cubes = cubes.reshape(CUBES, 7)
-    cubes = jnp.concatenate([cubes[:, :3], _unit(cubes[:, 3:])], axis=1)
+    cubes = jnp.concatenate([cubes[:, :3], normalised(cubes[:, 3:])], axis=1)
     grip = jnp.stack([slides[0], jnp.zeros_like(slides[0]), slides[1]])
 
-    # Bodies: the world, the gripper, the grip that turns the DLO down, links, cubes.
+    # Bodies: the world, the gripper, the grip that points the DLO down, links, cubes.
     world, held = jnp.zeros((1, 3)), jnp.stack([grip, grip])
     upright = jnp.tile(jnp.eye(1, 4), (2, 1))
-    xquat = jnp.concatenate([upright, turns[:1], turns, cubes[:, 3:]])
+    xquat = jnp.concatenate([upright, orientations[:1], orientations, cubes[:, 3:]])
     xmat = rotation(xquat)
-    offsets = _turned(xmat[3 : -CUBES - 1], model.body_pos[4:-CUBES])
+    offsets = _rotated(xmat[3 : -CUBES - 1], model.body_pos[4:-CUBES])
     xpos = jnp.concatenate([world, held, grip[None], grip + jnp.cumsum(offsets, axis=0), cubes[:, :3]])
 
     of_geoms, of_joints = model.geom_bodyid, model.jnt_bodyid
@@ -83,13 +83,13 @@ def kinematics(scene: Scene, model: mjx.Model, data: mjx.Data) -> mjx.Data:
         xpos=xpos,
         xquat=xquat,
         xmat=xmat,
-        xipos=xpos + _turned(xmat, model.body_ipos),
-        ximat=rotation(_product(xquat, model.body_iquat)),
+        xipos=xpos + _rotated(xmat, model.body_ipos),
+        ximat=rotation(product(xquat, model.body_iquat)),
         # Not so for the slides, for which it does not matter.
         xanchor=xpos[of_joints],
-        xaxis=_turned(xmat[model.body_parentid[of_joints]], model.jnt_axis),
-        geom_xpos=xpos[of_geoms] + _turned(xmat[of_geoms], model.geom_pos),
-        geom_xmat=rotation(_product(xquat[of_geoms], model.geom_quat)),
+        xaxis=_rotated(xmat[model.body_parentid[of_joints]], model.jnt_axis),
+        geom_xpos=xpos[of_geoms] + _rotated(xmat[of_geoms], model.geom_pos),
+        geom_xmat=rotation(product(xquat[of_geoms], model.geom_quat)),
     )
 
 
@@ -99,21 +99,10 @@ def _links(chain: Chain, joints: Float[Array, " positions"]):
         halves = jnp.concatenate([jnp.zeros(1), jnp.cumsum(joints)]) / 2 + jnp.pi / 4
         still = jnp.zeros_like(halves)
         return joints, jnp.stack([jnp.cos(halves), still, jnp.sin(halves), still], axis=-1)
-    bends = _unit(joints.reshape(chain.elements, 4))
+    bends = normalised(joints.reshape(chain.elements, 4))
     down = jnp.array([[0.5, 0.0, 0.5, 0.0]]) * 2**0.5
-    return bends.ravel(), jax.lax.associative_scan(_product, jnp.concatenate([down, bends]))
+    return bends.ravel(), jax.lax.associative_scan(product, jnp.concatenate([down, bends]))
 
 
-def _product(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """Of quaternions."""
-    (s, u), (t, v) = ((q[..., :1], q[..., 1:]) for q in (a, b))
-    scalar = s * t - jnp.sum(u * v, axis=-1, keepdims=True)
-    return jnp.concatenate([scalar, s * v + t * u + jnp.cross(u, v)], axis=-1)
-
-
-def _turned(matrices: Float[Array, "n 3 3"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+def _rotated(matrices: Float[Array, "n 3 3"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     return jnp.sum(matrices * vectors[:, None], axis=-1)
-
-
-def _unit(quaternions: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
-    return quaternions / jnp.linalg.norm(quaternions, axis=-1, keepdims=True)

@@ -20,31 +20,31 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlfi.envs.whip.parameters import WhipParameters
-from jaxlfi.envs.whip.physics.chain import SECTION
 from jaxlfi.envs.whip.physics.edits import dlo_edits, edited, edited_model
 from jaxlfi.envs.whip.physics.engine import State, ramp, settled
 from jaxlfi.envs.whip.physics.scene import CUBES, HAND, Scene, bare_model, base_model
+from jaxlfi.envs.whip.rig import SECTION
 
 CACHED_MODELS = 4096
-"""Models that are kept, of 65 kB each: more than there are scenes in most batches, which are stepped many times."""
+"""Models that are cached, 65 kB each: more than the scenes of most batches, which are stepped many times."""
 CHUNK = 256
-"""Scenes that are rolled out in one call, to bound the memory of the substeps' states."""
+"""Maximum number of scenes that are rolled out in one call, which bounds the memory of the substeps' states."""
 
 
 def processors() -> int:
-    """Processors this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class NativeEngine:
-    """MuJoCo on all cores: one model a scene, built where it is first seen, and stepped outside of JAX."""
+    """MuJoCo on all cores: one model per scene, built when the scene is first seen, and stepped outside of JAX."""
 
     def __init__(self, scene: Scene = Scene(), threads: int | None = None):
         """An engine.
 
         Args:
-            scene: what all its scenes have in common.
-            threads: as many as there are processors for this process, by default.
+            scene: settings that all scenes of the engine share.
+            threads: number of threads; by default that of the processors that this process may use.
         """
         self.scene = scene
         self._threads = threads or processors()
@@ -69,23 +69,23 @@ def _advance_many(scene: Scene, threads: int, parameters: WhipParameters, state:
     alive = np.flatnonzero(~state.failed)
     with _LOCK:
         for rows in np.split(alive, range(CHUNK, len(alive), CHUNK)) if len(alive) else ():
-            _advance_rows(_workshop(scene, threads), rows, parameters, state, target)
+            _advance_rows(_rollout_pool(scene, threads), rows, parameters, state, target)
     return tuple(leaf.reshape((*batch, *leaf.shape[1:])) for leaf in (state.qpos, state.qvel, state.failed))
 
 
 _LOCK = threading.Lock()
-"""Around the workshops, each of which does one rollout at a time."""
+"""Held while a rollout pool is in use: each does one rollout at a time."""
 
 
-def _advance_rows(workshop: "_Workshop", rows: np.ndarray, parameters: WhipParameters, state: State, target) -> None:
-    """Advance some scenes, in place, those whose cubes are at rest without them where that does no harm."""
-    scene, still = workshop.scene, np.all(state.qvel[rows, -6 * CUBES :] == 0, axis=1)
+def _advance_rows(pool: "_RolloutPool", rows: np.ndarray, parameters: WhipParameters, state: State, target) -> None:
+    """Advance some scenes, in place; cubes at rest are left out unless something comes near them."""
+    scene, still = pool.scene, np.all(state.qvel[rows, -6 * CUBES :] == 0, axis=1)
     first, last = scene.first_cube, state.qvel.shape[1] - 6 * CUBES
     control = np.stack([ramp(state.target[row], target[row], scene.substeps, np) for row in rows])
     pick = lambda row: jax.tree.map(lambda leaf: leaf[row], parameters)
 
     bare = rows[still]
-    ends, failed, places = workshop.bare.roll(
+    ends, failed, places = pool.bare.roll(
         [pick(row) for row in bare], state.qpos[bare, :first], state.qvel[bare, :last], control[still]
     )
     cubes = state.qpos[bare, first:].reshape(-1, CUBES, 7)[..., :3]
@@ -94,7 +94,7 @@ def _advance_rows(workshop: "_Workshop", rows: np.ndarray, parameters: WhipParam
     state.failed[bare[alone]] = failed[alone]
 
     together = np.setdiff1d(rows, bare[alone], assume_unique=True)
-    ends, failed, _ = workshop.whole.roll(
+    ends, failed, _ = pool.whole.roll(
         [pick(row) for row in together],
         state.qpos[together],
         state.qvel[together],
@@ -105,12 +105,12 @@ def _advance_rows(workshop: "_Workshop", rows: np.ndarray, parameters: WhipParam
 
 
 def _near(scene: Scene, places, cubes, length, side) -> np.ndarray:
-    """Whether the gripper or a link has come so near a cube that their bounding spheres touch, shape [B].
+    """Whether the gripper or a link has come so near to a cube that their bounding spheres touch, shape [B].
 
     Args:
         scene: the scene.
-        places: of the gripper's and the links' centres when contacts were looked for, shape [B, time, 1 + links, 3].
-        cubes: where the cubes are at rest, shape [B, 6, 3].
+        places: centres of the gripper and the links at each collision check, shape [B, time, 1 + links, 3].
+        cubes: positions of the cubes at rest, shape [B, 6, 3].
         length: of the DLO, shape [B].
         side: of the cubes, shape [B].
     """
@@ -118,10 +118,10 @@ def _near(scene: Scene, places, cubes, length, side) -> np.ndarray:
     hand = np.full((len(length), 1), np.linalg.norm(HAND))
     reach = np.concatenate([hand, links], axis=1) + side[:, None] / 2 * 3**0.5  # [B, 1 + links]
     middle = cubes.mean(axis=1)
-    spread = np.linalg.norm(cubes - middle[:, None], axis=-1).max(axis=-1, initial=0.0)
-    # Most never come near the stack as a whole.
+    radius = np.linalg.norm(cubes - middle[:, None], axis=-1).max(axis=-1, initial=0.0)
+    # Most links never come near the stack as a whole.
     suspects = np.any(
-        np.linalg.norm(places - middle[:, None, None], axis=-1) < (reach + spread[:, None])[:, None], axis=(1, 2)
+        np.linalg.norm(places - middle[:, None, None], axis=-1) < (reach + radius[:, None])[:, None], axis=(1, 2)
     )
     near = np.zeros(len(length), bool)
     for row in np.flatnonzero(suspects):
@@ -141,11 +141,11 @@ def _quietly():
         mujoco.set_mju_user_warning(before)
 
 
-class _Bench:
-    """Models of one kind, and the memory that threads simulate them in."""
+class _ModelCache:
+    """The models of one kind that were built last, and the memory that threads simulate them in."""
 
-    def __init__(self, scene: Scene, base: mujoco.MjModel, make: Callable, pool, threads: int):
-        self._scene, self._base, self._make, self._pool = scene, base, make, pool
+    def __init__(self, scene: Scene, base: mujoco.MjModel, make: Callable, rollout, threads: int):
+        self._scene, self._base, self._make, self._rollout = scene, base, make, rollout
         self._data = [mujoco.MjData(base) for _ in range(threads)]
         self._models: OrderedDict[tuple, mujoco.MjModel] = OrderedDict()
 
@@ -160,7 +160,7 @@ class _Bench:
         models = [self._model(scene) for scene in parameters]
         start = np.concatenate([np.zeros((len(models), 1)), qpos, qvel], axis=1)
         with _quietly():
-            states, points = self._pool.rollout(models, self._data, start, control)
+            states, points = self._rollout.rollout(models, self._data, start, control)
         end = states[:, -1]
         # MuJoCo stops the clock of a simulation that has become unstable.
         stopped = np.abs(end[:, 0] - self._scene.control_interval) > self._scene.timestep / 2
@@ -170,7 +170,7 @@ class _Bench:
         return np.split(after, [qpos.shape[1]], axis=1), failed, points
 
     def _model(self, parameters: WhipParameters) -> mujoco.MjModel:
-        """The model of a scene; the least recently used is forgotten first."""
+        """The model of a scene; the least recently used one is dropped first."""
         key = tuple(leaf.tobytes() for leaf in jax.tree.leaves(parameters))
         if key not in self._models:
             self._models[key] = self._make(self._scene, jax.tree.map(np.float64, parameters))
@@ -181,22 +181,22 @@ class _Bench:
 
 
 @dataclasses.dataclass
-class _Workshop:
-    """Threads, and the two kinds of models of a scene."""
+class _RolloutPool:
+    """The threads of a rollout, and the two caches of models: with the cubes and without."""
 
     scene: Scene
-    whole: _Bench
-    bare: _Bench
+    whole: _ModelCache
+    bare: _ModelCache
 
 
 @functools.lru_cache(maxsize=8)
-def _workshop(scene: Scene, threads: int) -> _Workshop:
-    pool = mujoco.rollout.Rollout(nthread=threads)
-    whole = _Bench(scene, base_model(scene), edited_model, pool, threads)
-    bare = _Bench(scene, bare_model(scene), _bare, pool, threads)
-    return _Workshop(scene, whole, bare)
+def _rollout_pool(scene: Scene, threads: int) -> _RolloutPool:
+    rollout = mujoco.rollout.Rollout(nthread=threads)
+    whole = _ModelCache(scene, base_model(scene), edited_model, rollout, threads)
+    bare = _ModelCache(scene, bare_model(scene), _bare, rollout, threads)
+    return _RolloutPool(scene, whole, bare)
 
 
 def _bare(scene: Scene, parameters: WhipParameters) -> mujoco.MjModel:
-    """The model of a scene without its cubes, whose other parts have the same places in a model."""
+    """The model of a scene without its cubes; all other parts have the same indices."""
     return edited(bare_model(scene), dlo_edits(scene, parameters))

@@ -9,46 +9,31 @@ import numpy as np
 
 from jaxlfi.envs.whip import frames
 from jaxlfi.envs.whip.parameters import MEDIAN, WhipParameters
-from jaxlfi.envs.whip.physics.chain import GRAVITY, SECTION, Chain, link_inertias, link_masses
+from jaxlfi.envs.whip.physics.chain import Chain, link_inertias, link_masses
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, GRAVITY, RGBA, SECTION, STACK, START
 
-START = (0.40, 0.36)
-"""Where the gripper begins, x and z in m: the longest DLO just clears the table."""
-STACK = 0.60
-"""Where the stack of cubes stands, x in m."""
 HAND = (0.02, 0.015, 0.03)
 """Half the gripper's width, depth and height, in m; the DLO is held at the middle of its lower side."""
 CUBES = len(frames.COLOURS)
 SINKING = np.array([40.06, 106.59, 159.92, 199.98, 226.71, 240.08]) * 1e-6
-"""How far the cubes of a stack at rest have sunk into what is below, bottom-up, in m.
+"""Total penetration of the contacts below each cube of a stack at rest, bottom-up, in m.
 
-It follows from the softness of the contacts and the weights above, whatever the cubes' size and density.
+It follows from the softness of the contacts and does not depend on the cubes' size and density.
 """
-
-RGBA = {
-    "red": (0.85, 0.15, 0.15, 1),
-    "green": (0.15, 0.65, 0.2, 1),
-    "blue": (0.1, 0.2, 0.6, 1),
-    "orange": (0.95, 0.55, 0.1, 1),
-    "purple": (0.5, 0.2, 0.6, 1),
-    "yellow": (0.95, 0.85, 0.1, 1),
-    "dlo": (0.2, 0.5, 0.95, 1),
-    "gripper": (0.4, 0.4, 0.4, 1),
-    "table": (0.85, 0.8, 0.75, 1),
-}
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What is the same in all scenes.
+    """Settings of the simulation that all scenes share.
 
     Attributes:
-        chain: how the DLO is cut into links.
+        chain: division of the DLO into links.
         timestep: of the physics, in s.
         iterations: of Newton's solver; with 2 the stack of cubes explodes.
-        line_search: iterations of its line search.
-        air: density of the air that drags on the DLO, in kg/m^3.
-        stiffness, damping: of the impedance controller that moves the gripper, in N/m and N s/m: for its 1 kg, critical
-            damping at 30 rad/s.
+        line_search: iterations of the solver's line search.
+        air: density of the air, which causes drag on the DLO, in kg/m^3.
+        stiffness, damping: of the impedance controller of the gripper, in N/m and N s/m: critical damping at 30 rad/s
+            for its mass of 1 kg.
         control_interval: between two actions, in s.
     """
 
@@ -59,16 +44,16 @@ class Scene:
     air: float = 1.2
     stiffness: float = 900.0
     damping: float = 60.0
-    control_interval: float = 0.16
+    control_interval: float = CONTROL_INTERVAL
 
     @property
     def substeps(self) -> int:
-        """Physics steps between two actions."""
+        """Number of physics steps between two actions."""
         return round(self.control_interval / self.timestep)
 
     @property
     def first_cube(self) -> int:
-        """Where the first cube's position begins in qpos, and its velocity in qvel is 0 or more before."""
+        """Index of the first cube's position in qpos."""
         return 2 + self.chain.elements * (1 if self.chain.planar else 4)
 
 
@@ -76,13 +61,13 @@ def compile_model(scene: Scene, parameters: WhipParameters = MEDIAN) -> mujoco.M
     """The MuJoCo model of one scene, with parameters in NumPy or Python numbers.
 
     Raises:
-        ValueError: if the model has plugins, which MJX would ignore without a word.
+        ValueError: if the model has plugins, which MJX would ignore silently.
     """
     return refuse_plugins(build(scene, parameters).compile())
 
 
 def refuse_plugins(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Refuse what the engines do not simulate alike: MJX ignores plugins without a word.
+    """Refuse models with plugins, which MJX ignores silently, so that the engines would differ.
 
     Raises:
         ValueError: if there are any.
@@ -129,7 +114,7 @@ def cube_names() -> list[str]:
 
 
 def cube_positions(parameters: WhipParameters, xp=np):
-    """Where the cubes' centres are at rest, shape [6, 3], in m."""
+    """Centres of the cubes at rest, shape [6, 3], in m."""
     side, stack = parameters.cube_side, parameters.stack
     heights = side * (xp.arange(CUBES) + 0.5) - SINKING
     return xp.stack([xp.full(CUBES, STACK) + stack[0], xp.zeros(CUBES) + stack[1], heights], axis=-1)
@@ -207,7 +192,7 @@ def _add_cubes(spec: mujoco.MjSpec, parameters: WhipParameters) -> None:
 
 
 def _add_contacts(spec: mujoco.MjSpec, chain: Chain) -> None:
-    """What can touch: everything the table and the cubes, but the DLO not itself."""
+    """The pairs that can touch: everything with the table and the cubes, but not the DLO with itself."""
     links, cubes = link_names(chain), cube_names()
     pairs = [("table", cube) for cube in cubes]
     pairs += [(cubes[i], cubes[j]) for i in range(CUBES) for j in range(i + 1, CUBES)]
@@ -227,15 +212,15 @@ def _add_contacts(spec: mujoco.MjSpec, chain: Chain) -> None:
 
 @functools.lru_cache(maxsize=8)
 def base_model(scene: Scene) -> mujoco.MjModel:
-    """The model of the median scene, which all others differ from in numbers only."""
+    """The model of the median scene, from which all others differ in numbers only."""
     return compile_model(scene)
 
 
 @functools.lru_cache(maxsize=8)
 def bare_model(scene: Scene) -> mujoco.MjModel:
-    """The median scene without cubes, but for that like `base_model`, with sensors of where everything is.
+    """The median scene as in `base_model` but without cubes, and with position sensors.
 
-    The sensors tell the centres of the gripper and of the links, in m.
+    The sensors report the centres of the gripper and of the links, in m.
     """
     spec = build(scene)
     for pair in list(spec.pairs):

@@ -1,1 +1,1 @@
-"""An object that stands in for a real one: a soft body of finite elements, simulated apart from inference's chain."""
+"""FEM reference objects: soft bodies of finite elements in place of real DLOs, with none of inference's physics."""

@@ -1,15 +1,15 @@
-"""The heavy elastica: how an inextensible beam sags under its own weight, however far."""
+"""The heavy elastica: an inextensible beam that sags under its own weight, with large deflections."""
 
 import numpy as np
 from scipy.integrate import simpson, solve_bvp
 from scipy.optimize import brentq
 
 LIMITS = (0.1, 100.0)
-"""Elasto-gravity numbers between which a sag is sought."""
+"""Range of elasto-gravity numbers that `number_of_sag` searches."""
 
 
 def heavy_cantilever(number: float) -> tuple[float, float]:
-    """Where the tip of a horizontal cantilever comes to rest.
+    """The position of a horizontal cantilever's tip at rest.
 
     Solves theta'' = -G (1 - s) cos theta with theta(0) = 0 and theta'(1) = 0 for the slope theta downwards along the
     arc s in [0, 1] (Wang, 1986), by continuation in G.
@@ -18,7 +18,7 @@ def heavy_cantilever(number: float) -> tuple[float, float]:
         number: the elasto-gravity number G = rho g A L^3 / (E I).
 
     Returns:
-        Reach and sag of the tip as fractions of the length.
+        Horizontal reach and sag of the tip, as fractions of the length.
     """
     arc = np.linspace(0, 1, 201)
     slope = np.stack([number * (1 - (1 - arc) ** 3) / 6, number * (1 - arc) ** 2 / 2]) * min(1, 1 / number)

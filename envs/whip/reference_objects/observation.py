@@ -1,4 +1,4 @@
-"""What is seen of the stand-in: segmentation images with a camera's noise, and the keypoints found in them."""
+"""Observations of a reference object: segmentation images with a camera's noise, and keypoints found in them."""
 
 import dataclasses
 import functools
@@ -11,14 +11,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlfi.envs.whip.frames import COLOURS, Frames
 from jaxlfi.envs.whip.recording import Recording, hit_flags
 from jaxlfi.envs.whip.reference_objects.scene import SIMULATOR
-from jaxlfi.envs.whip.reference_objects.simulation import CONTROL_INTERVAL, FRAME_INTERVAL, StandIn
+from jaxlfi.envs.whip.reference_objects.simulation import FRAME_INTERVAL, ReferenceRig
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, RGBA
 from jaxlfi.envs.whip.vision import masks
 from jaxlfi.envs.whip.vision.camera import Camera, project, side_camera
 from jaxlfi.envs.whip.vision.raster import noisy, segmentation
 
 IMAGE_SIZE = 256
 """Side of the segmentation images, in pixels (section VI-C)."""
-HEX = dict(zip((*COLOURS, "dlo"), "#D92626 #26A633 #1A3399 #F28C1A #803399 #F2D91A #3380F2".split(), strict=True))
+HEX = {name: "#" + "".join(f"{round(255 * channel):02X}" for channel in RGBA[name][:3]) for name in (*COLOURS, "dlo")}
 """Colours of the cubes and the DLO."""
 
 
@@ -36,7 +37,7 @@ def found(
 
 
 def in_every_frame(function, key: jax.Array, camera: Camera, frames: Frames, cube_side: Float[Array, ""] | float):
-    """What `function`, `look` or `found`, makes of each frame, each with a key of its own; NumPy arrays [F, ...]."""
+    """The result of `function` (`look` or `found`) for each frame, with a key per frame; NumPy arrays [F, ...]."""
     frames = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), frames)
     return jax.tree.map(np.asarray, _mapped(function, key, camera, frames, jnp.asarray(cube_side, jnp.float32)))
 
@@ -50,15 +51,15 @@ def _mapped(function, key, camera, frames, cube_side):
     return jax.lax.map(one, jnp.arange(frames.gripper.shape[0]))
 
 
-def record(key: jax.Array, rig: StandIn, actions: Float[Array, "16 2"]) -> tuple[Recording, Frames]:
-    """One rollout as a camera sees it, and what it was in truth.
+def record(key: jax.Array, rig: ReferenceRig, actions: Float[Array, "16 2"]) -> tuple[Recording, Frames]:
+    """One rollout as a camera sees it, and its true frames.
 
     Args:
         key: of the camera's noise.
-        rig: the stand-in.
+        rig: with the object in its gripper.
         actions: displacements of the gripper's set-point, in m, shape [16, 2].
     """
-    actions, camera, thing = np.asarray(actions, float), side_camera(rig.place), rig.thing
+    actions, camera, dlo = np.asarray(actions, float), side_camera(rig.place), rig.dlo
     times, frames = rig.rollout(actions)
     keypoints, seen = in_every_frame(found, key, camera, frames, rig.place.cube_side)
     recording = Recording(
@@ -68,21 +69,21 @@ def record(key: jax.Array, rig: StandIn, actions: Float[Array, "16 2"]) -> tuple
         seen=seen,
         actions=actions,
         camera=camera,
-        source="stand-in",
+        source="simulated",
         description=(
-            f"Stand-in for a DLO of silicone, {1e3 * thing.length:.0f} mm long, Shore {thing.hardness}: "
-            "a simulated soft body of finite elements, seen through noisy segmentation images"
+            f"FEM reference object for a DLO of silicone, {1e3 * dlo.length:.0f} mm long, Shore {dlo.hardness}: "
+            "seen through noisy segmentation images"
         ),
         frame_rate=1 / FRAME_INTERVAL,
         control_interval=CONTROL_INTERVAL,
         image_size=IMAGE_SIZE,
         colours=HEX,
         facts={
-            "length (m)": thing.length,
-            "mass (kg)": thing.mass,
-            "Shore hardness": thing.hardness,
-            "effective Young's modulus (Pa)": thing.effective_young,
-            "effective Young's modulus of a DLO of 75 kg/m^3 that moves alike (Pa)": round(thing.light_young),
+            "length (m)": dlo.length,
+            "mass (kg)": dlo.mass,
+            "Shore hardness": dlo.hardness,
+            "effective Young's modulus (Pa)": dlo.effective_young,
+            "effective Young's modulus of a DLO of 75 kg/m^3 that moves alike (Pa)": round(dlo.light_young),
         },
         provenance={"simulator": SIMULATOR},
     )

@@ -1,44 +1,41 @@
-"""The stand-in's scene as a MuJoCo model: a soft body in the gripper, table and cubes."""
+"""The scene of a reference object as a MuJoCo model: a soft body in the gripper, table and cubes."""
 
 import mujoco
 import numpy as np
 
 from jaxlfi.envs.whip.frames import COLOURS
 from jaxlfi.envs.whip.parameters import MEDIAN, WhipParameters
-from jaxlfi.envs.whip.reference_objects.objects import SECTION, Object
+from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
+from jaxlfi.envs.whip.rig import SECTION, STACK, START
 
 SIMULATOR = f"MuJoCo {mujoco.__version__}, trilinear finite elements"
-"""What simulates it."""
-START = (0.40, 0.36)
-"""Where the gripper begins, x and z in m."""
-STACK = 0.60
-"""Where the stack of cubes stands, x in m."""
+"""The simulator, as recordings name it."""
 TIMESTEP = 0.002
-"""Of the physics, in s."""
+"""Time step of the physics, in s."""
 CELL = 0.0125
-"""About the length of a finite element, in m; each spans the whole section."""
+"""Approximate length of a finite element, in m; each spans the whole section."""
 SKIN = 0.0005
-"""Thickness of the layer around the finite elements that contacts are with, in m."""
+"""Thickness of the contact layer around the finite elements, in m."""
 
 PLACE = MEDIAN.replace(cube_density=1.54e-3 / 0.025**3)
-"""Where the real DLOs would be whipped: the median scene, its cubes of 1.54 g (section VI-B)."""
+"""The scene of the real DLOs: the median one, with cubes of 1.54 g (section VI-B)."""
 
 
-def cells(thing: Object) -> int:
-    """Finite elements along the object."""
-    return round(thing.length / CELL)
+def cells(dlo: ReferenceObject) -> int:
+    """Number of finite elements along the object."""
+    return round(dlo.length / CELL)
 
 
-def whip_model(thing: Object, place: WhipParameters = PLACE) -> mujoco.MjModel:
+def whip_model(dlo: ReferenceObject, place: WhipParameters = PLACE) -> mujoco.MjModel:
     """The object hanging from the gripper beside the stack.
 
     Args:
-        thing: what is held.
-        place: of which the cubes and the stack's place are used.
+        dlo: the object in the gripper.
+        place: the scene, of which the cubes and the position of the stack are used.
     """
     x, z = START
     spec = _specification(
-        thing,
+        dlo,
         (x, 0.0, z),
         f"""
         <geom name="table" type="plane" size="1 1 0.05" contype="1" conaffinity="1"/>
@@ -64,33 +61,35 @@ def whip_model(thing: Object, place: WhipParameters = PLACE) -> mujoco.MjModel:
     return spec.compile()
 
 
-def cantilever_model(thing: Object, gravity: tuple[float, float, float], timestep: float = 0.01) -> mujoco.MjModel:
+def cantilever_model(
+    dlo: ReferenceObject, gravity: tuple[float, float, float], timestep: float = 0.01
+) -> mujoco.MjModel:
     """The object alone, hanging from a clamp that does not move.
 
     Args:
-        thing: what is held.
+        dlo: the object in the clamp.
         gravity: in m/s^2; along x the object is a horizontal cantilever.
         timestep: in s.
     """
-    model = _specification(thing).compile()
+    model = _specification(dlo).compile()
     model.opt.gravity, model.opt.timestep = gravity, timestep
     return model
 
 
-def centreline(thing: Object, data: mujoco.MjData) -> np.ndarray:
+def centreline(dlo: ReferenceObject, data: mujoco.MjData) -> np.ndarray:
     """Points of the object's axis from the grip to the tip, in m, shape [cells + 1, 3]."""
-    levels = data.flexvert_xpos.reshape(2, 2, cells(thing) + 1, 3)
+    levels = data.flexvert_xpos.reshape(2, 2, cells(dlo) + 1, 3)
     return levels.mean(axis=(0, 1))[::-1]
 
 
-def _soft_body(thing: Object, top: tuple[float, float, float]) -> str:
+def _soft_body(dlo: ReferenceObject, top: tuple[float, float, float]) -> str:
     """Eight-noded cells, one behind the other, the topmost nodes fixed to the world."""
-    n, side = cells(thing), SECTION - 2 * SKIN
-    middle = top[2] - thing.length / 2
+    n, side = cells(dlo), SECTION - 2 * SKIN
+    middle = top[2] - dlo.length / 2
     return f"""
     <flexcomp name="dlo" type="grid" dim="3" dof="trilinear" count="2 2 {n + 1}" cellcount="1 1 {n}"
-      spacing="{side} {side} {thing.length / n}" pos="{top[0]} {top[1]} {middle}" mass="{thing.mass}" radius="{SKIN}">
-      <elasticity young="{thing.young}" poisson="{thing.poisson}" damping="{thing.damping}"/>
+      spacing="{side} {side} {dlo.length / n}" pos="{top[0]} {top[1]} {middle}" mass="{dlo.mass}" radius="{SKIN}">
+      <elasticity young="{dlo.young}" poisson="{dlo.poisson}" damping="{dlo.damping}"/>
       <contact contype="1" conaffinity="1" selfcollide="none" condim="3" friction="0.6" solref="0.01 1"/>
       <pin gridrange="0 0 {n} 1 1 {n}"/>
     </flexcomp>"""
@@ -106,7 +105,7 @@ def _cube(i: int, place: WhipParameters) -> str:
     </body>"""
 
 
-def _specification(thing: Object, top=(0.0, 0.0, 0.0), bodies: str = "", actuators: str = "") -> mujoco.MjSpec:
+def _specification(dlo: ReferenceObject, top=(0.0, 0.0, 0.0), bodies: str = "", actuators: str = "") -> mujoco.MjSpec:
     # The discrete integrator takes the soft body's stiffness implicitly. With fewer iterations it does not converge
     # for stiff objects. A failed simulation must look like one: by default MuJoCo resets it to its beginning.
     spec = mujoco.MjSpec.from_string(f"""
@@ -116,13 +115,13 @@ def _specification(thing: Object, top=(0.0, 0.0, 0.0), bodies: str = "", actuato
         <flag autoreset="disable"/>
       </option>
       <default><geom condim="3" friction="0.6" solref="0.01 1"/></default>
-      <worldbody>{_soft_body(thing, top)}{bodies}</worldbody>
+      <worldbody>{_soft_body(dlo, top)}{bodies}</worldbody>
       {actuators}
     </mujoco>""")
     # MuJoCo gives each node the same mass, so that the tip would have twice its own.
-    n = cells(thing)
+    n = cells(dlo)
     for body in spec.bodies:
         if body.name.startswith("dlo_"):
             tip = body.name.endswith("_0")
-            body.mass = thing.mass / n / (8 if tip else 4)
+            body.mass = dlo.mass / n / (8 if tip else 4)
     return spec

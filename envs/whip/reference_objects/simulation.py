@@ -1,4 +1,4 @@
-"""The stand-in, to be acted on like a real rig: one object, one episode after another."""
+"""A reference object in the gripper, to be acted on like a real rig: one object, one episode after another."""
 
 import jax
 import mujoco
@@ -7,48 +7,47 @@ from jaxtyping import Float
 
 from jaxlfi.envs.whip.frames import COLOURS, Frames
 from jaxlfi.envs.whip.parameters import WhipParameters
-from jaxlfi.envs.whip.reference_objects.objects import Object
-from jaxlfi.envs.whip.reference_objects.scene import PLACE, START, TIMESTEP, centreline, whip_model
+from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
+from jaxlfi.envs.whip.reference_objects.scene import PLACE, TIMESTEP, centreline, whip_model
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, START
 from jaxlfi.envs.whip.rules import ACTION_LIMIT
 
-CONTROL_INTERVAL = 0.16
-"""Between two actions, in s."""
 FRAME_INTERVAL = 0.016
-"""Between two frames, in s: 62.5 Hz, as near to the camera's 60 as goes evenly into the control interval."""
+"""Between two frames, in s: 62.5 Hz, the frame rate nearest to a camera's 60 Hz that divides the control interval."""
 SETTLING = 1.5
-"""How long the object hangs before an episode begins, in s: soft ones stretch and bounce."""
+"""Time for which the object hangs before an episode begins, in s: soft objects stretch and bounce."""
 FATAL = ("mjWARN_CONTACTFULL", "mjWARN_CNSTRFULL", "mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
-"""MuJoCo's warnings after which a simulation is worth nothing."""
+"""Warnings of MuJoCo after which a simulation is invalid."""
 
 
-class StandInError(RuntimeError):
-    """The simulation has broken down."""
+class UnstableError(RuntimeError):
+    """The simulation has become unstable."""
 
 
-class StandIn:
-    """One object in its place: MuJoCo's finite elements, and none of the physics that inference simulates with.
+class ReferenceRig:
+    """One object in its scene, by MuJoCo's finite elements: none of the physics that inference simulates with.
 
     Example:
         >>> from jaxlfi.envs.whip.reference_objects.objects import load
-        >>> rig = StandIn(load("dlo-1"))
+        >>> rig = ReferenceRig(load("dlo-1"))
         >>> rig.reset().gripper.round(3)
         array([0.4 , 0.36])
         >>> rig.step([0.03, 0.0]).dlo.shape  # frames, points, x y z
         (10, 17, 3)
     """
 
-    def __init__(self, thing: Object, place: WhipParameters = PLACE):
+    def __init__(self, dlo: ReferenceObject, place: WhipParameters = PLACE):
         """Let the object come to rest.
 
         Args:
-            thing: what is held.
-            place: one scene, of which the cubes and the stack's place are used.
+            dlo: the object in the gripper.
+            place: the scene, of which the cubes and the position of the stack are used.
 
         Raises:
-            StandInError: where it does not come to rest in one piece.
+            UnstableError: if the simulation becomes unstable.
         """
-        self.thing, self.place = thing, place
-        self._model = whip_model(thing, place)
+        self.dlo, self.place = dlo, place
+        self._model = whip_model(dlo, place)
         self._data = mujoco.MjData(self._model)
         self._target = np.array(START)
         self._data.ctrl[:] = START
@@ -73,8 +72,8 @@ class StandIn:
             The ten frames of the interval, the last of which is its end.
 
         Raises:
-            ValueError: for an action that is too large or none.
-            StandInError: where the simulation breaks down.
+            ValueError: for an action that is too large, or not two numbers.
+            UnstableError: if the simulation becomes unstable.
         """
         action = np.asarray(action, float)
         if action.shape != (2,) or not (np.abs(action) <= ACTION_LIMIT + 1e-6).all():  # also refuses NaN
@@ -99,7 +98,7 @@ class StandIn:
 
         Raises:
             ValueError: for actions that are too large.
-            StandInError: where the simulation breaks down.
+            UnstableError: if the simulation becomes unstable.
         """
         frames = [_stacked([self.reset()]), *(self.step(action) for action in np.asarray(actions, float))]
         together = jax.tree.map(lambda *parts: np.concatenate(parts), *frames)
@@ -111,9 +110,9 @@ class StandIn:
         bodies = [self._data.body(colour) for colour in COLOURS]
         return Frames(
             gripper=self._data.body("gripper").xpos[[0, 2]],
-            dlo=centreline(self.thing, self._data),
+            dlo=centreline(self.dlo, self._data),
             cubes=np.stack([body.xpos for body in bodies]),
-            turns=np.stack([body.xquat for body in bodies]),
+            orientations=np.stack([body.xquat for body in bodies]),
         )
 
     def _state(self) -> np.ndarray:
@@ -126,10 +125,10 @@ class StandIn:
         try:
             mujoco.mj_step(self._model, self._data, nstep=steps)
         except mujoco.FatalError as error:  # the first of a broken simulation's contacts
-            raise StandInError(f"{self.thing.name}: {error}") from error
+            raise UnstableError(f"{self.dlo.name}: {error}") from error
         broken = [name for name in FATAL if self._data.warning[getattr(mujoco.mjtWarning, name)].number]
         if broken or not np.isfinite(self._data.qpos).all():
-            raise StandInError(f"{self.thing.name}: broke down at {self._data.time:.3f} s: {broken}")
+            raise UnstableError(f"{self.dlo.name}: became unstable at {self._data.time:.3f} s: {broken}")
 
 
 def _stacked(frames: list[Frames]) -> Frames:

@@ -8,15 +8,15 @@ from jaxlfi.envs.whip.vision.keypoints import along
 from jaxlfi.envs.whip.vision.raster import DLO
 
 EVEN = (0.25, 0.5, 0.75, 1.0)
-"""Fractions of the visible DLO's length, from the grip, at which it gets its keypoints; those of `keypoints.CLEAN`."""
+"""Fractions of the visible DLO's length, from the grip, at which it gets its keypoints; as for `keypoints.CLEAN`."""
 MIN_COUNT = 5
-"""Pixels below which nothing counts as seen."""
+"""Minimum number of pixels of an object that counts as seen."""
 SAMPLES, KNOTS = 256, 32
-"""Pixels of the DLO that its centreline is made of, and points of that line."""
+"""Number of the DLO's pixels that its centreline is fitted to, and number of points of that line."""
 BANDWIDTH = 3 / 256
-"""Of the smoothing along the line, in widths of the image: about half of the DLO's width."""
+"""Bandwidth of the smoothing along the line, in widths of the image: about half of the DLO's width."""
 REACH = 4 / 256
-"""Up to here, in widths of the image, pixels are neighbours; further ones are so only where nothing else is."""
+"""Distance up to which pixels are neighbours, in widths of the image; gaps in the mask are bridged all the same."""
 
 
 def keypoints(
@@ -28,7 +28,7 @@ def keypoints(
 
     Args:
         labels: as `raster.segmentation` has them, possibly noisy.
-        grip: about where the gripper is seen, in normalised pixels: it tells the DLO's ends from each other.
+        grip: approximate position of the gripper, in normalised pixels: it distinguishes the DLO's ends.
         arcs: fractions of the DLO's visible length.
 
     Returns:
@@ -68,11 +68,11 @@ def centroids(labels: Int[Array, "size size"]) -> tuple[Float[Array, "6 2"], Boo
 def centreline(
     labels: Int[Array, "size size"], grip: Float[Array, "2"]
 ) -> tuple[Float[Array, "knots 2"], Bool[Array, ""]]:
-    """The middle of the DLO's mask, from the end near the grip to the tip; whatever the shape, and across gaps.
+    """The middle of the DLO's mask, from the end near the grip to the tip, for any shape and across gaps.
 
     Pixels are put in order by the length of their shortest path to the tip through the mask, and averaged in groups;
     the order is then refined by projection onto the line so found, as in principal curves (Hastie and Stuetzle, 1989).
-    Paths leave the mask only where it is broken. Parts of the DLO that touch in the image are not told apart.
+    Paths leave the mask only where it is broken. Parts of the DLO that touch in the image are not distinguished.
 
     Returns:
         Points in normalised pixels, shape [K, 2], and whether there are enough pixels.
@@ -147,6 +147,6 @@ def _smoothed(pixels: Float[Array, "samples 2"], place: Float[Array, " samples"]
     weight = jnp.exp(-0.5 * (away / width) ** 2)
     weight /= weight.sum(axis=-1, keepdims=True)
     mean = jnp.sum(weight * away, axis=-1, keepdims=True)
-    spread = jnp.sum(weight * (away - mean) ** 2, axis=-1, keepdims=True)
-    weight *= 1 - mean * (away - mean) / jnp.maximum(spread, 1e-12)
+    variance = jnp.sum(weight * (away - mean) ** 2, axis=-1, keepdims=True)
+    weight *= 1 - mean * (away - mean) / jnp.maximum(variance, 1e-12)
     return jnp.matmul(weight, pixels, precision="highest")

@@ -1,4 +1,4 @@
-"""Segmentation images by casting a ray through every pixel, and the noise of a camera's masks."""
+"""Segmentation images by ray casting, and the noise of a camera's masks."""
 
 import jax
 import jax.numpy as jnp
@@ -6,12 +6,12 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.envs.whip.frames import COLOURS, Frames
-from jaxlfi.envs.whip.vision.camera import Camera, rotation
+from jaxlfi.envs.whip.quaternions import rotation
+from jaxlfi.envs.whip.rig import SECTION
+from jaxlfi.envs.whip.vision.camera import Camera
 
 DLO = len(COLOURS) + 1
 """The DLO's label. Those of the cubes are 1 to 6, bottom-up; 0 is the background, the gripper too."""
-SECTION = 0.015
-"""Side of the DLO's square section, in m (section VI-A)."""
 
 
 @struct.dataclass
@@ -34,15 +34,15 @@ def segmentation(
     width: Float[Array, ""] | float = SECTION,
     size: int = 256,
 ) -> Int[Array, "size size"]:
-    """What a perfect segmentation of one frame would be; vmap for many.
+    """The perfect segmentation of one frame; vmap for many.
 
-    Every pixel takes the label of the first body that the ray through its centre meets, whatever that body is: cubes
-    are cubes, and the DLO is a bar of square section swept along its centreline, its sides along and across y. The
+    Every pixel takes the label of the first body on the ray through its centre. The DLO is a bar of square section
+    swept along its centreline, its sides along and across y. The
     gripper and the table are not drawn.
 
     Args:
         camera: through which the scene is seen.
-        frames: one instant.
+        frames: one frame.
         cube_side: side of the cubes, in m.
         width: side of the DLO's section, in m.
         size: of the image, in pixels.
@@ -50,7 +50,7 @@ def segmentation(
     Returns:
         Labels: 0 background, 1 to 6 the cubes, bottom-up, 7 the DLO; rows downwards, columns to the right.
     """
-    cubes, bar = _cubes(frames.cubes, frames.turns, cube_side), _bar(frames.dlo, width)
+    cubes, bar = _cubes(frames.cubes, frames.orientations, cube_side), _bar(frames.dlo, width)
     bodies = jax.tree.map(lambda *parts: jnp.concatenate(parts), cubes, bar)
     labels = jnp.minimum(jnp.arange(bodies.offsets.shape[0]) + 1, DLO)
     faces, towards = _faces(camera, bodies)
@@ -71,8 +71,8 @@ def segmentation(
     return jax.lax.scan(draw, image, (labels, faces, towards))[0][0]
 
 
-def _cubes(centres, turns, side) -> Bodies:
-    axes = jnp.swapaxes(rotation(turns), -1, -2)
+def _cubes(centres, orientations, side) -> Bodies:
+    axes = jnp.swapaxes(rotation(orientations), -1, -2)
     normals = jnp.concatenate([axes, -axes], axis=-2)
     return Bodies(normals, jnp.sum(normals * centres[:, None], axis=-1) + 0.5 * side)
 
@@ -104,7 +104,7 @@ def _faces(camera: Camera, bodies: Bodies):
     ahead = bodies.offsets - jnp.sum(bodies.normals * camera.position, axis=-1)
     towards = ahead < 0
     ahead = jnp.where(jnp.abs(ahead) < 1e-9, 1e-9, ahead)  # a plane through the pinhole
-    local = jnp.matmul(bodies.normals, rotation(camera.turn), precision="highest") / ahead[..., None]
+    local = jnp.matmul(bodies.normals, rotation(camera.orientation), precision="highest") / ahead[..., None]
     return (local[..., 0], -local[..., 1], -local[..., 2]), towards
 
 
@@ -114,14 +114,14 @@ def noisy(
     specks: Float[Array, ""] | float = 0.002,
     wobble: Float[Array, ""] | float = 0.7,
 ) -> Int[Array, "size size"]:
-    """A segmentation as a learnt one errs: ragged at the boundaries, with salt and pepper.
+    """A segmentation with the errors of a learnt one: ragged boundaries, and salt-and-pepper noise.
 
     Args:
         key: of the image.
         labels: of one image, as `segmentation` gives them.
-        specks: probability of a pixel to get a label at random instead, 0 to 7.
-        wobble: by how much boundaries are displaced, a standard deviation in pixels; displacements are drawn
-            every four pixels and interpolated.
+        specks: probability that a pixel gets a random label, 0 to 7.
+        wobble: standard deviation of the displacement of boundaries, in pixels; displacements are drawn every four
+            pixels and interpolated.
     """
     key_wobble, key_specks, key_salt = jax.random.split(key, 3)
     size = labels.shape[0]

@@ -278,7 +278,7 @@ class TestRecords:
 
 
 class TestBatching:
-    """A lane's result depends on its own key and rates only, bit for bit."""
+    """The result of a simulation depends on its own key and rates only, bit for bit."""
 
     @pytest.mark.parametrize("single", [simulate, jax.jit(simulate)], ids=["eager", "jit"])
     def test_vmap_equals_loop(self, prior_batch, single):
@@ -340,7 +340,7 @@ class TestBatching:
         assert (jax.jit(run)(*prior_arguments())[0] == prior_batch[0]).all()
 
     def test_schedule_does_not_matter(self, prior_batch):
-        schedule = lv.Schedule(lanes=48, records=100)
+        schedule = lv.Schedule(slots=48, records=100)
         run = jax.jit(jax.vmap(lv.make_simulator(schedule=schedule)))
         assert (run(*prior_arguments())[0] == prior_batch[0]).all()
 
@@ -401,10 +401,10 @@ def seeds():
 
 @pytest.fixture(scope="module")
 def words(seeds):
-    """[256 lanes, 8192 counters]."""
+    """[256 streams, 8192 counters]."""
     counters = jnp.arange(8192, dtype=jnp.uint32)
-    lanes = jax.tree.map(lambda leaf: leaf[:, None], seeds)
-    return np.asarray(counter_rng.random_word(lanes, counters))
+    streams = jax.tree.map(lambda leaf: leaf[:, None], seeds)
+    return np.asarray(counter_rng.random_word(streams, counters))
 
 
 @pytest.fixture(scope="module")
@@ -417,7 +417,7 @@ def hard_words():
 
 
 class TestCounterRng:
-    """Statistical tests of streams as the simulator uses them: lanes of consecutive counters."""
+    """Statistical tests of streams as the simulator uses them: streams of consecutive counters."""
 
     def test_uniform_and_exponential_laws(self, words):
         uniforms = np.asarray(counter_rng.uniform(words)).ravel()
@@ -442,7 +442,7 @@ class TestCounterRng:
             assert abs(product) < 4 / 12 / np.sqrt(block.size)
 
     @pytest.mark.parametrize("lag", [1, 2, 16])
-    def test_neighbouring_lanes_are_independent(self, words, hard_words, lag):
+    def test_neighbouring_streams_are_independent(self, words, hard_words, lag):
         for block in (words, *hard_words):
             uniforms = block / 2.0**32 - 0.5
             product = (uniforms[:-lag] * uniforms[lag:]).mean()
@@ -460,8 +460,8 @@ class TestCounterRng:
             across = (byte[::2] * 256 + byte[1::2]).ravel()
             assert stats.chisquare(np.bincount(across, minlength=65536)).pvalue > 1e-4
 
-    def test_lane_sums_are_independent_draws(self, words, hard_words):
-        """Means of a lane over counters and of a counter over lanes spread as they ought to."""
+    def test_sums_of_streams_are_independent_draws(self, words, hard_words):
+        """Means of a stream over counters, and of a counter over streams, have the right standard deviation."""
         for block in (words, *hard_words):
             uniforms = block / 2.0**32 - 0.5
             for axis in (0, 1):

@@ -14,8 +14,9 @@ from jaxlfi.envs.whip import planner, rules
 from jaxlfi.envs.whip.parameters import median
 from jaxlfi.envs.whip.physics.engine import settled
 from jaxlfi.envs.whip.physics.kinematics import initial_positions
-from jaxlfi.envs.whip.physics.scene import START, Scene
+from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.planner import CrossEntropy
+from jaxlfi.envs.whip.rig import START
 
 
 class Terrain:
@@ -36,7 +37,7 @@ class Terrain:
 
 
 TERRAIN = Terrain()
-METHOD = CrossEntropy(population=16, elites=4, iterations=6, stacks=3, enough=1.999)
+METHOD = CrossEntropy(population=16, elites=4, iterations=6, stacks=3, target_return=1.999)
 
 
 play = jax.jit(functools.partial(planner.play, TERRAIN))
@@ -106,8 +107,8 @@ def test_the_mean_is_over_the_middles_of_equal_parts():
     """The gripper stops 2 cm beyond where the undisplaced stack's cube is pushed."""
     reach = actions((1, 0.0, 0.06), (2, 0.06, 0.0))
     jitters = {0.0: 1.0, 0.029: 1.0, 0.031: 2 / 3, 0.5: 2 / 3}  # the third place is two thirds of the range away
-    for jitter, share in jitters.items():
-        assert mean_return(median(), reach, jitter=jitter) == pytest.approx(2 * share)
+    for jitter, fraction in jitters.items():
+        assert mean_return(median(), reach, jitter=jitter) == pytest.approx(2 * fraction)
     aside = median().replace(stack=jnp.array([0.01, 0.0]))
     assert mean_return(aside, reach, jitter=0.016) == pytest.approx(2 * 2 / 3)
 

@@ -80,7 +80,7 @@ def test_the_exploratory_actions_stay_in_the_workspace():
     assert np.all(path > rules.WORKSPACE[0] + 0.0099) and np.all(path < rules.WORKSPACE[1] - 0.0099)
 
 
-def test_unstable_simulations_are_told_of(key):
+def test_unstable_simulations_are_reported(key):
     shaky = NativeEngine(Scene(chain=Chain(elements=16, retardation=0.0, viscosity=0.0), timestep=0.005))
     made = whip_task(shaky, DETECTORS["clean"], NUISANCES["fixed"], exploratory_actions(), truth=(0.23, 8e3))
     stiff = made.to_coordinates(jnp.array([[100.0, 5e5], [120.0, 4e5]]))

@@ -58,7 +58,7 @@ def changed(name: str, index, value) -> dict:
 
 @pytest.mark.parametrize("hits", [None, np.arange(jittered().size)[:, None] > np.array([9, 99, 20, 999, 50, 2])])
 def test_what_is_written_is_read(tmp_path, hits):
-    recording = recorded(hits=hits, image_size=128, source="stand-in")
+    recording = recorded(hits=hits, image_size=128, source="simulated")
     write(tmp_path / "one.npz", recording)
     back = read(tmp_path / "one.npz")
     np.testing.assert_array_equal(back.times, recording.times)
@@ -69,7 +69,7 @@ def test_what_is_written_is_read(tmp_path, hits):
     for name in ("source", "description", "frame_rate", "control_interval", "image_size", "colours", "facts"):
         assert getattr(back, name) == getattr(recording, name)
     assert back.provenance == {"by": "a test"}
-    for name in ("position", "turn", "field_of_view"):
+    for name in ("position", "orientation", "field_of_view"):
         np.testing.assert_array_equal(getattr(back.camera, name), getattr(recording.camera, name))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "one.npz"]
 
@@ -90,8 +90,8 @@ def test_other_names_are_refused(tmp_path):
 
 def described(path, **changes):
     """Change a description on the disk; None takes an entry away."""
-    told = {**json.loads(path.with_suffix(".json").read_text()), **changes}
-    path.with_suffix(".json").write_text(json.dumps({k: v for k, v in told.items() if v is not None}))
+    described = {**json.loads(path.with_suffix(".json").read_text()), **changes}
+    path.with_suffix(".json").write_text(json.dumps({k: v for k, v in described.items() if v is not None}))
 
 
 def with_array(path, name, value):
@@ -100,7 +100,7 @@ def with_array(path, name, value):
 
 
 UNITS = {name: unit for name, unit in recordings.UNITS.items() if name != "hits"}
-CAMERA = {"position": [0, -1, 0], "turn": [1, 0, 0, 0], "field_of_view": 40.0, "image_size": 256}
+CAMERA = {"position": [0, -1, 0], "orientation": [1, 0, 0, 0], "field_of_view": 40.0, "image_size": 256}
 SPOILED = {
     "no description": (lambda path: path.with_suffix(".json").unlink(), "expected a description in one.json"),
     "damaged description": (lambda path: path.with_suffix(".json").write_text('{"schema'), "expected a description in"),
@@ -115,20 +115,23 @@ SPOILED = {
     "millimetres": (lambda path: described(path, units={**UNITS, "gripper": "mm"}), "units: expected .*'gripper': 'm'"),
     "other order": (lambda path: described(path, keypoints=[*ORDER[4:], *ORDER[:4]]), "keypoints: expected the order"),
     "no camera turn": (lambda path: described(path, camera={"position": [0, 0, 0]}), "camera: expected .*turn"),
-    "worded camera": (lambda path: described(path, camera={**CAMERA, "turn": "up"}), "camera: expected an array of"),
+    "worded camera": (
+        lambda path: described(path, camera={**CAMERA, "orientation": "up"}),
+        "camera: expected an array of",
+    ),
     "missing array": (lambda path: with_array(path, "seen", None), "arrays: expected .*'seen'"),
     "extra array": (lambda path: with_array(path, "forces", np.ones(3)), "arrays: expected .*got .*'forces'"),
     "numbers as flags": (lambda path: with_array(path, "seen", np.ones((163, 10))), "seen: expected an array of bools"),
 }
 
 
-@pytest.mark.parametrize("spoil, told", SPOILED.values(), ids=SPOILED)
-def test_files_that_do_not_fit_are_refused_in_one_line(tmp_path, spoil, told):
+@pytest.mark.parametrize("spoil, message", SPOILED.values(), ids=SPOILED)
+def test_files_that_do_not_fit_are_refused_in_one_line(tmp_path, spoil, message):
     path = tmp_path / "one.npz"
     write(path, recorded())
     read(path)
     spoil(path)
-    with pytest.raises(ValueError, match=told) as caught:
+    with pytest.raises(ValueError, match=message) as caught:
         read(path)
     assert "\n" not in str(caught.value) and "one" in str(caught.value)
 
@@ -136,7 +139,7 @@ def test_files_that_do_not_fit_are_refused_in_one_line(tmp_path, spoil, told):
 # --------------------------------------------------------------------------------------------------- contents
 
 
-TURNED = side_camera(median()).replace(turn=np.array([1.0, 1.0, 0.0, 0.0]))
+TURNED = side_camera(median()).replace(orientation=np.array([1.0, 1.0, 0.0, 0.0]))
 WIDE = side_camera(median()).replace(field_of_view=200.0)
 REFUSED = [
     ({"source": "simulated"}, "source: expected one of"),
@@ -165,9 +168,9 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize("changes, told", REFUSED, ids=[told for _, told in REFUSED])
-def test_contents_that_do_not_fit_are_refused(changes, told):
-    with pytest.raises(ValueError, match=told):
+@pytest.mark.parametrize("changes, message", REFUSED, ids=[message for _, message in REFUSED])
+def test_contents_that_do_not_fit_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
         recorded(**changes)
 
 
@@ -179,10 +182,10 @@ def test_what_is_not_seen_may_be_anything():
 # ------------------------------------------------------------------------------------------------- resampling
 
 
-def expected_states(instants: np.ndarray) -> np.ndarray:
+def expected_states(times: np.ndarray) -> np.ndarray:
     """Gripper and keypoints of the straight lines, shape [T, 22]."""
-    lines = STARTS + RATES * instants[:, None, None]
-    return np.concatenate([GRIPPER(instants), lines.reshape(-1, 20)], axis=1)
+    lines = STARTS + RATES * times[:, None, None]
+    return np.concatenate([GRIPPER(times), lines.reshape(-1, 20)], axis=1)
 
 
 @pytest.mark.parametrize("control_interval", [0.16, 0.11])
@@ -274,7 +277,7 @@ def test_the_exploratory_actions_keep_within_the_workspace():
 def test_stand_ins_come_recorded(number):
     path = DATA / f"dlo-{number}.npz"
     recording = read(path)
-    assert recording.source == "stand-in" and "real" not in path.with_suffix(".json").read_text().lower()
+    assert recording.source == "simulated" and "real" not in path.with_suffix(".json").read_text().lower()
     assert path.stat().st_size < 100_000
     np.testing.assert_allclose(recording.actions, exploratory_actions(), atol=1e-7)
     assert recording.times.size == 161 and recording.seen.mean() > 0.98 and not recording.hits.any()

@@ -21,6 +21,7 @@ from jaxlfi.envs.whip.physics import engine as physics
 from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.physics.native import NativeEngine
 from jaxlfi.envs.whip.physics.scene import Scene
+from jaxlfi.envs.whip.rig import START
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 
 ENGINE, FINE = NativeEngine(threads=1), NativeEngine(Scene(control_interval=0.08), threads=1)
@@ -35,7 +36,7 @@ def small(monkeypatch):
     monkeypatch.setattr(commands, "pick", lambda name, scene=Scene(): engines[round(scene.control_interval, 3)])
     monkeypatch.setattr(render, "PIECES", 2)
     monkeypatch.setattr(render, "SIZE", 64)
-    method = functools.partial(planner.CrossEntropy, population=16, elites=4, iterations=3, stacks=1, enough=1.8)
+    method = functools.partial(planner.CrossEntropy, population=16, elites=4, iterations=3, stacks=1, target_return=1.8)
     monkeypatch.setattr(planner, "CrossEntropy", method)
 
 
@@ -52,8 +53,8 @@ def whip_file(tmp_path):
 def test_a_rollout_is_drawn_and_saved(tmp_path, whip_file, capsys):
     out = tmp_path / "new" / "folder"
     assert run("render", "--policy", whip_file, "--detector", "transporter", "--seed", 3, "--out", out) == 0
-    told = capsys.readouterr().out
-    assert "return 2.00 in 7 steps, hit yellow\n" in told and f"{out / 'film.gif'}" in told
+    printed = capsys.readouterr().out
+    assert "return 2.00 in 7 steps, hit yellow\n" in printed and f"{out / 'film.gif'}" in printed
     assert {path.name for path in out.iterdir()} == {"sheet.png", "film.gif", "rollout.npz"}
     with Image.open(out / "film.gif") as film:
         assert film.n_frames == 33 and film.info["duration"] == 160  # of 0.08 s, at half the speed
@@ -65,7 +66,7 @@ def test_a_rollout_is_drawn_and_saved(tmp_path, whip_file, capsys):
         np.testing.assert_array_equal(arrays["actions"], WHIP)
         np.testing.assert_allclose(arrays["rewards"][:7], [0, 0, 0, 0, 0, 0, 2])
         np.testing.assert_array_equal(arrays["hits"][7], [0, 0, 0, 0, 0, 1])
-        assert arrays["length"] == 7 and arrays["return"] == 2.0 and arrays["frames/turns"].shape == (17, 6, 4)
+        assert arrays["length"] == 7 and arrays["return"] == 2.0 and arrays["frames/orientations"].shape == (17, 6, 4)
         np.testing.assert_allclose(arrays["frames/gripper"][:16], arrays["states"][:, :2])
         assert arrays["parameters/young"] == pytest.approx(2.5e4)
 
@@ -74,8 +75,8 @@ def test_a_plan_is_found_saved_and_can_be_drawn(tmp_path, capsys, monkeypatch):
     """350 mm and 100 kPa are easy."""
     words = ("--length", 350, "--young", 1e5, "--out")
     assert run("plan", *words, tmp_path / "plan.npz") == 0
-    told = capsys.readouterr()
-    assert told.out.startswith("mean return") and "planning: 3 of 3 rounds to do" in told.err
+    printed = capsys.readouterr()
+    assert printed.out.startswith("mean return") and "planning" in printed.err
     with np.load(tmp_path / "plan.npz") as arrays:
         assert arrays["value"] >= 1.8 == pytest.approx(np.max(arrays["history"]), abs=0.2)
         assert arrays["actions"].shape == (16, 2) and arrays["parameters/length"] == pytest.approx(0.35)
@@ -107,7 +108,7 @@ def test_policies_are_drawn_from_the_seed(monkeypatch):
         (["--policy", "{folder}/text.npz"], "expected a whole .npz file"),
     ],
 )
-def test_bad_input_is_told_in_one_line(tmp_path, capsys, words, message):
+def test_bad_input_is_an_error_of_one_line(tmp_path, capsys, words, message):
     np.savez(tmp_path / "short.npz", actions=np.zeros((15, 2)))
     np.savez(tmp_path / "empty.npz", other=np.zeros((16, 2)))
     np.savez(tmp_path / "nan.npz", actions=np.full((16, 2), np.nan))
@@ -151,7 +152,7 @@ def test_a_film_goes_through_the_rollout(monkeypatch):
     assert shot.dlo.shape == (33, 14, 3)
     see = jax.jit(jax.vmap(lambda qpos: frames(ENGINE.scene, parameters, qpos)))
     np.testing.assert_array_equal(shot.dlo[::2], see(rollout.states.qpos).dlo)
-    corners = np.concatenate([[physics.START], rollout.states.target[1:]])
+    corners = np.concatenate([[START], rollout.states.target[1:]])
     targets = np.stack([np.interp(np.arange(1, 33) / 2, np.arange(17), corners[:, i]) for i in range(2)], axis=-1)
     straight = jax.jit(lambda targets: physics.rollout(FINE, parameters, targets).qpos)(
         jnp.asarray(targets, jnp.float32)
@@ -163,9 +164,9 @@ def test_a_film_goes_through_the_rollout(monkeypatch):
 # ----------------------------------------------------------------------------------------------------- pictures
 
 
-def instants(count=9, size=12):
+def made_up_film(count=9, size=12):
     random = np.random.default_rng(0)
-    return figures.Instants(
+    return figures.Film(
         labels=random.integers(0, 3, (count, size, size)),
         dlo=random.uniform(0.2, 0.8, (count, 4, 2)),
         cubes=random.uniform(0.2, 0.8, (count, 6, 2)),
@@ -178,8 +179,8 @@ def instants(count=9, size=12):
     )
 
 
-def test_a_sheet_shows_every_instant_and_explains_itself():
-    shown, figure = instants(), Figure()
+def test_a_sheet_shows_every_frame_and_explains_itself():
+    shown, figure = made_up_film(), Figure()
     figures.draw_sheet(figure, shown, "title")
     pictures = figure.axes[:9]
     assert [axes.get_title() for axes in pictures] == shown.captions and len(figure.axes) == 12
@@ -192,13 +193,13 @@ def test_a_sheet_shows_every_instant_and_explains_itself():
         np.testing.assert_allclose(image[..., 3], (shown.labels[t] > 0) * (figures.OVER if t > 4 else 1), atol=0.01)
         assert axes.get_ylim() == (1.0, 0.0)  # v is down
     (explained,) = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
-    told = [text.get_text() for text in explained.get_texts()]
-    assert told == ["keypoint on the DLO", "not found: the last", "keypoint of a cube", "gripper", "table"]
+    labels = [text.get_text() for text in explained.get_texts()]
+    assert labels == ["keypoint on the DLO", "not found: the last", "keypoint of a cube", "gripper", "table"]
     assert figures.sheet_height(17) > figures.sheet_height(11) == figures.sheet_height(6)
 
 
 def test_an_animation_has_all_frames(tmp_path):
-    shown = instants(5, 40)
+    shown = made_up_film(5, 40)
     path = figures.save_animation(tmp_path / "a" / "film.gif", shown, "title", 0.05, np.ones(5))
     with Image.open(path) as film:
         assert (film.n_frames, film.info["duration"], film.info["loop"]) == (5, 50, 0)

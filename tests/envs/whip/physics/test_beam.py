@@ -17,10 +17,11 @@ from experiments.whip_physics.rollouts import fastest_cube, random_scene, random
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.parameters import MEDIAN, median
 from jaxlfi.envs.whip.physics import engine as physics
-from jaxlfi.envs.whip.physics.chain import GRAVITY, SECTION, Chain
+from jaxlfi.envs.whip.physics.chain import Chain
 from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.physics.native import NativeEngine
-from jaxlfi.envs.whip.physics.scene import START, Scene, compile_model
+from jaxlfi.envs.whip.physics.scene import Scene, compile_model
+from jaxlfi.envs.whip.rig import GRAVITY, SECTION, START
 
 OURS = ("ball joints", "planar hinges")
 DLO = MEDIAN.replace(length=0.22, young=1.7e4, density=64.0)
@@ -117,7 +118,7 @@ def test_balance_by_mujocos_own_accelerations():
     assert np.abs(data.qacc).max() > 1.0
 
 
-def test_what_has_no_balance_is_told():
+def test_what_has_no_equilibrium_is_refused():
     model = models.model("planar hinges", 4, DLO)
     model.jnt_stiffness[:] = 0  # a force along no spring
     with pytest.raises(RuntimeError, match=r"equilibrium: expected torques that balance to 1e-9 .* got "):
@@ -319,7 +320,7 @@ def test_the_table_by_hand():
     }
     numbers = statistics(episodes)
     assert numbers["failed"] == numbers["failed_saturated"] == numbers["wild"] == 1
-    assert numbers["failed_share"] == 0.25
+    assert numbers["failed_fraction"] == 0.25
     assert (numbers["fastest_cube"], numbers["deepest"], numbers["greatest_lag"]) == (4.5, 0.02, 0.03)
     assert numbers["stacks"] == {"median": {"lateral": 1e-4, "vertical": 2e-4, "drift": 3e-4}}
     plain, balls, planar = table(arrays, {"planar hinges": {**numbers, "steps_per_second": 1234.6}})

@@ -240,7 +240,7 @@ def test_unknown_engines_are_refused():
     ("name", "missing", "advice"),
     [("mjx", "mujoco.mjx", r"pip install 'jaxlfi\[whip\]'"), ("warp", "warp", r"pip install 'mujoco-mjx\[warp\]'")],
 )
-def test_what_is_not_installed_is_told(name, missing, advice, monkeypatch):
+def test_what_is_not_installed_is_named(name, missing, advice, monkeypatch):
     monkeypatch.setitem(sys.modules, missing, None)
     if name == "mjx":
         monkeypatch.delattr(mujoco, "mjx")

@@ -87,12 +87,12 @@ def test_responses_are_the_inverse_of_the_inertia(base):
     """Uneven links: the kinetic energy's matrix, inverted in double precision."""
     lengths, masses, inertias = np.array([[0.3, 0.1, 0.5], [0.2, 0.05, 0.4], [2e-3, 3e-4, 1e-2]])
     n = len(lengths)
-    # Shifts across of the base, the centres and the ends, and turns, by the speeds of the base and the joints.
-    turns = np.concatenate([np.zeros((n, 1)), np.tril(np.ones((n, n)))], axis=1)
-    ends = np.cumsum(lengths[:, None] * turns, axis=0) + np.eye(1, n + 1)
-    centres = ends - lengths[:, None] / 2 * turns
+    # Shifts across of the base, the centres and the ends, and rotations, by the speeds of the base and the joints.
+    rotations = np.concatenate([np.zeros((n, 1)), np.tril(np.ones((n, n)))], axis=1)
+    ends = np.cumsum(lengths[:, None] * rotations, axis=0) + np.eye(1, n + 1)
+    centres = ends - lengths[:, None] / 2 * rotations
     finite = 1e12 if np.isinf(base) else base
-    matrix = centres.T @ np.diag(masses) @ centres + turns.T @ np.diag(inertias) @ turns
+    matrix = centres.T @ np.diag(masses) @ centres + rotations.T @ np.diag(inertias) @ rotations
     matrix[0, 0] += finite
     inverse = np.linalg.inv(matrix)
     response = respond(*(jnp.asarray(x, jnp.float32) for x in (lengths, masses, inertias)), base)
@@ -100,4 +100,4 @@ def test_responses_are_the_inverse_of_the_inertia(base):
     close(response.base, 0.0 if np.isinf(base) else inverse[0, 0], atol=1e-11)
     close(response.joints, np.diag(inverse)[1:])
     close(response.centres, np.diag(centres @ inverse @ centres.T))
-    close(response.turns, np.diag(turns @ inverse @ turns.T))
+    close(response.rotations, np.diag(rotations @ inverse @ rotations.T))

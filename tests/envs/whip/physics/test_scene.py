@@ -25,20 +25,21 @@ from jaxlfi.envs.whip.physics.chain import Chain, elasto_gravity
 from jaxlfi.envs.whip.physics.edits import edited_model
 from jaxlfi.envs.whip.physics.kinematics import frames, initial_positions
 from jaxlfi.envs.whip.physics.native import NativeEngine
-from jaxlfi.envs.whip.physics.scene import START, Scene, base_model, compile_model, refuse_plugins
+from jaxlfi.envs.whip.physics.scene import Scene, base_model, compile_model, refuse_plugins
+from jaxlfi.envs.whip.rig import START
 
 PLANAR, BALLS = Scene(), Scene(chain=Chain(planar=False))
 NAMES = ("length", "young", *NUISANCES)
 both = pytest.mark.parametrize("scene", [PLANAR, BALLS], ids=["planar", "balls"])
 
 
-def within_ranges(shares) -> WhipParameters:
-    """Parameters at these shares of their ranges, one an entry of `NAMES` (two for the stack, three for the camera)."""
-    shares = iter(shares)
+def within_ranges(fractions) -> WhipParameters:
+    """Parameters at these fractions of their ranges, one an entry of `NAMES` (two for the stack, three for the camera)."""
+    fractions = iter(fractions)
     values = {}
     for name in NAMES:
         low, high = np.asarray(getattr(LOWEST, name)), np.asarray(getattr(HIGHEST, name))
-        values[name] = low + (high - low) * np.reshape([next(shares) for _ in range(low.size)], low.shape)
+        values[name] = low + (high - low) * np.reshape([next(fractions) for _ in range(low.size)], low.shape)
     return WhipParameters(**values)
 
 
@@ -47,7 +48,7 @@ def some_parameters() -> list[WhipParameters]:
     corners = [
         [length, young, *[nuisances] * 10] for length, young, nuisances in ((0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 1, 1))
     ]
-    return [within_ranges(shares) for shares in [*corners, *np.random.default_rng(3).uniform(size=(3, 12))]]
+    return [within_ranges(fractions) for fractions in [*corners, *np.random.default_rng(3).uniform(size=(3, 12))]]
 
 
 def links(model) -> list[int]:
@@ -79,10 +80,10 @@ def test_links_are_a_square_beam(scene, elements):
     # E I / h and (tau E + eta_0) I / h
     inertia, h = 0.015**4 / 12, 0.31 / elements
     joints = [j for j in range(model.njnt) if model.joint(j).name.startswith("joint")]
-    freedoms = (model.jnt_dofadr[joints][:, None] + np.arange(scene.chain.freedoms)).ravel()
+    dofs = (model.jnt_dofadr[joints][:, None] + np.arange(scene.chain.dofs)).ravel()
     assert len(joints) == elements and set(model.jnt_bodyid[joints]) == set(bodies[1:])
     np.testing.assert_allclose(model.jnt_stiffness[joints], 7e3 * inertia / h, rtol=1e-12)
-    np.testing.assert_allclose(model.dof_damping[freedoms], (0.005 * 7e3 + 60.0) * inertia / h, rtol=1e-12)
+    np.testing.assert_allclose(model.dof_damping[dofs], (0.005 * 7e3 + 60.0) * inertia / h, rtol=1e-12)
     assert not model.dof_armature.any() and not model.dof_frictionloss.any()
 
 
@@ -157,8 +158,8 @@ def test_possible_parameters(key):
         assert check(parameters) is parameters
     for name in NUISANCES:  # all of the range, each axis for itself
         low, high = np.asarray(getattr(LOWEST, name)), np.asarray(getattr(HIGHEST, name))
-        share = (np.asarray(getattr(drawn, name)) - low) / (high - low)
-        assert np.all(share.min(axis=0) < 0.1) and np.all(share.max(axis=0) > 0.9)
+        fraction = (np.asarray(getattr(drawn, name)) - low) / (high - low)
+        assert np.all(fraction.min(axis=0) < 0.1) and np.all(fraction.max(axis=0) > 0.9)
 
 
 def test_elasto_gravity_numbers():
@@ -247,7 +248,7 @@ def test_where_everything_is(scene):
         np.testing.assert_allclose(seen.gripper, data.body("gripper").xpos[[0, 2]], atol=1e-6)
         cubes = [model.body(i).id for i in range(model.nbody) if model.body(i).name.endswith(" cube")]
         np.testing.assert_allclose(seen.cubes, data.xpos[cubes], atol=1e-6)
-        np.testing.assert_allclose(seen.turns, data.xquat[cubes], atol=1e-6)
+        np.testing.assert_allclose(seen.orientations, data.xquat[cubes], atol=1e-6)
         assert np.ptp(seen.dlo[:, 0]) > 0.01
 
 

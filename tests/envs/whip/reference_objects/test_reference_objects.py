@@ -1,4 +1,4 @@
-"""The stand-in for the real object, against beam theory, statics and its own recordings."""
+"""The FEM reference objects against beam theory, statics and their own recordings."""
 
 import ast
 import dataclasses
@@ -19,20 +19,19 @@ from jaxlfi.envs.whip.recording import read
 from jaxlfi.envs.whip.reference_objects import objects, scene
 from jaxlfi.envs.whip.reference_objects.calibration import at_rest, calibrate
 from jaxlfi.envs.whip.reference_objects.elastica import heavy_cantilever, number_of_sag
-from jaxlfi.envs.whip.reference_objects.objects import SECTION, TABLE, load
+from jaxlfi.envs.whip.reference_objects.objects import TABLE, load
 from jaxlfi.envs.whip.reference_objects.observation import found
 from jaxlfi.envs.whip.reference_objects.scene import cantilever_model, cells, centreline
-from jaxlfi.envs.whip.reference_objects.simulation import FRAME_INTERVAL, StandIn, StandInError
+from jaxlfi.envs.whip.reference_objects.simulation import FRAME_INTERVAL, ReferenceRig, UnstableError
+from jaxlfi.envs.whip.rig import GRAVITY, SECTION, START
 from jaxlfi.envs.whip.vision.camera import project
 from jaxlfi.envs.whip.vision.keypoints import ON_DLO, along
 from jaxlfi.envs.whip.vision.masks import EVEN
 
-GRAVITY = 9.81
-
 
 @pytest.fixture(scope="module")
-def rig() -> StandIn:
-    return StandIn(load("dlo-1"))
+def rig() -> ReferenceRig:
+    return ReferenceRig(load("dlo-1"))
 
 
 # ------------------------------------------------------------------------------------------------- the elastica
@@ -70,31 +69,31 @@ def test_the_number_of_a_sag():
 
 
 def test_objects_are_those_of_the_table():
-    things = [load(f"dlo-{i}") for i in range(4)]
-    assert [thing.length for thing in things] == [0.200, 0.200, 0.270, 0.290]
-    assert [thing.mass for thing in things] == [0.04747, 0.04294, 0.05780, 0.06394]
-    medium, extra, soft, other = (thing.effective_young for thing in things)
+    dlos = [load(f"dlo-{i}") for i in range(4)]
+    assert [dlo.length for dlo in dlos] == [0.200, 0.200, 0.270, 0.290]
+    assert [dlo.mass for dlo in dlos] == [0.04747, 0.04294, 0.05780, 0.06394]
+    medium, extra, soft, other = (dlo.effective_young for dlo in dlos)
     assert medium > soft > extra == other
-    assert things[0].light_young > 5e4 and all(1e3 < thing.light_young < 5e4 for thing in things[1:])
+    assert dlos[0].light_young > 5e4 and all(1e3 < dlo.light_young < 5e4 for dlo in dlos[1:])
     with pytest.raises(ValueError, match=r"name: expected one of dlo-0, .*, got 'dlo-4'"):
         load("dlo-4")
-    for thing in TABLE:
-        assert dataclasses.replace(load(thing.name), young=thing.young) == thing
+    for dlo in TABLE:
+        assert dataclasses.replace(load(dlo.name), young=dlo.young) == dlo
 
 
 def test_an_object_has_its_calibrated_modulus():
-    thing = load("dlo-1")
-    assert calibrate(thing).effective_young == pytest.approx(thing.effective_young, rel=5e-3)
+    dlo = load("dlo-1")
+    assert calibrate(dlo).effective_young == pytest.approx(dlo.effective_young, rel=5e-3)
 
 
 def test_an_object_sags_in_the_shape_of_the_elastica():
     """All along, and with both ends: what the calibration by the tip alone could not see."""
-    thing, number = load("dlo-2"), 12.0
-    weight = thing.density * SECTION**2 * thing.length**3 / (SECTION**4 / 12)
-    line = at_rest(thing, (number * thing.effective_young / weight, 0.0, 0.0)) / thing.length
+    dlo, number = load("dlo-2"), 12.0
+    weight = dlo.density * SECTION**2 * dlo.length**3 / (SECTION**4 / 12)
+    line = at_rest(dlo, (number * dlo.effective_young / weight, 0.0, 0.0)) / dlo.length
     slope = lambda s, y: [y[1], -number * (1 - s) * np.cos(y[0]), np.cos(y[0]), np.sin(y[0])]
     clamped = brentq(lambda c: solve_ivp(slope, (0, 1), [0, c, 0, 0], rtol=1e-9).y[1, -1], 0, 0.6 * number)
-    arc = np.linspace(0, 1, cells(thing) + 1)
+    arc = np.linspace(0, 1, cells(dlo) + 1)
     beam = solve_ivp(slope, (0, 1), [0, clamped, 0, 0], rtol=1e-9, t_eval=arc).y[2:]
     np.testing.assert_allclose([-line[:, 2], line[:, 0]], beam, atol=0.012)
     np.testing.assert_allclose(line[:, 1], 0, atol=1e-6)
@@ -102,28 +101,28 @@ def test_an_object_sags_in_the_shape_of_the_elastica():
 
 def test_an_object_swings_at_the_frequency_of_a_beam():
     """1.8751^2 / (2 pi) sqrt(E I / (rho A L^4)), without gravity: the mass is where it should be, too."""
-    thing = dataclasses.replace(load("dlo-0"), damping=1e-6)
-    model = cantilever_model(thing, (2.0, 0.0, 0.0), timestep=0.001)
+    dlo = dataclasses.replace(load("dlo-0"), damping=1e-6)
+    model = cantilever_model(dlo, (2.0, 0.0, 0.0), timestep=0.001)
     data, places = mujoco.MjData(model), []
     mujoco.mj_step(model, data, nstep=60)
     model.opt.gravity[:] = 0
     for _ in range(700):
         mujoco.mj_step(model, data)
-        places.append(centreline(thing, data)[-1, 0])
+        places.append(centreline(dlo, data)[-1, 0])
     crossings = np.flatnonzero(np.diff(np.sign(places)))
     measured = 1 / (2 * np.diff(crossings).mean() * model.opt.timestep)
-    bending = thing.effective_young * SECTION**2 / 12 / thing.density
-    assert measured == pytest.approx(1.8751**2 / (2 * np.pi) * np.sqrt(bending) / thing.length**2, rel=0.03)
+    bending = dlo.effective_young * SECTION**2 / 12 / dlo.density
+    assert measured == pytest.approx(1.8751**2 / (2 * np.pi) * np.sqrt(bending) / dlo.length**2, rel=0.03)
 
 
 def test_the_gripper_bears_the_weight_once_and_the_object_is_stretched_by_it(rig):
     """Of the mass all but the nodes held hang; a bar of the nodes' section stretches by m g l / (2 E A)."""
-    frame, thing = rig.reset(), rig.thing
-    hanging = thing.mass * (1 - 1 / (2 * cells(thing)))
-    assert (scene.START[1] - frame.gripper[1]) * 900 == pytest.approx(hanging * GRAVITY, rel=1e-3)
+    frame, dlo = rig.reset(), rig.dlo
+    hanging = dlo.mass * (1 - 1 / (2 * cells(dlo)))
+    assert (START[1] - frame.gripper[1]) * 900 == pytest.approx(hanging * GRAVITY, rel=1e-3)
     section = (SECTION - 2 * scene.SKIN) ** 2
-    stretch = thing.mass * GRAVITY * thing.length / (2 * thing.young * section)
-    assert frame.dlo[0, 2] - frame.dlo[-1, 2] - thing.length == pytest.approx(stretch, rel=0.06)
+    stretch = dlo.mass * GRAVITY * dlo.length / (2 * dlo.young * section)
+    assert frame.dlo[0, 2] - frame.dlo[-1, 2] - dlo.length == pytest.approx(stretch, rel=0.06)
 
 
 # ---------------------------------------------------------------------------------------------------- episodes
@@ -131,19 +130,18 @@ def test_the_gripper_bears_the_weight_once_and_the_object_is_stretched_by_it(rig
 
 def test_an_episode_begins_at_rest(rig):
     frame = rig.reset()
-    np.testing.assert_allclose(frame.gripper, scene.START, atol=1e-3)
+    np.testing.assert_allclose(frame.gripper, START, atol=1e-3)
     np.testing.assert_allclose(frame.dlo[0, [0, 2]], frame.gripper, atol=1e-9)
     np.testing.assert_allclose(frame.dlo[:, :2], [[0.40, 0.0]] * 17, atol=1e-5)
     side = float(rig.place.cube_side)
     np.testing.assert_allclose(frame.cubes, [[0.60, 0, side * (i + 0.5)] for i in range(6)], atol=5e-4)
-    np.testing.assert_allclose(frame.turns, [[1, 0, 0, 0]] * 6, atol=1e-5)
+    np.testing.assert_allclose(frame.orientations, [[1, 0, 0, 0]] * 6, atol=1e-5)
     after = rig.step([0.0, 0.0])
     assert np.abs(after.dlo - frame.dlo).max() < 1e-4 and np.abs(after.cubes - frame.cubes).max() < 1e-5
 
 
 def test_the_scene_is_where_the_simulated_one_is():
     """Written twice, as the two share no physics."""
-    assert (scene.START, scene.STACK, SECTION) == (simulated.START, simulated.STACK, simulated.SECTION)
     other = simulated.compile_model(simulated.Scene(), scene.PLACE)
     own = scene.whip_model(load("dlo-1"), scene.PLACE.replace(stack=(0.02, -0.005), cube_side=0.02))
     cube = own.body("yellow")
@@ -158,10 +156,10 @@ def test_the_scene_is_where_the_simulated_one_is():
 
 def test_the_physics_is_not_that_of_inference():
     folder = Path(objects.__file__).parent
-    shared = {"camera", "frames", "parameters", "rules", "masks", "raster", "recording", "standin"}
+    shared = {"frames", "parameters", "recording", "reference_objects", "rig", "rules", "vision"}
     for path in folder.glob("*.py"):
         modules = {node.module for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)}
-        own = {module.split(".")[2] for module in modules if module.startswith("jaxlfi.envs.whip.")}
+        own = {module.split(".")[3] for module in modules if module.startswith("jaxlfi.envs.whip.")}
         assert own <= shared, path.name
 
 
@@ -170,19 +168,21 @@ def test_steps_make_a_rollout_and_a_reset_forgets(rig):
     actions = np.array([[0.06, -0.06]] * 2 + [[0.06, 0.0]] * 2)
     times, frames = rig.rollout(actions)
     np.testing.assert_allclose(times, 0.016 * np.arange(41))
-    assert frames.dlo.shape == (41, 17, 3) and frames.cubes.shape == (41, 6, 3) and frames.turns.shape == (41, 6, 4)
+    assert (
+        frames.dlo.shape == (41, 17, 3) and frames.cubes.shape == (41, 6, 3) and frames.orientations.shape == (41, 6, 4)
+    )
     again = [rig.reset(), *(rig.step(action) for action in actions)]
     np.testing.assert_array_equal(frames.dlo[0], again[0].dlo)
-    for name in ("gripper", "dlo", "cubes", "turns"):
+    for name in ("gripper", "dlo", "cubes", "orientations"):
         stepped = np.concatenate([getattr(part, name) for part in again[1:]])
         np.testing.assert_array_equal(getattr(frames, name)[1:], stepped)
 
-    target = np.array(scene.START) + np.cumsum(actions, axis=0)
+    target = np.array(START) + np.cumsum(actions, axis=0)
     assert np.abs(frames.gripper[10::10] - target).max() < 0.03  # it lags by some 2 / 30 s
     moved = frames.cubes[-1, :, 0] - frames.cubes[0, :, 0]
     assert moved.max() > 0.03 and moved.min() > 0  # all have been pushed away
-    np.testing.assert_allclose(np.linalg.norm(frames.turns, axis=-1), 1, atol=1e-9)
-    lengths = np.linalg.norm(np.diff(frames.dlo, axis=1), axis=-1).sum(axis=1) / rig.thing.length
+    np.testing.assert_allclose(np.linalg.norm(frames.orientations, axis=-1), 1, atol=1e-9)
+    lengths = np.linalg.norm(np.diff(frames.dlo, axis=1), axis=-1).sum(axis=1) / rig.dlo.length
     assert 0.9 < lengths.min() and lengths.max() < 1.1 and frames.dlo[..., 2].min() > -0.01
 
 
@@ -198,7 +198,7 @@ def test_a_simulation_that_breaks_down_says_so(rig, tmp_path, monkeypatch, veloc
     monkeypatch.chdir(tmp_path)  # MuJoCo keeps a log where it is
     before = rig.reset()
     rig._data.qvel[7] = velocity
-    with pytest.raises(StandInError, match="dlo-1"):
+    with pytest.raises(UnstableError, match="dlo-1"):
         rig.step([0.01, 0.0])
     np.testing.assert_array_equal(rig.reset().dlo, before.dlo)
     rig.step([0.01, 0.0])
@@ -214,7 +214,7 @@ def test_a_recording_is_what_the_stand_in_does_and_its_images_show(rig):
     np.testing.assert_allclose(recording.times, times, atol=1e-9)
     assert recording.frame_rate == pytest.approx(1 / FRAME_INTERVAL)
     np.testing.assert_allclose(recording.gripper, frames.gripper, atol=1e-4)
-    for name, kept in (("length (m)", rig.thing.length), ("mass (kg)", rig.thing.mass)):
+    for name, kept in (("length (m)", rig.dlo.length), ("mass (kg)", rig.dlo.mass)):
         assert recording.facts[name] == kept
 
     some = [0, 70, 110]

@@ -7,11 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxlfi.envs.whip.parameters import MEDIAN
-from jaxlfi.envs.whip.vision.camera import FIELD_OF_VIEW, Camera, project, rotation, side_camera
+from jaxlfi.envs.whip.quaternions import rotation
+from jaxlfi.envs.whip.vision.camera import FIELD_OF_VIEW, Camera, project, side_camera
 
 TILTED = Camera(
     position=jnp.array([0.31, -0.83, 0.42]),
-    turn=jnp.asarray(Rotation.from_euler("xyz", [75.0, 8.0, -12.0], degrees=True).as_quat(scalar_first=True)),
+    orientation=jnp.asarray(Rotation.from_euler("xyz", [75.0, 8.0, -12.0], degrees=True).as_quat(scalar_first=True)),
     field_of_view=jnp.asarray(50.0),
 )
 
@@ -25,13 +26,13 @@ def mujocos(camera: Camera, points: np.ndarray) -> np.ndarray:
     mujoco = pytest.importorskip("mujoco")
     numbers = lambda array: " ".join(map(str, np.asarray(array).tolist()))
     model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><worldbody><camera pos="{numbers(camera.position)}" quat="{numbers(camera.turn)}" '
+        f'<mujoco><worldbody><camera pos="{numbers(camera.position)}" quat="{numbers(camera.orientation)}" '
         f'fovy="{float(camera.field_of_view)}"/></worldbody></mujoco>'
     )
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
-    np.testing.assert_allclose(rotation(camera.turn).ravel(), data.cam_xmat[0], atol=1e-6)
+    np.testing.assert_allclose(rotation(camera.orientation).ravel(), data.cam_xmat[0], atol=1e-6)
     right, up, back = ((points - data.cam_xpos[0]) @ data.cam_xmat[0].reshape(3, 3)).T
     half = np.tan(np.deg2rad(model.cam_fovy[0]) / 2)
     return np.stack([0.5 + 0.5 * right / (-back * half), 0.5 - 0.5 * up / (-back * half)], axis=-1)
@@ -45,7 +46,7 @@ def test_projection_against_mujoco(camera):
 
 def test_the_side_camera_looks_along_y_with_z_up():
     """As `xyaxes="1 0 0 0 0 1"` says in a model's XML."""
-    np.testing.assert_allclose(rotation(side_camera(MEDIAN).turn), [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-7)
+    np.testing.assert_allclose(rotation(side_camera(MEDIAN).orientation), [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-7)
     assert float(side_camera(MEDIAN).field_of_view) == pytest.approx(FIELD_OF_VIEW)
 
 

@@ -38,8 +38,8 @@ def swinging(steps: int) -> Frames:
     start = np.stack([gripper[:, 0], 0 * gripper[:, 0], gripper[:, 1]], axis=-1)[:, None]
     dlo = np.concatenate([start, start + np.cumsum(links, axis=1)], axis=1)
     cubes = np.array([0.6, 0.0, 0.0]) + np.arange(6)[:, None] * [0.01, 0.002, 0.025] * (1 + time[..., None])
-    turns = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (steps, 6, 4))
-    return Frames(*(jnp.asarray(part, jnp.float32) for part in (gripper, dlo, cubes, turns)))
+    orientations = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (steps, 6, 4))
+    return Frames(*(jnp.asarray(part, jnp.float32) for part in (gripper, dlo, cubes, orientations)))
 
 
 FRAMES = swinging(16)

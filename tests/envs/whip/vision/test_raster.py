@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from jaxlfi.envs.whip.frames import Frames
 from jaxlfi.envs.whip.parameters import MEDIAN
+from jaxlfi.envs.whip.rig import SECTION
 from jaxlfi.envs.whip.vision import masks
 from jaxlfi.envs.whip.vision.camera import Camera, project, side_camera
 from jaxlfi.envs.whip.vision.keypoints import CLEAN, along
-from jaxlfi.envs.whip.vision.raster import DLO, SECTION, noisy, segmentation
+from jaxlfi.envs.whip.vision.raster import DLO, noisy, segmentation
 
 SIDE = 0.025
 STACK = np.array([0.6, 0.0, 0.0125]) + np.arange(6)[:, None] * [0.0, 0.0, SIDE]
@@ -24,7 +25,7 @@ UPRIGHT = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (6, 4))
 SIDEWAYS = side_camera(MEDIAN)
 TILTED = Camera(
     position=jnp.array([0.40, -0.80, 0.45]),
-    turn=jnp.asarray(Rotation.from_euler("xyz", [75.0, 5.0, -4.0], degrees=True).as_quat(scalar_first=True)),
+    orientation=jnp.asarray(Rotation.from_euler("xyz", [75.0, 5.0, -4.0], degrees=True).as_quat(scalar_first=True)),
     field_of_view=jnp.asarray(42.0),
 )
 
@@ -36,8 +37,8 @@ def centreline(bend, length=0.25, start=(0.40, 0.0, 0.36)) -> np.ndarray:
     return np.concatenate([[start], start + np.cumsum(links, axis=0)])
 
 
-def scene(dlo, cubes=STACK, turns=UPRIGHT) -> Frames:
-    return Frames(*(jnp.asarray(part, jnp.float32) for part in (dlo[0, [0, 2]], dlo, cubes, turns)))
+def scene(dlo, cubes=STACK, orientations=UPRIGHT) -> Frames:
+    return Frames(*(jnp.asarray(part, jnp.float32) for part in (dlo[0, [0, 2]], dlo, cubes, orientations)))
 
 
 def tumbled(seed: int) -> Frames:
@@ -71,7 +72,7 @@ def labels_at(labels: np.ndarray, points) -> np.ndarray:
 def corners_of_bodies(frames: Frames, side: float):
     """The eight corners of each cube and of each piece of the DLO, with their labels."""
     cube = side / 2 * np.array(list(itertools.product([-1, 1], repeat=3)))
-    for i, (centre, turn) in enumerate(zip(np.asarray(frames.cubes), np.asarray(frames.turns), strict=True)):
+    for i, (centre, turn) in enumerate(zip(np.asarray(frames.cubes), np.asarray(frames.orientations), strict=True)):
         yield i + 1, centre + Rotation.from_quat(turn, scalar_first=True).apply(cube)
     points = np.asarray(frames.dlo, float)
     links = np.diff(points, axis=0)
@@ -91,7 +92,7 @@ def corners_of_bodies(frames: Frames, side: float):
 
 def cast(camera: Camera, frames: Frames, side: float, size: int) -> np.ndarray:
     """Labels in double precision: the nearest entry of each pixel's ray into the hulls of bodies' corners."""
-    turn = Rotation.from_quat(np.asarray(camera.turn), scalar_first=True)
+    turn = Rotation.from_quat(np.asarray(camera.orientation), scalar_first=True)
     half = np.tan(np.deg2rad(float(camera.field_of_view)) / 2)
     axis = (2 * np.arange(size) + 1) / size - 1
     x, y = np.meshgrid(half * axis, -half * axis)
@@ -157,7 +158,7 @@ def mujocos(camera: Camera, frames: Frames, side: float) -> np.ndarray:
     text = lambda array: " ".join(f"{number:.9g}" for number in np.ravel(array))
     geoms = [
         f'<geom type="box" size="{text([side / 2] * 3)}" pos="{text(at)}" quat="{text(turn)}"/>'
-        for at, turn in zip(np.asarray(frames.cubes), np.asarray(frames.turns), strict=True)
+        for at, turn in zip(np.asarray(frames.cubes), np.asarray(frames.orientations), strict=True)
     ]
     geoms += [
         f'<geom type="box" size="{text([SECTION / 2] * 2)}" fromto="{text(a)} {text(b)}"/>'
@@ -165,7 +166,7 @@ def mujocos(camera: Camera, frames: Frames, side: float) -> np.ndarray:
     ]
     model = mujoco.MjModel.from_xml_string(
         f'<mujoco><visual><map znear="0.01"/></visual><worldbody><camera pos="{text(camera.position)}" '
-        f'quat="{text(camera.turn)}" fovy="{float(camera.field_of_view)}"/>{"".join(geoms)}</worldbody></mujoco>'
+        f'quat="{text(camera.orientation)}" fovy="{float(camera.field_of_view)}"/>{"".join(geoms)}</worldbody></mujoco>'
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
