@@ -1,9 +1,9 @@
-"""The objects that stand in for real DLOs: calibrated, whipped once each, and recorded.
+"""The FEM reference objects: calibrated, whipped once each, and recorded.
 
     python -m experiments.reference_objects --out experiments/results/reference-objects --data envs/whip/data
 
-Writes objects.json and a recording of each object to the folder of data, which must not have any of them, and a table
-of the calibration and a sheet of pictures of each rollout to the folder of results. Takes some minutes.
+Writes objects.json and a recording of each object to the folder of data, which must not contain them, and a table of
+the calibration and a sheet of pictures of each rollout to the folder of results. Takes some minutes.
 """
 
 import argparse
@@ -43,11 +43,11 @@ COLUMNS = {
     "beam's reach / length": lambda _, found: f"{found.beam_reach:.4f}",
     "hanging length (mm)": lambda _, found: f"{1e3 * found.hanging_length:.1f}",
 }
-"""Of the table of the calibration."""
+"""Columns of the table of the calibration."""
 
 
 def described(dlo: ReferenceObject, found: Calibration) -> dict:
-    """All that objects.json has of one object."""
+    """The entry of one object in objects.json."""
     return {
         **dataclasses.asdict(dlo),
         "light_young": round(dlo.light_young),

@@ -422,7 +422,7 @@ SUMMARY_NAMES = (
     "Y lag 2",
     "X with Y",
 )
-"""Names of the nine summaries: levels, spreads, autocorrelations at a lag, and the correlation of X with Y."""
+"""Names of the nine summaries: means, variances, autocorrelations at a lag, and the correlation of X with Y."""
 
 
 def lotka_volterra_nine(trajectory: Float[Array, "records 2"]) -> Float[Array, "9"]:

@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
         "--policy",
         default="explore",
         metavar="NAME|FILE",
-        help="explore: actions that excite the DLO; random: random actions within the workspace; plan: actions that hit "
+        help="explore: actions that excite the DLO; random: random actions in the workspace; plan: actions that hit "
         'the top cube, found by a search; or an .npz with an array "actions" [16, 2] in m (default: explore)',
     )
     render.add_argument(

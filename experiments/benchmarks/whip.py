@@ -2,10 +2,10 @@
 
 Prints
 
-* steps of the physics and episodes a second, of random episodes in random scenes, by each engine for several sizes of
-  batches, and how many failed; against MuJoCo called by a plain Python loop on one core, and its own loop in C on one
-  core, which is the floor: the same models and actions. On a processor, MJX's batches are shared out among as many
-  devices as there are cores, and larger ones are cut to the first control steps;
+* physics steps and episodes per second, of random episodes in random scenes, for each engine and several batch sizes,
+  and how many failed; against MuJoCo called by a plain Python loop on one core, and its own loop in C on one core,
+  which is the floor: the same models and actions. On a processor, MJX's batches are divided among as many devices as
+  there are cores, and larger ones are limited to the first control steps;
 * seconds of tracing and compiling an episode of MJX, cold and from the cache on disk;
 * how far MJX agrees with MuJoCo: of sixty DLOs, eight at the corners of Phi and Theta_0 and the others random, each
   moved in five ways, how many knock the same cubes off. After contact motions are chaotic, so the yardstick is MuJoCo
@@ -53,9 +53,9 @@ from jaxlfi.run_store import command_line, environment
 
 SCENE = Scene()
 EPISODE = rules.STEPS * SCENE.substeps
-"""Steps of the physics."""
+"""Number of physics steps of an episode."""
 PATIENCE = 20_000
-"""Steps of the physics that MJX takes at most in a timed call on a processor."""
+"""Maximum number of physics steps of MJX in a timed call on a processor."""
 
 
 def random_batch(count: int) -> tuple[WhipParameters, jax.Array]:

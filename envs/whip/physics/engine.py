@@ -43,7 +43,7 @@ class Engine(Protocol):
     scene: Scene
 
     def advance(self, parameters: WhipParameters, state: State, target: Float[Array, "2"]) -> State:
-        """Simulate one control interval, in which the set-point moves at constant speed from the state's to the new one.
+        """Simulate one control interval, in which the set-point moves evenly from the state's to the new one.
 
         Args:
             parameters: of the scene.

@@ -96,7 +96,7 @@ def centreline(
 
 
 def _some_pixels(mask: Bool[Array, "size size"]) -> tuple[Float[Array, "samples 2"], Int[Array, ""]]:
-    """Every n-th pixel of a mask, in normalised pixels, such that there are as many as wanted; and how many it has."""
+    """`SAMPLES` pixels of a mask at equal intervals, in normalised pixels, and the number of its pixels."""
     size = mask.shape[0]
     rank = jnp.cumsum(mask.ravel())
     wanted = 1 + jnp.arange(SAMPLES) * rank[-1] // SAMPLES

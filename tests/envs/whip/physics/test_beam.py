@@ -21,6 +21,7 @@ from jaxlfi.envs.whip.physics.chain import Chain
 from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.physics.native import NativeEngine
 from jaxlfi.envs.whip.physics.scene import Scene, compile_model
+from jaxlfi.envs.whip.reference_objects.elastica import heavy_elastica
 from jaxlfi.envs.whip.rig import GRAVITY, SECTION, START
 
 OURS = ("ball joints", "planar hinges")
@@ -52,7 +53,7 @@ def test_frequencies_of_a_beam():
 def test_the_heavy_elastica_balances_its_weight(number):
     """The curvature everywhere against the moment of all that hangs beyond, by quadrature."""
     s = np.linspace(0, 1, 4001)
-    along, below = beam.heavy_elastica(number, s).T
+    along, below = heavy_elastica(number, s).T
     angle = np.unwrap(np.arctan2(np.gradient(below, s), np.gradient(along, s)))
     area = np.concatenate([[0], np.cumsum((along[1:] + along[:-1]) / 2 * np.diff(s))])
     moment = number * (area[-1] - area - (1 - s) * along)
@@ -87,7 +88,7 @@ def test_the_plain_cable_is_too_stiff():
 @functools.cache
 def sag_error(kind: str, elements: int, number: float) -> np.ndarray:
     """Of the tip: relative of how far it hangs down, and in lengths of the DLO of how far it reaches."""
-    exact = beam.heavy_elastica(number, np.array([1.0]))[0]
+    exact = heavy_elastica(number, np.array([1.0]))[0]
     tip = statics.sagged(models.model(kind, elements, models.with_number(DLO, number)), GRAVITY)[-1] / DLO.length
     return np.array([tip[1] / exact[1] - 1, tip[0] - exact[0]])
 

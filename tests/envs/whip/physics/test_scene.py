@@ -34,7 +34,7 @@ both = pytest.mark.parametrize("scene", [PLANAR, BALLS], ids=["planar", "balls"]
 
 
 def within_ranges(fractions) -> WhipParameters:
-    """Parameters at these fractions of their ranges, one an entry of `NAMES` (two for the stack, three for the camera)."""
+    """Parameters at these fractions of their ranges, per entry of `NAMES` (two for the stack, three for the camera)."""
     fractions = iter(fractions)
     values = {}
     for name in NAMES:

@@ -113,10 +113,13 @@ def test_a_transporters_orders_are_uniform(key):
 def test_places_and_order_stay_through_a_trajectory(key):
     """Without noise, a shuffled detector sees the same points of the DLO in all frames."""
     quiet = TRANSPORTER.replace(noise=0.0, cube_noise=0.0, missing=0.0)
-    keypoints, _ = one(key, quiet, CAMERA, FRAMES)
-    arcs = begin(jax.random.fold_in(key, 0), quiet).arcs
-    assert sorted(arcs.tolist()) != arcs.tolist()
-    np.testing.assert_allclose(keypoints, jnp.concatenate([at(arcs), CUBES], axis=1), atol=1e-6)
+    shuffled = []
+    for own in jax.random.split(key, 4):
+        keypoints, _ = one(own, quiet, CAMERA, FRAMES)
+        arcs = begin(jax.random.fold_in(own, 0), quiet).arcs
+        shuffled.append(sorted(arcs.tolist()) != arcs.tolist())
+        np.testing.assert_allclose(keypoints, jnp.concatenate([at(arcs), CUBES], axis=1), atol=1e-6)
+    assert any(shuffled)  # one in 24 is in order by chance
 
 
 def test_noise_is_white(key):
