@@ -41,9 +41,9 @@ def search(length: float, young: float, method: planner.CrossEntropy, engine, se
     """The plan for one DLO, and how it was found.
 
     Returns:
-        `actions` [16, 2]; `value`, the mean return over the positions of the search; `elsewhere`, over others; `hit`
-        [6] with the stack in the middle; `rollouts` in total, and `first`, until the first plan that was good (NaN if none
-        was); `seconds`.
+        `actions` [16, 2]; `value`, the mean return over the positions of the search; `elsewhere`, over others;
+        `hit` [6] with the stack in the middle; `rollouts` in total, and `first`, until the first plan that was good
+        (NaN if none was); `seconds`.
     """
     began = time.monotonic()
     parameters = median(length, young)

@@ -299,7 +299,7 @@ def _check_arrays(recording: Recording) -> None:
 def _check_times(recording: Recording) -> None:
     times, rate = recording.times, recording.frame_rate
     if times.size < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise ValueError("times: expected at least two increasing time stamps in s, got {times.size} that are not")
+        raise ValueError("times: expected at least two increasing time stamps in s, got others")
     measured = 1 / np.median(np.diff(times))
     if abs(measured / rate - 1) > 0.05:  # the median, as cameras lose frames
         raise ValueError(f"frame_rate: expected what the time stamps say, {measured:.4g} Hz, got {rate:g}")

@@ -14,7 +14,8 @@ pytest.importorskip("mujoco")
 from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxlfi.envs.whip import cli, commands, figures, planner, render
+from jaxlfi.envs.whip import cli, commands, figures, planner, real2sim, render
+from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip.episode import Whip
 from jaxlfi.envs.whip.parameters import median
 from jaxlfi.envs.whip.physics import engine as physics
@@ -22,7 +23,7 @@ from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.physics.native import NativeEngine
 from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.rig import START
-from jaxlfi.envs.whip.vision.keypoints import DETECTORS
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS, Detector
 
 ENGINE, FINE = NativeEngine(threads=1), NativeEngine(Scene(control_interval=0.08), threads=1)
 WHIP = np.array([[-0.06, 0.0]] * 2 + [[0.06, 0.0]] * 4 + [[0.0, 0.0]] * 10, np.float32)
@@ -55,19 +56,19 @@ def test_a_rollout_is_drawn_and_saved(tmp_path, whip_file, capsys):
     assert run("render", "--policy", whip_file, "--detector", "transporter", "--seed", 3, "--out", out) == 0
     printed = capsys.readouterr().out
     assert "return 2.00 in 7 steps, hit yellow\n" in printed and f"{out / 'film.gif'}" in printed
-    assert {path.name for path in out.iterdir()} == {"sheet.png", "film.gif", "rollout.npz"}
+    assert {path.name for path in out.iterdir()} == {"sheet.png", "film.gif", "rollout.npz", "rollout.json"}
     with Image.open(out / "film.gif") as film:
         assert film.n_frames == 33 and film.info["duration"] == 160  # of 0.08 s, at half the speed
         assert film.width == 64 + 12
     with Image.open(out / "sheet.png") as sheet:
         assert sheet.width == 1432
     with np.load(out / "rollout.npz") as arrays:
-        assert arrays["states"].shape == (16, 28) and arrays["hits"].shape == (17, 6)
+        assert arrays["keypoints"].shape == (17, 10, 2) and arrays["hits"].shape == (17, 6)
         np.testing.assert_array_equal(arrays["actions"], WHIP)
         np.testing.assert_allclose(arrays["rewards"][:7], [0, 0, 0, 0, 0, 0, 2])
         np.testing.assert_array_equal(arrays["hits"][7], [0, 0, 0, 0, 0, 1])
         assert arrays["length"] == 7 and arrays["return"] == 2.0 and arrays["frames/orientations"].shape == (17, 6, 4)
-        np.testing.assert_allclose(arrays["frames/gripper"][:16], arrays["states"][:, :2])
+        np.testing.assert_allclose(arrays["frames/gripper"], arrays["gripper"])
         assert arrays["parameters/young"] == pytest.approx(2.5e4)
 
 
@@ -86,6 +87,39 @@ def test_a_plan_is_found_saved_and_can_be_drawn(tmp_path, capsys, monkeypatch):
     )
     with np.load(tmp_path / "drawn" / "rollout.npz") as rollout, np.load(tmp_path / "plan.npz") as arrays:
         assert rollout["return"] == pytest.approx(arrays["value"])
+
+
+def test_a_rollout_can_be_inferred_from(tmp_path, whip_file, monkeypatch):
+    """What `render` writes is a recording: its states are those of the rollout, and its actions are simulated."""
+    monkeypatch.setattr(render, "save_pictures", lambda *arguments: [])
+    assert run("render", "--policy", whip_file, "--out", tmp_path / "seen") == 0
+    recording = real2sim.recorded(str(tmp_path / "seen" / "rollout.npz"))
+    assert recording.source == "simulated" and recording.frame_rate == 6.25
+    observed = recordings.trajectory(recording)
+    np.testing.assert_allclose(observed[:, -2:], WHIP)
+    with np.load(tmp_path / "seen" / "rollout.npz") as arrays:
+        np.testing.assert_allclose(observed[:, :2], arrays["frames/gripper"][:16], rtol=1e-6)
+        np.testing.assert_array_equal(observed[:, 22:28], arrays["hits"][:16])
+        where = np.broadcast_to(recording.seen[:16, :, None], (16, 10, 2)).reshape(16, 20)
+        np.testing.assert_allclose(observed[:, 2:22][where], arrays["keypoints"][:16].reshape(16, 20)[where], rtol=1e-5)
+
+
+def test_a_rollout_that_no_camera_saw_is_saved_all_the_same(tmp_path, whip_file, capsys, monkeypatch):
+    monkeypatch.setattr(render, "save_pictures", lambda *arguments: [])
+    monkeypatch.setattr(commands, "DETECTORS", {"clean": Detector(bias=100.0)})
+    assert run("render", "--policy", whip_file, "--out", tmp_path / "lost") == 0
+    assert "rollout.npz cannot be inferred from" in capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "lost").iterdir()] == ["rollout.npz"]
+
+
+def test_without_mujoco_it_says_what_to_install(tmp_path):
+    script = (
+        "import sys; sys.modules['mujoco'] = None; from jaxlfi.envs.whip import cli; "
+        f"sys.exit(cli.main(['render', '--out', {str(tmp_path / 'out')!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr == ("jaxlfi whip: error: the whipping task needs MuJoCo and MJX: pip install 'jaxlfi[whip]'\n")
 
 
 def test_policies_are_drawn_from_the_seed(monkeypatch):
