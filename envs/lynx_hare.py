@@ -55,9 +55,9 @@ def growth(trajectory: Float[Array, "years 2"]) -> Float[Array, "12"]:
 
     Integrated over a year, the equations are linear in the rates: the logarithm of X grows by theta_1 times the mean
     of Y, less theta_2, and that of Y by theta_3, less theta_4 times the mean of X. Slope and intercept of these two
-    regressions (the mean over a year by the trapezoidal rule, in units of its geometric mean over all years) hold most
-    of what 21 noisy years know of the rates, in four numbers. The others are the means and the logarithms of the
-    standard deviations of the log-series, and their autocorrelations at one and three years.
+    regressions (the mean over a year by the trapezoidal rule, in units of its geometric mean over all years) contain
+    most of the information that 21 noisy years have on the rates, in four numbers. The others are the means and the
+    logarithms of the standard deviations of the log-series, and their autocorrelations at one and three years.
     """
     level = jnp.log(jnp.clip(trajectory, 1e-6, 1e9))
     gain = jnp.diff(level, axis=0)

@@ -75,7 +75,7 @@ NOISES: dict[str, Noise] = {"gaussian": gaussian_noise, "lognormal": lognormal_n
 
 
 def task(noise: Literal["gaussian", "lognormal"] = "gaussian", duration: float = 200.0, interval: float = 0.1) -> Task:
-    """The noisy ODE of appendix A: X = 9 predators and Y = 40 prey at first, rates in natural units.
+    """The noisy ODE of appendix A: initially X = 9 predators and Y = 40 prey, rates in natural units.
 
     Args:
         noise: "gaussian" or "lognormal".

@@ -17,12 +17,12 @@ from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS, ON_DLO, Detector, Tracking, begin, measured, track
 
 OBSERVATION = 28
-"""Numbers in an observation."""
+"""Length of an observation."""
 
 
 @struct.dataclass
 class Episode:
-    """What the next step needs.
+    """State of an episode between two steps.
 
     Attributes:
         state: of the physics.
@@ -70,8 +70,8 @@ class Whip:
     """The whipping task.
 
     Attributes:
-        engine: of its physics.
-        detector: of its keypoints.
+        engine: the physics.
+        detector: the error model of the keypoints.
 
     Example:
         >>> import jax
@@ -118,7 +118,7 @@ class Whip:
         return Episode(state, tracking, episode.start, verdict.hit, steps), step
 
     def frames(self, parameters: WhipParameters, episode: Episode) -> Frames:
-        """What there is to see."""
+        """The current frame."""
         return frames(self.engine.scene, parameters, episode.state.qpos)
 
     def _look(self, key, parameters, tracking, state):

@@ -11,7 +11,7 @@ from jaxlfi.support import Support
 
 @struct.dataclass
 class WhipParameters:
-    """One whipping scene, in SI units; leaves may carry leading axes, one scene an entry (section VI-B).
+    """One whipping scene, in SI units; leaves may carry leading axes, one scene per entry (section VI-B).
 
     Attributes:
         length: of the DLO, l, in m.
@@ -50,7 +50,7 @@ MEDIAN = WhipParameters(
     stack=(0.0, 0.0),
     camera=(0.0, 0.0, 0.0),
 )
-"""mu, what the paper calls the median of Theta_0, with nothing displaced."""
+"""mu, which the paper calls the median of Theta_0, with no displacements."""
 
 LOWEST = WhipParameters(0.050, 0.5e3, 50.0, 0.3, 0.020, 80.0, (-0.02, -0.005), (-0.025, -0.025, -0.025))
 """Lower bounds: of length and young by Phi, of the nuisances by sections VI-B and VI-H."""

@@ -6,21 +6,21 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 STEPS = 16
-"""Control steps in an episode."""
+"""Number of control steps in an episode."""
 ACTION_LIMIT = 0.06
-"""The furthest that an action moves the set-point along x or z, in m."""
+"""Maximum displacement of the set-point by an action, along x and along z, in m."""
 WORKSPACE = np.array([[0.275, 0.1], [0.6, 0.5]], np.float32)
 """Lower and upper limits of the gripper's x and z, in m."""
 HIT_DISTANCE = 0.06
-"""How far a cube's keypoint must have moved from its start to count as hit, in normalised pixels."""
+"""Displacement of a cube's keypoint from its start above which the cube counts as hit, in normalised pixels."""
 TOP = 5
 """Index of the target, the yellow cube."""
 PENALTIES = np.array([0.05 * 2 ** (4 - i) for i in range(TOP)], np.float32)
-"""For hitting a cube below the target, from the red one at the bottom up."""
+"""Penalties for hitting the cubes below the target, from the red one at the bottom up."""
 
 
 def moved_target(target: Float[Array, "*batch 2"], action: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
-    """The set-point after an action (dx, dz) in m; what is beyond the limit of an action is clipped."""
+    """The set-point after an action (dx, dz) in m, which is clipped to its limit."""
     return target + jnp.clip(action, -ACTION_LIMIT, ACTION_LIMIT)
 
 
@@ -57,7 +57,7 @@ def reward(hit: Bool[Array, "*batch 6"], out: Bool[Array, "*batch"]) -> Float[Ar
 
 @struct.dataclass
 class Verdict:
-    """What the rules make of one step.
+    """The rules applied to one step.
 
     Attributes:
         hit: cubes hit so far, bottom-up, shape [6].

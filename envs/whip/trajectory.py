@@ -18,7 +18,7 @@ from jaxlfi.envs.whip.vision.keypoints import ON_DLO, Detector, detect, measured
 
 
 def seen(engine: Engine, parameters: WhipParameters, actions: Float[Array, "time 2"]) -> tuple[Frames, Bool[Array, ""]]:
-    """What there is to see of one scene before each action and after the last, T + 1 frames.
+    """Frames of one scene before each action and after the last, T + 1 of them.
 
     All actions are applied, even after a hit or outside of the workspace.
 

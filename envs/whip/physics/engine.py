@@ -18,7 +18,7 @@ from jaxlfi.envs.whip.rig import START
 
 @struct.dataclass
 class State:
-    """What the physics of one scene needs for the next step.
+    """State of the physics of one scene.
 
     Attributes:
         qpos: MuJoCo's joint positions.

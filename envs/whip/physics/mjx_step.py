@@ -1,4 +1,4 @@
-"""A step of MJX, with kinematics that know the chain and a solver that single precision does not break."""
+"""A step of MJX with batched kinematics of the chain, and a solver that is robust in single precision."""
 
 import jax
 import jax.numpy as jnp
@@ -20,13 +20,13 @@ PARTS = (
     mjx.fwd_actuation,
     mjx.fwd_acceleration,
 )
-"""Of a step between kinematics and solver: those of `mjx.step` that the scene has a use for, in their order."""
+"""The stages of `mjx.step` between kinematics and solver that the scene needs, in their order."""
 HEAVIER = (0.0, 1e-5, 1e-3)
 """By which fractions the diagonal of the mass matrix is increased in the solver's attempts."""
 
 
 def step(scene: Scene, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """What `mjx.step` does, for one scene: `timestep` seconds on."""
+    """One physics step of one scene, in place of `mjx.step`."""
     data = kinematics(scene, model, data)
     for part in PARTS:
         data = part(model, data)
@@ -34,7 +34,7 @@ def step(scene: Scene, model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """What `mjx.solve` does; where that gives no numbers, again with joints that have slightly more inertia.
+    """The result of `mjx.solve`; if it is not finite, that with slightly more inertia of the joints.
 
     In single precision the matrix of Newton's method, which contains the stiffness of the contacts, is at times
     indistinguishable from an indefinite one (scaled to a unit diagonal, its smallest eigenvalue is about 3e-7), and
@@ -57,11 +57,11 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def kinematics(scene: Scene, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """What `mjx.kinematics` does, for the bodies of `scene.build`, all links at once.
+    """The result of `mjx.kinematics` for the bodies of `scene.build`, computed for all links at once.
 
     MJX goes from link to link. On a processor XLA makes one kernel of that (jax 0.9), which computes every link's
-    ancestors anew for each number it needs: a second and a half a step of twelve links. Elsewhere it is twenty
-    thousand instructions to compile.
+    ancestors anew for each number it needs: 1.5 s for a step of twelve links. Elsewhere it compiles to twenty thousand
+    instructions.
     """
     slides, joints, cubes = jnp.split(data.qpos, [2, scene.first_cube])
     joints, orientations = _links(scene.chain, joints)

@@ -1,7 +1,7 @@
 """Physics by MuJoCo's own threaded rollouts, called from inside compiled programs: the fast engine on a processor.
 
-The contacts within the stack of cubes take four fifths of a step. While the cubes are at rest they are left out, until
-something comes near: then that interval is simulated again with them.
+The contacts within the stack of cubes take four fifths of a step. While the cubes are at rest they are left out; if
+the gripper or the DLO comes near them in an interval, that interval is simulated again with them.
 """
 
 import contextlib
@@ -132,7 +132,7 @@ def _near(scene: Scene, places, cubes, length, side) -> np.ndarray:
 
 @contextlib.contextmanager
 def _quietly():
-    """Without MuJoCo's warnings, which it prints and appends to a file: failures are counted here."""
+    """Suppress MuJoCo's warnings, which it prints and appends to a file: failures are counted here."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:

@@ -1,4 +1,4 @@
-"""Keypoints from segmentation images: the cubes' centroids, and places along the DLO's mask."""
+"""Keypoints from segmentation images: the cubes' centroids, and points along the DLO's mask."""
 
 import jax
 import jax.numpy as jnp
@@ -116,16 +116,16 @@ def _path_lengths(cost: Float[Array, "n n"], source: Int[Array, ""]) -> Float[Ar
 
 
 def _arc(line: Float[Array, "knots 2"]) -> Float[Array, " knots"]:
-    """How far along a line its points are."""
+    """Arc lengths of a line's points."""
     return jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.linalg.norm(jnp.diff(line, axis=0), axis=-1))])
 
 
 def _projected(
     pixels: Float[Array, "samples 2"], place: Float[Array, " samples"], line: Float[Array, "knots 2"]
 ) -> Float[Array, " samples"]:
-    """How far along a line the pixels are, by the nearest point of it or of its straight continuation.
+    """Arc lengths of the pixels' projections onto a line or its straight continuation.
 
-    A pixel keeps near its former place, however near another part of the line comes.
+    A pixel stays near its former projection, even if another part of the line is nearer.
     """
     step, arc, ends = jnp.diff(line, axis=0), _arc(line), jnp.arange(KNOTS - 1)
     length = jnp.maximum(jnp.diff(arc), 1e-6)
@@ -139,7 +139,7 @@ def _projected(
 
 
 def _smoothed(pixels: Float[Array, "samples 2"], place: Float[Array, " samples"], inset: float):
-    """Pixels averaged by local linear regression on their places, at even places from the first to the last."""
+    """Pixels smoothed by local linear regression on their arc lengths, at equal intervals from first to last."""
     knots = jnp.linspace(place.min() + inset, place.max() - inset, KNOTS)
     away = place - knots[:, None]
     # Across gaps, and at the ends, the kernel widens until there is something to average.

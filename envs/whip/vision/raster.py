@@ -11,7 +11,7 @@ from jaxlfi.envs.whip.rig import SECTION
 from jaxlfi.envs.whip.vision.camera import Camera
 
 DLO = len(COLOURS) + 1
-"""The DLO's label. Those of the cubes are 1 to 6, bottom-up; 0 is the background, the gripper too."""
+"""The DLO's label. The cubes are 1 to 6, bottom-up; 0 is the background, including the gripper."""
 
 
 @struct.dataclass
@@ -78,7 +78,7 @@ def _cubes(centres, orientations, side) -> Bodies:
 
 
 def _bar(centreline, width) -> Bodies:
-    """A prism a segment, mitred where two meet."""
+    """One prism per segment, mitred where two meet."""
     step = jnp.diff(centreline, axis=0)
     length = jnp.linalg.norm(step, axis=-1, keepdims=True)
     along = step / jnp.maximum(length, 1e-12)  # 0 between points that coincide; their prism's sides are then NaN
@@ -100,7 +100,7 @@ def _unit(vectors):
 
 
 def _faces(camera: Camera, bodies: Bodies):
-    """The planes of faces as the camera has them: three coefficients [B, 6] each, and which face towards it."""
+    """The planes of faces in the camera's axes, three coefficients [B, 6] each, and which of them face the camera."""
     ahead = bodies.offsets - jnp.sum(bodies.normals * camera.position, axis=-1)
     towards = ahead < 0
     ahead = jnp.where(jnp.abs(ahead) < 1e-9, 1e-9, ahead)  # a plane through the pinhole

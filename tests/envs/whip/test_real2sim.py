@@ -96,7 +96,7 @@ def test_random_nuisances_differ_from_key_to_key(key):
 
 
 @pytest.mark.parametrize("name", ["dlo-0", "dlo-1", "dlo-2", "dlo-3"])
-def test_stand_ins_are_observed_by_name(name):
+def test_reference_objects_are_observed_by_name(name):
     made = task(object=name, engine="native")
     assert made.observation.shape == (16, 30) and np.isfinite(made.observation).all()
     assert made.truth is None

@@ -285,7 +285,7 @@ def test_the_exploratory_actions_keep_within_the_workspace():
 
 
 @pytest.mark.parametrize("number", range(4))
-def test_stand_ins_come_recorded(number):
+def test_reference_objects_come_recorded(number):
     path = DATA / f"dlo-{number}.npz"
     recording = read(path)
     assert recording.source == "simulated" and "real" not in path.with_suffix(".json").read_text().lower()

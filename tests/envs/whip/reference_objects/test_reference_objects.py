@@ -207,7 +207,7 @@ def test_a_simulation_that_breaks_down_says_so(rig, tmp_path, monkeypatch, veloc
 # -------------------------------------------------------------------------------------------------- recordings
 
 
-def test_a_recording_is_what_the_stand_in_does_and_its_images_show(rig):
+def test_a_recording_is_what_the_rig_does_and_its_images_show(rig):
     """Physics made again now; keypoints found in a few images, as recorded and near the truth."""
     recording = read(objects.FILE.parent / "dlo-1.npz")
     times, frames = rig.rollout(np.asarray(exploratory_actions()))
