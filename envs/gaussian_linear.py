@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.task import Task
 
 DIM = 2
 NOISE = np.array([0.3, 0.5], np.float32)

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs.lotka_volterra.ode import lognormal_noise, populations
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.tasks.task import Task
 
 SUBSTEPS = 25
 """Integration steps per year."""

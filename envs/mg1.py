@@ -13,8 +13,8 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.task import Task
 
 NAMES = ("service min", "service max", "arrival rate")
 """theta_1..theta_3 of the paper."""

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from jaxlfi import compile_cache
+from jaxlfi.io import compile_cache
 
 if __name__ == "__main__":  # before jax starts
     os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={os.cpu_count() or 1}")
@@ -25,23 +25,23 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from jaxlfi import atomic
-from jaxlfi.bayessim import Settings
-from jaxlfi.commands import bootstrap_interval
-from jaxlfi.describe import heuristic_to_json, settings_to_json
+from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.bayessim.batch import Lane, LaneEngine, rounds, stack_inputs
+from jaxlfi.bayessim.keys import run_keys
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.bayessim.record import theta_error, trajectory_error
+from jaxlfi.cli.commands import bootstrap_interval
 from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.figures import seeds as strips
 from jaxlfi.figures import style
 from jaxlfi.heuristics import Edge, Fixed, Heuristic, Truncate
-from jaxlfi.history import theta_error, trajectory_error
-from jaxlfi.keys import run_keys
-from jaxlfi.lanes import Lane, LaneEngine, rounds, stack_inputs
-from jaxlfi.observation import simulate_observation
-from jaxlfi.presets import QUICK
-from jaxlfi.progress import RoundProgress
-from jaxlfi.run_store import environment
-from jaxlfi.tailed import with_tails
-from jaxlfi.task import Task
+from jaxlfi.io import files as atomic
+from jaxlfi.io.progress import RoundProgress
+from jaxlfi.io.serialise import heuristic_to_json, settings_to_json
+from jaxlfi.runs.folder import environment
+from jaxlfi.tasks.observation import simulate_observation
+from jaxlfi.tasks.priors import with_tails
+from jaxlfi.tasks.task import Task
 
 REFERENCE = "misspecified+edge"
 """The row that all others are compared with, seed by seed."""

@@ -15,10 +15,10 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxlfi import atomic
-from jaxlfi.commands import bootstrap_interval
+from jaxlfi.cli.commands import bootstrap_interval
 from jaxlfi.envs import mg1
 from jaxlfi.figures import History, density, open_collection, style
+from jaxlfi.io import files as atomic
 
 SEEDS = 3
 """Number of simulations at the truth that are shown."""

@@ -23,9 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxlfi import atomic, cli, run_store
+from jaxlfi.cli import parser as cli
 from jaxlfi.envs.whip.episode import OBSERVATION
 from jaxlfi.figures import History, open_collection, samples, style
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import folder as run_store
 
 OBJECTS = ("dlo-0", "dlo-1", "dlo-2", "dlo-3")
 CONFIGURATIONS = ("initial", "initial+edge")

@@ -14,7 +14,6 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxlfi import atomic
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.reference_objects.calibration import Calibration, calibrated
@@ -24,6 +23,7 @@ from jaxlfi.envs.whip.reference_objects.scene import SIMULATOR
 from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig
 from jaxlfi.envs.whip.vision.keypoints import ON_DLO
 from jaxlfi.figures import style
+from jaxlfi.io import files as atomic
 
 HOW = (
     "young is such that the soft body, clamped horizontally at an elasto-gravity number of about 5, sags as much as "

@@ -24,14 +24,15 @@ from rich.progress import track
 from rich.table import Table
 
 import jaxlfi
-from jaxlfi import atomic, run_store
-from jaxlfi.belief import RESTRICTIONS
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.distributions.belief import RESTRICTIONS
 from jaxlfi.envs.whip.parameters import MEDIAN
 from jaxlfi.envs.whip.physics.chain import elasto_gravity
 from jaxlfi.envs.whip.real2sim import task
 from jaxlfi.figures import style
-from jaxlfi.presets import QUICK
-from jaxlfi.simulation import trajectory_and_outcome
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import folder as run_store
+from jaxlfi.tasks.simulation import trajectory_and_outcome
 
 INSIDE = 20
 OUTSIDE = np.array(

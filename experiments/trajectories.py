@@ -12,9 +12,10 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxlfi import atomic, tasks
 from jaxlfi.figures import style
-from jaxlfi.task import Task
+from jaxlfi.io import files as atomic
+from jaxlfi.tasks import registry as tasks
+from jaxlfi.tasks.task import Task
 
 SEEDS = 3
 COLOURS = ("#025358", "#F5A025", "#995FDD", "#E41A1C")

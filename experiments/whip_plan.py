@@ -19,12 +19,12 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxlfi import atomic
 from jaxlfi.envs.whip import planner
 from jaxlfi.envs.whip.frames import COLOURS
 from jaxlfi.envs.whip.parameters import median
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.figures import style
+from jaxlfi.io import files as atomic
 
 LENGTHS = (0.05, 0.12, 0.20, 0.25, 0.29, 0.35)
 """Lengths of the DLOs, in m."""

@@ -8,36 +8,48 @@ import importlib
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Belief": "jaxlfi.belief",
+    "Belief": "jaxlfi.distributions.belief",
     "Centre": "jaxlfi.heuristics",
     "Choice": "jaxlfi.heuristics",
     "Edge": "jaxlfi.heuristics",
-    "Estimator": "jaxlfi.estimator",
+    "Estimator": "jaxlfi.estimators.base",
     "Fixed": "jaxlfi.heuristics",
-    "GaussianMixture": "jaxlfi.mixture",
-    "METHODS": "jaxlfi.presets",
+    "GaussianMixture": "jaxlfi.distributions.mixture",
+    "Heuristic": "jaxlfi.heuristics",
+    "HostSimulator": "jaxlfi.tasks.host",
+    "METHODS": "jaxlfi.bayessim.presets",
+    "MaskedFlow": "jaxlfi.estimators.flow_estimators",
     "Matched": "jaxlfi.heuristics",
+    "MixtureNetwork": "jaxlfi.estimators.mixture_network",
     "Mode": "jaxlfi.heuristics",
-    "PAPER": "jaxlfi.presets",
-    "PRESETS": "jaxlfi.presets",
-    "QUICK": "jaxlfi.presets",
-    "Run": "jaxlfi.inference",
-    "Settings": "jaxlfi.bayessim",
-    "SimulatorError": "jaxlfi.observation",
-    "Support": "jaxlfi.support",
-    "SupportWarning": "jaxlfi.inference",
-    "Task": "jaxlfi.task",
+    "PAPER": "jaxlfi.bayessim.presets",
+    "PRESETS": "jaxlfi.bayessim.presets",
+    "Posterior": "jaxlfi.estimators.posterior",
+    "QUICK": "jaxlfi.bayessim.presets",
+    "Run": "jaxlfi.runs.run",
+    "Settings": "jaxlfi.bayessim.settings",
+    "SimulatorError": "jaxlfi.tasks.host",
+    "SplineFlow": "jaxlfi.estimators.flow_estimators",
+    "Support": "jaxlfi.distributions.support",
+    "SupportWarning": "jaxlfi.runs.run",
+    "Task": "jaxlfi.tasks.task",
     "Truncate": "jaxlfi.heuristics",
-    "infer": "jaxlfi.inference",
-    "stack": "jaxlfi.lanes",
-    "with_tails": "jaxlfi.tailed",
+    "infer": "jaxlfi.runs.infer",
+    "load": "jaxlfi.runs.load",
+    "stack": "jaxlfi.bayessim.batch",
+    "with_tails": "jaxlfi.tasks.priors",
 }
+
+_MODULES = ("plot",)
+"""Modules that are found as `jaxlfi.NAME` without an import of their own."""
 
 __all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str):
     """Load a public name from the module it lives in."""
+    if name in _MODULES:
+        return importlib.import_module(f"jaxlfi.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'jaxlfi' has no attribute {name!r}")
     value = getattr(importlib.import_module(_HOMES[name]), name)
@@ -46,4 +58,4 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted({*globals(), *__all__, *_MODULES})

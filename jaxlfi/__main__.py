@@ -2,6 +2,6 @@
 
 import sys
 
-from jaxlfi.cli import main
+from jaxlfi.cli.parser import main
 
 sys.exit(main())

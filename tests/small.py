@@ -7,10 +7,10 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from jaxlfi import lanes
-from jaxlfi.bayessim import Settings
+from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.bayessim.algorithm import batch as lanes
 from jaxlfi.envs import gaussian_linear
-from jaxlfi.estimator import Estimator
+from jaxlfi.estimators.estimator import Estimator
 
 TASK = "jaxlfi.envs.gaussian_linear:task"
 # Few and small steps: training amplifies rounding, and runs that ought to be equal are compared to a
@@ -51,7 +51,8 @@ class SharedEngine(lanes.LaneEngine):
 
 def share_engine(monkeypatch) -> None:
     """Let all sessions of a test use one task and one engine: their lanes and observations must be equal."""
-    from jaxlfi import session, tasks
+    from jaxlfi.runs import session
+    from jaxlfi.tasks.registry import registry as tasks
 
     made = []
 
@@ -66,7 +67,7 @@ def share_engine(monkeypatch) -> None:
 
 def command(*arguments: str) -> int:
     """Run the command line in this process; its exit status."""
-    from jaxlfi import cli
+    from jaxlfi.cli.parser import parser as cli
 
     try:
         return cli.main([str(argument) for argument in arguments])

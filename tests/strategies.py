@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from jaxlfi.belief import Belief
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
 
 DIMS = (2, 3)
 SHAPES = ((1, 2), (4, 3))

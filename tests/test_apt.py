@@ -15,16 +15,18 @@ from scipy.stats import ks_2samp
 from test_bayessim import EXACT, MODEST, TASK, X, infer, lane, whitened
 
 import jaxlfi
-from jaxlfi import bayessim, cli, run_store
-from jaxlfi.bayessim import Settings
+from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim.presets import METHODS, QUICK
+from jaxlfi.cli.parser import parser as cli
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
-from jaxlfi.estimator import Estimator, Network, draw, initialise, normalisers
+from jaxlfi.estimators.estimator import Estimator, Network, draw, initialise, normalisers
+from jaxlfi.estimators.posterior import draws_within, posterior
 from jaxlfi.heuristics import Fixed
-from jaxlfi.posterior import draws_within, posterior
-from jaxlfi.presets import METHODS, QUICK
-from jaxlfi.sampling import posterior_samples
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.runs import folder as run_store
+from jaxlfi.runs.load import posterior_samples
+from jaxlfi.tasks.task import Task
 
 ATOMIC = dataclasses.replace(MODEST, hidden=(32, 32), steps=2000, learning_rate=3e-3, loss="atomic")
 FLOW = Estimator(
@@ -242,7 +244,7 @@ def test_a_damaged_network_is_told(folder, tmp_path, capsys, damage):
         network.write_bytes(network.read_bytes()[:100])
     elif damage == "foreign":
         config = json.loads((copy / "config.json").read_text())
-        config["settings"]["estimator"]["hidden"] = [9, 9]
+        config["settings"]["estimator"]["hyperparameters"]["hidden"] = [9, 9]
         (copy / "config.json").write_text(json.dumps(config))
     else:
         network.unlink()

@@ -66,11 +66,11 @@ everywhere = pytest.mark.parametrize("path", files(*PACKAGES), ids=identify)
 def test_there_is_something_to_check():
     assert {name_of(path) for path in files(*PACKAGES)} > {
         "jaxlfi",
-        "jaxlfi.bayessim",
+        "jaxlfi.bayessim.algorithm",
         "jaxlfi.heuristics.edge",
         "jaxlfi.envs.lynx_hare",
     }
-    assert "jaxlfi.support.Support" in imported(ROOT / "jaxlfi/belief.py")
+    assert "jaxlfi.distributions.support.Support" in imported(ROOT / "jaxlfi/distributions/belief.py")
 
 
 @everywhere
@@ -84,6 +84,18 @@ def test_imports_go_downwards(path):
 def test_heuristics_see_beliefs_and_no_network(path):
     assert not {name for name in imported(path) for network in NETWORKS if within(name, network)}
     assert not {name for name in imported(path) if within(name, "flax.linen") or within(name, "optax")}
+
+
+FIGURES_READ = ("jaxlfi.figures",)
+"""What of jaxlfi figures may import: one another. They read config.json and .npz files themselves, with NumPy."""
+
+
+@pytest.mark.parametrize("path", files("jaxlfi/figures"), ids=identify)
+def test_figures_know_no_task(path):
+    """A figure is a function of saved arrays: no task, simulator or network, and no JAX to bring one in."""
+    own = {name for name in imported(path) if within(name, "jaxlfi")} - {"jaxlfi"}
+    assert not {name for name in own if not any(within(name, module) for module in FIGURES_READ)}
+    assert not {name for name in imported(path) for library in ("jax", "flax", "envs") if within(name, library)}
 
 
 @everywhere
@@ -156,7 +168,7 @@ def test_examples_are_found():
         name_of(path): sum(len(test.examples) for test in finder.find(importlib.import_module(name_of(path))))
         for path in with_examples()
     }
-    assert min(examples.values()) >= 1 and examples["jaxlfi.support"] >= 2
+    assert min(examples.values()) >= 1 and examples["jaxlfi.distributions.support"] >= 2
 
 
 def test_the_library_runs_without_matplotlib():

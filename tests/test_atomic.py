@@ -7,7 +7,7 @@ import optax
 import pytest
 from scipy import stats
 
-from jaxlfi.npe.atomic import acceptance, atomic, contrast, log_prob_truncated, nll, sample_within
+from jaxlfi.estimators.atomic_loss import acceptance, atomic, contrast, log_prob_truncated, nll, sample_within
 
 
 def test_nll_is_the_weighted_mean():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments import baselines
-from jaxlfi.commands import bootstrap_interval
+from jaxlfi.cli.commands import bootstrap_interval
 from tests.small import SETTINGS, gaussian, whole_runs  # noqa: F401 - a fixture
 
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxlfi import bayessim
-from jaxlfi.bayessim import Settings
-from jaxlfi.belief import Belief, rejected
+from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.bayessim.algorithm import algorithm as bayessim
 from jaxlfi.diagnostics import bound_warnings, edge_mass
+from jaxlfi.distributions.belief import Belief, rejected
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
-from jaxlfi.estimator import Estimator
+from jaxlfi.estimators.estimator import Estimator
 from jaxlfi.heuristics import Choice, Edge, Fixed
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.tasks.task import Task
 
 TASK = gaussian_linear.task()
 X = jnp.asarray(gaussian_linear.MIXING @ np.array([1.0, -0.5], np.float32))

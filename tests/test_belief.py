@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from scipy import stats
 
-from jaxlfi.belief import RESTRICTIONS, Belief, uninformed
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
+from jaxlfi.distributions.belief import RESTRICTIONS, Belief, uninformed
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
 from tests.strategies import keys, problems
 
 CLIPPED = jax.jit(RESTRICTIONS["clip"], static_argnames="n")

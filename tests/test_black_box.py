@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi.black_box import simulate_within_budget
+from jaxlfi.bayessim.host import simulate_within_budget
 from jaxlfi.envs.gaussian_linear import MIXING, NOISE, posterior
 from jaxlfi.heuristics import Edge, Fixed
-from jaxlfi.observation import SimulatorError
+from jaxlfi.tasks.observation import SimulatorError
 from tests.small import SETTINGS, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)

@@ -13,11 +13,18 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import atomic, cli, commands, observation, run_store, session, sweep, tasks
-from jaxlfi.bayessim import Settings
-from jaxlfi.estimator import Estimator
-from jaxlfi.heuristics import HEURISTICS
-from jaxlfi.presets import PRESETS
+from jaxlfi.io import files as atomic
+from jaxlfi.cli.parser import parser as cli
+from jaxlfi.cli.parser import commands
+from jaxlfi.tasks.registry import observation
+from jaxlfi.runs import folder as run_store
+from jaxlfi.runs import session
+from jaxlfi.studies import grid as sweep
+from jaxlfi.tasks.registry import registry as tasks
+from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.estimators.estimator import Estimator
+from jaxlfi.heuristics import Mode, registry
+from jaxlfi.bayessim.presets import PRESETS
 from tests import test_black_box
 from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
@@ -32,7 +39,7 @@ def error_line(capsys, *arguments) -> str:
 
 
 def test_help_teaches_and_does_not_wait_for_jax():
-    script = "import sys, jaxlfi.cli as c; c.main(['--help'] if len(sys.argv) < 2 else [sys.argv[1], '--help'])"
+    script = "import sys, jaxlfi.cli.parser as c; c.main(['--help'] if len(sys.argv) < 2 else [sys.argv[1], '--help'])"
     check = "import atexit, sys; atexit.register(lambda: print('jax' in sys.modules)); "
     for name, wanted in (("infer", "delta"), ("compare", "SUPPORT[+HEURISTIC]"), ("grid", "NAME=V,V,...")):
         done = subprocess.run([sys.executable, "-c", check + script, name], capture_output=True, text=True, check=True)
@@ -45,11 +52,12 @@ def test_every_setting_and_hyperparameter_has_a_documented_flag():
     for name in ("infer", "compare", "grid"):
         documented = {action.dest for action in choices[name]._actions if action.help}
         fields = {field.name for kind in (Settings, Estimator) for field in dataclasses.fields(kind)} - {"estimator"}
-        assert fields | set(commands.hyperparameters()) <= documented
+        rules = [registry.load(rule) for rule in registry.names()]
+        assert fields | {name for rule in rules for name in registry.hyperparameters(rule)} <= documented
 
 
 def test_names_known_without_jax_are_the_real_ones():
-    assert set(cli.PRESETS) == set(PRESETS) and set(cli.HEURISTICS) == set(HEURISTICS)
+    assert set(cli.PRESETS) == set(PRESETS)
 
 
 def test_version(capsys):
@@ -381,7 +389,7 @@ def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line
     np.testing.assert_array_equal(edge.mass_threshold, [0.125, 0.5])
     assert edge.expansion == 0.1
     mode = commands.build_heuristic(parse(), "mode", PRESETS["paper"], task)
-    assert mode == HEURISTICS["mode"]()
+    assert mode == Mode()
 
 
 def test_one_task_is_described(registered, capsys):

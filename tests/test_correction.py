@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxlfi.belief import Belief, uninformed
-from jaxlfi.correction import CORRECTIONS, effective_size, equal_weights, importance_weights
-from jaxlfi.dataset import Dataset
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.bayessim.correction import CORRECTIONS, effective_size, equal_weights, importance_weights
+from jaxlfi.distributions.belief import Belief, uninformed
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.tasks.task import Task
 
 BOX = Support([-9.0, -7.0], [9.0, 7.0])
 

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlfi.dataset import augment, empty
-from jaxlfi.simulation import within_budget
+from jaxlfi.estimators.dataset import augment, empty
+from jaxlfi.tasks.simulation import within_budget
 
 CAPACITY, BUDGET = 8, 5
 augmented = jax.jit(augment)

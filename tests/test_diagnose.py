@@ -12,21 +12,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi import atomic, bayessim, cli, diagnose, run_store, sweep, tasks
-from jaxlfi.belief import Belief, uninformed
-from jaxlfi.diagnose import Plan, Subject, repeat
-from jaxlfi.diagnose import subject as subjects
+from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim.keys import run_keys
+from jaxlfi.cli.parser import parser as cli
+from jaxlfi.distributions.belief import Belief, uninformed
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
-from jaxlfi.estimator import Estimator, Network, initialise
+from jaxlfi.estimators.estimator import Estimator, Network, initialise
+from jaxlfi.estimators.normaliser import Normaliser
+from jaxlfi.estimators.posterior import truncated_draws, truncated_log_prob
 from jaxlfi.figures import calibration, checks, style
 from jaxlfi.heuristics import Edge, Fixed
-from jaxlfi.inference import Run
-from jaxlfi.keys import run_keys
-from jaxlfi.normalise import Normaliser
-from jaxlfi.observation import SimulatorError
-from jaxlfi.posterior import truncated_draws, truncated_log_prob
-from jaxlfi.sampling import network_arrays, read_run
-from jaxlfi.support import Support
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import folder as run_store
+from jaxlfi.runs.inference import Run
+from jaxlfi.runs.load import network_arrays, read_run
+from jaxlfi.studies import calibration as diagnose
+from jaxlfi.studies import grid as sweep
+from jaxlfi.studies.calibration import Plan, Subject, repeat
+from jaxlfi.studies.calibration import subject as subjects
+from jaxlfi.tasks.observation import SimulatorError
+from jaxlfi.tasks.registry import registry as tasks
 from tests.small import SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 X = np.array([-0.6, -0.3], np.float32)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxlfi import black_box
-from jaxlfi.belief import Belief
+from jaxlfi.bayessim.algorithm import host as black_box
 from jaxlfi.diagnostics import bound_warnings, discrepancy, edge_mass, trajectory_distance
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.task import Task
 
 see = jax.jit(discrepancy, static_argnames=("task", "restriction", "n"))
 BOX = Support([0.0, -2.0], [4.0, 6.0])

@@ -5,13 +5,14 @@ import sys
 import numpy as np
 import pytest
 
-from jaxlfi import atomic, run_store
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
-from jaxlfi.export import MissingLibrary, to_inference_data
 from jaxlfi.heuristics import Fixed
-from jaxlfi.sampling import posterior_samples
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import folder as run_store
+from jaxlfi.runs.export import MissingLibrary, to_inference_data
+from jaxlfi.runs.load import posterior_samples
+from jaxlfi.tasks.task import Task
 from tests.small import command, settings
 
 X = np.array([0.9, -0.7], np.float32)

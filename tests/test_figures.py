@@ -1,9 +1,11 @@
 """Figures: what is drawn is what was saved, for runs of all kinds, and nothing else is touched."""
 
+import collections
 import csv
 import json
 import sys
 import warnings
+from html.parser import HTMLParser
 from pathlib import Path
 
 import matplotlib
@@ -22,10 +24,12 @@ from jaxlfi.figures import (
     load,
     losses,
     open_collection,
+    page,
     pairs,
     polars,
     predictive,
     report,
+    reporting,
     representative,
     samples,
     seeds,
@@ -33,7 +37,7 @@ from jaxlfi.figures import (
     style,
     supports,
 )
-from jaxlfi.figures.history import spread_of
+from jaxlfi.figures.history import robust_sd
 
 COMPARED = ("ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre")
 TRUTH = np.log([0.01, 0.5, 1.0, 0.01])
@@ -47,9 +51,9 @@ def write_run(
     seed: int = 0,
     dim: int = 4,
     rounds: int = 6,
-    attempts: int = 30,
+    simulation_budget: int = 30,
     components: int = 4,
-    passes: int = 12,
+    epochs: int = 12,
     records: int = 151,
     channels: tuple[str, ...] = ("predators X", "prey Y"),
     truth: bool = True,
@@ -63,13 +67,13 @@ def write_run(
         seed: of the run.
         dim: parameters.
         rounds: rounds.
-        attempts: simulations a round.
+        simulation_budget: simulations of each round.
         components: of the mixture.
-        passes: of training.
+        epochs: of training.
         records: of a trajectory.
         channels: of a trajectory.
         truth: whether it is known.
-        failures: share of the first round's simulations and samples that fail.
+        failures: fraction of the first round's simulations and samples that fail.
     """
     rng = np.random.default_rng([seed, *configuration.encode()])
     support, _, heuristic = configuration.partition("+")
@@ -86,13 +90,17 @@ def write_run(
     fraction = 1.0
     mean, scale = (low + high) / 2, (high - low) / 3
     for i in range(rounds):
-        theta = rng.uniform(low, high, (attempts, dim)) if i == 0 else mean + scale * rng.normal(size=(attempts, dim))
+        theta = (
+            rng.uniform(low, high, (simulation_budget, dim))
+            if i == 0
+            else mean + scale * rng.normal(size=(simulation_budget, dim))
+        )
         theta = theta.clip(low, high)
         fraction = failures * (0.7**i)
-        failure = rng.binomial(1, fraction, attempts) * rng.integers(1, 3, attempts)
-        kept = (failure == 0) & (np.cumsum(failure == 0) <= int(0.8 * attempts))
-        last = np.flatnonzero(kept)[-1] + 1 if kept.sum() == int(0.8 * attempts) else attempts
-        counted = np.arange(attempts) < last
+        failure = rng.binomial(1, fraction, simulation_budget) * rng.integers(1, 3, simulation_budget)
+        kept = (failure == 0) & (np.cumsum(failure == 0) <= int(0.8 * simulation_budget))
+        last = np.flatnonzero(kept)[-1] + 1 if kept.sum() == int(0.8 * simulation_budget) else simulation_budget
+        counted = np.arange(simulation_budget) < last
         for name, value in {"theta": theta, "counted": counted, "kept": kept, "failure": failure}.items():
             keep(name, value)
         keep("proposal_low", low), keep("proposal_high", high)
@@ -118,10 +126,12 @@ def write_run(
         factor = np.tril(0.3 * rng.normal(size=(components, dim, dim))) * (1 - np.eye(dim)) + 0.9 * np.eye(dim)
         tril = scale[:, None] * factor
         keep("logits", logits), keep("means", means), keep("scale_tril", tril)
-        steps = np.arange(1, passes + 1)
-        loss = -1.2 * i + 6 * np.exp(-4 * steps / passes) + 0.1 * rng.normal(size=(2, passes))
+        steps = np.arange(1, epochs + 1)
+        loss = -1.2 * i + 6 * np.exp(-4 * steps / epochs) + 0.1 * rng.normal(size=(2, epochs))
         keep("loss", loss)
-        keep("validation_loss", loss + 0.6 + 0.8 * (steps / passes) ** 2)
+        keep("chosen_epoch", np.full(2, epochs - 1))
+        keep("mass_inside", np.float32(0.9))
+        keep("validation_loss", loss + 0.6 + 0.8 * (steps / epochs) ** 2)
         draws = (mean + scale * rng.normal(size=(20, dim))).clip(low, high)
         keep("sample_theta", draws)
         keep("sample_theta_error", np.abs(draws - target) if truth else np.full((20, dim), np.nan))
@@ -138,8 +148,8 @@ def write_run(
     def wave(shift: float) -> np.ndarray:
         return 120 * np.exp(1.1 * np.sin(0.75 * times[:, None] + phase + shift)) / (1 + phase)
 
-    spread = stacked["sample_theta_error"][-1].mean() if truth else 0.4
-    predicted = np.stack([wave(0.5 * spread * rng.normal()) * np.exp(0.15 * rng.normal()) for _ in range(20)])
+    error = stacked["sample_theta_error"][-1].mean() if truth else 0.4
+    predicted = np.stack([wave(0.5 * error * rng.normal()) * np.exp(0.15 * rng.normal()) for _ in range(20)])
     summaries = ("mean X", "mean Y", "log var X", "log var Y", "X with Y")
     x_of = lambda theta: theta[:, :1] * np.arange(1, 6) + theta[:, -1:] ** 2
     x = x_of(target[None])[0]
@@ -148,7 +158,13 @@ def write_run(
     folder.mkdir(parents=True)
     last = {name: stacked[name][-1] for name in ("logits", "means", "scale_tril", "support_low", "support_high")}
     many = (mean + scale * rng.normal(size=(1000, dim))).clip(low, high)
-    np.savez(folder / "posterior.npz", **last, draws=many)
+    np.savez(
+        folder / "posterior.npz",
+        **last,
+        draws=np.exp(many),
+        log=np.full(dim, True),
+        parameters=np.array([f"parameter {d}" for d in range(dim)]),
+    )
     dataset = [stacked["theta"][i][stacked["kept"][i]] for i in range(rounds)]
     np.savez(
         folder / "dataset.npz",
@@ -180,7 +196,7 @@ def write_run(
         "format": "jaxlfi-run",
         "task": "lotka_volterra",
         "names": names.tolist(),
-        "units": ["ln(1/time)"] * dim,
+        "units": ["1/time"] * dim,
         "configuration": None,
         "support": {"name": support, "low": stacked["proposal_low"][0].tolist()},
         "heuristic": {"name": heuristic or "none", "matched": False, "hyperparameters": {}},
@@ -331,7 +347,7 @@ def test_samples_shows_proposals_boxes_means_and_truth(compared):
     assert axes.get_xlabel() == "$\\theta_{1}$ ln predator birth\n[ln(1/time)]"
 
 
-def test_samples_shows_the_last_mixture_and_the_way_of_its_mean(compared):
+def test_samples_shows_the_last_mixture_and_the_path_of_the_mean(compared):
     history = representative(compared.runs["ok"])
     figure = drawn(samples.draw, [history], height=5.0)
     axes = figure.axes[1]
@@ -343,6 +359,7 @@ def test_samples_shows_the_last_mixture_and_the_way_of_its_mean(compared):
     area = np.diff(corners[0, :, 0])[None, :] * np.diff(corners[:, 0, 1])[:, None]
     inside = float((np.asarray(mesh.get_array()).reshape(area.shape) * area).sum())
     assert inside == pytest.approx(1.0, abs=0.05)
+    assert [bar.get_xlabel() for bar in axes.child_axes] == ["posterior density"]
     box = axes.patches[0]
     np.testing.assert_allclose(box.get_xy(), history.support_low[-1, :2])
 
@@ -361,9 +378,9 @@ def test_efficiency_lines_are_means_over_seeds(compared):
     attempted = np.stack([h.attempted for h in histories])
     failed = np.stack([h.failed for h in histories])
     draws = {
-        "attempted simulations": attempted,
+        "simulations": attempted,
         "success rate [%]": 100 * (attempted - failed) / attempted,
-        "cumulated failures": failed.cumsum(1),
+        "cumulative failures": failed.cumsum(1),
     }
     for title, values in draws.items():
         shown = line(panel(figure, title), "broad")
@@ -415,7 +432,7 @@ def test_support_draws_the_configurations_that_adapt(compared):
     assert sorted(limit.get_ydata()[0] for limit in marked(axes, "limit")) == [-6.0, 4.0]
 
 
-def test_losses_of_one_run_by_pass_and_of_many_by_round(compared):
+def test_losses_of_one_run_by_epoch_and_of_several_by_round(compared):
     history = compared.runs["ok"][0]
     figure = drawn(losses.draw, {"ok": [history]})
     for i, shown in enumerate(panel(figure, "training loss").lines):
@@ -470,15 +487,15 @@ def correlated(rng, n: int) -> tuple[np.ndarray, np.ndarray]:
     return rng.multivariate_normal([1.0, -2.0], covariance, n), covariance
 
 
-@pytest.mark.parametrize("share", [0.5, 0.8, 0.95])
-def test_contours_of_normal_draws_are_their_ellipses(share):
+@pytest.mark.parametrize("enclosed", [0.5, 0.8, 0.95])
+def test_contours_of_normal_draws_are_their_ellipses(enclosed):
     draws, covariance = correlated(np.random.default_rng(0), 40_000)
     x, y, density_ = pairs.smoothed(draws, np.array([[-50.0, -50.0], [50.0, 50.0]]))
     assert density_.sum() == pytest.approx(1)
     np.testing.assert_allclose([density_.sum(0) @ x, density_.sum(1) @ y], [1.0, -2.0], atol=0.03)
-    inside = density_ >= pairs.levels(density_, [share])[0]
+    inside = density_ >= pairs.levels(density_, [enclosed])[0]
     area = inside.sum() * (x[1] - x[0]) * (y[1] - y[0])
-    ellipse = np.pi * stats.chi2(2).ppf(share) * np.sqrt(np.linalg.det(covariance))
+    ellipse = np.pi * stats.chi2(2).ppf(enclosed) * np.sqrt(np.linalg.det(covariance))
     assert area == pytest.approx(ellipse, rel=0.2)  # the kernel widens, by a quarter of a standard deviation
     # The ellipse leans to the right: the first axis is horizontal.
     assert inside[y > -1.5][:, x > 1.5].sum() > 3 * inside[y > -1.5][:, x < 0.5].sum()
@@ -488,15 +505,16 @@ def test_a_density_does_not_fade_at_the_support():
     """Draws that are uniform in a box have one density up to its bounds, and none beyond."""
     box = np.array([[0.0, 10.0], [1.0, 14.0]])
     draws = np.random.default_rng(1).uniform(*box, (100_000, 2))
-    x, y, share = pairs.smoothed(draws, box)
+    x, y, fraction = pairs.smoothed(draws, box)
     assert x.min() > 0 and x.max() < 1 and y.min() > 10 and y.max() < 14
-    np.testing.assert_allclose(share, share.mean(), rtol=0.15)
+    np.testing.assert_allclose(fraction, fraction.mean(), rtol=0.15)
 
 
 def test_draws_all_in_one_place_have_a_density():
     for draws in (np.zeros((50, 2)), np.column_stack([np.zeros(50), np.linspace(0, 1, 50)])):
-        _, _, share = pairs.smoothed(draws, np.array([[0.0, 0.0], [1.0, 1.0]]))
-        assert np.isfinite(share).all() and share.sum() == pytest.approx(1)
+        for box in ([[0.0, 0.0], [1.0, 1.0]], [[-np.inf] * 2, [np.inf] * 2]):
+            _, _, fraction = pairs.smoothed(draws, np.array(box))
+            assert np.isfinite(fraction).all() and fraction.sum() == pytest.approx(1)
 
 
 def test_pairs_shows_all_draws_with_support_and_truth(compared):
@@ -532,7 +550,7 @@ def test_pairs_are_arranged_by_how_many_fit(tmp_path):
 
 
 def test_polars_measure_all_in_the_units_of_ok(compared):
-    """Widths of its first support, and the spread of its first round's summaries."""
+    """Widths of its first support, and standard deviations of its first round's summaries."""
     chosen = [compared.runs[name][0] for name in ("misspecified", "ok")]
     bare, ok = chosen
     figure = drawn(polars.draw, chosen)
@@ -540,11 +558,11 @@ def test_polars_measure_all_in_the_units_of_ok(compared):
     assert len(circles) == 4
     with np.load(ok.folder / "dataset.npz") as dataset:
         first = dataset["x"][dataset["round"] == 0]
-    spread = (np.percentile(first, 84, axis=0) - np.percentile(first, 16, axis=0)) / 2
+    deviation = (np.percentile(first, 84, axis=0) - np.percentile(first, 16, axis=0)) / 2
     for column, history in enumerate(chosen):
         width = ok.proposal_high[0] - ok.proposal_low[0]
         np.testing.assert_allclose(width, 7.0)
-        expected = [history.theta_error[-1] / width, np.abs(history.final_x - history.x) / spread]
+        expected = [history.theta_error[-1] / width, np.abs(history.final_x - history.x) / deviation]
         for axes, errors in zip(circles[column::2], expected, strict=True):
             (mean,) = marked(axes, "mean")
             np.testing.assert_allclose(mean.get_ydata()[:-1], np.nanmean(errors, axis=0))
@@ -569,10 +587,10 @@ def test_polars_leave_out_what_has_no_unit_or_no_value(tmp_path):
     assert [text.get_text() for text in both.axes[-1].texts] == ["none"]
 
 
-def test_the_spread_of_normal_numbers_is_their_standard_deviation():
+def test_the_robust_sd_of_normal_numbers_is_their_standard_deviation():
     x = np.random.default_rng(2).normal(5.0, [0.3, 20.0], (40_000, 2))
     x[:100] = 1e6  # but for a few
-    np.testing.assert_allclose(spread_of(x), [0.3, 20.0], rtol=0.03)
+    np.testing.assert_allclose(robust_sd(x), [0.3, 20.0], rtol=0.03)
 
 
 def test_seeds_marks_mean_and_median(compared):
@@ -655,6 +673,12 @@ def test_labels_name_symbol_and_unit():
 # Whole reports
 
 
+def drawable_pictures(collection) -> list[str]:
+    """Names of the pictures of a collection, drawn but not written."""
+    with style.context():
+        return [name for name, make in reporting.PICTURES.items() if make(collection) is not None]
+
+
 def names_of(paths: list[Path]) -> list[str]:
     """File names without their folders."""
     return [path.name for path in paths]
@@ -671,12 +695,12 @@ def test_report_of_a_comparison(compared):
         pixels = points_of(path)
         assert pixels[..., :3].std() > 0.02
         assert pixels.shape[1] in (round(40 * style.TEXT_WIDTH), round(40 * style.COLUMN_WIDTH))
-    page = paths[0].read_text(encoding="utf-8")
-    assert page.count("data:image/png;base64,") == len(EVERYTHING)
-    assert "http" not in page.replace("http-equiv", "")
-    assert "jaxlfi compare lotka_volterra" in page
+    text = paths[0].read_text(encoding="utf-8")
+    assert text.count("data:image/png;base64,") == len(EVERYTHING)
+    assert "http" not in text.replace("http-equiv", "")
+    assert "jaxlfi compare lotka_volterra" in text and "There are no simulated trajectories" not in text
     for name, values in compared.values("theta_error").items():
-        row = next(text for text in page.splitlines() if style.configuration_label(name) in text)
+        row = next(line for line in text.splitlines() if style.configuration_label(name) in line)
         for number in (values.mean(), np.median(values), values.std(ddof=1)):
             assert f">{number:.3g}<" in row
 
@@ -686,7 +710,7 @@ def test_report_of_a_comparison(compared):
     [
         ({"dim": 1, "channels": ("x",)}, {"seeds"}),
         ({"dim": 3, "truth": False}, {"seeds"}),
-        ({"dim": 4, "rounds": 1, "passes": 1, "components": 1, "records": 21}, {"seeds"}),
+        ({"dim": 4, "rounds": 1, "epochs": 1, "components": 1, "records": 21}, {"seeds"}),
         ({"dim": 2, "failures": 1.0, "records": 1}, {"seeds", "predictive"}),
     ],
     ids=["one", "unknown-truth", "one-round", "all-failed"],
@@ -698,6 +722,18 @@ def test_report_of_one_run(tmp_path, options, missing):
     assert "&lt;somewhere&gt;" in paths[0].read_text(encoding="utf-8")
 
 
+def test_legends_fit_into_figures_of_one_column(tmp_path):
+    collection = open_collection(write_run(tmp_path / "run", rounds=2, records=21))
+    for name in ("curves", "predictive", "pairs", "polars"):
+        with style.context():
+            figure, _, _ = reporting.PICTURES[name](collection)
+            figure.draw_without_rendering()
+        width, height = figure.get_size_inches() * figure.dpi
+        assert width == style.COLUMN_WIDTH * figure.dpi
+        box = figure.legends[0].get_window_extent()
+        assert box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height, name
+
+
 def test_report_of_seeds(tmp_path):
     for seed in range(3):
         write_run(tmp_path / f"seed_{seed:03d}", seed=seed, dim=2)
@@ -706,7 +742,7 @@ def test_report_of_seeds(tmp_path):
     errors = sorted(h.final_theta_error for h in collection.runs["misspecified+edge"])
     assert representative(collection.runs["misspecified+edge"]).final_theta_error == errors[1]
     np.testing.assert_allclose(sorted(collection.values("theta_error")["misspecified+edge"]), errors)
-    assert names_of(report(tmp_path, dpi=30)[1:]) == [f"{name}.png" for name in EVERYTHING]
+    assert drawable_pictures(collection) == EVERYTHING
 
 
 def test_report_of_a_comparison_without_truth(tmp_path):
@@ -766,6 +802,101 @@ def test_report_survives_a_posterior_that_is_not_finite(tmp_path):
     assert any("not finite" in text.get_text() for text in figure.axes[1].texts)
 
 
+def without_trajectories(folder: Path, saved: bool) -> Path:
+    """A run whose posterior was not simulated; `saved`: its arrays are there and hold NaN."""
+
+    def edit(arrays):
+        arrays["sample_trajectory_error"].fill(np.nan)
+        for name in ("final_trajectory", "final_x"):
+            arrays[name].fill(np.nan) if saved else arrays.pop(name)
+
+    change(folder, "history.npz", edit)
+    return folder
+
+
+def test_report_of_a_run_whose_posterior_was_not_simulated(tmp_path):
+    expected = [name for name in EVERYTHING if name not in ("predictive", "seeds")]
+    folder = without_trajectories(write_run(tmp_path / "run", dim=3, rounds=2, epochs=1), saved=True)
+    paths = report(folder, dpi=30)
+    assert names_of(paths[1:]) == [f"{name}.png" for name in expected]
+    text = paths[0].read_text(encoding="utf-8")
+    assert "There are no simulated trajectories" in text
+    assert "from the true parameters. Error bars" in text and "observed trajectory" not in captions(text)
+    panels = drawn(curves.draw, open_collection(folder).runs).axes
+    assert [axes.get_title().split(" ")[0] for axes in panels] == [style.symbol(d) for d in range(3)]
+    change(folder, "history.npz", lambda a: [a.pop(name) for name in ("final_trajectory", "final_x")])
+    assert drawable_pictures(open_collection(folder)) == expected
+
+
+def captions(text: str) -> str:
+    """The captions on a page."""
+    return " ".join(part.split("</figcaption>")[0] for part in text.split("<figcaption>")[1:])
+
+
+def test_a_comparison_where_one_posterior_was_not_simulated(tmp_path):
+    write_compare(tmp_path, ("ok", "misspecified+edge"), 1, dim=3, rounds=2)
+    without_trajectories(tmp_path / "ok" / "seed_000", saved=False)
+    collection = open_collection(tmp_path)
+    assert drawable_pictures(collection) == [name for name in EVERYTHING if name != "seeds"]
+    figure = drawn(discrepancy.draw, collection.runs)
+    assert [text.get_text().strip() for text in panel(figure, "trajectory").texts] == ["none"]
+    figure = drawn(predictive.draw, *reporting.columns({"misspecified+edge": collection.runs["misspecified+edge"]}))
+    assert len(figure.axes) == 2
+
+
+def test_draws_are_read_into_inference_space(tmp_path):
+    folder = write_run(tmp_path / "run", dim=3, rounds=1)
+    natural = np.random.default_rng(4).uniform(0.1, 2.0, (50, 3))
+    change(folder, "posterior.npz", lambda a: a.update(draws=natural, log=np.array([True, False, True])))
+    draws = load(folder).draws
+    np.testing.assert_allclose(draws[:, [0, 2]], np.log(natural[:, [0, 2]]))
+    np.testing.assert_array_equal(draws[:, 1], natural[:, 1])
+    natural[3, 0] = -0.1  # no logarithm
+    change(folder, "posterior.npz", lambda a: a.update(draws=natural))
+    assert not pairs.drawable(load(folder))
+    change(folder, "posterior.npz", lambda a: a.update(log=np.array([True])))
+    with pytest.raises(ValueError, match=r"posterior\.npz: expected log of shape \(3,\), got \(1,\)"):
+        load(folder)
+
+
+MARKUP = "<b>[red]$x_1$</b> &amp; \"'\\"
+
+
+def test_markup_in_names_is_shown_as_it_is(tmp_path):
+    """Names of folders, configurations, tasks, parameters and warnings are text, on the page and in the pictures."""
+    folder = tmp_path / MARKUP.replace("/", "|")
+    write_run(folder, dim=1, rounds=1, records=11, channels=(MARKUP,))
+    config = json.loads((folder / "config.json").read_text())
+    config |= {"task": None, "configuration": MARKUP, "warnings": [MARKUP], "units": [MARKUP], "preset": MARKUP}
+    (folder / "config.json").write_text(json.dumps(config))
+    change(folder, "observation.npz", lambda a: a.update(names=np.array([MARKUP]), summaries=np.array([MARKUP] * 5)))
+    text = report(folder, dpi=30)[0].read_text(encoding="utf-8")
+    assert "<b>" not in text and "[red]" in text
+    parser = Texts()
+    parser.feed(text)
+    assert any(found.startswith(folder.name) for found in parser.found["h1"])
+    assert MARKUP.replace("_", " ") in parser.found["td"]  # as in the pictures' legends
+    assert MARKUP in parser.found["p"] and MARKUP in parser.found["dd"]
+
+
+class Texts(HTMLParser):
+    """The text in each kind of element."""
+
+    def __init__(self):
+        super().__init__()
+        self.found, self._open = collections.defaultdict(list), []
+
+    def handle_starttag(self, tag, attrs):
+        self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        while self._open and self._open.pop() != tag:
+            pass
+
+    def handle_data(self, data):
+        self.found[self._open[-1] if self._open else ""].append(data)
+
+
 def test_unfinished_runs_are_named_and_left_out(tmp_path):
     write_compare(tmp_path, ("ok", "misspecified"), 2, dim=2, rounds=3)
     (tmp_path / "ok" / "seed_001" / "history.npz").unlink()
@@ -774,7 +905,8 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
     collection = open_collection(tmp_path)
     assert {name: len(runs) for name, runs in collection.runs.items()} == {"ok": 1, "misspecified": 1}
     assert {Path(path).parent.name for path in collection.unfinished} == {"ok", "misspecified"}
-    assert "misspecified/seed_000" in report(tmp_path, dpi=30)[0].read_text(encoding="utf-8")
+    notes = [text for text in page.render(collection, []).splitlines() if "note" in text and "left out" in text]
+    assert len(notes) == 1 and "misspecified/seed_000" in notes[0] and "ok/seed_001" in notes[0]
 
 
 # Folders that are none

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi import dataset as datasets
-from jaxlfi.dataset import Dataset
-from jaxlfi.estimator import Estimator, Network, condition, initialise
-from jaxlfi.fitting import fit
-from jaxlfi.normalise import fit_normaliser
-from jaxlfi.support import Support
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators import dataset as datasets
+from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.estimators.estimator import Estimator, Network, condition, initialise
+from jaxlfi.estimators.normaliser import fit_normaliser
+from jaxlfi.estimators.training import fit
 
 SCALE = Support([-4.0, -6.0], [4.0, 2.0])
 CAPACITY, SIZE = 48, 40

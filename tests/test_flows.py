@@ -10,8 +10,8 @@ import optax
 import pytest
 from scipy import stats
 
-from jaxlfi.mdn import MDN
-from jaxlfi.npe.flows import FLOWS, MAF, NSF, coupling, spline
+from jaxlfi.estimators.flows import FLOWS, MAF, NSF, coupling, spline
+from jaxlfi.estimators.mdn import MDN
 
 SMALL = {"transforms": 2, "hidden": 8, "blocks": 1}
 """For what takes longer to compile than to run."""

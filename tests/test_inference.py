@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import Support, atomic, inference
+from jaxlfi import Support
 from jaxlfi.heuristics import Edge, Fixed
-from jaxlfi.observation import SimulatorError
-from jaxlfi.run_store import read_belief
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import inference
+from jaxlfi.runs.folder import read_belief
+from jaxlfi.tasks.observation import SimulatorError
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
@@ -99,7 +101,7 @@ def test_without_an_observation_one_is_simulated_at_the_truth():
         ({"support": "unknown"}, "support: expected one of"),
         ({"support": Support([0.0], [1.0])}, "support: expected bounds for 2 parameters, got 1"),
         ({"support": Support([0.0, 0.0], [1.0, 11.0])}, "inside the feasible domain Phi"),
-        ({"heuristic": "edge"}, "heuristic: expected one such as"),
+        ({"heuristic": "edge"}, "heuristic: expected an instance such as"),
         ({"heuristic": Edge(expansion=np.ones(3))}, r"scalars or 2 values, got shape \(3,\)"),
         ({"settings": settings(simulation_budget=5)}, "attempts: expected at least"),
         (

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi import bayessim, lanes
+from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim.algorithm import batch as lanes
+from jaxlfi.bayessim.batch import Lane, LaneEngine, stack_heuristics, stack_inputs
+from jaxlfi.bayessim.keys import run_keys
+from jaxlfi.bayessim.record import own_evidence
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
-from jaxlfi.history import own_evidence
-from jaxlfi.keys import run_keys
-from jaxlfi.lanes import Lane, LaneEngine, stack_heuristics, stack_inputs
 from tests.small import SETTINGS, gaussian, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)

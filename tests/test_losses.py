@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
-from jaxlfi.losses import LOSSES, Rows
-from jaxlfi.npe.atomic import contrast
+from jaxlfi.estimators.atomic_loss import contrast
+from jaxlfi.estimators.losses import LOSSES, Rows
 
 
 def key():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from jaxlfi.mdn import ACTIVATIONS, MDN, MixtureHead
+from jaxlfi.estimators.mdn import ACTIVATIONS, MDN, MixtureHead
 
 
 def network(module, key, obs: int):

@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.optimize import brentq
 from scipy.special import logsumexp, ndtr
 
-from jaxlfi.mixture import GaussianMixture, component_log_prob, systematic
+from jaxlfi.distributions.mixture import GaussianMixture, component_log_prob, systematic
 from tests.strategies import floats, keys, mixtures, shapes, vectors
 
 N = 20_000

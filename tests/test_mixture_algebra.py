@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.special import logsumexp
 
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.mixture_algebra import FLOOR, POLICIES, pool, product, quotient, reduce
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.mixture_algebra import FLOOR, POLICIES, pool, product, quotient, reduce
 from tests.strategies import mixtures, shapes, vectors
 
 PRODUCT = jax.jit(product)

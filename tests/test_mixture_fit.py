@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from jaxlfi.npe.mixture_fit import fit_mixture
+from jaxlfi.distributions.mixture_fit import fit_mixture
 
 FIT = jax.jit(fit_mixture, static_argnames=("components", "iterations", "restarts"))
 SETTINGS = {"components": 3, "iterations": 15, "restarts": 2}

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlfi.normalise import TRANSFORMS, Normaliser, fit_normaliser, normalised
+from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser, normalised
 from tests.strategies import vectors
 
 NUMPY = {"zscore": lambda x: x, "asinh": np.arcsinh}

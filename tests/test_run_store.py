@@ -9,17 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi import atomic, bayessim, run_store
-from jaxlfi.checkpoint import Checkpoint, CheckpointError
-from jaxlfi.describe import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json
+from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim.presets import METHODS, PRESETS
+from jaxlfi.bayessim.record import posterior_draws
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs import lotka_volterra, lynx_hare, mg1
+from jaxlfi.estimators.posterior import draws_within
 from jaxlfi.heuristics import Centre, Edge, Fixed, Matched, Mode
-from jaxlfi.history import posterior_draws
-from jaxlfi.inference import observe
-from jaxlfi.posterior import draws_within
-from jaxlfi.presets import METHODS, PRESETS
-from jaxlfi.simulation import trajectory_and_outcome
-from jaxlfi.support import Support
+from jaxlfi.io import files as atomic
+from jaxlfi.io.serialise import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json
+from jaxlfi.runs import folder as run_store
+from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
+from jaxlfi.runs.inference import observe
+from jaxlfi.tasks.simulation import trajectory_and_outcome
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, share_engine, whole_runs  # noqa: F401 - a fixture
 
 ROUNDS, ADDITIONS, ATTEMPTS, DIM, COMPONENTS, OBS, SAMPLES = 2, 20, 25, 2, 4, 2, 20
@@ -179,7 +181,7 @@ def test_config_says_what_was_run_and_with_what(folder):
     assert config["task"] == TASK and config["seed"] == 0 and config["names"] == ["first", "second"]
     assert config["support"] == {"name": "misspecified", "low": [-3.0, -3.0], "high": [0.0, 3.0]}
     assert config["heuristic"]["hyperparameters"]["mass_threshold"] == 0.005
-    assert config["settings"]["rounds"] == 2 and config["settings"]["estimator"]["hidden"] == [16]
+    assert config["settings"]["rounds"] == 2 and config["settings"]["estimator"]["hyperparameters"]["hidden"] == [16]
     assert config["versions"]["jax"] == jax.__version__ and config["platform"]["backend"] == "cpu"
 
 

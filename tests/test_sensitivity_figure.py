@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from jaxlfi import atomic, figures
+from jaxlfi import figures
 from jaxlfi.figures import sensitivity, style
 
 NAMES = ("zone_fraction", "mass_threshold", "expansion")
@@ -29,7 +29,7 @@ def drawn(grid: sensitivity.Grid, draw, bars: int, laid_out: bool = False):
         figure = style.new_figure(*sensitivity.size(grid, bars))
         draw(figure, grid)
         if laid_out:
-            figure.canvas.draw()
+            figure.draw_without_rendering()
     count = len(grid.names)
     return np.array(figure.axes[: count**2]).reshape(count, count)
 
@@ -141,7 +141,7 @@ def test_any_number_of_hyperparameters_fits(axes):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A grid's folder as `jaxlfi.sweep` leaves it."""
+    """A grid's folder as `jaxlfi.studies.grid` leaves it."""
     grid = grid_of_noise()
     config = {
         "format": "jaxlfi-grid",
@@ -153,14 +153,14 @@ def folder(tmp_path):
         "runs": 120,
         "axes": [{"name": n, "values": list(v), "default": d} for n, v, d in zip(NAMES, VALUES, DEFAULTS, strict=True)],
     }
-    atomic.write_json(tmp_path / "config.json", config)
+    (tmp_path / "config.json").write_text(json.dumps(config))
     values = {f"values/{name}": np.array(v) for name, v in zip(NAMES, VALUES, strict=True)}
-    atomic.write_arrays(tmp_path / "grid.npz", {"axes": np.array(NAMES), **values, **grid.arrays})
+    np.savez(tmp_path / "grid.npz", axes=np.array(NAMES), **values, **grid.arrays)
     return tmp_path
 
 
 def test_report_draws_a_grid(folder):
-    paths = figures.report(folder, dpi=50)
+    paths = figures.report(folder, dpi=30)
     assert [path.relative_to(folder).as_posix() for path in paths] == [
         "report.html",
         "figures/sensitivity.png",
@@ -171,9 +171,21 @@ def test_report_draws_a_grid(folder):
     assert page.count("data:image/png;base64,") == 2
 
 
+def test_a_grid_whose_posteriors_were_not_simulated_has_parameter_errors_only(folder):
+    with np.load(folder / "grid.npz") as stored:
+        arrays = dict(stored)
+    arrays["trajectory_error"].fill(np.nan)
+    np.savez(folder / "grid.npz", **arrays)
+    grid = sensitivity.load(folder)
+    panels = drawn(grid, sensitivity.draw, bars=1)
+    assert not any(panels[row, column].images for row, column in itertools.combinations(range(3), 2))
+    assert [image.get_gid() for image in panels[1, 1].images] == ["theta_error"]
+    assert "no trajectories were simulated" in figures.report(folder, dpi=30)[0].read_text()
+
+
 def test_report_refuses_a_grid_that_is_not_finished_or_damaged(folder):
     config = json.loads((folder / "config.json").read_text())
-    atomic.write_json(folder / "config.json", config | {"axes": config["axes"][:2]})
+    (folder / "config.json").write_text(json.dumps(config | {"axes": config["axes"][:2]}))
     with pytest.raises(ValueError, match="of one grid"):
         figures.report(folder)
     (folder / "grid.npz").write_bytes(b"PK")

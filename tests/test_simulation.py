@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlfi.simulation import simulate, trajectory_and_outcome, within_budget
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.simulation import simulate, trajectory_and_outcome, within_budget
+from jaxlfi.tasks.task import Task
 
 BUDGET = 9
 budget = jax.jit(within_budget)

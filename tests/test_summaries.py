@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi import summaries
+from jaxlfi.tasks.registry import summaries
 
 
 def plain_series(trajectory):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from jaxlfi.support import Support, check_within
+from jaxlfi.distributions.support import Support, check_within
 from tests.strategies import DIMS, boxes, keys, vectors
 
 PHI = Support([-1.0, 0.0], [4.0, 10.0])

@@ -15,16 +15,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jaxlfi import atomic, bayessim, sweep
+from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.diagnostics import discrepancy
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Centre, Edge, Matched, Mode
-from jaxlfi.keys import run_keys
-from jaxlfi.observation import SimulatorError
-from jaxlfi.run_store import StoreError
-from jaxlfi.sweep import Axis, Grid, chunks
-from jaxlfi.sweep import folder as store
-from jaxlfi.sweep.grid import observations
+from jaxlfi.io import files as atomic
+from jaxlfi.runs.folder import StoreError
+from jaxlfi.studies import grid as sweep
+from jaxlfi.studies.grid import Axis, Grid, chunks
+from jaxlfi.studies.grid import folder as store
+from jaxlfi.studies.grid.grid import observations
+from jaxlfi.tasks.observation import SimulatorError
 from tests.small import FLAGS, SETTINGS, command, whole_runs  # noqa: F401 - a fixture
 
 REFERENCE = "tests.test_sweep:task"
@@ -383,7 +385,7 @@ def test_other_things_that_are_refused():
 TWO_DEVICES = """
 import sys
 from pathlib import Path
-from jaxlfi.cli import main
+from jaxlfi.cli.parser import main
 import jax
 assert jax.local_device_count() == 2
 sys.exit(main(sys.argv[1:]))
@@ -424,7 +426,7 @@ import jax
 jax.config.update("jax_cpu_collectives_implementation", "gloo")
 jax.distributed.initialize(sys.argv[1], num_processes=2, process_id=int(sys.argv[2]))
 from rich.console import Console
-from jaxlfi import sweep
+from jaxlfi.studies import grid as sweep
 from tests.test_sweep import LENGTH, make_grid
 assert jax.process_count() == 2 and jax.local_device_count() == 1 and jax.device_count() == 2
 folder = Path(sys.argv[3])

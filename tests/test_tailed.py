@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from jaxlfi.bayessim import prior_draws
+from jaxlfi.bayessim.algorithm import prior_draws
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
-from jaxlfi.observation import simulate_observation
-from jaxlfi.support import Support
-from jaxlfi.tailed import TailedUniform, with_tails
-from jaxlfi.task import Task
+from jaxlfi.tasks.observation import simulate_observation
+from jaxlfi.tasks.priors import TailedUniform, with_tails
+from jaxlfi.tasks.task import Task
 
 LOW, HIGH, SIGMA = np.array([-3.0, 0.5, -0.1]), np.array([2.0, 0.6, 4.0]), np.array([1.0, 0.03, 0.41])
 """Three boxes of unlike place, width and tails."""

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlfi import summaries
-from jaxlfi.bayessim import prior_draws
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.bayessim.algorithm import prior_draws
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.registry import summaries
+from jaxlfi.tasks.task import Task
 from tests.strategies import vectors
 
 

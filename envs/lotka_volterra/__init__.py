@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs.lotka_volterra.jump_process import SUMMARY_NAMES, JumpProcess, lotka_volterra_nine, make_simulator
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.tasks.task import Task
 
 NAMES = ("ln predator birth", "ln predator death", "ln prey birth", "ln prey death")
 """theta_1..theta_4 of the paper, natural logarithms of rates."""

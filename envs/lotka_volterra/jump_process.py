@@ -34,8 +34,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Key
 
-from jaxlfi import summaries
 from jaxlfi.envs.lotka_volterra import counter_rng
+from jaxlfi.tasks import summaries
 
 SUCCESS = 0
 TOO_MANY_EVENTS = 1
@@ -426,7 +426,7 @@ SUMMARY_NAMES = (
 
 
 def lotka_volterra_nine(trajectory: Float[Array, "records 2"]) -> Float[Array, "9"]:
-    """The nine summaries of Papamakarios and Murray (2016): `jaxlfi.summaries.series` of the two populations.
+    """The nine summaries of Papamakarios and Murray (2016): `jaxlfi.tasks.summaries.series` of the two populations.
 
     In this order: mean X, mean Y, log(var X + 1), log(var Y + 1), autocorrelations of X at lags 1 and 2, of Y at
     lags 1 and 2, and the correlation of X with Y.

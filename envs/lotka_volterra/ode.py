@@ -11,9 +11,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs.lotka_volterra.jump_process import SUMMARY_NAMES, lotka_volterra_nine
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.tasks.task import Task
 
 NAMES = ("predator birth", "predator death", "prey birth", "prey death")
 """theta_1..theta_4 of the paper."""

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxlfi.cli import OneLineParser
+from jaxlfi.cli.parser import OneLineParser
 from jaxlfi.envs.whip import require_mujoco
 
 EXAMPLES = """\
@@ -88,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     try:
         require_mujoco()
-        from jaxlfi import compile_cache
+        from jaxlfi.io import compile_cache
 
         compile_cache.enable()
         from jaxlfi.envs.whip import commands

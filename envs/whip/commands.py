@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from rich.console import Console
 from rich.progress import Progress
 
-from jaxlfi import atomic
 from jaxlfi.envs.whip import planner, rules
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip import render as drawing
@@ -24,6 +23,7 @@ from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
+from jaxlfi.io import files as atomic
 
 POLICIES = ("explore", "random", "plan")
 

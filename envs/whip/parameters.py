@@ -6,7 +6,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from jaxlfi.support import Support
+from jaxlfi.distributions.support import Support
 
 
 @struct.dataclass

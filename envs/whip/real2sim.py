@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs.whip import parameters as ranges
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip.exploration import exploratory_actions
@@ -20,9 +21,8 @@ from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.trajectory import trajectory
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS, Detector
-from jaxlfi.summaries import cross_correlation
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.tasks.summaries import cross_correlation
+from jaxlfi.tasks.task import Task
 
 TRUTH = (0.23, 8e3)
 """Length (m) and Young's modulus (Pa) of the simulated DLO that is observed where no object is named."""

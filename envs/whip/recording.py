@@ -40,12 +40,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxlfi import atomic
 from jaxlfi.envs.whip.frames import COLOURS
 from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.envs.whip.rules import ACTION_LIMIT, HIT_DISTANCE, STEPS
 from jaxlfi.envs.whip.vision.camera import Camera
 from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS, ON_DLO
+from jaxlfi.io import files as atomic
 
 SCHEMA, VERSION = "jaxlfi.whip.recording", 1
 SOURCES = ("simulated", "real")

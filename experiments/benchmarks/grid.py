@@ -2,7 +2,7 @@
 
 Times whole runs of EDGE on Lotka-Volterra at `quick`, ten rounds each, in one process:
 
-* side by side: the lanes of a grid as one chunk of one compiled program over all devices (`jaxlfi.sweep`);
+* side by side: the lanes of a grid as one chunk of one compiled program over all devices (`jaxlfi.studies.grid`);
 * one after another: the same lanes through a compiled `jaxlfi.infer`, as a loop over hyperparameters would.
 
 Compilation is left out of both. What a run costs in a chunk falls with the lanes in it up to some 40 on two cores.
@@ -21,7 +21,7 @@ import jax
 from jaxlfi import QUICK, infer
 from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.heuristics import Edge
-from jaxlfi.sweep import Axis, Grid, grid_lanes, prepare, run_chunk
+from jaxlfi.studies.grid import Axis, Grid, grid_lanes, prepare, run_chunk
 
 AXES = (Axis("mass_threshold", (0.001, 0.005, 0.05)), Axis("expansion", (0.1, 0.2, 0.4)))
 

@@ -26,14 +26,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi import bayessim, dataset
+from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim.presets import PRESETS
 from jaxlfi.envs.lotka_volterra import task as lotka_volterra
-from jaxlfi.estimator import Estimator, Network, initialise
-from jaxlfi.fitting import fit
+from jaxlfi.estimators import dataset
+from jaxlfi.estimators.estimator import Estimator, Network, initialise
+from jaxlfi.estimators.normaliser import fit_normaliser
+from jaxlfi.estimators.training import fit
 from jaxlfi.heuristics import Edge
-from jaxlfi.normalise import fit_normaliser
-from jaxlfi.presets import PRESETS
-from jaxlfi.simulation import simulate, within_budget
+from jaxlfi.tasks.simulation import simulate, within_budget
 
 BATCH, DIM, OBS = 100, 4, 9
 ROWS = 1000
@@ -199,13 +200,13 @@ def run_table() -> None:
 
 _COMPILE_ONE_RUN = """
 import time
-from jaxlfi import compile_cache
+from jaxlfi.io import compile_cache
 compile_cache.enable()
 import jax, jax.numpy as jnp
 from jaxlfi.envs.lotka_volterra import task as factory
-from jaxlfi import bayessim
+from jaxlfi.bayessim.algorithm import algorithm as bayessim
 from jaxlfi.heuristics import Edge
-from jaxlfi.presets import QUICK
+from jaxlfi.bayessim.presets import QUICK
 task = factory()
 run = jax.jit(lambda key: bayessim.run(key, task, QUICK, Edge(), jnp.zeros(9), task.support("ok")))
 lowered = run.lower(jax.random.key(0))

@@ -37,7 +37,6 @@ import mujoco.rollout
 import numpy as np
 
 from experiments.whip_physics.rollouts import random_scene, random_targets
-from jaxlfi import atomic
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.parameters import FEASIBLE, INITIAL, WhipParameters, median
@@ -49,7 +48,8 @@ from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.physics.native import NativeEngine
 from jaxlfi.envs.whip.physics.scene import CUBES, Scene
 from jaxlfi.envs.whip.rig import START
-from jaxlfi.run_store import command_line, environment
+from jaxlfi.io import files as atomic
+from jaxlfi.runs.folder import command_line, environment
 
 SCENE = Scene()
 EPISODE = rules.STEPS * SCENE.substeps
@@ -151,7 +151,7 @@ def _line(name: str, batch: int, rate: float, more: str = "") -> None:
 
 _COMPILE_AN_EPISODE = """
 import time
-from jaxlfi import compile_cache
+from jaxlfi.io import compile_cache
 compile_cache.enable()
 import jax
 from jaxlfi.envs.whip.physics.engine import rollout

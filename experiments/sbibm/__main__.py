@@ -21,14 +21,16 @@ from rich.console import Console
 
 from experiments.sbibm.c2st import c2st
 from experiments.sbibm.tasks import TASKS, observation, reference
-from jaxlfi import atomic, bayessim, compile_cache
-from jaxlfi.bayessim import Settings
-from jaxlfi.belief import rejected
-from jaxlfi.describe import settings_to_json
+from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim.presets import FLOW, METHODS
+from jaxlfi.distributions.belief import rejected
+from jaxlfi.estimators.posterior import draws_within
 from jaxlfi.heuristics import Fixed
-from jaxlfi.posterior import draws_within
-from jaxlfi.presets import FLOW, METHODS
-from jaxlfi.run_store import environment
+from jaxlfi.io import compile_cache
+from jaxlfi.io import files as atomic
+from jaxlfi.io.serialise import settings_to_json
+from jaxlfi.runs.folder import environment
 
 OBSERVATIONS = (1, 2, 3)
 ROUNDS = 10

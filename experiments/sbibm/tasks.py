@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from jaxlfi.support import Support
-from jaxlfi.task import Task
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.task import Task
 
 DATA = Path(__file__).parent / "data"
 SCALE = float(np.sqrt(0.1))

@@ -19,12 +19,12 @@ from rich.console import Console
 
 from experiments.whip_physics import figures, measure, rollouts
 from experiments.whip_physics.models import KINDS
-from jaxlfi import atomic
 from jaxlfi.envs.whip.physics.chain import Chain
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.figures import style
-from jaxlfi.run_store import command_line, environment
+from jaxlfi.io import files as atomic
+from jaxlfi.runs.folder import command_line, environment
 
 CHAINS = {"ball joints": Chain(planar=False), "planar hinges": Chain()}
 """The chains that a scene can have, by their kind."""

@@ -1,5 +1,6 @@
 """Diagnostics: how far a posterior is from the truth, whether it is calibrated, and where it piles up on a bound."""
 
+from jaxlfi.diagnostics.bounds import bound_warnings, edge_mass
 from jaxlfi.diagnostics.c2st import c2st
 from jaxlfi.diagnostics.calibration import (
     OK,
@@ -18,9 +19,9 @@ from jaxlfi.diagnostics.calibration import (
 from jaxlfi.diagnostics.discrepancy import (
     POSTERIOR_SAMPLES,
     Discrepancy,
-    bound_warnings,
+    compared,
     discrepancy,
-    edge_mass,
+    not_simulated,
     trajectory_distance,
 )
 from jaxlfi.diagnostics.predictive import PredictiveCheck, predictive_check
@@ -35,6 +36,7 @@ __all__ = [
     "Uniformity",
     "bound_warnings",
     "c2st",
+    "compared",
     "coverage_verdict",
     "density_ranks",
     "discrepancy",
@@ -42,6 +44,7 @@ __all__ = [
     "distance_verdict",
     "edge_mass",
     "histogram",
+    "not_simulated",
     "predictive_check",
     "ranks",
     "ranks_verdict",

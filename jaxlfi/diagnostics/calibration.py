@@ -31,29 +31,29 @@ class Uniformity:
     """Whether ranks are uniform; K points, bands as [2, K] of lower and upper ends.
 
     Attributes:
-        level: shares of the ranks looked at, shape [K].
-        share: of the truths whose rank lies in them; of a calibrated posterior the level itself, shape [K].
+        level: fractions of the ranks looked at, shape [K].
+        fraction: of the truths whose rank lies in them; of a calibrated posterior the level itself, shape [K].
         pointwise: band that a calibrated curve leaves at one given point with probability 1 - `POINTWISE`, binomial.
         simultaneous: band that it leaves anywhere with probability `SIGNIFICANCE` at most.
         worst: the level at which the curve strays most.
         p_value: probability that a calibrated curve strays as far, `SIGNIFICANCE` or less where it leaves that band.
         shift: how far the mean rank is off, in standard errors: negative where truths are below their draws.
-        spread: how much farther than they should the ranks are from the middle one, in standard errors: positive
+        dispersion: how much farther than they should the ranks are from the middle one, in standard errors: positive
             where truths are at either end of their draws.
     """
 
     level: Float[np.ndarray, " points"]
-    share: Float[np.ndarray, " points"]
+    fraction: Float[np.ndarray, " points"]
     pointwise: Float[np.ndarray, "2 points"]
     simultaneous: Float[np.ndarray, "2 points"]
     worst: float
     p_value: float
     shift: float
-    spread: float
+    dispersion: float
 
-    def share_at(self, level: float) -> float:
-        """Share of the truths at a level, between the points."""
-        return float(np.interp(level, [0.0, *self.level, 1.0], [0.0, *self.share, 1.0]))
+    def fraction_at(self, level: float) -> float:
+        """Fraction of the truths at a level, between the points."""
+        return float(np.interp(level, [0.0, *self.level, 1.0], [0.0, *self.fraction, 1.0]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ def ranks(
 
     Args:
         key: consumed.
-        truths: parameters that an observation was simulated at, in coordinates, shape [N, D].
+        truths: parameters that an observation was simulated at, in inference space, shape [N, D].
         draws: from the posterior of each observation, shape [N, L, D].
 
     Returns:
@@ -106,7 +106,7 @@ def density_ranks(
 ) -> Int[Array, " n"]:
     """How many of L draws have a higher posterior density than the truth: expected coverage (Hermans et al. 2022).
 
-    The truth lies in the highest-density region of level c where its rank is below c (L + 1), so the share of truths
+    The truth lies in the highest-density region of level c where its rank is below c (L + 1), so the fraction of truths
     of such ranks is the coverage of these regions.
 
     Args:
@@ -175,14 +175,14 @@ def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) 
     middle = 2 * (rank + 0.5) / (draws + 1) - 1
     return Uniformity(
         level=level,
-        share=below / count,
+        fraction=below / count,
         pointwise=_band(tails > 1 - POINTWISE) / count,
         simultaneous=_band(p_values > SIGNIFICANCE) / count,
         worst=float(level[np.argmin(tails[place, below])]),
         p_value=float(np.min(p_values[place, below])),
         # Of a uniform variable on [-1, 1] the second moment is 1/3, with a variance of 4/45.
         shift=float(np.mean(middle) * np.sqrt(3 * count)),
-        spread=float((np.mean(middle**2) - 1 / 3) * np.sqrt(45 * count / 4)),
+        dispersion=float((np.mean(middle**2) - 1 / 3) * np.sqrt(45 * count / 4)),
     )
 
 
@@ -204,9 +204,9 @@ def ranks_verdict(result: Uniformity) -> str:
     """
     if result.p_value > SIGNIFICANCE:
         return OK
-    if abs(result.shift) > abs(result.spread):
+    if abs(result.shift) > abs(result.dispersion):
         return HIGH if result.shift < 0 else LOW
-    return OVER if result.spread > 0 else UNDER
+    return OVER if result.dispersion > 0 else UNDER
 
 
 def coverage_verdict(result: Uniformity) -> str:
@@ -224,7 +224,7 @@ def distance_verdict(result: Uniformity) -> str:
     """
     if result.p_value > SIGNIFICANCE:
         return OK
-    return OVER if max(result.shift, result.spread, key=abs) > 0 else UNDER
+    return OVER if max(result.shift, result.dispersion, key=abs) > 0 else UNDER
 
 
 def _edges(draws: int) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Figures: from the saved arrays of runs to pictures and a page; the only package that imports matplotlib.
 
-`report(folder)` draws all that applies to a run folder. Each picture is a module with a function `draw`
-from loaded runs to a matplotlib figure, to be used on its own:
+`report(folder)` draws all pictures that apply to a run folder. Each picture is a module with a function `draw`
+from loaded runs to a matplotlib figure, for use on its own:
 
     from jaxlfi.figures import curves, open_collection, style
 

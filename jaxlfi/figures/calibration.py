@@ -1,4 +1,4 @@
-"""Calibration: where truths rank among posterior draws, and how often credible regions hold them."""
+"""Calibration: ranks of truths among posterior draws, and coverage of credible regions."""
 
 from collections.abc import Mapping
 
@@ -8,14 +8,18 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxlfi.figures.style import parameter_name
+from jaxlfi.figures.legends import below as legend_below
+from jaxlfi.figures.style import grid_shape, is_wide, parameter_name
 
 COLUMNS = 4
-"""Parameters side by side."""
+"""Parameters side by side, at most."""
 COLOUR = "#15158B"
 BAND = "#8C8C8C"
+"""Colours of curves and of bands."""
 NARROW, WIDE = 0.45, 0.2
-"""Opacity of the pointwise band and of the simultaneous one."""
+"""Opacities of the pointwise and of the simultaneous band."""
+RANKS, COVERAGE, DISTANCE = "ranks_share", "coverage_share", "distance_share"
+"""Arrays of cumulative fractions: of ranks, and of truths in densest regions and in regions around random points."""
 
 Arrays = Mapping[str, np.ndarray]
 """The arrays of diagnostics.npz."""
@@ -23,11 +27,11 @@ Arrays = Mapping[str, np.ndarray]
 
 def rows(arrays: Arrays) -> int:
     """Rows of panels that `draw_ranks` needs, each a histogram over a curve."""
-    return -(-len(arrays["names"]) // COLUMNS)
+    return grid_shape(len(arrays["names"]), COLUMNS)[0]
 
 
 def draw_ranks(figure: Figure, arrays: Arrays) -> None:
-    """For each parameter a histogram of ranks, and below it their cumulative share less what it should be.
+    """For each parameter a histogram of ranks, and below it their cumulative fraction minus the expected one.
 
     Args:
         figure: empty.
@@ -49,16 +53,16 @@ def draw_ranks(figure: Figure, arrays: Arrays) -> None:
         draw_difference(below, arrays, d)
         above.set_title(parameter_name(names, d))
         if d + columns >= len(names):
-            below.set_xlabel("rank of the truth")
+            below.set_xlabel("normalised rank of the truth")
             below.tick_params(labelbottom=True)
         if d % columns == 0:
-            above.set_ylabel("truths")
-            below.set_ylabel("excess below")
-    _legend(figure, "truths", "one bin")
+            above.set_ylabel("number of truths")
+            below.set_ylabel("ECDF − uniform")
+    _legend(figure, "truths", "bin")
 
 
 def draw_histogram(axes: Axes, arrays: Arrays, d: int) -> None:
-    """Truths in each bin of ranks, with the binomial band of each bin.
+    """Number of truths in each bin of ranks, with the binomial band of each bin.
 
     Args:
         axes: to draw on.
@@ -74,7 +78,7 @@ def draw_histogram(axes: Axes, arrays: Arrays, d: int) -> None:
 
 
 def draw_difference(axes: Axes, arrays: Arrays, d: int) -> None:
-    """The cumulative share of ranks less the level, with its simultaneous band.
+    """The cumulative fraction of ranks minus the level, with its simultaneous band.
 
     Args:
         axes: to draw on.
@@ -85,28 +89,28 @@ def draw_difference(axes: Axes, arrays: Arrays, d: int) -> None:
     low, high = (_with_ends(side) - level for side in arrays["ranks_simultaneous"])
     axes.fill_between(level, low, high, color=BAND, alpha=WIDE, linewidth=0)
     axes.axhline(0, color="#555555", linewidth=0.6)
-    axes.plot(level, _with_ends(arrays["ranks_share"][d]) - level, color=COLOUR, gid="difference")
+    axes.plot(level, _with_ends(arrays[RANKS][d]) - level, color=COLOUR, gid="difference")
     axes.grid(True)
 
 
 def draw_coverage(figure: Figure, arrays: Arrays) -> None:
-    """Share of truths in the densest region of each level: expected coverage.
+    """Expected coverage: the fraction of truths in the highest-density region of each level.
 
     Args:
         figure: empty.
         arrays: of diagnostics.npz.
     """
-    _draw_curve(figure, arrays, "coverage_share", "level of the densest region", "share of truths in it")
+    _draw_curve(figure, arrays, COVERAGE, "level of the highest-density region", "fraction of truths inside")
 
 
 def draw_tarp(figure: Figure, arrays: Arrays) -> None:
-    """Share of truths in the region of each level around random points: TARP.
+    """TARP: the fraction of truths in the region of each level around random points.
 
     Args:
         figure: empty.
         arrays: of diagnostics.npz.
     """
-    _draw_curve(figure, arrays, "distance_share", "level of the region around a random point", "share of truths in it")
+    _draw_curve(figure, arrays, DISTANCE, "level of the region around a random point", "fraction of truths inside")
 
 
 def _draw_curve(figure: Figure, arrays: Arrays, name: str, xlabel: str, ylabel: str) -> None:
@@ -120,19 +124,18 @@ def _draw_curve(figure: Figure, arrays: Arrays, name: str, xlabel: str, ylabel: 
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel=xlabel, ylabel=ylabel)
     axes.set_aspect("equal")
     axes.grid(True)
-    _legend(figure, "posteriors of this run's method", "one level")
+    _legend(figure, "this run's method", "level")
 
 
 def _with_ends(values: np.ndarray) -> np.ndarray:
-    """Curve and bands all start at 0 and end at 1."""
+    """The values with 0 before and 1 after them."""
     return np.concatenate([[0.0], values, [1.0]])
 
 
-def _legend(figure: Figure, drawn: str, one: str) -> None:
+def _legend(figure: Figure, drawn: str, unit: str) -> None:
     handles = [
         Line2D([], [], color=COLOUR, label=drawn),
-        Patch(color=BAND, alpha=NARROW, linewidth=0, label=f"95 % of calibrated ones, at {one}"),
-        Patch(color=BAND, alpha=WIDE, linewidth=0, label="99 %, at all together"),
+        Patch(color=BAND, alpha=NARROW, linewidth=0, label=f"95 % band of a calibrated method, each {unit}"),
+        Patch(color=BAND, alpha=WIDE, linewidth=0, label="99 % band of a calibrated method, whole curve"),
     ]
-    wide = figure.get_size_inches()[0] > 5
-    figure.legend(handles=handles, loc="outside lower center", ncols=3 if wide else 1)
+    legend_below(figure, handles, at_most=3 if is_wide(figure) else 1)

@@ -1,4 +1,4 @@
-"""Checks: the observation among simulations of the posterior, and all pictures of a folder of diagnostics."""
+"""Checks: the observation among simulations from the posterior, and all pictures of a folder of diagnostics."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,17 +7,17 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxlfi.figures import calibration, style
-from jaxlfi.figures.calibration import BAND, COLOUR, Arrays
-from jaxlfi.figures.history import read_arrays
+from jaxlfi.figures.calibration import BAND, COLOUR, COVERAGE, DISTANCE, Arrays
+from jaxlfi.figures.history import read_arrays, robust_sd
+from jaxlfi.figures.predictive import QUANTILES
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
 
-QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 REACH = 8.0
-"""Standard deviations beyond which a summary is drawn on the margin."""
+"""Standard deviations beyond which a summary is drawn at the edge of the panel."""
 
 
 def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
-    """Draw all pictures of diagnostics.npz that there are arrays for.
+    """Draw all pictures that diagnostics.npz has the arrays of.
 
     Args:
         folder: of the diagnostics.
@@ -27,7 +27,7 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
         FOLDER/figures/*.png.
 
     Raises:
-        ValueError: for a folder without whole diagnostics.
+        ValueError: for a folder whose diagnostics.npz is missing or damaged.
     """
     folder = Path(folder)
     arrays = read_arrays(folder / "diagnostics.npz", ("names", "units"))
@@ -42,19 +42,18 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
 
 
 def standardised(arrays: Arrays) -> tuple[np.ndarray, np.ndarray]:
-    """Simulated summaries [n, S] and the observed ones [S], less the simulated median and in robust deviations.
+    """Simulated summaries [n, S] and observed ones [S], minus the simulated median, in robust standard deviations.
 
-    A summary that does not vary is in units of the least deviation that is a number.
+    A summary that does not vary is divided by the smallest positive float, so that any deviation is drawn.
     """
     simulated = arrays["predictive_x"][np.isfinite(arrays["predictive_x"]).all(axis=1)]
     middle = np.median(simulated, axis=0)
-    low, high = np.quantile(simulated, [0.16, 0.84], axis=0)
-    scale = np.where(high > low, (high - low) / 2, np.finfo(np.float32).tiny)
+    scale = np.maximum(robust_sd(simulated), np.finfo(np.float32).tiny)
     return (simulated - middle) / scale, (arrays["observed_x"] - middle) / scale
 
 
 def draw(figure: Figure, arrays: Arrays) -> None:
-    """Left: each observed summary among the simulated ones. Right: how far all together are from the typical.
+    """Left: each observed summary among the simulated ones. Right: their joint distance from the simulations' centre.
 
     Args:
         figure: empty.
@@ -67,17 +66,17 @@ def draw(figure: Figure, arrays: Arrays) -> None:
     for (low, high), opacity in zip(((0, 4), (1, 3)), (0.25, 0.5), strict=True):
         left.bar(place, bands[high] - bands[low], bottom=bands[low], width=0.7, color=BAND, alpha=opacity, linewidth=0)
     left.plot(place, np.clip(observed, -REACH, REACH), "o", color=COLOUR, gid="observed")
-    left.set(xlabel="summary", ylabel="deviations from the simulated median", xlim=(0.3, len(place) + 0.7))
+    left.set(xlabel="summary", ylabel="standard deviations from the median", xlim=(0.3, len(place) + 0.7))
     left.use_sticky_edges = False  # bars would end at the frame
     left.margins(y=0.05)
     left.autoscale_view(scalex=False)
     left.xaxis.get_major_locator().set_params(integer=True)
-    left.set_title("each summary (bars: 50 % and 90 % of simulations)")
+    left.set_title("each summary: observed (dots), 50 % and 90 % of simulations (bars)")
     left.grid(True, axis="y")
     right.hist(arrays["predictive_distances"], bins=20, color=BAND, alpha=0.6, gid="simulated")
     right.axvline(float(arrays["observed_distance"]), color=COLOUR, gid="observed")
-    right.set(xlabel="distance", ylabel="simulations")
-    right.set_title(f"all together (p = {float(arrays['predictive_p_value']):.2g})")
+    right.set(xlabel="Mahalanobis distance (line: observed)", ylabel="number of simulations")
+    right.set_title(f"all summaries (p = {float(arrays['predictive_p_value']):.2g})")
 
 
 def _ranks_size(arrays: Arrays) -> tuple[float, float]:
@@ -95,8 +94,8 @@ def _predictive_size(arrays: Arrays) -> tuple[float, float]:
 
 PICTURES: dict[str, tuple[str, Callable[[Arrays], tuple[float, float]], Callable[[Figure, Arrays], None]]] = {
     "ranks": ("bin_count", _ranks_size, calibration.draw_ranks),
-    "coverage": ("coverage_share", _square, calibration.draw_coverage),
-    "tarp": ("distance_share", _square, calibration.draw_tarp),
+    "coverage": (COVERAGE, _square, calibration.draw_coverage),
+    "tarp": (DISTANCE, _square, calibration.draw_tarp),
     "predictive": ("predictive_x", _predictive_size, draw),
 }
-"""By the name of the file: an array it needs, its size in inches, and what draws it."""
+"""By file name: an array the picture needs, its size in inches, and the function that draws it."""

@@ -1,4 +1,4 @@
-"""Collection: the runs under a folder, by configuration and seed, and the table of their results."""
+"""Collection: the runs of a folder, by configuration and seed, and the table of their results."""
 
 import csv
 import dataclasses
@@ -28,7 +28,7 @@ class Row:
         seed: the run's seed.
         theta_error: |theta - theta_gt| summed over parameters, mean over posterior samples.
         trajectory_error: distance from the observed trajectory, mean over posterior samples.
-        success_rate: share of the attempted simulations that did not fail.
+        success_rate: fraction of the simulations that did not fail.
         seconds: time the run took.
     """
 
@@ -42,14 +42,14 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """All there is to show of a folder.
+    """The content of a folder that figures are drawn from.
 
     Attributes:
         folder: where it was read from.
         config: its config.json.
         runs: histories by configuration.
         table: one row a run.
-        unfinished: folders of runs that have not yet as many rounds as the others; they are left out.
+        unfinished: folders of runs with fewer rounds than the others; they are left out.
     """
 
     folder: Path
@@ -63,6 +63,11 @@ class Collection:
         order = [*self.runs, *(row.configuration for row in self.table if row.configuration not in self.runs)]
         found = {name: [getattr(r, measure) for r in self.table if r.configuration == name] for name in order}
         return {name: np.array(values, float) for name, values in found.items() if values}
+
+
+def seed_count(runs: Runs) -> int:
+    """The largest number of seeds of any configuration."""
+    return max(len(histories) for histories in runs.values())
 
 
 def representative(histories: Sequence[History]) -> History:
@@ -159,7 +164,7 @@ def _ordered(names: Mapping[str, Path], config: Mapping[str, Any]) -> list[str]:
 
 
 def _alike(folder: Path, runs: Mapping[str, list[History]], unfinished: list[str]) -> dict[str, list[History]]:
-    """The runs that can be put side by side: of the same parameters, and as many rounds as the longest."""
+    """The runs that can be compared: of the same parameters, and with as many rounds as the longest."""
     every = [history for histories in runs.values() for history in histories]
     for history in every[1:]:
         if history.names != every[0].names:

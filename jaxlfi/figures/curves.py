@@ -4,8 +4,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.bands import draw_band, legend
-from jaxlfi.figures.collection import Runs
+from jaxlfi.figures.bands import draw_band
+from jaxlfi.figures.collection import Runs, seed_count
+from jaxlfi.figures.legends import of_configurations
 from jaxlfi.figures.style import iterations_axis, looks, parameter_name
 
 
@@ -27,8 +28,8 @@ def theta_curve(runs: Runs, configuration: str, alpha: float = 1.0) -> np.ndarra
 def middle_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard error of values [seeds, R, N]: over seeds' means, or over a single seed's samples."""
     count = len(values) if len(values) > 1 else values.shape[2]
-    spread = statistics.sd(statistics.mean(values, 2), 0) if len(values) > 1 else statistics.sd(values[0], 1)
-    return statistics.mean(values, (0, 2)), spread / np.sqrt(count)
+    deviation = statistics.sd(statistics.mean(values, 2), 0) if len(values) > 1 else statistics.sd(values[0], 1)
+    return statistics.mean(values, (0, 2)), deviation / np.sqrt(count)
 
 
 def drawable(runs: Runs) -> bool:
@@ -37,12 +38,12 @@ def drawable(runs: Runs) -> bool:
 
 
 def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:
-    """A panel for the trajectory and, where the truth is known, one for each parameter.
+    """A panel for the trajectory, where trajectories were simulated, and one a parameter, where the truth is known.
 
     Args:
         figure: empty.
         runs: configurations with their seeds.
-        alpha: how steeply a loss is punished.
+        alpha: factor of the loss in exp(-alpha loss).
     """
     look = looks(list(runs))
     first = next(iter(runs.values()))[0]
@@ -52,7 +53,7 @@ def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:
     below = [[f"{d}" for d in range(r, min(r + columns, first.dim))] for r in range(0, first.dim, columns)]
     mosaic = [["trajectory"] * columns] if any(v is not None for v in trajectories.values()) else []
     if any(v is not None for v in thetas.values()):
-        # An odd last parameter has the row to itself.
+        # The last row's panels fill its width.
         mosaic += [row + [row[-1]] * (columns - len(row)) for row in below]
     heights = [1.5 if row[0] == "trajectory" else 1.0 for row in mosaic]
     panels = figure.subplot_mosaic(mosaic, gridspec_kw={"height_ratios": heights})
@@ -74,6 +75,6 @@ def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:
     top = max((axes.get_ylim()[1] for panel, axes in panels.items() if panel != "trajectory"), default=1.0)
     for panel, axes in panels.items():
         axes.set_ylim(0, None if panel == "trajectory" else top)
-    seeds = max(len(histories) for histories in runs.values())
+    seeds = seed_count(runs)
     over = f"{seeds} seeds" if seeds > 1 else "the posterior samples of one seed"
-    legend(figure, look, f"mean ± standard error over {over}")
+    of_configurations(figure, look, f"mean ± standard error over {over}")

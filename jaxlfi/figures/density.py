@@ -44,7 +44,7 @@ def density(points: np.ndarray, weight: np.ndarray, mean: np.ndarray, covariance
 
 
 def grid(low: float, high: float, mean: np.ndarray, scale: np.ndarray, points: int = 180) -> np.ndarray:
-    """Points over an interval, closer around the components, so that no peak falls between them.
+    """Points over an interval, closer around the components, so that narrow peaks are resolved.
 
     Args:
         low: lower end of the interval.

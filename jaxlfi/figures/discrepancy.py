@@ -1,4 +1,4 @@
-"""How far the last posterior is from the true parameters, and its trajectories from the observed one."""
+"""Distance of the last posterior from the true parameters, and of its trajectories from the observed one."""
 
 from typing import NamedTuple
 
@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.bands import balanced
-from jaxlfi.figures.collection import Runs
+from jaxlfi.figures.collection import Runs, seed_count
 from jaxlfi.figures.curves import drawable
-from jaxlfi.figures.style import Look, looks, parameter_name, unit_label
+from jaxlfi.figures.legends import above, balanced
+from jaxlfi.figures.style import Look, grid_shape, looks, parameter_name, unit_label
 
 __all__ = ["Panel", "draw", "draw_bars", "drawable", "final_errors", "panels"]
 
@@ -54,7 +54,7 @@ def draw_bars(axes: Axes, errors: dict[str, np.ndarray], look: dict[str, Look]) 
 
 
 class Panel(NamedTuple):
-    """What one panel shows.
+    """The content of one panel.
 
     Attributes:
         title: a parameter, or "trajectory".
@@ -77,7 +77,7 @@ def panels(runs: Runs) -> list[Panel]:
         trajectories |= {} if trajectory is None else {name: trajectory}
     result = []
     units = [unit_label(first.names, first.units, d) for d in range(first.dim)]
-    width = 20 if len(set(units)) == 1 else 15  # room for a scale of its own
+    width = 20 if len(set(units)) == 1 else 15  # panels of several units have a scale each
     for d, unit in enumerate(units if thetas else ()):
         title = parameter_name(first.names, d, width)
         result.append(Panel(title, unit, {name: theta[:, d] for name, theta in thetas.items()}))
@@ -94,8 +94,7 @@ def draw(figure: Figure, runs: Runs) -> None:
     look = looks(list(runs))
     shown = panels(runs)
     parameters = [place for place, panel in enumerate(shown) if panel.title != "trajectory"]
-    rows = -(-len(shown) // 5)
-    columns = -(-len(shown) // rows)
+    rows, columns = grid_shape(len(shown), 5)
     every = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, (title, _, values) in zip(every, shown, strict=False):
         draw_bars(axes, values, look)
@@ -112,13 +111,7 @@ def draw(figure: Figure, runs: Runs) -> None:
     for place, (axes, (title, unit, _)) in enumerate(zip(every, shown, strict=False)):
         if place % columns == 0 or title == "trajectory" or not one_unit:
             axes.set_ylabel(" ".join(["discrepancy", unit]).strip())
-    seeds = max(len(histories) for histories in runs.values())
+    seeds = seed_count(runs)
     handles = [Patch(color=own.colour, label=own.label) for own in look.values()]
     over = f"posterior samples of {seeds} seeds" if seeds > 1 else "posterior samples of one seed"
-    figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=balanced(list(look.values()), figure.get_size_inches()[0]),
-        title=f"mean ± standard deviation over the {over}",
-        title_fontsize=7,
-    )
+    above(figure, handles, f"mean ± standard deviation over the {over}", balanced(list(look.values()), figure))

@@ -1,31 +1,32 @@
-"""How many simulations each round attempted, and how many of them failed."""
+"""Simulations run in each round, and how many of them failed."""
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.bands import draw_band, legend
-from jaxlfi.figures.collection import Runs
+from jaxlfi.figures.bands import draw_band
+from jaxlfi.figures.collection import Runs, seed_count
+from jaxlfi.figures.legends import of_configurations
 from jaxlfi.figures.style import iterations_axis, looks
 
 PANELS = {
-    "attempted": "attempted simulations",
+    "attempted": "simulations",
     "success_rate": "success rate [%]",
-    "cumulated": "cumulated failures",
+    "cumulative": "cumulative failures",
 }
 
 
 def quantities(runs: Runs, configuration: str) -> dict[str, np.ndarray]:
-    """What the panels show of a configuration, by panel, each of shape [seeds, R]."""
+    """The values of a configuration by panel, shape [seeds, R] each."""
     attempted = np.stack([h.attempted for h in runs[configuration]]).astype(float)
     failed = np.stack([h.failed for h in runs[configuration]]).astype(float)
     rate = np.where(attempted > 0, 100 * (1 - failed / np.maximum(attempted, 1)), np.nan)
-    return {"attempted": attempted, "success_rate": rate, "cumulated": np.cumsum(failed, axis=1)}
+    return {"attempted": attempted, "success_rate": rate, "cumulative": np.cumsum(failed, axis=1)}
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Simulations, success rate and failures so far over iterations; mean over seeds, and its sd as a band.
+    """Simulations, success rate and cumulative failures over iterations: means ± standard deviations over seeds.
 
     Args:
         figure: empty.
@@ -36,8 +37,8 @@ def draw(figure: Figure, runs: Runs) -> None:
     rounds = next(iter(runs.values()))[0].rounds
     for name in runs:
         for panel, values in quantities(runs, name).items():
-            middle, spread = statistics.mean(values, 0), statistics.sd(values, 0)
-            draw_band(axes[panel], np.arange(1, rounds + 1), middle, spread, look[name])
+            middle, deviation = statistics.mean(values, 0), statistics.sd(values, 0)
+            draw_band(axes[panel], np.arange(1, rounds + 1), middle, deviation, look[name])
     for panel, title in PANELS.items():
         axes[panel].set_title(title)
         axes[panel].grid(True)
@@ -45,6 +46,6 @@ def draw(figure: Figure, runs: Runs) -> None:
         iterations_axis(axes[panel], rounds)
     low, _ = axes["success_rate"].get_ylim()
     axes["success_rate"].set_ylim(max(low, -3.0), 103.0)
-    axes["cumulated"].set_ylim(bottom=0)
-    seeds = max(len(histories) for histories in runs.values())
-    legend(figure, look, f"mean ± standard deviation over {seeds} seeds" if seeds > 1 else "one seed")
+    axes["cumulative"].set_ylim(bottom=0)
+    seeds = seed_count(runs)
+    of_configurations(figure, look, f"mean ± standard deviation over {seeds} seeds" if seeds > 1 else "one seed")

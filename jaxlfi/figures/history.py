@@ -1,4 +1,4 @@
-"""History: the saved arrays of one inference run, as the figures take them."""
+"""History: the saved arrays of one inference run, as the figures use them."""
 
 import dataclasses
 import json
@@ -24,24 +24,24 @@ REQUIRED = (
     "means",
     "scale_tril",
 )
-"""Arrays of history.npz that no figure can do without."""
+"""Arrays of history.npz that a run must have to be drawn."""
 
 
 @dataclasses.dataclass(frozen=True)
 class History:
-    """One run; R rounds of A attempts, D parameters, K components, E networks, P passes, N posterior samples.
+    """One run; R rounds of A simulations, D parameters, K components, E networks, P epochs, N posterior samples.
 
-    What a run does not have (a truth, a posterior that was simulated from, ...) is NaN or None.
+    Parameters are in inference space. What a run does not have (a truth, simulations of the posterior) is NaN or None.
 
     Attributes:
         folder: where it was read from.
-        configuration: what the run is called among others, "misspecified+edge".
+        configuration: the run's name among others, "misspecified+edge".
         seed: the run's seed.
         config: config.json.
-        names: of the parameters, in inference coordinates.
+        names: of the parameters in inference space, "ln k" for a logarithm.
         units: of the parameters.
         theta: proposals, shape [R, A, D].
-        counted: which attempts count, shape [R, A].
+        counted: simulations up to the last one needed, shape [R, A].
         kept: which were added to the dataset, shape [R, A].
         failure: 0 or the code of the reason, shape [R, A].
         proposal_low: lower bounds of the support each round drew from, shape [R, D].
@@ -51,23 +51,23 @@ class History:
         logits: posterior mixture of each round, shape [R, K].
         means: its means, shape [R, K, D].
         scale_tril: its Cholesky factors, shape [R, K, D, D].
-        loss: training loss of each pass, shape [R, E, P], or None.
+        loss: training loss of each epoch, shape [R, E, P], or None.
         validation_loss: the same on held-out simulations, or None.
         theta_error: |theta - theta_gt| of posterior samples after each round, shape [R, N, D], or None.
-        trajectory_error: distance of their trajectories from the observed one, shape [R, N], NaN: failed.
+        trajectory_error: distance of their trajectories from the observed one, shape [R, N], NaN: failed; or None.
         attempted: simulations of each round, shape [R].
         failed: failures of each round, shape [R].
-        seconds: time of each round, shape [R].
+        seconds: duration of each round, shape [R].
         final_trajectory: simulations of the last posterior's samples, shape [N, T, C], or None.
         final_x: their summaries, shape [N, S], NaN: failed; or None.
-        draws: of the last posterior, shape [n, D], or None.
+        draws: of the last posterior in inference space, shape [n, D], or None.
         observed: the observed trajectory, shape [T, C], or None.
         x: its summary, shape [S], or None.
-        x_scale: spread of the first round's summaries, shape [S], or None (`spread_of`).
+        x_scale: standard deviations of the first round's summaries, shape [S], or None (`robust_sd`).
         summaries: names of the summary's numbers.
         truth: theta_gt, shape [D], NaN where unknown.
         times: shape [T], or None.
-        record_label: what the trajectory's rows are counted by, "time".
+        record_label: name of the trajectory's row axis, "time".
         channels: names of the trajectory's columns.
         feasible_low: lower limits Phi, shape [D], or None.
         feasible_high: upper limits Phi, or None.
@@ -128,7 +128,7 @@ class History:
 
     @property
     def accumulated_means(self) -> np.ndarray:
-        """Mean of all simulations kept up to each round, shape [R, D]; NaN before the first."""
+        """Mean parameters of all simulations kept up to each round, shape [R, D]; NaN before the first."""
         kept = self.kept[..., None]
         total = np.cumsum(np.where(kept, self.theta, 0.0).sum(1), axis=0)
         count = np.cumsum(self.kept.sum(1))[:, None]
@@ -167,7 +167,7 @@ class History:
 
     @property
     def success_rate(self) -> float:
-        """Share of all attempted simulations that did not fail."""
+        """Fraction of all simulations that did not fail."""
         attempted = self.attempted.sum()
         return float(1 - self.failed.sum() / attempted) if attempted else float("nan")
 
@@ -176,9 +176,9 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     """Read one run's folder.
 
     Args:
-        folder: holds config.json of format "jaxlfi-run", history.npz and, mostly, observation.npz, posterior.npz and
-            dataset.npz.
-        configuration: what to call the run; by default as config.json does, or by support and heuristic.
+        folder: holds config.json of format "jaxlfi-run" and history.npz; observation.npz, posterior.npz and dataset.npz
+            are read where they are there.
+        configuration: the run's name; by default that in config.json, or made from support and heuristic.
 
     Raises:
         ValueError: for a folder that is missing, of another kind or damaged.
@@ -188,9 +188,11 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     if config["format"] != "jaxlfi-run":
         raise ValueError(f"{folder}: expected config.json of format 'jaxlfi-run', got {config['format']!r}")
     arrays = read_arrays(folder / "history.npz", REQUIRED)
-    observation = _arrays_if_there(folder / "observation.npz")
+    observation, posterior, dataset = (
+        _arrays_if_there(folder / f"{name}.npz") for name in ("observation", "posterior", "dataset")
+    )
     _check_shapes(folder / "history.npz", arrays)
-    rounds, _attempts, dim = arrays["theta"].shape
+    rounds, _, dim = arrays["theta"].shape
     trajectory = _trajectory(observation.get("trajectory"))
     times = _times(observation.get("times"), trajectory)
     x = observation.get("x")
@@ -201,7 +203,7 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
         configuration=configuration or _configuration(config),
         seed=config["seed"] if isinstance(config.get("seed"), int) else 0,
         config=config,
-        names=_texts(observation.get("names"), config.get("coordinates") or config.get("names"), dim, "theta {}"),
+        names=_texts(observation.get("names"), config.get("names"), dim, "theta {}"),
         units=_texts(None, config.get("units"), dim, ""),
         counted=counted,
         kept=arrays["kept"].astype(bool),
@@ -215,20 +217,15 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
         seconds=np.broadcast_to(np.asarray(arrays.get("seconds", np.nan), float), (rounds,)),
         final_trajectory=_samples(_optional(arrays, "final_trajectory")),
         final_x=_rows(_optional(arrays, "final_x"), obs),
-        draws=_rows(_arrays_if_there(folder / "posterior.npz").get("draws"), dim),
+        draws=_in_inference_space(folder / "posterior.npz", posterior, dim),
         observed=trajectory,
         x=x,
-        x_scale=_x_scale(_arrays_if_there(folder / "dataset.npz"), obs),
+        x_scale=_x_scale(dataset, obs),
         summaries=_texts(observation.get("summaries"), None, obs, "x_{}"),
         truth=_vector(observation.get("truth"), dim),
         times=times,
         record_label=_record_label(observation, times),
-        channels=_texts(
-            observation.get("channels"),
-            config.get("channels"),
-            0 if trajectory is None else trajectory.shape[1],
-            "x{}",
-        ),
+        channels=_texts(observation.get("channels"), None, 0 if trajectory is None else trajectory.shape[1], "x{}"),
         feasible_low=_limits(config, "low", dim),
         feasible_high=_limits(config, "high", dim),
         **{name: arrays[name] for name in REQUIRED if name not in ("counted", "kept", "failure")},
@@ -273,8 +270,8 @@ def read_arrays(path: Path, required: tuple[str, ...] = ()) -> dict[str, np.ndar
     return arrays
 
 
-def spread_of(x: np.ndarray) -> np.ndarray:
-    """Half the distance from the 16th to the 84th percentile of each column: a normal's standard deviation.
+def robust_sd(x: np.ndarray) -> np.ndarray:
+    """Half the distance from the 16th to the 84th percentile of each column: the standard deviation of a normal.
 
     Args:
         x: shape [N, S], N >= 1.
@@ -292,14 +289,14 @@ def _one_line(error: Exception) -> str:
 
 
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Refuse arrays that do not agree with one another in rounds, attempts, parameters or components."""
+    """Refuse arrays that do not agree in the numbers of rounds, simulations, parameters or components."""
     if arrays["theta"].ndim != 3 or arrays["logits"].ndim != 2 or arrays["theta"].shape[0] < 1:
         raise ValueError(
-            f"{path}: expected theta [rounds, attempts, parameters] and logits [rounds, components] of at "
+            f"{path}: expected theta [rounds, simulations, parameters] and logits [rounds, components] of at "
             f"least one round, got {arrays['theta'].shape} and {arrays['logits'].shape}"
         )
-    (rounds, attempts, dim), components = arrays["theta"].shape, arrays["logits"].shape[1]
-    expected = dict.fromkeys(("counted", "kept", "failure"), (rounds, attempts))
+    (rounds, simulations, dim), components = arrays["theta"].shape, arrays["logits"].shape[1]
+    expected = dict.fromkeys(("counted", "kept", "failure"), (rounds, simulations))
     expected |= {name: (rounds, dim) for name in REQUIRED if name.endswith(("_low", "_high"))}
     expected |= {
         "logits": (rounds, components),
@@ -319,7 +316,7 @@ def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _optional(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
-    """An array that has something to show, or None."""
+    """An array with a finite value, or None."""
     array = arrays.get(name)
     return array if array is not None and array.size and np.isfinite(array).any() else None
 
@@ -346,14 +343,25 @@ def _rows(array: np.ndarray | None, columns: int) -> np.ndarray | None:
 
 
 def _x_scale(dataset: Mapping[str, np.ndarray], obs: int) -> np.ndarray | None:
-    """Spread of the summaries of the first round that has any."""
+    """Standard deviations of the summaries of the first round that has any."""
     if not {"x", "round"} <= dataset.keys() or not len(dataset["x"]) or dataset["x"].shape[1:] != (obs,):
         return None
-    return spread_of(dataset["x"][dataset["round"] == dataset["round"].min()])
+    return robust_sd(dataset["x"][dataset["round"] == dataset["round"].min()])
+
+
+def _in_inference_space(path: Path, posterior: Mapping[str, np.ndarray], dim: int) -> np.ndarray | None:
+    """The draws in posterior.npz: natural units in the file, logarithms where its `log` is true."""
+    draws, log = _rows(posterior.get("draws"), dim), posterior.get("log", np.zeros(dim, bool))
+    if log.shape != (dim,):
+        raise ValueError(f"{path}: expected log of shape {(dim,)}, got {log.shape}")
+    if draws is None or not log.any():
+        return draws
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(log, np.log(np.where(log, draws, 1.0)), draws)
 
 
 def _record_label(observation: Mapping[str, np.ndarray], times: np.ndarray | None) -> str:
-    """As saved; else "record" where there are no times but numbers."""
+    """As saved; else "time", or "record" where times are row numbers."""
     if "record_label" in observation:
         return str(observation["record_label"])
     return "record" if times is None or np.array_equal(times, np.arange(len(times))) else "time"
@@ -370,7 +378,7 @@ def _times(array: np.ndarray | None, trajectory: np.ndarray | None) -> np.ndarra
 
 
 def _texts(first: Any, second: Any, length: int, default: str) -> tuple[str, ...]:
-    """The first of two lists of texts that has the right length, or made-up ones."""
+    """The first of two lists of texts that has the right length, or numbered defaults."""
     for given in (first, second):
         if given is not None and len(given) == length and length:
             return tuple(str(text) for text in given)
@@ -379,8 +387,6 @@ def _texts(first: Any, second: Any, length: int, default: str) -> tuple[str, ...
 
 def _limits(config: Mapping[str, Any], side: str, dim: int) -> np.ndarray | None:
     limits = config.get(f"feasible_{side}")
-    if limits is None and isinstance(config.get("feasible"), Mapping):
-        limits = config["feasible"].get(side)
     array = np.asarray([] if limits is None else limits, float)
     return array if array.shape == (dim,) else None
 

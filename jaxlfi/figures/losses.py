@@ -1,28 +1,29 @@
-"""Training and validation losses: pass by pass within the rounds of one run, or round by round for many."""
+"""Training and validation losses: epoch by epoch within the rounds of one run, or round by round for several runs."""
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import NullFormatter
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.bands import draw_band, legend
-from jaxlfi.figures.collection import Runs
+from jaxlfi.figures.bands import draw_band
+from jaxlfi.figures.collection import Runs, seed_count
 from jaxlfi.figures.history import History
-from jaxlfi.figures.style import iteration_bar, iteration_colours, iterations_axis, looks
+from jaxlfi.figures.legends import of_configurations
+from jaxlfi.figures.style import integer_ticks, iteration_bar, iteration_colours, iterations_axis, looks
 
 PANELS = {"loss": "training loss", "validation_loss": "validation loss"}
 
 
-def passes(history: History, panel: str) -> np.ndarray | None:
-    """Loss after each pass, mean over the ensemble's networks, shape [R, P]; NaN after an early stop."""
+def by_epoch(history: History, panel: str) -> np.ndarray | None:
+    """Loss after each epoch, mean over the ensemble's networks, shape [R, P]; NaN after an early stop."""
     values = getattr(history, panel)
     return None if values is None else statistics.mean(np.where(np.isfinite(values), values, np.nan), 1)
 
 
 def by_round(history: History, panel: str) -> np.ndarray | None:
-    """One loss a round, shape [R]: the last pass' training loss, the best validation loss."""
-    values = passes(history, panel)
+    """One loss a round, shape [R]: the training loss of the last epoch, the lowest validation loss."""
+    values = by_epoch(history, panel)
     if values is None:
         return None
     if panel == "validation_loss":
@@ -32,12 +33,12 @@ def by_round(history: History, panel: str) -> np.ndarray | None:
 
 
 def drawable(runs: Runs) -> bool:
-    """Whether losses were kept."""
+    """Whether losses were saved."""
     return any(getattr(h, panel) is not None for hs in runs.values() for h in hs for panel in PANELS)
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Losses of one run pass by pass, or of several runs round by round.
+    """Losses of one run epoch by epoch, or of several runs round by round.
 
     Args:
         figure: empty.
@@ -48,8 +49,8 @@ def draw(figure: Figure, runs: Runs) -> None:
     axes = dict(zip(shown, figure.subplots(1, len(shown), squeeze=False, sharey=True)[0], strict=True))
     if len(every) == 1:
         for panel in shown:
-            draw_passes(axes[panel], every[0], panel)
-        _limit(list(axes.values()), [passes(every[0], panel) for panel in shown])
+            draw_epochs(axes[panel], every[0], panel)
+        _limit(list(axes.values()), [by_epoch(every[0], panel) for panel in shown])
         iteration_bar(figure, np.array(list(axes.values())), every[0].rounds)
     else:
         look = looks(list(runs))
@@ -60,40 +61,40 @@ def draw(figure: Figure, runs: Runs) -> None:
                     x = np.arange(1, every[0].rounds + 1)
                     draw_band(axes[panel], x, statistics.mean(values, 0), statistics.sd(values, 0), look[name])
             iterations_axis(axes[panel], every[0].rounds)
-        seeds = max(len(histories) for histories in runs.values())
-        title = "last pass of training, best of validation" + (f"; mean ± sd over {seeds} seeds" if seeds > 1 else "")
-        legend(figure, look, title)
+        seeds = seed_count(runs)
+        title = "last training loss, lowest validation loss" + (f"; mean ± sd over {seeds} seeds" if seeds > 1 else "")
+        of_configurations(figure, look, title)
     for panel in shown:
         axes[panel].set_title(PANELS[panel])
         axes[panel].grid(True)
     axes[shown[0]].set_ylabel("negative log-density")
 
 
-def draw_passes(axes: Axes, history: History, panel: str) -> None:
-    """One line a round over the passes of its training, coloured by iteration.
+def draw_epochs(axes: Axes, history: History, panel: str) -> None:
+    """One line a round over the epochs of its training, coloured by iteration.
 
     Args:
         axes: to draw on.
         history: the run.
         panel: "loss" or "validation_loss".
     """
-    values = passes(history, panel)
+    values = by_epoch(history, panel)
     colours, norm = iteration_colours(history.rounds)
     single = "o" if values.shape[1] == 1 else None
     for i, line in enumerate(values):
         axes.plot(np.arange(1, len(line) + 1), line, marker=single, color=colours(norm(i + 1)), linewidth=0.8)
-    axes.set_xlabel("pass")
+    axes.set_xlabel("epoch")
     if values.shape[1] > 30:
         axes.set_xscale("log")
         axes.xaxis.set_minor_formatter(NullFormatter())
     else:
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
+        integer_ticks(axes.xaxis)
     if values.shape[1] > 1:
         axes.set_xlim(1, values.shape[1])
 
 
 def _limit(panels: list[Axes], values: list[np.ndarray]) -> None:
-    """Leave out of sight the few extreme values that would flatten everything else."""
+    """Limits that leave out the highest 1 % of losses, which would flatten all other lines."""
     every = np.concatenate([v[np.isfinite(v)] for v in values])
     if not every.size:
         return

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxlfi.figures import statistics
 from jaxlfi.figures.collection import Collection
-from jaxlfi.figures.style import Look, looks
+from jaxlfi.figures.style import Look, looks, unit_label
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,8 +22,8 @@ class Picture:
     Attributes:
         path: the png.
         title: its heading.
-        caption: what is seen.
-        width: in inches, as on paper.
+        caption: the text below it.
+        width: in inches, as in a paper.
     """
 
     path: Path
@@ -79,8 +79,8 @@ def render(collection: Collection, pictures: Sequence[Picture]) -> str:
     """The page as text.
 
     Args:
-        collection: what was run.
-        pictures: in the order to show them.
+        collection: the runs.
+        pictures: in their order on the page.
     """
     config = collection.config
     first = next(iter(collection.runs.values()))[0]
@@ -99,7 +99,7 @@ def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
 
     Args:
         config: the grid's config.json.
-        pictures: in the order to show them.
+        pictures: in their order on the page.
     """
     heuristic = config["heuristic"]["name"]
     title = f"{_short(config['task'])}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
@@ -111,7 +111,7 @@ def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
         "Seeds": len(config["seeds"]),
         **_provenance(config.get),
     }
-    note = "<p>Every run is a line of table.csv; grid.npz has the same and more as arrays.</p>"
+    note = "<p>table.csv has one line for each run; grid.npz has these and further results as arrays.</p>"
     return _document(title, [_definitions(facts), note], pictures, config)
 
 
@@ -135,7 +135,7 @@ def _document(title: str, parts: Sequence[str], pictures: Sequence[Picture], con
 
 
 def _facts(collection: Collection) -> str:
-    """How the runs were made: what config.json says of it, else the first run's."""
+    """Parameters and provenance of the runs, from the folder's config.json or the first run's."""
     first = next(iter(collection.runs.values()))[0]
     configs = (collection.config, first.config)
 
@@ -143,7 +143,7 @@ def _facts(collection: Collection) -> str:
         return next((config[name] for config in configs for name in names if config.get(name)), None)
 
     facts = {
-        "Parameters": ", ".join(f"{n} [{u}]" if u else n for n, u in zip(first.names, first.units, strict=True)),
+        "Parameters": ", ".join(_labels(first.names, first.units)),
         "Rounds": first.rounds,
         "Seeds": max(len(histories) for histories in collection.runs.values()),
         **_provenance(get),
@@ -152,7 +152,7 @@ def _facts(collection: Collection) -> str:
 
 
 def _provenance(get: Callable[..., Any]) -> dict[str, Any]:
-    """What a run was made with, looked up by one of the names it may go by in config.json."""
+    """Settings and environment of a run, each looked up by its names in config.json."""
     return {
         "Preset": get("preset"),
         "Command": get("command_line") or get("command"),
@@ -163,7 +163,7 @@ def _provenance(get: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _definitions(facts: Mapping[str, Any]) -> str:
-    """Names and what is known by them, without those of which nothing is."""
+    """A list of names and values, without those that have no value."""
     lines = []
     for name, value in facts.items():
         if value in (None, "", {}):
@@ -175,16 +175,21 @@ def _definitions(facts: Mapping[str, Any]) -> str:
 
 
 def _notes(collection: Collection) -> str:
-    """Warnings the run left, and runs that are not in the pictures."""
+    """Warnings of the run, results that are missing, and runs that are not in the pictures."""
     notes = [str(text) for text in collection.config.get("warnings") or []]
     if collection.unfinished:
         names = ", ".join(str(Path(p).relative_to(collection.folder)) for p in collection.unfinished)
         notes.append(f"Not finished, and left out of the pictures: {names}.")
+    if all(h.trajectory_error is None for histories in collection.runs.values() for h in histories):
+        notes.append(
+            "There are no simulated trajectories of posterior samples: none were simulated, or all simulations failed. "
+            "Trajectory errors and the posterior predictive are left out."
+        )
     return "".join(f'<p class="note">{html.escape(note)}</p>' for note in notes)
 
 
 def _table(collection: Collection) -> str:
-    """Mean, median and standard deviation over seeds of every measure, a line for each configuration."""
+    """Mean, median and standard deviation over seeds of every measure, one row for each configuration."""
     look = looks(list(collection.values("seed")))
     head = "".join(f'<th class="first" colspan="3">{name}</th>' for name in _COLUMNS.values())
     below = '<th class="first">mean</th><th>median</th><th>sd</th>' * len(_COLUMNS)
@@ -194,8 +199,8 @@ def _table(collection: Collection) -> str:
         cells = []
         for measure, values in columns.items():
             scaled = values[name] * (100 if measure == "success_rate" else 1)
-            spread = float(statistics.sd(scaled)) if len(scaled) > 1 else float("nan")
-            three = [_number(x) for x in (float(statistics.mean(scaled)), statistics.median(scaled), spread)]
+            deviation = float(statistics.sd(scaled)) if len(scaled) > 1 else float("nan")
+            three = [_number(x) for x in (float(statistics.mean(scaled)), statistics.median(scaled), deviation)]
             cells.append('<td class="first">{}</td><td>{}</td><td>{}</td>'.format(*three))
         seeds = len(values[name])
         lines.append(f"<tr><td>{_swatch(own)}</td><td>{seeds}</td>{''.join(cells)}</tr>")
@@ -203,18 +208,30 @@ def _table(collection: Collection) -> str:
         f'<div class="wide"><table><thead><tr><th>configuration</th><th>seeds</th>{head}</tr>'
         f"<tr><th></th><th></th>{below}</tr></thead><tbody>{''.join(lines)}</tbody>"
         "<caption>Parameter error: |θ − θ<sub>gt</sub>| summed over parameters, mean over posterior samples. "
-        "Trajectory error: distance from the observed trajectory in its standard deviations, mean over the "
-        "samples that could be simulated. Success rate: of all attempted simulations.</caption></table></div>"
+        "Trajectory error: distance per record from the observed trajectory in its standard deviations, mean over the "
+        "posterior samples whose simulation succeeded. Success rate: percentage of all simulations that succeeded. "
+        "Mean, median and standard deviation (sd) are over seeds.</caption></table></div>"
     )
 
 
 def _swatch(own: Look) -> str:
-    return f'<i class="swatch" style="background:{own.colour}"></i>{html.escape(own.label)}'
+    return f'<i class="swatch" style="background:{own.colour}"></i>{html.escape(_without_escapes(own.label))}'
+
+
+def _labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
+    """Names of parameters with their units in brackets."""
+    brackets = [_without_escapes(unit_label(names, units, d)) for d in range(len(names))]
+    return [f"{name} {bracket}".strip() for name, bracket in zip(names, brackets, strict=True)]
+
+
+def _without_escapes(label: str) -> str:
+    """A label that was written for matplotlib, where a dollar sign has a backslash."""
+    return label.replace(r"\$", "$")
 
 
 def _figure(name: str, picture: Picture) -> str:
     data = base64.b64encode(picture.path.read_bytes()).decode("ascii")
-    # On a screen a paper's figure is shown somewhat larger than printed.
+    # A third larger than in print (96 pixels an inch), to be read on a screen.
     pixels = round(picture.width * 128)
     title, caption = html.escape(picture.title), html.escape(picture.caption)
     return (

@@ -1,126 +1,222 @@
-"""Corner plots: the last posterior's marginal of every parameter, and of every pair of them."""
+"""Pair plots: the marginal of every parameter and the joint of every pair of them, from draws."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
-from matplotlib.ticker import MaxNLocator
 
 from jaxlfi.figures.history import History
-from jaxlfi.figures.style import TRUTH, Look, looks, parameter_label, shade, symbol
+from jaxlfi.figures.legends import below
+from jaxlfi.figures.style import (
+    GREY,
+    TRUTH,
+    TRUTH_LINE,
+    Look,
+    grid_shape,
+    is_wide,
+    looks,
+    or_labels,
+    parameter_label,
+    round_ticks,
+    shade,
+    symbol,
+)
 
-MOST = 6
-"""Parameters that a corner plot has room for."""
-SHARES = (0.95, 0.8, 0.5)
-"""Shares of the draws inside the contours, from the outermost on."""
+MAX_PARAMETERS = 6
+"""Largest number of parameters for pair plots in a report, where those of several runs stand side by side."""
+FRACTIONS = (0.95, 0.8, 0.5)
+"""Fractions of the draws that the contours enclose, from the outermost contour on."""
 _SHADES = (0.68, 0.3, -0.2)
 _BINS = 48
-_TRUTH_LINE = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 0.8}
-_TRUTH_POINT = TRUTH | {"markersize": 4.5, "markeredgewidth": 0.5}
-_BEFORE = {"linestyle": (0, (1, 1.2)), "linewidth": 0.8}
+_TRUTH_POINT = TRUTH | {"markersize": 5.5, "markeredgewidth": 0.5}
+_SUPPORT = {"linestyle": "-", "linewidth": 0.9}
+_FIRST_SUPPORT = {"linestyle": (0, (1, 1.2)), "linewidth": 0.8}
+
+Box = tuple[np.ndarray, np.ndarray]
+"""Lower and upper bounds of the parameters, shape [D] each."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cloud:
+    """Draws of one distribution over D parameters, with their support and true parameters.
+
+    Attributes:
+        draws: shape [n, D].
+        look: how they are drawn.
+        truth: shape [D], NaN where unknown.
+        support: the box that holds all draws, or None; densities do not fade towards its bounds.
+        first_support: the support before adaptation, or None where it is the same.
+    """
+
+    draws: np.ndarray
+    look: Look
+    truth: np.ndarray
+    support: Box | None = None
+    first_support: Box | None = None
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters D."""
+        return self.draws.shape[1]
+
+    @property
+    def boxes(self) -> list[tuple[Box, dict]]:
+        """The supports that are known, the last one first, each with its line style."""
+        both = (self.support, _SUPPORT), (self.first_support, _FIRST_SUPPORT)
+        return [(box, style) for box, style in both if box is not None]
 
 
 def drawable(history: History) -> bool:
-    """Whether draws of the last posterior were saved, of no more parameters than there is room for."""
-    return history.draws is not None and history.dim <= MOST and bool(np.isfinite(history.draws).all())
+    """Whether finite draws of the last posterior were saved, of at most `MAX_PARAMETERS` parameters."""
+    return history.draws is not None and history.dim <= MAX_PARAMETERS and bool(np.isfinite(history.draws).all())
 
 
-def window(histories: Sequence[History], d: int) -> tuple[float, float]:
-    """Axis limits of a parameter: all but the farthest draws, the truth, and the bounds that are not far off."""
-    ends = np.concatenate([np.quantile(h.draws[:, d], [0.003, 0.997]) for h in histories])
-    ends = np.concatenate([ends, [h.truth[d] for h in histories if np.isfinite(h.truth[d])]])
+def cloud_of(history: History, look: Look) -> Cloud:
+    """A run's saved draws with its last support, its first one where that is another, and the truth."""
+    low, high = history.supports
+    first = (low[0], high[0]) if history.adapts else None
+    return Cloud(history.draws, look, history.truth, (low[-1], high[-1]), first)
+
+
+def window(clouds: Sequence[Cloud], d: int) -> tuple[float, float]:
+    """Axis limits of a parameter: the central 99.4 % of the draws, the truth, and bounds that are near them."""
+    ends = np.concatenate([np.quantile(cloud.draws[:, d], [0.003, 0.997]) for cloud in clouds])
+    ends = np.concatenate([ends, [cloud.truth[d] for cloud in clouds if np.isfinite(cloud.truth[d])]])
     low, high = float(ends.min()), float(ends.max())
-    bounds = np.concatenate([np.stack(h.supports)[:, [0, -1], d].ravel() for h in histories])
-    reach = 0.35 * ((high - low) or np.ptp(bounds))
-    near = bounds[(bounds >= low - reach) & (bounds <= high + reach)]
+    bounds = np.array([bound[d] for cloud in clouds for box, _ in cloud.boxes for bound in box])
+    width = (high - low) or float(np.ptp(bounds) if bounds.size else 0.0) or 0.1 * abs(low) or 1.0
+    near = bounds[(bounds >= low - 0.35 * width) & (bounds <= high + 0.35 * width)]
     low, high = min([low, *near]), max([high, *near])
-    margin = 0.06 * ((high - low) or np.ptp(bounds))
+    margin = 0.06 * ((high - low) or width)
     return low - margin, high + margin
 
 
 def smoothed(draws: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A density estimate from draws of two parameters: their histogram, smoothed by a normal kernel.
 
-    The histogram ends at the bounds of the box, and what the kernel would spread beyond is reflected.
+    The histogram ends at the bounds of the box, and what the kernel would move beyond them is reflected.
 
     Args:
         draws: shape [n, 2].
-        box: lower and upper bounds of the two, shape [2, 2].
+        box: lower and upper bounds of the two, shape [2, 2]; infinite where there are none.
 
     Returns:
-        Two axes of cell centres, [B] each, and the share of the draws in each cell, [B, B], the second parameter first.
+        Two axes of cell centres, [B] each, and the fraction of draws in each cell, [B, B], the second parameter first.
     """
     low, high = np.quantile(draws, [0.002, 0.998], axis=0)
-    margin = 0.15 * np.maximum(high - low, 0.02 * (box[1] - box[0]))
+    width = box[1] - box[0]
+    # Draws that are all in one place are given a width to be drawn with.
+    single = np.where(high > low, 0.0, np.where(low == 0, 1.0, np.abs(low)))
+    margin = 0.15 * np.maximum(high - low, 0.02 * np.where(np.isfinite(width), width, single))
     low, high = np.maximum(low - margin, box[0]), np.minimum(high + margin, box[1])
     counts, *edges = np.histogram2d(*draws.T, bins=_BINS, range=list(zip(low, high, strict=True)))
     reach = np.arange(-8, 9)
     kernel = np.exp(-0.5 * (reach / 2.2) ** 2)
     kernel /= kernel.sum()
-    share = np.pad(counts, reach[-1], mode="symmetric")
+    fraction = np.pad(counts, reach[-1], mode="symmetric")
     for axis in (0, 1):
-        share = np.apply_along_axis(np.convolve, axis, share, kernel, mode="valid")
+        fraction = np.apply_along_axis(np.convolve, axis, fraction, kernel, mode="valid")
     x, y = ((e[1:] + e[:-1]) / 2 for e in edges)
-    return x, y, share.T / share.sum()
+    return x, y, fraction.T / fraction.sum()
 
 
-def levels(share: np.ndarray, shares: Sequence[float] = SHARES) -> np.ndarray:
-    """The least density inside the smallest region that holds each of the shares of the draws.
+def levels(fraction: np.ndarray, enclosed: Sequence[float] = FRACTIONS) -> np.ndarray:
+    """The lowest density inside the smallest region that holds each of some fractions of the draws.
 
     Args:
-        share: of the draws in each cell, any shape, of sum 1.
-        shares: in (0, 1).
+        fraction: of the draws in each cell, any shape, of sum 1.
+        enclosed: the fractions, in (0, 1).
     """
-    ordered = np.sort(share, axis=None)[::-1]
-    return ordered[np.searchsorted(np.cumsum(ordered), shares).clip(max=ordered.size - 1)]
+    ordered = np.sort(fraction, axis=None)[::-1]
+    return ordered[np.searchsorted(np.cumsum(ordered), enclosed).clip(max=ordered.size - 1)]
 
 
-def draw_marginal(axes: Axes, history: History, d: int, look: Look) -> None:
-    """A histogram of one parameter's draws, with the support's bounds and the truth.
+def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int) -> None:
+    """Histograms of one parameter's draws, with the supports' bounds and the truth.
 
     Args:
         axes: to draw on.
-        history: the run.
+        clouds: to draw over one another.
         d: index of the parameter.
-        look: of the configuration.
     """
-    style = {"histtype": "stepfilled", "color": shade(look.colour, 0.45), "gid": "marginal"}
-    heights, _, _ = axes.hist(history.draws[:, d], bins=24, density=True, **style)
-    for bounds, style in _boxes(history, look):
+    highest = 0.0
+    for cloud in clouds:
+        look = cloud.look
+        fill = {"color": shade(look.colour, 0.45)} if len(clouds) == 1 else {"color": look.colour, "alpha": 0.25}
+        common = {"bins": 24, "density": True}
+        heights, _, _ = axes.hist(cloud.draws[:, d], histtype="stepfilled", gid="marginal", **common, **fill)
+        if len(clouds) > 1:
+            line = {"color": look.colour, "linestyle": look.linestyle, "linewidth": 0.9}
+            axes.hist(cloud.draws[:, d], histtype="step", **common, **line)
+        highest = max(highest, heights.max())
+    for bounds, style in _boxes(clouds):
         for bound in bounds:
             axes.axvline(bound[d], **style)
-    if np.isfinite(history.truth[d]):
-        axes.axvline(history.truth[d], gid="truth", **_TRUTH_LINE)
-    axes.set_ylim(0, 1.12 * heights.max())
+    for truth in _truths(clouds):
+        if np.isfinite(truth[d]):
+            axes.axvline(truth[d], gid="truth", **TRUTH_LINE)
+    axes.set_ylim(0, 1.12 * highest)
     axes.set_yticks([])
 
 
-def draw_pair(axes: Axes, history: History, pair: tuple[int, int], look: Look) -> None:
-    """Filled contours around shares of the draws of two parameters, with the support and the truth.
+def draw_pair(axes: Axes, clouds: Sequence[Cloud], pair: tuple[int, int]) -> None:
+    """Contours around fractions of the draws of two parameters, with the supports and the truth.
+
+    One cloud has filled contours; several have lines over a light fill.
 
     Args:
         axes: to draw on.
-        history: the run.
+        clouds: to draw over one another.
         pair: indices of the parameters, the horizontal one first.
-        look: of the configuration.
     """
     chosen = list(pair)
-    low, high = history.supports
-    x, y, share = smoothed(history.draws[:, chosen], np.stack([low[-1, chosen], high[-1, chosen]]))
-    steps = np.append(levels(share), 1.0)
-    if np.all(np.diff(steps) > 0):
-        axes.contourf(x, y, share, steps, colors=[shade(look.colour, amount) for amount in _SHADES], zorder=1)
-    for (low, high), style in _boxes(history, look):
-        axes.add_patch(Rectangle(low[chosen], *(high - low)[chosen], fill=False, zorder=2, **style))
-    if np.isfinite(history.truth[chosen]).all():
-        axes.plot(*history.truth[chosen], zorder=3, gid="truth", **_TRUTH_POINT)
+    for cloud in clouds:
+        _draw_contours(axes, cloud, chosen, filled=len(clouds) == 1)
+    for (low, high), style in _boxes(clouds):
+        corner, (width, height) = low[chosen], (high - low)[chosen]
+        axes.add_patch(Rectangle(corner, width, height, fill=False, zorder=2, **style))
+    for truth in _truths(clouds):
+        if np.isfinite(truth[chosen]).all():
+            axes.plot(*truth[chosen], gid="truth", zorder=3, **_TRUTH_POINT)
+
+
+def _boxes(clouds: Sequence[Cloud]) -> list[tuple[Box, dict]]:
+    """The supports of some clouds without repetitions, with line styles in the colour of a single cloud, or grey."""
+    boxes = {np.stack(box).tobytes(): (box, style) for cloud in clouds for box, style in cloud.boxes}
+    return [(box, {"color": _colour(clouds), **style}) for box, style in boxes.values()]
+
+
+def _truths(clouds: Sequence[Cloud]) -> list[np.ndarray]:
+    """The true parameters of some clouds, without repetitions."""
+    return list({cloud.truth.tobytes(): cloud.truth for cloud in clouds}.values())
+
+
+def _colour(clouds: Sequence[Cloud]) -> str:
+    return clouds[0].look.colour if len(clouds) == 1 else GREY
+
+
+def _draw_contours(axes: Axes, cloud: Cloud, chosen: list[int], filled: bool) -> None:
+    draws, look = cloud.draws[:, chosen], cloud.look
+    low, high = cloud.support or (np.full(cloud.dim, -np.inf), np.full(cloud.dim, np.inf))
+    x, y, fraction = smoothed(draws, np.stack([low[chosen], high[chosen]]))
+    steps = np.append(levels(fraction), 1.0)
+    if not np.all(np.diff(steps) > 0):  # a constant density has no contours
+        axes.plot(*draws.T, ".", color=look.colour, markersize=2, gid="draws")
+    elif filled:
+        axes.contourf(x, y, fraction, steps, colors=[shade(look.colour, amount) for amount in _SHADES], zorder=1)
+    else:
+        axes.contourf(x, y, fraction, steps[[0, -1]], colors=[look.colour], alpha=0.15, zorder=1)
+        line = {"colors": [look.colour], "linestyles": [look.linestyle], "linewidths": 0.8}
+        axes.contour(x, y, fraction, steps[:-1], zorder=1.5, **line)
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """A corner plot for each run, all on the same axes.
+    """A pair plot for each run, side by side, all on the same axes.
 
     Args:
         figure: empty.
@@ -128,88 +224,131 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
         titles: of the plots; by default the configurations' names.
     """
     look = looks([h.configuration for h in histories])
-    dim = histories[0].dim
-    rows, columns = arrangement(len(histories), dim)
-    windows = [window(histories, d) for d in range(dim)]
+    clouds = [cloud_of(history, look[history.configuration]) for history in histories]
+    titles = or_labels(titles, [cloud.look for cloud in clouds])
+    draw_groups(figure, [[cloud] for cloud in clouds], [symbol(d) for d in range(clouds[0].dim)], titles)
+    handles = [*_fraction_handles(clouds, _colour(clouds)), *_mark_handles(clouds)]
+    key = parameter_key(histories[0], figure)
+    below(figure, handles, at_most=len(handles) if is_wide(figure) else 2, title=key, handlelength=1.6)
+
+
+def draw_overlay(figure: Figure, clouds: Sequence[Cloud], labels: Sequence[str]) -> None:
+    """One pair plot with all clouds drawn over one another.
+
+    Args:
+        figure: empty.
+        clouds: draws of the same parameters.
+        labels: of the axes, one for each parameter.
+    """
+    draw_groups(figure, [clouds], labels)
+    own = _cloud_handles(clouds) if len(clouds) > 1 else _fraction_handles(clouds, _colour(clouds))
+    if handles := [*own, *_mark_handles(clouds)]:
+        below(figure, handles, at_most=grid_shape(len(handles), 5 if is_wide(figure) else 2)[1])
+
+
+def draw_groups(
+    figure: Figure, groups: Sequence[Sequence[Cloud]], labels: Sequence[str], titles: Sequence[str] | None = None
+) -> None:
+    """A pair plot for each group of clouds; the clouds of a group are drawn over one another.
+
+    Args:
+        figure: empty.
+        groups: clouds over the same parameters.
+        labels: of the axes, one for each parameter.
+        titles: of the groups, in the colour of their first cloud; or None.
+    """
+    dim = groups[0][0].dim
+    rows, columns = arrangement(len(groups), dim)
+    windows = [window([cloud for group in groups for cloud in group], d) for d in range(dim)]
     # Groups of panels with a gap beside and a title above them: one grid keeps all panels of one size.
     widths = [1.0] * dim + ([0.16] + [1.0] * dim) * (columns - 1)
-    heights = ([0.32] + [1.0] * dim) * rows
+    heights = ([0.32 if titles else 0.01] + [1.0] * dim) * rows
     grid = figure.add_gridspec(len(heights), len(widths), width_ratios=widths, height_ratios=heights)
-    for place, history in enumerate(histories):
-        own = look[history.configuration]
+    for place, group in enumerate(groups):
         top, left = (dim + 1) * (place // columns) + 1, (dim + 1) * (place % columns)
-        header = figure.add_subplot(grid[top - 1, left : left + dim])
-        header.set_axis_off()
-        title = own.label if titles is None else titles[place]
-        header.text(0, 0, title, color=own.colour, fontweight="bold", fontsize="medium", va="bottom")
+        if titles:
+            header = figure.add_subplot(grid[top - 1, left : left + dim])
+            header.set_axis_off()
+            style = {"color": group[0].look.colour, "fontweight": "bold", "fontsize": "medium"}
+            header.text(0, 0, titles[place], va="bottom", **style)
         for i in range(dim):
             for j in range(i + 1):
                 axes = figure.add_subplot(grid[top + i, left + j])
                 if i == j:
-                    draw_marginal(axes, history, i, own)
+                    draw_marginal(axes, group, i)
                 else:
-                    draw_pair(axes, history, (j, i), own)
-                _frame(axes, (j, i), windows, last=i == dim - 1, labelled=left == 0)
+                    draw_pair(axes, group, (j, i))
+                _frame(axes, (j, i), windows, labels, last=i == dim - 1, numbered=left == 0)
+                for axis in (axes.xaxis, axes.yaxis) if i != j else (axes.xaxis,):
+                    round_ticks(axis, 4 if columns * dim <= 4 else 3)
     figure.align_labels()
-    _legend(figure, histories)
 
 
 def arrangement(count: int, dim: int) -> tuple[int, int]:
-    """Rows and columns of corner plots, so that no more than a dozen panels stand side by side."""
-    most = min(4, 12 // dim)
-    rows = -(-count // most)
-    return rows, -(-count // rows)
+    """Rows and columns of pair plots, so that no more than a dozen panels stand side by side."""
+    return grid_shape(count, max(1, min(4, 12 // dim)))
 
 
 def parameter_key(history: History, figure: Figure) -> str:
-    """What the symbols of the parameters stand for, in lines of the figure's width."""
+    """Symbols, names and units of the parameters, in lines of the figure's width."""
     names = [parameter_label(history.names, history.units, d, 99).replace("\n", " ") for d in range(history.dim)]
-    across = 4 if figure.get_size_inches()[0] > 5 else 2
+    across = 4 if is_wide(figure) else 2
     return "\n".join(",  ".join(names[i : i + across]) for i in range(0, len(names), across))
 
 
-def _boxes(history: History, look: Look) -> list[tuple[tuple[np.ndarray, np.ndarray], dict]]:
-    """The last support, and the first one where it is another."""
-    low, high = history.supports
-    last = (low[-1], high[-1]), {"color": look.colour, "linewidth": 0.9}
-    first = (low[0], high[0]), {"color": look.colour, **_BEFORE}
-    return [last, first] if history.adapts else [last]
-
-
-def _frame(axes: Axes, pair: tuple[int, int], windows: list[tuple[float, float]], last: bool, labelled: bool) -> None:
-    """Limits and ticks; numbers and symbols at the corner's left and lower sides."""
+def _frame(
+    axes: Axes,
+    pair: tuple[int, int],
+    windows: list[tuple[float, float]],
+    labels: Sequence[str],
+    last: bool,
+    numbered: bool,
+) -> None:
+    """Limits and ticks; numbers and labels at the left and lower sides of the group."""
     x, y = pair
     axes.set_xlim(*windows[x])
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=3, steps=[1, 2, 2.5, 5, 10]))
     axes.tick_params(labelsize=6, labelbottom=last, pad=1.2)
     axes.tick_params(axis="x", labelrotation=90)
     if last:
-        axes.set_xlabel(symbol(x))
+        axes.set_xlabel(labels[x])
     if x == y:
         return
     axes.set_ylim(*windows[y])
-    axes.yaxis.set_major_locator(MaxNLocator(nbins=3, steps=[1, 2, 2.5, 5, 10]))
-    axes.tick_params(axis="y", labelleft=x == 0 and labelled)
+    axes.tick_params(axis="y", labelleft=x == 0 and numbered)
     if x == 0:
-        axes.set_ylabel(symbol(y))
+        axes.set_ylabel(labels[y])
 
 
-def _legend(figure: Figure, histories: Sequence[History]) -> None:
-    grey = "#777777"
-    handles = [
-        Patch(color=shade(grey, amount), linewidth=0, label=f"{share:.0%} of the draws")
-        for share, amount in zip(SHARES[::-1], _SHADES[::-1], strict=True)
+def _fraction_handles(clouds: Sequence[Cloud], colour: str) -> list[Artist]:
+    """Legend entries of filled contours, which are drawn for pairs of parameters only."""
+    if clouds[0].dim == 1:
+        return []
+    return [
+        Patch(color=shade(colour, amount), linewidth=0, label=f"{100 * fraction:.0f} % of the draws")
+        for fraction, amount in zip(FRACTIONS[::-1], _SHADES[::-1], strict=True)
     ]
-    handles.append(Line2D([], [], color=grey, linewidth=0.9, label="support"))
-    if any(h.adapts for h in histories):
-        handles.append(Line2D([], [], color=grey, label="first support", **_BEFORE))
-    if any(np.isfinite(h.truth).all() for h in histories):
-        handles.append(Line2D([], [], label="truth", **_TRUTH_POINT))
-    figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        ncols=len(handles) if figure.get_size_inches()[0] > 5 else 3,
-        title=parameter_key(histories[0], figure),
-        title_fontsize=7,
-        handlelength=1.6,
-    )
+
+
+def _cloud_handles(clouds: Sequence[Cloud]) -> list[Artist]:
+    """Legend entries of clouds that are drawn over one another."""
+    lines = [
+        Line2D([], [], color=cloud.look.colour, linestyle=cloud.look.linestyle, label=cloud.look.label)
+        for cloud in clouds
+    ]
+    if clouds[0].dim == 1:
+        return lines
+    percentages = ", ".join(f"{100 * fraction:.0f}" for fraction in FRACTIONS[::-1])
+    return [*lines, Line2D([], [], linestyle="none", label=f"contours: {percentages} % of the draws")]
+
+
+def _mark_handles(clouds: Sequence[Cloud]) -> list[Artist]:
+    """Legend entries of supports and truth, as far as there are any."""
+    handles: list[Artist] = []
+    if any(cloud.support is not None for cloud in clouds):
+        handles.append(Line2D([], [], color=_colour(clouds), label="support", **_SUPPORT))
+    if any(cloud.first_support is not None for cloud in clouds):
+        handles.append(Line2D([], [], color=_colour(clouds), label="first support", **_FIRST_SUPPORT))
+    if any(np.isfinite(cloud.truth).any() for cloud in clouds):
+        marker = {"label": "truth", **_TRUTH_POINT} if clouds[0].dim > 1 else {"label": "truth", **TRUTH_LINE}
+        handles.append(Line2D([], [], **marker))
+    return handles

@@ -1,4 +1,4 @@
-"""Radar plots: how far posterior samples are from the truth by parameter, and their simulations by summary."""
+"""Radar plots: errors of posterior samples by parameter, and of their simulations by summary."""
 
 import textwrap
 from collections.abc import Sequence
@@ -13,39 +13,40 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxlfi.figures import statistics
 from jaxlfi.figures.history import History
+from jaxlfi.figures.legends import below
 from jaxlfi.figures.pairs import parameter_key
-from jaxlfi.figures.style import Look, looks, plain, symbol
+from jaxlfi.figures.style import GREY, Look, looks, or_labels, plain, symbol
 
-MIN_SIMULATIONS, MOST = 3, 20
-"""Fewer spokes are no surface, and more cannot be told apart."""
+MIN_SPOKES, MAX_SPOKES = 3, 20
+"""Fewer spokes enclose no area, and more cannot be distinguished."""
 
 
 def reference(histories: Sequence[History]) -> History:
-    """The run whose units all are measured in: of the OK support, or the first."""
+    """The run whose first round gives the units of all errors: that of the OK support, or the first."""
     return next((h for h in histories if h.configuration == "ok"), histories[0])
 
 
 def parameter_errors(history: History, unit: History) -> np.ndarray | None:
     """|theta - theta_gt| of the last posterior's samples in widths of a run's first support, shape [N, D], or None."""
     low, high = unit.supports
-    if history.theta_error is None or not MIN_SIMULATIONS <= history.dim <= MOST:
+    if history.theta_error is None or not MIN_SPOKES <= history.dim <= MAX_SPOKES:
         return None
     return history.theta_error[-1] / (high[0] - low[0])
 
 
 def summary_errors(history: History, unit: History) -> np.ndarray | None:
-    """|x - x^r| of the samples' simulations in spreads of a run's first simulations, shape [N, S], or None."""
-    if history.final_x is None or unit.x_scale is None or not MIN_SIMULATIONS <= len(history.x) <= MOST:
+    """|x - x^r| of the samples' simulations in standard deviations of a run's first round, shape [N, S], or None."""
+    if history.final_x is None or unit.x_scale is None or not MIN_SPOKES <= len(history.x) <= MAX_SPOKES:
         return None
-    # One that never varied has no unit, and no spoke.
+    # A summary that never varied has no unit, and no spoke.
     scale = np.where(unit.x_scale > 0, unit.x_scale, np.nan)
     return np.abs(history.final_x - history.x) / scale
 
 
 def panels(histories: Sequence[History]) -> dict[str, list[np.ndarray]]:
-    """What there is to draw: "parameters", "summaries", each with the errors [N, spokes] of every run.
+    """The rows to draw: "parameters", "summaries", each with the errors [N, spokes] of every run.
 
-    A run that has none, because all of its simulations failed, has NaN.
+    The errors of a run whose simulations all failed are NaN.
     """
     unit = reference(histories)
     every = {
@@ -103,17 +104,17 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
     look = looks([h.configuration for h in histories])
     first = histories[0]
     rows = panels(histories)
+    titles = or_labels(titles, [look[h.configuration] for h in histories])
     spokes = {
         "parameters": [symbol(d) for d in range(first.dim)],
         "summaries": [textwrap.fill(plain(name), 9, break_long_words=False) for name in first.summaries],
     }
-    # Names of rows and titles of columns have cells of their own: beside a circle, layout would not know of their room.
+    # Names of rows and titles of columns have cells of their own, as the layout reserves no room beside a circle.
     widths, heights = [0.06] + [1.0] * len(histories), [0.12] + [1.0] * len(rows)
     grid = figure.add_gridspec(len(heights), len(widths), width_ratios=widths, height_ratios=heights)
     for column, history in enumerate(histories, 1):
-        own = look[history.configuration]
-        title = own.label if titles is None else titles[column - 1]
-        _write(figure.add_subplot(grid[0, column]), title, color=own.colour, fontsize="medium")
+        colour = look[history.configuration].colour
+        _write(figure.add_subplot(grid[0, column]), titles[column - 1], color=colour, fontsize="medium")
     for row, (name, errors) in enumerate(rows.items(), 1):
         _write(figure.add_subplot(grid[row, 0]), name, rotation=90)
         reach = np.concatenate([statistics.mean(e, 0) + statistics.sd(e, 0) for e in errors])
@@ -122,16 +123,15 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
             axes = figure.add_subplot(grid[row, column], projection="polar")
             draw_radar(axes, own_errors, spokes[name], look[history.configuration])
             axes.set_rlim(0, 1.05 * top or 1.0)
-    grey = "#777777"
     handles = [
-        Line2D([], [], color=grey, marker="o", markersize=2.6, linewidth=1.0, label="mean over posterior samples"),
-        Patch(color=grey, alpha=0.3, linewidth=0, label="± standard deviation"),
+        Line2D([], [], color=GREY, marker="o", markersize=2.6, linewidth=1.0, label="mean over posterior samples"),
+        Patch(color=GREY, alpha=0.3, linewidth=0, label="± standard deviation"),
     ]
     names = parameter_key(first, figure) if "parameters" in rows else None
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, title=names, title_fontsize=7)
+    below(figure, handles, at_most=2, title=names)
 
 
 def _write(axes: Axes, text: str, **style) -> None:
-    """Nothing but a word in the middle of a cell."""
+    """A word in the middle of a cell without axes."""
     axes.set_axis_off()
     axes.text(0.5, 0.5, text, ha="center", va="center", fontweight="bold", **style)

@@ -1,4 +1,4 @@
-"""Trajectories the posterior predicts, against the observed one."""
+"""Trajectories simulated from the posterior, and the observed one."""
 
 from collections.abc import Sequence
 
@@ -9,11 +9,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxlfi.figures.history import History
-from jaxlfi.figures.style import Look, looks, plain
+from jaxlfi.figures.legends import below
+from jaxlfi.figures.style import GREY, Look, is_wide, looks, or_labels, plain
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-FEW_RECORDS = 40
-"""Observations of at most so many records are drawn as points."""
+MAX_POINTS = 40
+"""Records up to which an observation is drawn as points, and as a line beyond."""
 
 
 def quantiles(history: History) -> np.ndarray:
@@ -22,7 +23,7 @@ def quantiles(history: History) -> np.ndarray:
 
 
 def drawable(history: History) -> bool:
-    """Whether there are simulations of the last posterior, and an observation of the same kind."""
+    """Whether there are simulations of the last posterior, and an observation of the same shape."""
     simulated, observed = history.predictions, history.observed
     if simulated is None or observed is None:
         return False
@@ -55,12 +56,12 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
         titles: of the columns; by default the configurations' names.
     """
     look = looks([h.configuration for h in histories])
+    titles = or_labels(titles, [look[h.configuration] for h in histories])
     first = histories[0]
     axes = figure.subplots(len(first.channels), len(histories), squeeze=False, sharex=True, sharey="row")
     for column, history in enumerate(histories):
         own = look[history.configuration]
-        title = own.label if titles is None else titles[column]
-        axes[0, column].set_title(title, color=own.colour, fontweight="bold")
+        axes[0, column].set_title(titles[column], color=own.colour, fontweight="bold")
         for channel in range(len(first.channels)):
             draw_channel(axes[channel, column], history, channel, own)
             axes[channel, column].grid(True)
@@ -69,19 +70,17 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
     for channel, name in enumerate(first.channels):
         axes[channel, 0].set_ylabel(plain(name))
         _robust_limits(axes[channel, 0], histories, channel)
-    grey = "#666666"
     handles = [
         Line2D([], [], label="observed", **_observed(first)),
-        Line2D([], [], color=grey, label="median of the posterior's simulations"),
-        Patch(color=grey, alpha=0.5, linewidth=0, label="25–75 %"),
-        Patch(color=grey, alpha=0.2, linewidth=0, label="5–95 %"),
+        Line2D([], [], color=GREY, label="median of posterior simulations"),
+        Patch(color=GREY, alpha=0.5, linewidth=0, label="central 50 %"),
+        Patch(color=GREY, alpha=0.2, linewidth=0, label="central 90 %"),
     ]
-    wide = figure.get_size_inches()[0] > 5
-    figure.legend(handles=handles, loc="outside lower center", ncols=4 if wide else 2)
+    below(figure, handles, at_most=4 if is_wide(figure) else 2)
 
 
 def _few(history: History) -> bool:
-    return len(history.observed) <= FEW_RECORDS
+    return len(history.observed) <= MAX_POINTS
 
 
 def _observed(history: History) -> dict:
@@ -91,7 +90,7 @@ def _observed(history: History) -> dict:
 
 
 def _robust_limits(axes: Axes, histories: Sequence[History], channel: int) -> None:
-    """Show all of the observation, and of the predictions as much as leaves the observation legible."""
+    """Limits that show all of the observation, and predictions within three times its range."""
     observed = np.concatenate([h.observed[:, channel] for h in histories])
     predicted = np.concatenate([quantiles(h)[..., channel].ravel() for h in histories])
     low, high = float(observed.min()), float(observed.max())

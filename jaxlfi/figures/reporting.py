@@ -1,6 +1,6 @@
 """Report: all pictures of a run folder, and a page with them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +21,15 @@ from jaxlfi.figures import (
     style,
     supports,
 )
-from jaxlfi.figures.collection import Collection, Runs, open_collection, representative
+from jaxlfi.figures.collection import Collection, Runs, open_collection, representative, seed_count
 from jaxlfi.figures.history import History, read_config
 from jaxlfi.figures.page import Picture
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
 
 COLUMNS = ("ok", "misspecified", "broad", "misspecified+edge")
-"""The configurations shown side by side where a picture has room for four."""
+"""The configurations to show side by side, where there are more than `MAX_COLUMNS`."""
+MAX_COLUMNS = 4
+"""Largest number of configurations side by side in one picture."""
 
 
 def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
@@ -35,10 +37,10 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
 
     Args:
         folder: of one run, of several seeds, of a comparison, or of a sensitivity grid.
-        dpi: resolution of the pictures, which are as wide as a paper's column or text.
+        dpi: resolution of the pictures, which are one or two columns of a paper wide.
 
     Returns:
-        The files written: FOLDER/report.html, then FOLDER/figures/*.png as they appear on it.
+        The files written: FOLDER/report.html, then FOLDER/figures/*.png in the order of the page.
 
     Raises:
         ValueError: for a folder that is missing, of another kind or damaged; nothing is written then.
@@ -52,7 +54,7 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
 
 
 def _written(folder: Path, makers: Mapping[str, Callable], loaded, render: Callable, dpi: float) -> list[Path]:
-    """Draw what there is to draw of what was loaded, and write the page."""
+    """Draw the pictures that apply to a collection or grid, and write the page."""
     pictures: list[Picture] = []
     with style.context():
         for name, make in makers.items():
@@ -72,10 +74,11 @@ Made = tuple[Figure, str, str] | None
 """A figure with its title and caption, or None where there is nothing to draw."""
 
 
-def columns(runs: Runs, most: int = 4) -> tuple[list[History], list[str]]:
+def columns(runs: Runs) -> tuple[list[History], list[str]]:
     """One run for each of up to four configurations, the seed of median error, and the columns' titles."""
     preferred = [name for name in COLUMNS if name in runs]
-    chosen = list(runs) if len(runs) <= most else [*preferred, *(n for n in runs if n not in preferred)][:most]
+    every = list(runs) if len(runs) <= MAX_COLUMNS else [*preferred, *(n for n in runs if n not in preferred)]
+    chosen = every[:MAX_COLUMNS]
     histories = [representative(runs[name]) for name in chosen]
     look = style.looks(chosen)
     titles = []
@@ -92,10 +95,10 @@ def _samples(collection: Collection) -> Made:
     samples.draw(figure, histories, titles)
     first, second = ("Left", "Right") if len(histories) == 1 else ("Above", "Below")
     caption = (
-        f"{first}: the parameters drawn in each iteration with the support they were drawn from; the bigger "
-        f"dots are the means of the data accumulated up to each iteration. {second}, closer: the last "
-        "posterior, with the support it is kept in and arrows along the weighted means of the iterations."
-        + _which_seed(collection.runs)
+        f"{first}: the parameters simulated in each iteration and the supports they were drawn from (boxes), coloured "
+        "by iteration; crosses are failed simulations, large dots the means of all simulations up to each iteration. "
+        f"{second}, enlarged: the density of the last posterior's mixture and its support (box); arrows join the "
+        "weighted means of the posteriors of successive iterations." + _which_seed(collection.runs)
     )
     return figure, "Samples and posterior", caption
 
@@ -103,23 +106,29 @@ def _samples(collection: Collection) -> Made:
 def _efficiency(collection: Collection) -> Made:
     figure = style.new_figure(TEXT_WIDTH, 2.1 + _legend_height(collection.runs))
     efficiency.draw(figure, collection.runs)
-    caption = "Simulations attempted in each iteration, the share that succeeded, and the failures so far."
+    caption = (
+        "Number of simulations in each iteration, the percentage of them that succeeded, and the cumulative number "
+        "of failed simulations." + _lines(collection.runs, "standard deviations")
+    )
     return figure, "Data efficiency", caption
 
 
 def _curves(collection: Collection) -> Made:
     if not curves.drawable(collection.runs):
         return None
-    dim = next(iter(collection.runs.values()))[0].dim
+    known, simulated = _measured(collection.runs)
+    dim = _first(collection).dim
     wide = dim > 4
     rows = -(-dim // (3 if wide else 2))
-    known = any(h.theta_error is not None for histories in collection.runs.values() for h in histories)
     figure = style.new_figure(TEXT_WIDTH if wide and known else COLUMN_WIDTH, 2.3 + (1.2 * rows if known else 0.2))
     curves.draw(figure, collection.runs)
     caption = (
-        "exp(-loss) of posterior samples in each iteration, 1 is perfect: Euclidean distance to the observed "
-        "trajectory (per record, in its standard deviations; a failed simulation counts 0), and absolute "
-        "difference from each true parameter where it is known. Bands are standard errors."
+        "Accuracy exp(-error) of posterior samples after each iteration; 1 is perfect."
+        + simulated
+        * " Trajectory: the error is the Euclidean distance to the observed trajectory, per record and in "
+        "standard deviations of the observed one; a failed simulation has accuracy 0."
+        + known * " Parameters: the error is the absolute difference from the true value."
+        + " Lines are means, bands standard errors."
     )
     return figure, "Accuracy over iterations", caption
 
@@ -131,20 +140,24 @@ def _discrepancy(collection: Collection) -> Made:
     width = COLUMN_WIDTH if len(panels) <= 2 else TEXT_WIDTH
     figure = style.new_figure(width, 0.6 + 1.7 * -(-len(panels) // 5) + _legend_height(collection.runs))
     discrepancy.draw(figure, collection.runs)
+    known, simulated = _measured(collection.runs)
+    references = known * ["the true parameters"] + simulated * ["the observed trajectory"]
     caption = (
-        "Discrepancy of posterior samples after the last iteration from the true parameters and the observed "
-        "trajectory. Error bars are standard deviations over samples and seeds; failed simulations are left "
-        "out."
+        f"Mean discrepancy of posterior samples after the last iteration from {' and '.join(references)}. Error bars "
+        "are standard deviations over samples and seeds" + simulated * "; failed simulations are left out" + "."
     )
     return figure, "Final discrepancy", caption
 
 
 def _supports(collection: Collection) -> Made:
-    dim = next(iter(collection.runs.values()))[0].dim
-    width = COLUMN_WIDTH if dim == 1 else TEXT_WIDTH
-    figure = style.new_figure(width, 0.6 + 1.6 * -(-dim // 4))
+    width = COLUMN_WIDTH if _first(collection).dim == 1 else TEXT_WIDTH
+    figure = style.new_figure(width, 0.6 + 1.6 * -(-_first(collection).dim // 4))
     supports.draw(figure, collection.runs)
-    caption = "Bounds of the support from the first (iteration 0) to the last adaptation."
+    left_out = len(supports.adapting(collection.runs)) < len(collection.runs)
+    caption = (
+        "Lower and upper bounds of the support of each parameter, from the initial support (iteration 0) to the last "
+        "adaptation." + left_out * " Configurations of a fixed support are left out."
+    )
     return figure, "Supports", caption
 
 
@@ -153,7 +166,11 @@ def _losses(collection: Collection) -> Made:
         return None
     figure = style.new_figure(TEXT_WIDTH, 2.3 + _legend_height(collection.runs))
     losses.draw(figure, collection.runs)
-    caption = "Negative log-density of the parameters, scaled to [-1, 1], under the network."
+    one = sum(len(histories) for histories in collection.runs.values()) == 1
+    caption = (
+        "Negative log-density of the parameters, scaled to [-1, 1], under the network, mean over the ensemble's "
+        "networks: " + ("after each epoch of training." if one else "after the training of each iteration.")
+    ) + _lines(collection.runs, "standard deviations")
     return figure, "Training", caption
 
 
@@ -165,7 +182,10 @@ def _predictive(collection: Collection) -> Made:
     width = COLUMN_WIDTH if len(histories) == 1 else TEXT_WIDTH
     figure = style.new_figure(width, 0.8 + 1.35 * len(histories[0].channels))
     predictive.draw(figure, histories, titles)
-    caption = "Simulations of samples of the last posterior, against the observed trajectory." + _which_seed(runs)
+    caption = (
+        "Trajectories simulated with samples of the last posterior, and the observed trajectory. The bands hold the "
+        "central 50 % and 90 % of the simulations of each record." + _which_seed(runs)
+    )
     return figure, "Posterior predictive", caption
 
 
@@ -180,8 +200,8 @@ def _pairs(collection: Collection) -> Made:
     figure = style.new_figure(width, 1.0 + rows * (0.3 + width * dim / (across * dim + 0.6)))
     pairs.draw(figure, histories, titles)
     caption = (
-        "Draws of the last posterior, kept in its support: each parameter on the diagonal, each pair of parameters "
-        "below it, with contours that enclose half, four fifths and 95 % of the draws." + _which_seed(runs)
+        "Draws of the last posterior, restricted to its support: the marginal of each parameter on the diagonal, each "
+        "pair of parameters below it, with contours that enclose 50 %, 80 % and 95 % of the draws." + _which_seed(runs)
     )
     return figure, "Posterior by pairs of parameters", caption
 
@@ -196,29 +216,30 @@ def _polars(collection: Collection) -> Made:
     polars.draw(figure, histories, titles)
     unit = style.configuration_label(polars.reference(histories).configuration)
     units = {
-        "parameters": f"of the parameters from the true ones, in widths of the first support of {unit}",
-        "summaries": "of their simulations' summaries from the observed ones, in standard deviations of the first "
-        f"iteration's simulations of {unit} (half the distance of their 16th and 84th percentiles)",
+        "parameters": f"of parameters from the true ones, in widths of the first support of {unit}",
+        "summaries": "of the summaries of their simulations from the observed ones, in standard deviations of the "
+        f"first iteration's simulations of {unit} (half the distance between the 16th and 84th percentiles)",
     }
     caption = (
         "Absolute discrepancy of posterior samples after the last iteration: "
         + "; ".join(units[name] for name in rows)
-        + ". A flow's samples are those of the mixture that is fitted to it."
+        + ". Where the posterior is a flow, the samples are drawn from a mixture fitted to it."
         + _which_seed(collection.runs)
     )
     return figure, "Discrepancy by parameter and summary", caption
 
 
 def _seeds(collection: Collection) -> Made:
-    values = collection.values("theta_error")
+    values, what = collection.values("theta_error"), "Parameter"
     label = "parameter error (sum of |θ − θ$_{gt}$|)"
     if not _positive(values):
-        values, label = collection.values("trajectory_error"), "trajectory error [observed sd]"
+        values, what = collection.values("trajectory_error"), "Trajectory"
+        label = "trajectory error [observed sd]"
     if not _positive(values) or max(len(v) for v in values.values()) < 2:
         return None
     figure = style.new_figure(COLUMN_WIDTH if len(values) <= 3 else TEXT_WIDTH, 2.6)
     seeds.draw(figure, values, label)
-    caption = "Error after the last iteration, a point for each seed, on a logarithmic scale."
+    caption = f"{what} error after the last iteration, one point for each seed, on a logarithmic scale."
     return figure, "Seeds", caption
 
 
@@ -234,19 +255,24 @@ PICTURES: dict[str, Callable[[Collection], Made]] = {
     "polars": _polars,
     "seeds": _seeds,
 }
-"""What makes each picture, by the name of its file."""
+"""The function that draws each picture, by file name."""
 
 
-_OVER = "Means over seeds and the other hyperparameters, ± their standard deviations."
+_OVER = "Cells are means ± standard deviations over seeds and all other hyperparameters."
 
 
 def _sensitivity(grid: sensitivity.Grid) -> Made:
-    figure = style.new_figure(*sensitivity.size(grid, bars=2))
+    measures = sensitivity.errors(grid)
+    figure = style.new_figure(*sensitivity.size(grid, len(measures)))
     sensitivity.draw(figure, grid)
+    places = (
+        "of simulated trajectories above the diagonal, of parameters below it"
+        if len(measures) > 1
+        else "of parameters; no trajectories were simulated from the posteriors"
+    )
     caption = (
-        "Discrepancy after the last iteration for every pair of hyperparameters: of simulated trajectories above "
-        f"the diagonal, of parameters below it; on the diagonal, for each hyperparameter alone. {_OVER} "
-        "The colours are reversed, as smaller is better. The heuristic's own values are bold."
+        f"Discrepancy after the last iteration for every pair of hyperparameters: {places}. On the diagonal: for each "
+        f"hyperparameter alone. {_OVER} Brighter colours are smaller errors. The heuristic's default values are bold."
     )
     return figure, "Sensitivity to hyperparameters", caption
 
@@ -255,8 +281,8 @@ def _feasibility(grid: sensitivity.Grid) -> Made:
     figure = style.new_figure(*sensitivity.size(grid, bars=1))
     sensitivity.draw_success(figure, grid)
     caption = (
-        "Share of all attempted simulations that succeeded, for every pair of hyperparameters; on the diagonal, for "
-        f"each alone. {_OVER}"
+        "Percentage of all simulations that succeeded, for every pair of hyperparameters; on the diagonal, for each "
+        f"hyperparameter alone. {_OVER} The heuristic's default values are bold."
     )
     return figure, "Simulation success", caption
 
@@ -265,21 +291,31 @@ GRID_PICTURES: dict[str, Callable[[sensitivity.Grid], Made]] = {
     "sensitivity": _sensitivity,
     "feasibility": _feasibility,
 }
-"""The pictures of a sensitivity grid, by the name of the file."""
+"""The function that draws each picture of a sensitivity grid, by file name."""
+
+
+def _first(collection: Collection) -> History:
+    return next(iter(collection.runs.values()))[0]
+
+
+def _measured(runs: Runs) -> tuple[bool, bool]:
+    """Whether any run has parameter errors, and whether any has trajectory errors."""
+    every = [history for histories in runs.values() for history in histories]
+    return any(h.theta_error is not None for h in every), any(h.trajectory_error is not None for h in every)
 
 
 def _those(runs: Runs, drawable: Callable[[History], bool]) -> Runs:
-    """The runs of which there is something to draw."""
+    """The runs that can be drawn."""
     chosen = {name: [h for h in histories if drawable(h)] for name, histories in runs.items()}
     return {name: histories for name, histories in chosen.items() if histories}
 
 
 def _which_seed(runs: Runs) -> str:
-    return " Of several seeds, that of median parameter error is shown." if _several(runs.values()) else ""
+    return " Of several seeds, the one of median parameter error is shown." if seed_count(runs) > 1 else ""
 
 
-def _several(groups: Sequence) -> bool:
-    return any(len(histories) > 1 for histories in groups)
+def _lines(runs: Runs, bands: str) -> str:
+    return f" Lines are means over seeds, bands {bands}." if seed_count(runs) > 1 else ""
 
 
 def _legend_height(runs: Runs) -> float:

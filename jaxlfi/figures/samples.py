@@ -1,4 +1,4 @@
-"""Where each round drew its parameters, and the posterior the run ended with."""
+"""The parameters simulated in each round, and the last posterior."""
 
 import itertools
 from collections.abc import Sequence
@@ -14,7 +14,19 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxlfi.figures import density
 from jaxlfi.figures.history import History
-from jaxlfi.figures.style import TRUTH, Look, iteration_bar, iteration_colours, looks, parameter_label
+from jaxlfi.figures.legends import below
+from jaxlfi.figures.style import (
+    TRUTH,
+    TRUTH_LINE,
+    Look,
+    integer_ticks,
+    iteration_bar,
+    iteration_colours,
+    looks,
+    or_labels,
+    parameter_label,
+    round_ticks,
+)
 
 _OUTLINE = [patheffects.withStroke(linewidth=1.5, foreground="white")]
 
@@ -27,7 +39,7 @@ def pairs(dim: int) -> list[tuple[int, ...]]:
 
 
 def limits(histories: Sequence[History], d: int) -> tuple[float, float]:
-    """Axis limits of a parameter that show all supports, the truth, and the means unless far off."""
+    """Axis limits of a parameter that show all supports, the truth, and the means unless they are far outside."""
     boxes = np.concatenate([np.concatenate(h.supports)[:, d] for h in histories])
     boxes = np.concatenate([boxes, [h.truth[d] for h in histories]])
     low, high = float(np.nanmin(boxes)), float(np.nanmax(boxes))
@@ -39,7 +51,7 @@ def limits(histories: Sequence[History], d: int) -> tuple[float, float]:
 
 
 def closer_limits(histories: Sequence[History], d: int) -> tuple[float, float]:
-    """Axis limits of a parameter around the last mixtures, the way to them, and the truth."""
+    """Axis limits of a parameter around the last mixtures, the path of the weighted means, and the truth."""
     shown = [np.concatenate([h.weighted_means[:, d] for h in histories]), [h.truth[d] for h in histories]]
     for history in histories:
         weight = density.weights(history.logits[-1])
@@ -68,25 +80,25 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
         titles: of the columns; by default the configurations' names.
     """
     look = looks([h.configuration for h in histories])
+    titles = or_labels(titles, [look[h.configuration] for h in histories])
     shown = pairs(histories[0].dim)
-    above, below = _panels(figure, len(shown), len(histories))
+    upper, lower = _panels(figure, len(shown), len(histories))
     for column, history in enumerate(histories):
         own = look[history.configuration]
-        title = own.label if titles is None else titles[column]
         if len(histories) > 1:
-            above[0, column].set_title(title, color=own.colour, fontweight="bold")
+            upper[0, column].set_title(titles[column], color=own.colour, fontweight="bold")
         else:
-            figure.suptitle(title, color=own.colour, fontweight="bold", fontsize="medium")
+            figure.suptitle(titles[0], color=own.colour, fontweight="bold", fontsize="medium")
         for row, pair in enumerate(shown):
-            draw_proposals(above[row, column], history, pair, [limits(histories, d) for d in pair])
-            draw_mixture(below[row, column], history, pair, [closer_limits(histories, d) for d in pair], own)
+            draw_proposals(upper[row, column], history, pair, [limits(histories, d) for d in pair])
+            draw_mixture(lower[row, column], history, pair, [closer_limits(histories, d) for d in pair], own)
             if column:
-                above[row, column].tick_params(labelleft=False)
-                above[row, column].set_ylabel("")
-                below[row, column].tick_params(labelleft=len(pair) == 1)
-                below[row, column].set_ylabel("")
+                upper[row, column].tick_params(labelleft=False)
+                upper[row, column].set_ylabel("")
+                lower[row, column].tick_params(labelleft=len(pair) == 1)
+                lower[row, column].set_ylabel("")
     if len(shown[0]) == 2:
-        iteration_bar(figure, above, histories[0].rounds)
+        iteration_bar(figure, upper, histories[0].rounds)
     _legend(figure, histories)
 
 
@@ -102,7 +114,7 @@ def _panels(figure: Figure, rows: int, columns: int) -> tuple[np.ndarray, np.nda
 def draw_proposals(
     axes: Axes, history: History, pair: tuple[int, ...], window: Sequence[tuple[float, float]] | None = None
 ) -> None:
-    """Proposals of all iterations over a pair of parameters (or one), with the supports they come from.
+    """Proposals of all iterations over a pair of parameters (or one), with the supports they were drawn from.
 
     Args:
         axes: to draw on.
@@ -140,7 +152,7 @@ def draw_proposals(
     _frame(axes, history, pair, window)
     if len(pair) == 1:
         axes.set_ylim(history.rounds + 0.7, 0.3)
-        axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
+        integer_ticks(axes.yaxis)
         axes.set_ylabel("iteration")
 
 
@@ -151,14 +163,14 @@ def draw_mixture(
     window: Sequence[tuple[float, float]] | None = None,
     look: Look | None = None,
 ) -> None:
-    """The last mixture's marginal over a pair of parameters (or one), and the way of its weighted mean.
+    """The last mixture's marginal over a pair of parameters (or one), and the path of the weighted means.
 
     Args:
         axes: to draw on.
         history: the run.
         pair: indices of one or two parameters.
         window: axis limits for each of them.
-        look: whose colour the density has.
+        look: its colour is the density's.
     """
     window = window or [closer_limits([history], d) for d in pair]
     look = look or looks([history.configuration])[history.configuration]
@@ -183,14 +195,14 @@ def _draw_density(axes: Axes, weight, mean, covariance, window, look: Look) -> N
     there = weight > 1e-3
     grids = [density.grid(*window[i], mean[there, i], scale[there, i]) for i in range(mean.shape[1])]
     points = np.stack(np.meshgrid(*grids, indexing="xy"), -1)
-    likelihood = density.density(points, weight, mean, covariance)
+    values = density.density(points, weight, mean, covariance)
     if len(grids) == 1:
-        axes.fill_between(grids[0], likelihood, color=look.colour, alpha=0.25, linewidth=0)
-        axes.plot(grids[0], likelihood, color=look.colour, gid="density")
-        axes.set_ylim(0, 1.15 * likelihood.max() or 1.0)
-        axes.set_ylabel("likelihood")
+        axes.fill_between(grids[0], values, color=look.colour, alpha=0.25, linewidth=0)
+        axes.plot(grids[0], values, color=look.colour, gid="density")
+        axes.set_ylim(0, 1.15 * values.max() or 1.0)
+        axes.set_ylabel("posterior density")
         return
-    mesh: QuadMesh = axes.pcolormesh(*grids, likelihood, cmap=look.density, vmin=0, shading="nearest", zorder=1)
+    mesh: QuadMesh = axes.pcolormesh(*grids, values, cmap=look.density, vmin=0, shading="nearest", zorder=1)
     # As wide as the panel, so that columns of panels stay aligned.
     bar = axes.figure.colorbar(mesh, cax=axes.inset_axes([0.0, 1.03, 1.0, 0.045]), orientation="horizontal")
     bar.locator = MaxNLocator(nbins=3, min_n_ticks=2)
@@ -199,7 +211,7 @@ def _draw_density(axes: Axes, weight, mean, covariance, window, look: Look) -> N
     bar.ax.xaxis.set_ticks_position("top")
     bar.ax.xaxis.set_label_position("top")
     bar.ax.tick_params(pad=0.5, length=1.5)
-    bar.set_label("likelihood", labelpad=1.5)
+    bar.set_label("posterior density", labelpad=1.5)
     bar.outline.set_linewidth(0.4)
 
 
@@ -239,7 +251,7 @@ def _draw_path(axes: Axes, history: History, pair: tuple[int, ...]) -> None:
 
 
 def _plane(theta: np.ndarray, pair: tuple[int, ...], iteration: np.ndarray) -> np.ndarray:
-    """Points [..., 2] to draw: two parameters, or one over its iteration, spread out within it."""
+    """Points [..., 2] to draw: two parameters, or one over its iteration, jittered so that points do not overlap."""
     if len(pair) == 2:
         return theta[..., list(pair)]
     height = iteration.astype(float)
@@ -264,50 +276,31 @@ def _mark_truth(axes: Axes, history: History, pair: tuple[int, ...]) -> None:
     if len(pair) == 2:
         axes.plot(*truth, zorder=10, gid="truth", **TRUTH)
     else:
-        axes.axvline(truth[0], color="black", linestyle=(0, (4, 2)), linewidth=0.9, zorder=10, gid="truth")
+        axes.axvline(truth[0], zorder=10, gid="truth", **TRUTH_LINE)
 
 
 def _frame(axes: Axes, history: History, pair: tuple[int, ...], window: Sequence[tuple[float, float]]) -> None:
     axes.set_xlim(*window[0])
     axes.set_xlabel(parameter_label(history.names, history.units, pair[0]))
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10]))
+    round_ticks(axes.xaxis, 5)
     if len(pair) == 2:
         axes.set_ylim(*window[1])
         axes.set_ylabel(parameter_label(history.names, history.units, pair[1]))
-        axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10]))
+        round_ticks(axes.yaxis, 5)
 
 
 def _legend(figure: Figure, histories: Sequence[History]) -> None:
-    grey, plain = "#3B528B", {"linestyle": "none"}
+    def marker(shape: str, size: float, label: str, **style) -> Line2D:
+        style = {"color": "#3B528B", "linestyle": "none", **style}
+        return Line2D([], [], marker=shape, markersize=size, label=label, **style)
+
     handles = [
-        Line2D([], [], marker="o", markersize=2.5, color=grey, markeredgewidth=0, label="simulated", **plain),
-        Line2D([], [], marker="x", markersize=3, color=grey, markeredgewidth=0.7, label="failed", **plain),
-        Line2D(
-            [],
-            [],
-            marker="o",
-            markersize=5.5,
-            color=grey,
-            markeredgecolor="white",
-            label="mean of data",
-            **plain,
-        ),
-        Line2D([], [], marker="s", markersize=6, color=grey, markerfacecolor="none", label="support", **plain),
-        Line2D(
-            [],
-            [],
-            marker=r"$\rightarrow$",
-            markersize=7,
-            color="black",
-            markeredgewidth=0.3,
-            label="weighted mean",
-            **plain,
-        ),
+        marker("o", 2.5, "simulated", markeredgewidth=0),
+        marker("x", 3, "failed", markeredgewidth=0.7),
+        marker("o", 5.5, "mean of data", markeredgecolor="white"),
+        marker("s", 6, "support", markerfacecolor="none"),
+        marker(r"$\rightarrow$", 7, "weighted mean", color="black", markeredgewidth=0.3),
     ]
     if any(np.isfinite(h.truth).all() for h in histories):
-        if histories[0].dim == 1:
-            handles.append(Line2D([], [], color="black", linestyle=(0, (4, 2)), linewidth=0.9, label="truth"))
-        else:
-            handles.append(Line2D([], [], label="truth", **TRUTH))
-    columns = len(handles) if figure.get_size_inches()[0] > 5 else 3
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, handletextpad=0.2, columnspacing=1.2)
+        handles.append(Line2D([], [], label="truth", **(TRUTH_LINE if histories[0].dim == 1 else TRUTH)))
+    below(figure, handles, handletextpad=0.2, columnspacing=1.2)

@@ -1,4 +1,4 @@
-"""How a result scatters over seeds, configuration by configuration."""
+"""A result of every seed, configuration by configuration."""
 
 from collections.abc import Mapping
 
@@ -8,35 +8,27 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from jaxlfi.figures.style import looks
+from jaxlfi.figures.legends import above
+from jaxlfi.figures.style import GREY, looks
 
 
 def draw(figure: Figure, values: Mapping[str, np.ndarray], label: str) -> None:
-    """Strips with boxes on a logarithmic scale, and marks for mean and median.
+    """Strips of points with boxes on a logarithmic scale; mean and median are marked.
 
     Args:
         figure: empty.
         values: one value a seed, by configuration; NaN is left out.
-        label: what they are, with unit.
+        label: of the axis, with unit.
     """
     axes = figure.subplots()
     draw_strips(axes, values)
     axes.set_ylabel(label)
     handles = [
-        Line2D(
-            [],
-            [],
-            marker="o",
-            markersize=3,
-            color="#888888",
-            markeredgewidth=0,
-            linestyle="none",
-            label="a seed",
-        ),
+        Line2D([], [], marker="o", markersize=3, color=GREY, markeredgewidth=0, linestyle="none", label="one seed"),
         Line2D([], [], color="black", linewidth=1.2, label="median (box: quartiles)"),
         Line2D([], [], linestyle="none", label="mean", **_MEAN),
     ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3)
+    above(figure, handles)
 
 
 def draw_strips(axes: Axes, values: Mapping[str, np.ndarray]) -> None:

@@ -1,8 +1,8 @@
 """How sensitive a heuristic is to its hyperparameters: heat maps over every pair of them, as in the appendix.
 
-The maps form a matrix, one row and one column a hyperparameter. Above the diagonal is the trajectory error, below
-it the parameter error, on the diagonal what is left of both for each value by itself. A cell is the mean over seeds
-and over all other hyperparameters, with the standard deviation of the same runs. The brighter, the better.
+The maps form a matrix, with one row and one column for each hyperparameter. Trajectory errors are above the diagonal,
+parameter errors below it, and both for single hyperparameters on it. A cell is the mean over seeds and over all other
+hyperparameters, with the standard deviation of the same runs. Brighter colours are better.
 """
 
 import dataclasses
@@ -35,14 +35,14 @@ SYMBOLS = {
 
 @dataclasses.dataclass(frozen=True)
 class Measure:
-    """Something that is measured of each run, and how it is drawn.
+    """A result of each run, and how it is drawn.
 
     Attributes:
         name: of the array.
         label: of the colour bar.
-        colours: a colour map whose bright end is the better one.
-        scale: values are shown multiplied by it.
-        smaller_is_better: of errors.
+        colours: colour map whose bright end is the better one.
+        scale: factor of the values shown.
+        smaller_is_better: true for errors.
     """
 
     name: str
@@ -59,12 +59,12 @@ SUCCESS = Measure("success_rate", "simulation success rate [%]", "cividis", scal
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """What a grid's folder holds.
+    """The results of a sensitivity grid.
 
     Attributes:
         names: hyperparameters, in the order of the arrays' leading axes.
         values: of each hyperparameter.
-        defaults: the heuristic's own value of each, the paper's.
+        defaults: the heuristic's default of each, the paper's value.
         arrays: measures, shape [axis..., seed].
         heuristic: its name.
     """
@@ -77,7 +77,7 @@ class Grid:
 
 
 def is_grid(folder: Path) -> bool:
-    """Whether a folder's config.json says that it is a grid's."""
+    """Whether a folder holds a sensitivity grid."""
     return Path(folder).is_dir() and read_config(Path(folder))["format"] == FORMAT
 
 
@@ -85,13 +85,15 @@ def load(folder: Path) -> Grid:
     """Read a grid's results.
 
     Raises:
-        ValueError: for a folder that is no finished grid, or damaged.
+        ValueError: for a folder that is damaged or holds no finished grid.
     """
     folder = Path(folder)
     config = read_config(folder)
     measures = (TRAJECTORY.name, PARAMETER.name, SUCCESS.name)
     if not (folder / "grid.npz").is_file():
-        raise ValueError(f"{folder}: expected a finished grid, found no grid.npz: go on with 'jaxlfi resume {folder}'")
+        raise ValueError(
+            f"{folder}: expected a finished grid, found no grid.npz: continue with 'jaxlfi resume {folder}'"
+        )
     arrays = read_arrays(folder / "grid.npz", ("axes", *measures))
     try:
         names = tuple(str(name) for name in arrays["axes"])
@@ -108,7 +110,7 @@ def load(folder: Path) -> Grid:
 
 
 def marginal(values: np.ndarray, *axes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation over all axes but the given ones, which come out in the order given.
+    """Mean and standard deviation over all axes but the given ones, in the order given.
 
     Args:
         values: shape [axis..., seed]; NaN is left out.
@@ -119,8 +121,19 @@ def marginal(values: np.ndarray, *axes: int) -> tuple[np.ndarray, np.ndarray]:
     return statistics.mean(pooled, -1), statistics.sd(pooled, -1)
 
 
+def errors(grid: Grid) -> tuple[Measure, ...]:
+    """The errors to draw: of trajectories, where any were simulated from the posteriors, and of parameters."""
+    simulated = np.isfinite(grid.arrays[TRAJECTORY.name]).any()
+    return (TRAJECTORY, PARAMETER) if simulated else (PARAMETER,)
+
+
 def size(grid: Grid, bars: int) -> tuple[float, float]:
-    """Width and height of the figure in inches: a column's where the cells stay readable, else a page's."""
+    """Width and height in inches of a figure with colour bars: one column where the cells stay readable, or two.
+
+    Args:
+        grid: the results.
+        bars: number of colour bars, one for each measure.
+    """
     cells = sum(len(values) for values in grid.values)
     width = COLUMN_WIDTH if cells <= 10 else TEXT_WIDTH
     square = width * (0.93 if len(grid.names) > 1 else 0.25 * bars)
@@ -128,17 +141,18 @@ def size(grid: Grid, bars: int) -> tuple[float, float]:
 
 
 def draw(figure: Figure, grid: Grid) -> None:
-    """Trajectory error above the diagonal, parameter error below it.
+    """Trajectory error above the diagonal, where trajectories were simulated, and parameter error below it.
 
     Args:
-        figure: empty, of `size(grid, bars=2)`.
+        figure: empty, of `size(grid, len(errors(grid)))`.
         grid: the results.
     """
-    _matrix(figure, grid, above=TRAJECTORY, below=PARAMETER)
+    *above, below = errors(grid)
+    _matrix(figure, grid, above=above[0] if above else None, below=below)
 
 
 def draw_success(figure: Figure, grid: Grid) -> None:
-    """Simulation success rate over all rounds, below the diagonal only, as above it would be the same.
+    """Simulation success rate over all rounds, below the diagonal only, as the matrix is symmetric.
 
     Args:
         figure: empty, of `size(grid, bars=1)`.
@@ -181,7 +195,7 @@ def _matrix(figure: Figure, grid: Grid, above: Measure | None, below: Measure) -
 
 
 def _scale(grid: Grid, measure: Measure) -> Normalize:
-    """From the least to the greatest mean that is shown; where all are equal, all are the best."""
+    """From the smallest to the largest mean shown; where all are equal, all have the best colour."""
     pairs = [pair for r in (1, 2) for pair in itertools.combinations(range(len(grid.names)), r)]
     means = [marginal(measure.scale * grid.arrays[measure.name], *pair)[0].ravel() for pair in pairs]
     means = np.concatenate(means)
@@ -194,7 +208,7 @@ def _scale(grid: Grid, measure: Measure) -> Normalize:
 
 
 def _font(figure: Figure, cells: int) -> float:
-    """Points of the numbers in cells: as large as a cell has room for; 0 where none is readable."""
+    """Font size of the numbers in cells, in points; 0 where cells are too small for readable numbers."""
     room = 72 * 0.78 * figure.get_size_inches()[0] / cells
     points = min(room / 3.6, 6.5)
     return points if points >= 3.0 else 0.0
@@ -261,7 +275,7 @@ def _cells(
 
 
 def _label(panels: np.ndarray, grid: Grid, upper: bool) -> None:
-    """Names along the left and the bottom; each triangle has its values along its own outer sides."""
+    """Names at the left and the bottom; each triangle has its values at its own outer sides."""
     last = len(grid.names) - 1
     for axes in panels.ravel():
         axes.set(xticks=[], yticks=[])

@@ -1,4 +1,4 @@
-"""Means and spreads that leave NaN out without a word, and give NaN where nothing is left."""
+"""Mean, standard deviation and median of the values that are not NaN; NaN where there are none."""
 
 import numpy as np
 

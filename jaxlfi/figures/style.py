@@ -9,6 +9,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
@@ -59,7 +60,7 @@ STYLE = {
     "figure.constrained_layout.w_pad": 0.03,
     "figure.constrained_layout.h_pad": 0.03,
 }
-"""matplotlib settings of all figures, put in force by `context` and nowhere else."""
+"""matplotlib settings of all figures, which `context` applies."""
 
 SUPPORT_COLOURS = {
     "ok": "#30B9EB",
@@ -68,13 +69,20 @@ SUPPORT_COLOURS = {
     "broader": "#995FDD",
     "broadest": "#369060",
 }
-"""Fixed supports: the hues the paper underlines them with, saturated."""
+"""Colours of fixed supports, after the paper's."""
 
 HEURISTIC_COLOURS = {"edge": "#F5A025", "mode": "#025358", "centre": "#45200E", "truncate": "#3C46FF"}
-"""Adapted supports. With the five above, any two stay apart (CIELAB 22) in each kind of colour blindness."""
+"""Colours of adapted supports. Any two of these nine differ by 22 in CIELAB in each kind of colour blindness."""
 
 OTHER_COLOURS = ("#7F7F7F", "#C2578F", "#8A8A1F", "#4F7CAC", "#B0713B", "#2E2E2E")
-"""For configurations by any other name, in the order they come."""
+"""Colours of configurations of any other name, in order of appearance."""
+
+SET_COLOURS = ("#15158B", "#F5A025", "#025358", "#C52B21", "#30B9EB", "#45200E", "#995FDD", "#369060")
+"""Colours of sets of samples that belong to no configuration, from the nine above."""
+_SET_LINES = ("-", (0, (4, 1.2)), (0, (1, 1)), (0, (6, 1, 1, 1)))
+
+GREY = "#777777"
+"""Colour of legend entries that hold for all configurations."""
 
 _MARKERS = {
     "ok": ("o", "-"),
@@ -98,7 +106,9 @@ TRUTH = {
     "markersize": 7.0,
     "linestyle": "none",
 }
-"""How the true parameters are marked in planes of parameters."""
+"""Marker of the true parameters in planes of two parameters."""
+TRUTH_LINE = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 0.9}
+"""Line of a true parameter along its axis."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +157,7 @@ def looks(configurations: Sequence[str]) -> dict[str, Look]:
     """The look of each configuration; a name from the paper has the same look in all figures.
 
     Args:
-        configurations: names such as "ok" or "misspecified+edge"; any others are given spare colours.
+        configurations: names such as "ok" or "misspecified+edge"; others get colours from `OTHER_COLOURS`.
     """
     result: dict[str, Look] = {}
     spare = 0
@@ -169,6 +179,19 @@ def looks(configurations: Sequence[str]) -> dict[str, Look]:
     return result
 
 
+def set_looks(labels: Sequence[str]) -> list[Look]:
+    """The looks of sets of samples with these labels."""
+    return [
+        Look(plain(label), SET_COLOURS[i % len(SET_COLOURS)], "o", _SET_LINES[i % len(_SET_LINES)])
+        for i, label in enumerate(labels)
+    ]
+
+
+def or_labels(titles: Sequence[str] | None, look: Sequence[Look]) -> list[str]:
+    """The titles, or the labels of the looks where none are given."""
+    return [own.label for own in look] if titles is None else list(titles)
+
+
 def configuration_label(name: str) -> str:
     """A configuration's name for a reader: "misspecified + EDGE"."""
     support, _, heuristic = name.partition("+")
@@ -179,7 +202,7 @@ def configuration_label(name: str) -> str:
 
 
 def plain(text: str) -> str:
-    """Text that matplotlib takes letter by letter (no mathematics), with spaces for underscores."""
+    """Text that matplotlib draws letter by letter (no mathematics), with spaces for underscores."""
     return text.replace("$", r"\$").replace("_", " ")
 
 
@@ -195,18 +218,45 @@ def parameter_name(names: Sequence[str], d: int, width: int = 26) -> str:
 
 def unit_label(names: Sequence[str], units: Sequence[str], d: int) -> str:
     """A parameter's unit in brackets, or ""; a logarithm's unit is the logarithm of the unit."""
-    unit = plain(units[d])
+    return _unit(names[d], units[d])
+
+
+def _unit(name: str, unit: str) -> str:
+    unit = plain(unit)
     if unit in ("", "1", "-"):
         return ""
-    if names[d].startswith("ln ") and not unit.startswith("ln"):
-        unit = f"ln({unit})"
-    return f"[{unit}]"
+    return f"[ln({unit})]" if name.startswith("ln ") and not unit.startswith("ln") else f"[{unit}]"
+
+
+def with_unit(text: str, unit: str, width: int = 18) -> str:
+    """A label broken where it is longer than `width`, with the unit on a line of its own."""
+    return "\n".join([*textwrap.wrap(text, width), *filter(None, [_unit(text, unit)])])
 
 
 def parameter_label(names: Sequence[str], units: Sequence[str], d: int, width: int = 26) -> str:
     """Axis label: symbol and name, and the unit on a line of its own."""
-    unit = unit_label(names, units, d)
-    return parameter_name(names, d, width) + (f"\n{unit}" if unit else "")
+    return "\n".join(filter(None, [parameter_name(names, d, width), unit_label(names, units, d)]))
+
+
+def round_ticks(axis: Axis, count: int) -> None:
+    """At most `count` + 1 ticks at round numbers."""
+    axis.set_major_locator(MaxNLocator(nbins=count, steps=[1, 2, 2.5, 5, 10]))
+
+
+def integer_ticks(axis: Axis, count: int = 6) -> None:
+    """At most `count` + 1 ticks at integers."""
+    axis.set_major_locator(MaxNLocator(nbins=count, integer=True, min_n_ticks=1))
+
+
+def grid_shape(count: int, most: int) -> tuple[int, int]:
+    """Rows and columns for `count` panels, at most `most` of them side by side, in rows of equal lengths."""
+    rows = -(-count // most)
+    return rows, -(-count // rows)
+
+
+def is_wide(figure: Figure) -> bool:
+    """Whether a figure is as wide as a paper's text rather than a column."""
+    return bool(figure.get_size_inches()[0] > 5)
 
 
 def iteration_colours(rounds: int) -> tuple[ListedColormap, BoundaryNorm]:
@@ -220,7 +270,7 @@ def iteration_colours(rounds: int) -> tuple[ListedColormap, BoundaryNorm]:
 def iterations_axis(axes: Axes, rounds: int, first: int = 1, label: bool = True) -> None:
     """Integer ticks for iterations `first` to `rounds`, and the axis' label."""
     axes.set_xlim(first - 0.35, rounds + 0.35)
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, min_n_ticks=1))
+    integer_ticks(axes.xaxis)
     if label:
         axes.set_xlabel("iteration")
 
@@ -237,13 +287,13 @@ def iteration_bar(figure: Figure, axes: np.ndarray, rounds: int) -> Colorbar:
 
 @contextlib.contextmanager
 def context() -> Iterator[None]:
-    """Put `STYLE` in force for figures made, drawn and saved inside; afterwards all is as before."""
+    """Apply `STYLE` to figures made, drawn and saved inside; the settings are restored afterwards."""
     with matplotlib.rc_context(STYLE):
         yield
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure in inches, laid out without overlaps, outside of pyplot."""
+    """An empty figure of a size in inches, laid out without overlaps, that pyplot does not hold on to."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

@@ -1,4 +1,4 @@
-"""Where the bounds of each parameter went, iteration by iteration."""
+"""The bounds of each parameter over iterations."""
 
 from collections.abc import Sequence
 
@@ -8,12 +8,19 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.bands import balanced
-from jaxlfi.figures.collection import Runs
+from jaxlfi.figures.collection import Runs, seed_count
 from jaxlfi.figures.history import History
-from jaxlfi.figures.style import Look, iterations_axis, looks, parameter_name, unit_label
+from jaxlfi.figures.legends import above, balanced
+from jaxlfi.figures.style import (
+    TRUTH_LINE,
+    Look,
+    grid_shape,
+    iterations_axis,
+    looks,
+    parameter_name,
+    unit_label,
+)
 
-_TRUTH = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 0.9}
 _LIMIT = {"color": "#777777", "linestyle": (0, (1, 1.5)), "linewidth": 0.9}
 
 
@@ -43,7 +50,7 @@ def draw_bounds(axes: Axes, histories: Sequence[History], d: int, look: Look) ->
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """One panel a parameter, with the configurations that adapt, the truth and the limits Phi.
+    """One panel a parameter, with the configurations that adapt, the truth and the feasible limits Phi.
 
     Args:
         figure: empty.
@@ -52,8 +59,7 @@ def draw(figure: Figure, runs: Runs) -> None:
     shown = adapting(runs)
     look = {name: own for name, own in looks(list(runs)).items() if name in shown}
     first = next(iter(shown.values()))[0]
-    rows = -(-first.dim // 4)
-    columns = -(-first.dim // rows)
+    rows, columns = grid_shape(first.dim, 4)
     every = figure.subplots(rows, columns, squeeze=False).ravel()
     for d, axes in enumerate(every):
         if d >= first.dim:
@@ -62,7 +68,7 @@ def draw(figure: Figure, runs: Runs) -> None:
         for name, histories in shown.items():
             draw_bounds(axes, histories, d, look[name])
         if np.isfinite(first.truth[d]):
-            axes.axhline(first.truth[d], **_TRUTH, gid="truth")
+            axes.axhline(first.truth[d], **TRUTH_LINE, gid="truth")
         for limit in (first.feasible_low, first.feasible_high):
             if limit is not None:
                 axes.axhline(limit[d], **_LIMIT, gid="limit")
@@ -74,15 +80,9 @@ def draw(figure: Figure, runs: Runs) -> None:
         iterations_axis(axes, first.rounds, first=0, label=d + columns >= first.dim)
     handles = [Line2D([], [], **own.line) for own in look.values()]
     if np.isfinite(first.truth).any():
-        handles.append(Line2D([], [], label="truth", **_TRUTH))
+        handles.append(Line2D([], [], label="truth", **TRUTH_LINE))
     if first.feasible_low is not None or first.feasible_high is not None:
-        handles.append(Line2D([], [], label=r"limits $\Phi$", **_LIMIT))
-    seeds = max(len(histories) for histories in shown.values())
-    columns = balanced(list(look.values()), figure.get_size_inches()[0]) if len(handles) > 5 else len(handles)
-    figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=columns,
-        title=f"mean bounds over {seeds} seeds, thin: each seed" if seeds > 1 else "bounds of one seed",
-        title_fontsize=7,
-    )
+        handles.append(Line2D([], [], label=r"feasible limits $\Phi$", **_LIMIT))
+    seeds = seed_count(shown)
+    title = f"mean bounds over {seeds} seeds, thin: each seed" if seeds > 1 else "bounds of one seed"
+    above(figure, handles, title, balanced(list(look.values()), figure) if len(handles) > 5 else None)

@@ -1,14 +1,19 @@
 """What a heuristic is: (previous belief, posterior, Phi) -> (belief, what it saw and did)."""
 
-from typing import Protocol, runtime_checkable
+import abc
+from typing import ClassVar
 
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from jaxlfi.belief import Belief
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.fields import Checked
+
+Value = Float[Array, ""] | Float[Array, " dim"] | float | int
+"""Of a hyperparameter: a scalar, or one value a dimension."""
 
 
 @struct.dataclass
@@ -26,10 +31,38 @@ class Adaptation:
     high_shift: Float[Array, "*batch dim"]
 
 
-@runtime_checkable
-class Heuristic(Protocol):
-    """A pure, branch-free rule. Hyperparameters are leaves: scalars or one value per dimension, shape [D]."""
+class Heuristic(Checked, abc.ABC):
+    """A pure, branch-free rule. Derive from it; the class is then a frozen dataclass and a pytree, without a decorator.
 
+    Hyperparameters are leaves, scalars or one value per dimension, shape [D]. They are declared by
+    `jaxlfi.fields.hyperparameter`, and what changes the structure of the computation by `jaxlfi.fields.option`; flags,
+    checks and the documentation are made from that. A package registers its heuristics by
+    `[project.entry-points."jaxlfi.heuristics"]` in pyproject.toml.
+
+    Attributes:
+        grows: whether the support can grow. Where it cannot, posterior mass at a bound has to be reported to the user.
+        compares_components: whether components are compared by their index with those of the previous posterior. They
+            are matched first (`Matched`) where networks start anew each round.
+
+    Example:
+        >>> from jaxlfi.fields import hyperparameter
+        >>> from jaxlfi.heuristics import adapted
+        >>> class Widen(Heuristic):
+        ...     expansion: float = hyperparameter(0.1, help="how far both bounds move", symbol="eta", low=0)
+        ...
+        ...     def __call__(self, previous, posterior, feasible):
+        ...         everywhere = jnp.ones_like(previous.support.low, bool)
+        ...         support = stretch(previous.support, feasible, everywhere, everywhere, self.expansion)
+        ...         return adapted(previous, posterior, support, evidence={})
+        >>> Widen(expansion=-1)
+        Traceback (most recent call last):
+        ValueError: expansion: expected a number in [0, inf), got -1
+    """
+
+    grows: ClassVar[bool] = True
+    compares_components: ClassVar[bool] = False
+
+    @abc.abstractmethod
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Adapt the support.
 
@@ -41,7 +74,6 @@ class Heuristic(Protocol):
         Returns:
             The next belief (this posterior on the adapted support) and the adaptation.
         """
-        ...
 
 
 def stretch(
@@ -49,7 +81,7 @@ def stretch(
     feasible: Support,
     left: Bool[Array, " dim"],
     right: Bool[Array, " dim"],
-    expansion: Float[Array, ""] | Float[Array, " dim"] | float,
+    expansion: Value,
 ) -> Support:
     """Stretch the chosen bounds by `expansion` times the width, as far as Phi allows (Algorithms 2 and 3).
 

@@ -1,16 +1,14 @@
 """CENTRE: slide the support so that the posterior's weighted mean is in its middle (Algorithm 4)."""
 
 import jax.numpy as jnp
-from flax import struct
 
-from jaxlfi.belief import Belief
-from jaxlfi.heuristics.base import Adaptation, adapted
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.heuristics.base import Adaptation, Heuristic, adapted
 
 
-@struct.dataclass
-class Centre:
+class Centre(Heuristic):
     """Centring-based adaptive bounds (Algorithm 4): no hyperparameters; the width is kept.
 
     Example:

@@ -1,18 +1,16 @@
-"""Choice: one of several heuristics, picked by a leaf, so that they can be lanes of one compiled program."""
+"""Choice: one of several heuristics, picked by a leaf, so that they can be runs of one batch."""
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array, Int
 
-from jaxlfi.belief import Belief
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics.base import Adaptation, Heuristic
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
 
 
-@struct.dataclass
-class Choice:
+class Choice(Heuristic):
     """Apply `rules[index]`. The index is a leaf: `vmap` over it compares heuristics within one program.
 
     All rules are evaluated (they cost microseconds) and one result is kept. The evidence of every rule is kept, under
@@ -25,6 +23,16 @@ class Choice:
 
     index: Int[Array, "*batch"] | int
     rules: tuple[Heuristic, ...]
+
+    @property
+    def grows(self) -> bool:
+        """Whether any rule can let the support grow."""
+        return any(rule.grows for rule in self.rules)
+
+    @property
+    def compares_components(self) -> bool:
+        """Whether any rule compares components."""
+        return any(rule.compares_components for rule in self.rules)
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Evaluate every rule and keep the chosen one's belief and shifts."""

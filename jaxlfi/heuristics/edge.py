@@ -1,17 +1,15 @@
 """EDGE: stretch a bound that posterior mass piles up against (Algorithm 2)."""
 
 import jax.numpy as jnp
-from flax import struct
-from jaxtyping import Array, Float
 
-from jaxlfi.belief import Belief
-from jaxlfi.heuristics.base import Adaptation, adapted, stretch
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.fields import hyperparameter
+from jaxlfi.heuristics.base import Adaptation, Heuristic, Value, adapted, stretch
 
 
-@struct.dataclass
-class Edge:
+class Edge(Heuristic):
     """Edge-driven Gaussian expansion (Algorithm 2; defaults of section V).
 
     A bound moves out by `expansion` times the width where the marginal mass in the zone along it exceeds
@@ -23,7 +21,7 @@ class Edge:
         expansion: eta, the step as a fraction of the current width.
         zone_width: an absolute width added to the zone: delta as Algorithm 2 writes it is
             `Edge(zone_fraction=0.0, zone_width=0.1)` (reading F).
-        tail: the share of the mass *beyond* the bound that counts as lying in the zone. 1 counts it all, which is
+        tail: the fraction of the mass *beyond* the bound that counts as lying in the zone. 1 counts it all, which is
             where clipping puts it and what keeps EDGE working when the mode itself has left the box; 0 counts the zone
             alone (reading G).
 
@@ -32,11 +30,17 @@ class Edge:
         0.001
     """
 
-    zone_fraction: Float[Array, ""] | Float[Array, " dim"] | float = 0.1
-    mass_threshold: Float[Array, ""] | Float[Array, " dim"] | float = 0.005
-    expansion: Float[Array, ""] | Float[Array, " dim"] | float = 0.2
-    zone_width: Float[Array, ""] | Float[Array, " dim"] | float = 0.0
-    tail: Float[Array, ""] | Float[Array, " dim"] | float = 1.0
+    zone_fraction: Value = hyperparameter(
+        0.1, help="the zone along a bound, as a fraction of the support's width", symbol="delta", low=0, high=1
+    )
+    mass_threshold: Value = hyperparameter(
+        0.005, help="posterior mass in the zone above which its bound moves", symbol="tau", low=0, high=1
+    )
+    expansion: Value = hyperparameter(
+        0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
+    )
+    zone_width: Value = hyperparameter(0.0, help="an absolute width added to the zone", symbol="delta", low=0)
+    tail: Value = hyperparameter(1.0, help="fraction of the mass beyond the bound that counts", low=0, high=1)
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Algorithm 2, over all dimensions at once; the evidence is the two edge masses M_L and M_R, shape [D]."""

@@ -1,21 +1,20 @@
 """No adaptation: standard BayesSim on the support it was given."""
 
-from flax import struct
-
-from jaxlfi.belief import Belief
-from jaxlfi.heuristics.base import Adaptation, adapted
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.heuristics.base import Adaptation, Heuristic, adapted
 
 
-@struct.dataclass
-class Fixed:
+class Fixed(Heuristic):
     """Keep the support as it is (the baseline of section V).
 
     Example:
         >>> Fixed()
         Fixed()
     """
+
+    grows = False
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """The posterior on the support of before; nothing is seen and nothing moves."""

@@ -3,20 +3,18 @@
 from itertools import permutations
 
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array, Int
 
-from jaxlfi.belief import Belief
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics.base import Adaptation, Heuristic
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
 
 MAX_EXACT = 6
 """Up to 6! = 720 permutations are tried; more components are matched greedily."""
 
 
-@struct.dataclass
-class Matched:
+class Matched(Heuristic):
     """Another heuristic, on a posterior whose components were first paired with the previous ones (reading C).
 
     Networks that start anew every round label their components arbitrarily; without matching, MODE would see
@@ -33,11 +31,27 @@ class Matched:
 
     rule: Heuristic
 
+    @property
+    def grows(self) -> bool:
+        """Whether the rule can let the support grow."""
+        return self.rule.grows
+
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Reorder the posterior's components (not before the first round), then apply the rule."""
         order = match(previous.mixture, posterior, previous.support)
         order = jnp.where(previous.informed, order, jnp.arange(order.shape[0]))
         return self.rule(previous, posterior.permute(order), feasible)
+
+
+def paired(rule: Heuristic, warm_start: bool) -> Heuristic:
+    """The rule as it has to be for such networks: `Matched` where it compares components of networks that start anew.
+
+    Example:
+        >>> from jaxlfi.heuristics import Edge, Mode
+        >>> type(paired(Mode(), warm_start=False)).__name__, type(paired(Edge(), warm_start=False)).__name__
+        ('Matched', 'Edge')
+    """
+    return Matched(rule) if rule.compares_components and not warm_start else rule
 
 
 def match(previous: GaussianMixture, posterior: GaussianMixture, support: Support) -> Int[Array, " comp"]:

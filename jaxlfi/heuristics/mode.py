@@ -1,17 +1,15 @@
 """MODE: stretch a bound that the modes of the posterior move towards (Algorithm 3)."""
 
 import jax.numpy as jnp
-from flax import struct
-from jaxtyping import Array, Float
 
-from jaxlfi.belief import Belief
-from jaxlfi.heuristics.base import Adaptation, adapted, stretch
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.fields import hyperparameter
+from jaxlfi.heuristics.base import Adaptation, Heuristic, Value, adapted, stretch
 
 
-@struct.dataclass
-class Mode:
+class Mode(Heuristic):
     """Mode-oriented domain expansion (Algorithm 3; defaults of section V).
 
     Components are compared by their index with those of the previous posterior, which means something where the
@@ -30,10 +28,20 @@ class Mode:
         0.2
     """
 
-    shift_threshold: Float[Array, ""] | Float[Array, " dim"] | float = 0.01
-    proximity: Float[Array, ""] | Float[Array, " dim"] | float = 0.4
-    mass_threshold: Float[Array, ""] | Float[Array, " dim"] | float = 0.05
-    expansion: Float[Array, ""] | Float[Array, " dim"] | float = 0.2
+    compares_components = True
+
+    shift_threshold: Value = hyperparameter(
+        0.01, help="how far a mode must have moved since the last round", symbol="nu_TH", low=0
+    )
+    proximity: Value = hyperparameter(
+        0.4, help="how near a bound a mode must be, as a fraction of the support's width", symbol="rho", low=0, high=1
+    )
+    mass_threshold: Value = hyperparameter(
+        0.05, help="weight of the modes moving towards a bound above which it moves", symbol="tau", low=0, high=1
+    )
+    expansion: Value = hyperparameter(
+        0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
+    )
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Algorithm 3; the evidence is the mode shifts [K, D] and the accumulated weights W_L and W_R, [D]."""

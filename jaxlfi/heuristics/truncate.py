@@ -1,20 +1,18 @@
 """Truncate: shrink the support to where the posterior is, and propose from the prior over it."""
 
 import jax.numpy as jnp
-from flax import struct
-from jaxtyping import Array, Float
 
-from jaxlfi.belief import Belief
-from jaxlfi.heuristics.base import Adaptation, adapted
-from jaxlfi.mixture import GaussianMixture
-from jaxlfi.support import Support
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.fields import hyperparameter
+from jaxlfi.heuristics.base import Adaptation, Heuristic, Value, adapted
 
 MIN_WIDTH = 1e-3
-"""Share of Phi's width below which no support is truncated."""
+"""Fraction of Phi's width below which no support is truncated."""
 
 
-@struct.dataclass
-class Truncate:
+class Truncate(Heuristic):
     """Truncated proposals on a box (Deistler et al. 2022; boxes as in Miller et al. 2021).
 
     The support shrinks to the part of it between `quantile` and 1 - `quantile` of each marginal of the posterior, and
@@ -30,18 +28,16 @@ class Truncate:
             nothing. It is a leaf and can be vmapped over.
 
     Raises:
-        ValueError: for a quantile outside [0, 0.5) given as a Python number.
+        ValueError: for a quantile outside [0, 0.5).
 
     Example:
         >>> Truncate(quantile=0.01).quantile
         0.01
     """
 
-    quantile: Float[Array, ""] | Float[Array, " dim"] | float = 1e-3
+    grows = False
 
-    def __post_init__(self):
-        if isinstance(self.quantile, float | int) and not 0 <= self.quantile < 0.5:
-            raise ValueError(f"quantile: expected a mass in [0, 0.5), got {self.quantile}")
+    quantile: Value = hyperparameter(1e-3, help="posterior mass given up beyond each bound", low=0, below=0.5)
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Intersect the support with the posterior's interval; the evidence is the interval's two ends, shape [D]."""

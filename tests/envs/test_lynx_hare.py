@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxlfi import bayessim
-from jaxlfi.belief import rejected
+from jaxlfi.bayessim import algorithm as bayessim
+from jaxlfi.bayessim.keys import run_keys
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.distributions.belief import rejected
 from jaxlfi.envs import lynx_hare
 from jaxlfi.envs.lotka_volterra.ode import populations
 from jaxlfi.envs.lynx_hare import Nuisance
 from jaxlfi.heuristics import Choice, Edge, Fixed
-from jaxlfi.keys import run_keys
-from jaxlfi.presets import QUICK
 
 SETTINGS = QUICK.replace(rounds=8)
 """Of the acceptance test."""

@@ -26,7 +26,7 @@ from jaxlfi.envs.mg1 import (
     waiting_times,
     zscore,
 )
-from jaxlfi.simulation import simulate
+from jaxlfi.tasks.simulation import simulate
 
 TRUTH = np.array([1.0, 5.0, 0.2])
 

@@ -7,7 +7,7 @@ import pytest
 
 from jaxlfi.envs import lotka_volterra
 from jaxlfi.envs.lotka_volterra.jump_process import JumpProcess, lotka_volterra_nine
-from jaxlfi.simulation import simulate, trajectory_and_outcome
+from jaxlfi.tasks.simulation import simulate, trajectory_and_outcome
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 from scipy.integrate import solve_ivp
 
-from jaxlfi import tasks
 from jaxlfi.envs.lotka_volterra.jump_process import lotka_volterra_nine
 from jaxlfi.envs.lotka_volterra.ode import NOISES, gaussian_noise, lognormal_noise, populations, task
-from jaxlfi.simulation import simulate
+from jaxlfi.tasks import registry as tasks
+from jaxlfi.tasks.simulation import simulate
 
 RATES = [(0.01, 0.1, 0.1, 0.02), (0.03, 0.15, 0.12, 0.011), (0.004, 0.31, 0.22, 0.006)]
 """Unlike in all four, so that two that are swapped would show."""

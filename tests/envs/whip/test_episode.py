@@ -20,7 +20,7 @@ from jaxlfi.envs.whip.physics.native import NativeEngine
 from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.vision.camera import project, side_camera
 from jaxlfi.envs.whip.vision.keypoints import CLEAN, DETECTORS
-from jaxlfi.summaries import cross_correlation
+from jaxlfi.tasks.summaries import cross_correlation
 
 
 class Puppet:

@@ -12,7 +12,7 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 
 import jaxlfi
-from jaxlfi import tasks
+from jaxlfi.distributions.support import check_within
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.parameters import median
@@ -23,8 +23,8 @@ from jaxlfi.envs.whip.real2sim import CHANNELS, DATA, NUISANCES, recorded, task,
 from jaxlfi.envs.whip.trajectory import trajectory
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
-from jaxlfi.simulation import trajectory_and_outcome
-from jaxlfi.support import check_within
+from jaxlfi.tasks import registry as tasks
+from jaxlfi.tasks.simulation import trajectory_and_outcome
 from tests.small import SETTINGS, command
 
 NATIVE = NativeEngine()

@@ -1,0 +1,222 @@
+"""Iterative BayesSim with support adaptation: Algorithm 1, lines 9-20, as init / step / run."""
+
+from collections.abc import Callable
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from jaxlfi.bayessim.correction import CORRECTIONS, CorrectionInfo, effective_size
+from jaxlfi.bayessim.keys import RoundKeys, init_key, round_keys
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.distributions.belief import RESTRICTIONS, Belief, uninformed
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators import dataset as datasets
+from jaxlfi.estimators.base import Network, untrained
+from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.estimators.training import FitInfo, fit
+from jaxlfi.heuristics import Adaptation, Heuristic
+from jaxlfi.tasks.priors import prior_draws
+from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
+from jaxlfi.tasks.task import Task
+
+
+@struct.dataclass
+class State:
+    """What the next round needs.
+
+    Attributes:
+        belief: the reference prior p_i on its support Theta_i.
+        proposals: the beliefs the rounds so far drew from, stacked, with room for all rounds.
+        dataset: all simulations so far.
+        network: the density estimator.
+    """
+
+    belief: Belief
+    proposals: Belief
+    dataset: Dataset
+    network: Network
+
+    @property
+    def feasible(self) -> Support:
+        """Phi; a named support that the task declares wider than Phi widens it for the run."""
+        return self.network.scale
+
+
+@struct.dataclass
+class Round:
+    """What one round did; `run` stacks these.
+
+    Attributes:
+        simulations: what was simulated.
+        failed: failures by reason, shape [R].
+        proposal: the belief that was drawn from.
+        belief: the posterior on the adapted support.
+        adaptation: what the heuristic saw and did.
+        correction: what the posterior's correction did.
+        fit: losses.
+    """
+
+    simulations: Simulations
+    failed: Int[Array, "*batch reason"]
+    proposal: Belief
+    belief: Belief
+    adaptation: Adaptation
+    correction: CorrectionInfo
+    fit: FitInfo
+
+
+def init(
+    key: jax.Array,
+    task: Task,
+    support: Support,
+    settings: Settings,
+    observed: Float[Array, " obs"],
+    first: int | None = None,
+) -> State:
+    """The state before the first round: no data, and nothing believed but the support.
+
+    Args:
+        key: consumed.
+        task: simulator, names and bounds.
+        support: Theta_0, in inference space.
+        settings: the numbers of the run.
+        observed: the real trajectory's summary x^r, shape [S].
+        first: simulations of the first round, where they are given and not made.
+    """
+    chex.assert_rank(observed, 1)
+    chex.assert_shape([support.low, support.high], (task.dim,))
+    belief = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
+    obs = observed.shape[-1]
+    first = settings.simulations_per_round if first is None else first
+    capacity = first + (settings.rounds - 1) * settings.simulations_per_round
+    return State(
+        belief=belief,
+        proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.rounds, *leaf.shape)), belief),
+        dataset=datasets.empty(capacity, task.dim, obs),
+        network=untrained(key, settings.estimator, obs, task.inference.feasible.hull(support), task.space),
+    )
+
+
+def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> Float[Array, "attempts dim"]:
+    """Draw theta ~ p_i (line 11): the prior over Theta_0 in the first round, then the restricted posterior.
+
+    A belief that is not informed is the prior over its support: so it is in the first round, and always by `Truncate`.
+    A defensive fraction of the draws stays with the prior over the *current* support: it covers the ground that the
+    support has gained, also where the posterior has locked itself onto a place where it learns nothing more.
+    """
+    key_prior, key_posterior, key_choice = jax.random.split(key, 3)
+    informed = RESTRICTIONS[settings.restriction](key_posterior, belief, settings.simulation_budget)
+    prior = prior_draws(key_prior, task.inference.prior, belief.support, settings.simulation_budget)
+    from_prior = (
+        jax.random.bernoulli(key_choice, settings.defensive, (settings.simulation_budget, 1)) | ~belief.informed
+    )
+    return jnp.where(from_prior, prior, informed)
+
+
+def update(
+    key: jax.Array,
+    task: Task,
+    settings: Settings,
+    heuristic: Heuristic,
+    observed: Float[Array, " obs"],
+    state: State,
+    round: Int[Array, ""] | int,
+    simulations: Simulations,
+) -> tuple[State, Round]:
+    """All of a round that comes after its simulations (lines 12-20)."""
+    dataset = datasets.augment(state.dataset, simulations, round)
+    proposals = jax.tree.map(lambda all_, now: all_.at[round].set(now), state.proposals, state.belief)
+    correction = CORRECTIONS[settings.correction]
+    weights = correction.row_weights(task, dataset, proposals, round, settings.defensive)
+    prior = task.inference.prior
+    log_prior = None if prior is None else prior.log_prob(dataset.theta)
+    # The rows that the rounds still to come have room for are not there yet.
+    expected = dataset.capacity - (settings.rounds - 1 - round) * settings.simulations_per_round
+    key_fit, key_condition = state.network.estimator.keys(key)
+    network, fit_info = fit(key_fit, _started(state, dataset), dataset, weights, expected, log_prior)
+    posterior = network.condition(observed, state.belief.support, key_condition)
+    mixture, not_positive_definite = correction.change(task, posterior.mixture, state.belief)
+    belief, adaptation = heuristic(state.belief, mixture, state.feasible)
+    info = Round(
+        simulations=simulations,
+        failed=simulations.failed(len(task.reasons)),
+        proposal=state.belief,
+        belief=belief,
+        adaptation=adaptation,
+        correction=CorrectionInfo(effective_size(weights), not_positive_definite, posterior.mass_inside),
+        fit=fit_info,
+    )
+    return State(belief, proposals, dataset, network), info
+
+
+def _started(state: State, dataset: Dataset) -> Network:
+    """A network that is trained on takes its normalisers from the first round that has simulations."""
+    fresh = state.network.with_normalisers(dataset)
+    return jax.tree.map(lambda kept, new: jnp.where(state.dataset.size > 0, kept, new), state.network, fresh)
+
+
+def step(
+    keys: RoundKeys,
+    task: Task,
+    settings: Settings,
+    heuristic: Heuristic,
+    observed: Float[Array, " obs"],
+    state: State,
+    round: Int[Array, ""] | int,
+) -> tuple[State, Round]:
+    """One round of Algorithm 1 for a simulator in JAX (lines 11-20).
+
+    Args:
+        keys: of the round, consumed.
+        task: simulator, names and bounds.
+        settings: the numbers of the run.
+        heuristic: how the support is adapted.
+        observed: the real trajectory's summary x^r, shape [S].
+        state: what the rounds before left.
+        round: index i of the round, from 0.
+
+    Returns:
+        The next state, and what the round did.
+    """
+    theta = propose(keys.propose, task, settings, state.belief)
+    x, failure = simulate(keys.simulate, task, theta)
+    simulations = within_budget(theta, x, failure, settings.simulations_per_round)
+    return update(keys.update, task, settings, heuristic, observed, state, round, simulations)
+
+
+def run(
+    key: jax.Array,
+    task: Task,
+    settings: Settings,
+    heuristic: Heuristic,
+    observed: Float[Array, " obs"],
+    support: Support,
+    look: Callable[[Array, State, Round], Any] = lambda index, state, info: info,
+) -> tuple[State, Any]:
+    """The whole inference, as one scan: Algorithm 1, lines 9-20.
+
+    Pure: jit it, and vmap it over keys, supports, observations and the leaves of heuristics and settings.
+
+    Args:
+        key: consumed (`RunKeys.run`).
+        task: a task whose simulator is in JAX.
+        settings: the numbers of the run.
+        heuristic: how the support is adapted.
+        observed: the real trajectory's summary x^r, shape [S].
+        support: Theta_0, in inference space.
+        look: what is kept of a round, from its index, the state after it and what it did; all of it by default.
+
+    Returns:
+        The last state, and what was kept of every round, stacked along a leading axis of length `settings.rounds`.
+    """
+    state = init(init_key(key), task, support, settings, observed)
+
+    def body(state, index):
+        state, info = step(round_keys(key, index), task, settings, heuristic, observed, state, index)
+        return state, look(index, state, info)
+
+    return jax.lax.scan(body, state, jnp.arange(settings.rounds))

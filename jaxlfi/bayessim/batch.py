@@ -1,0 +1,282 @@
+"""Batches: many inference runs (configurations times seeds) stepped together as one compiled program.
+
+The runs of a batch differ in leaves only (support, heuristic, seed, observation), so one compiled `vmap` of
+`algorithm.step` serves them all, sharded over the local devices. Each run has its own keys: what it gives does not
+depend on which other runs are in the batch, but for the rounding of differently batched arithmetic, which training
+amplifies from round to round. The same batch on the same number of devices repeats bit for bit.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, Int
+
+from jaxlfi.bayessim import algorithm
+from jaxlfi.bayessim.algorithm import Round, State
+from jaxlfi.bayessim.keys import init_key, key_of, round_keys, run_keys
+from jaxlfi.bayessim.programs import compiled, program
+from jaxlfi.bayessim.record import record
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.diagnostics.discrepancy import POSTERIOR_SAMPLES, Discrepancy, discrepancy, not_simulated
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.base import Network
+from jaxlfi.estimators.posterior import Posterior, truncated
+from jaxlfi.heuristics import Choice, Heuristic
+from jaxlfi.tasks.simulation import Simulations
+from jaxlfi.tasks.task import Task
+
+AXIS = "runs"
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSpec:
+    """One run of a batch, as it is named and recorded.
+
+    Attributes:
+        configuration: what the run is called in tables, such as "misspecified+edge".
+        support_name: the support's name, or "own".
+        support: Theta_0, in inference space.
+        heuristic: how it is adapted.
+        seed: of the run; `key_of(seed)` is its key.
+    """
+
+    configuration: str
+    support_name: str
+    support: Support
+    heuristic: Heuristic
+    seed: int
+
+
+@struct.dataclass
+class RunInputs:
+    """What a run brings to the compiled program; stacked along a leading axis for a batch.
+
+    Attributes:
+        key: the run's key.
+        support: Theta_0.
+        heuristic: the rule, or a `Choice` among the rules of all runs.
+        observed: the observed trajectory, shape [T, C] or [T].
+        x: its summary x^r, shape [S].
+    """
+
+    key: jax.Array
+    support: Support
+    heuristic: Heuristic
+    observed: Float[Array, "*shape"]
+    x: Float[Array, "*batch obs"]
+
+
+def stack_heuristics(rules: Sequence[Heuristic]) -> tuple[Heuristic, list[int | None]]:
+    """The rules of several runs as one stacked pytree.
+
+    Rules of the same structure differ in leaves only. Where there are more structures than one, each run gets a
+    `Choice` of one rule of each structure and follows its own.
+
+    Returns:
+        The stacked rule, and for each run its place in the choice (None without a choice).
+    """
+    structures = [_structure(rule) for rule in rules]
+    kinds = list(dict.fromkeys(structures))
+    if len(kinds) == 1:
+        return stack(rules), [None] * len(rules)
+    places = [kinds.index(structure) for structure in structures]
+    examples = [rules[structures.index(kind)] for kind in kinds]
+    choices = [
+        Choice(index=place, rules=tuple(rule if place == slot else other for slot, other in enumerate(examples)))
+        for rule, place in zip(rules, places, strict=True)
+    ]
+    return stack(choices), places
+
+
+def stack_inputs(specs: Sequence[RunSpec], observed: np.ndarray, x: np.ndarray) -> tuple[RunInputs, list[int | None]]:
+    """Inputs of a batch, and each run's place in the choice of heuristics.
+
+    Args:
+        specs: the runs.
+        observed: their observed trajectories, shape [L, T, C] or [L, T].
+        x: the summaries, shape [L, S].
+    """
+    heuristic, places = stack_heuristics([spec.heuristic for spec in specs])
+    keys = jnp.stack([key_of(spec.seed) for spec in specs])
+    support = stack([spec.support for spec in specs])
+    return RunInputs(keys, support, heuristic, jnp.asarray(observed), jnp.asarray(x)), places
+
+
+def posterior_after(belief: Belief, network: Network, x: Float[Array, " obs"]) -> Posterior:
+    """The posterior a run believes after a round, truncated to the support it adapted.
+
+    Where the density is a mixture of Gaussians it is the belief's own, with whatever correction and heuristic did to it.
+    """
+    density = belief.mixture if network.estimator.closed_form else network.estimator.density(network, x)
+    return truncated(density, belief.mixture, belief.support, network.space)
+
+
+def start_one(task: Task, first: int | None, settings: Settings, run: RunInputs) -> State:
+    """The state before the first round."""
+    return algorithm.init(init_key(run_keys(run.key).run), task, run.support, settings, run.x, first)
+
+
+def propose_one(
+    task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int
+) -> tuple[Float[Array, "attempts dim"], jax.Array]:
+    """Proposals of a round, and the key of their simulations."""
+    keys = round_keys(run_keys(run.key).run, index)
+    return algorithm.propose(keys.propose, task, settings, state.belief), keys.simulate
+
+
+def update_one(
+    task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, simulations: Simulations
+) -> tuple[State, Round]:
+    """All of a round that comes after its simulations."""
+    keys = round_keys(run_keys(run.key).run, index)
+    return algorithm.update(keys.update, task, settings, run.heuristic, run.x, state, index, simulations)
+
+
+def check_draws(run: RunInputs, state: State, index: Int[Array, ""] | int) -> tuple[Float[Array, "samples dim"], Array]:
+    """Draws of the posterior after a round, in inference space, and the key of their simulations."""
+    key_draw, key_simulate = jax.random.split(run_keys(run.key).of_check(index))
+    posterior = posterior_after(state.belief, state.network, run.x)
+    return posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference"), key_simulate
+
+
+def check_one(task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int) -> Discrepancy:
+    """How far the posterior after a round is from truth and observation, for a simulator in JAX."""
+    theta, key_simulate = check_draws(run, state, index)
+    if not settings.predictive:
+        return not_simulated(task, theta, run.observed, run.x.shape[-1])
+    return discrepancy(key_simulate, task, theta, run.observed)
+
+
+def round_one(
+    task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int
+) -> tuple[State, dict[str, Array]]:
+    """One round of one run, and its record."""
+    keys = round_keys(run_keys(run.key).run, index)
+    state, info = algorithm.step(keys, task, settings, run.heuristic, run.x, state, index)
+    return state, record(info, check_one(task, settings, run, state, index))
+
+
+def given_one(
+    task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, simulations: Simulations
+) -> tuple[State, dict[str, Array]]:
+    """One round of one run on simulations that were given, and its record."""
+    state, info = update_one(task, settings, run, state, index, simulations)
+    return state, record(info, check_one(task, settings, run, state, index))
+
+
+def run_one(task: Task, settings: Settings, run: RunInputs) -> tuple[State, dict[str, Array]]:
+    """A whole run as one scan, and the records of its rounds, stacked: for traced functions (`jax.vmap` of `infer`)."""
+    look = lambda index, state, info: record(info, check_one(task, settings, run, state, index))
+    return algorithm.run(run_keys(run.key).run, task, settings, run.heuristic, run.x, run.support, look)
+
+
+class BatchEngine:
+    """A batch as one compiled program: a `vmap` over runs, sharded over the local devices.
+
+    Engines of equal tasks share their compiled programs: a second run of the same shapes compiles nothing.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        settings: Settings,
+        inputs: RunInputs,
+        devices: Sequence[Any] | None = None,
+        first: Simulations | None = None,
+    ):
+        """Prepare, without compiling.
+
+        Args:
+            task: the task.
+            settings: the same for all runs.
+            inputs: stacked.
+            devices: defaults to all local devices, at most one a run.
+            first: simulations that take the place of the first round's, the same for all runs.
+        """
+        self.task, self.settings, self.runs = task, settings, inputs.x.shape[0]
+        devices = tuple(devices or jax.local_devices())[: self.runs]
+        self.mesh = Mesh(np.asarray(devices), (AXIS,))
+        self._padded = len(devices) * math.ceil(self.runs / len(devices))
+        self.inputs = self.place(inputs)
+        self.first = first
+
+    def start(self) -> State:
+        """The state before the first round."""
+        first = None if self.first is None else len(self.first.theta)
+        start = program(functools.partial(start_one, self.task, first), self.mesh, (None, 0))
+        return start(self.settings, self.inputs)
+
+    def compile(self, state: State, index: int = 0) -> Any:
+        """Compile a round ahead of its first use, so that it can be timed by itself; returns the program."""
+        return self._compiled(round_one, state, index)
+
+    def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
+        """Step every run; `state` is consumed.
+
+        Returns:
+            The next state, and the round's record (`jaxlfi.bayessim.record.record`) with a leading axis of one entry a
+            run.
+        """
+        if index == 0 and self.first is not None:
+            return self._step(given_one, state, index, self.first_round())
+        return self._step(round_one, state, index)
+
+    def first_round(self) -> Simulations:
+        """The given simulations, for every run."""
+        return self.place(jax.tree.map(lambda leaf: jnp.stack([leaf] * self.runs), self.first))
+
+    def load(self, inputs: RunInputs) -> None:
+        """Take the inputs of another batch of as many runs."""
+        self.inputs = self.place(inputs)
+
+    def fetch(self, state: State) -> State:
+        """The state of the runs on the host, without padding."""
+        return jax.tree.map(lambda leaf: leaf[: self.runs], jax.device_get(state))
+
+    def place(self, tree: Any) -> Any:
+        """Lay a stacked batch out over the devices, the last run repeated to fill them."""
+        sharding = NamedSharding(self.mesh, PartitionSpec(AXIS))
+        rows = np.minimum(np.arange(self._padded), self.runs - 1)
+        return jax.tree.map(lambda leaf: jax.device_put(jnp.asarray(leaf)[rows], sharding), tree)
+
+    def _step(self, one: Callable, state: State, index: int, *more: Any) -> tuple[State, dict[str, np.ndarray]]:
+        executable = self._compiled(one, state, index, *more)
+        state, rows = executable(self.settings, self.inputs, state, jnp.asarray(index), *more)
+        rows = jax.device_get(rows)
+        return state, {name: value[: self.runs] for name, value in rows.items()}
+
+    def _compiled(self, one: Callable, state: State, index: int, *more: Any) -> Any:
+        # The round's index is not batched: loops over minibatches then have one trip count for all runs.
+        in_axes = (None, 0, 0, None, *(0 for _ in more))
+        many = program(functools.partial(one, self.task), self.mesh, in_axes, donate=(2,))
+        return compiled(many, (self.settings, self.inputs, state, jnp.asarray(index), *more))
+
+
+def _structure(rule: Heuristic) -> tuple:
+    leaves, treedef = jax.tree.flatten(rule)
+    return treedef, tuple(np.shape(leaf) for leaf in leaves)
+
+
+def stack(trees: Sequence[Any]) -> Any:
+    """Pytrees of the same structure as one, with a leading axis: what `vmap` maps over.
+
+    Example:
+        >>> from jaxlfi.heuristics import Edge
+        >>> stack([Edge(mass_threshold=tau) for tau in (0.005, 0.5)]).mass_threshold.shape
+        (2,)
+    """
+
+    def leaf_stack(*leaves):
+        array = np.stack([np.asarray(leaf) for leaf in leaves])
+        return jnp.asarray(array)
+
+    return jax.tree.map(leaf_stack, *trees)

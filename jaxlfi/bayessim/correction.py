@@ -1,0 +1,149 @@
+"""From q_phi to the posterior: corrections for the proposals the simulations were drawn from, by name (reading A)."""
+
+import dataclasses
+from collections.abc import Callable
+
+import distrax
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.mixture_algebra import product, quotient, reduce
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.tasks.task import Task
+
+MASS_DRAWS = 512
+"""Monte Carlo draws for the truncation constant of each proposal (4 % error at mass 0.5)."""
+
+
+@struct.dataclass
+class CorrectionInfo:
+    """What a correction did in a round.
+
+    Attributes:
+        effective_size: effective number of simulations under the loss weights, (sum w)^2 / sum w^2, shape [].
+        not_positive_definite: component pairs whose quotient had no positive definite covariance, shape [].
+        mass_inside: of q_phi in the support, before any correction; the rest has leaked, shape [].
+    """
+
+    effective_size: Float[Array, "*batch"]
+    not_positive_definite: Int[Array, "*batch"]
+    mass_inside: Float[Array, "*batch"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Correction:
+    """A way from q_phi to p-hat: weights in the loss before the fit, and a change of the mixture after it.
+
+    Attributes:
+        row_weights: (task, dataset, proposals, round, defensive fraction) -> weight of each row in the loss, shape [C].
+        change: (task, q, previous belief) -> (posterior, pairs not positive definite).
+    """
+
+    row_weights: Callable[[Task, Dataset, Belief, Array, Array], Array]
+    change: Callable[[Task, GaussianMixture, Belief], tuple[GaussianMixture, Array]]
+
+
+def equal_weights(
+    task: Task,
+    dataset: Dataset,
+    proposals: Belief,
+    round: Int[Array, ""] | int,
+    defensive: Float[Array, ""] | float = 0.0,
+) -> Array:
+    """Every simulation counts the same, but for those given with the density they were drawn from."""
+    return jnp.where(dataset.valid, dataset.weight, 0.0)
+
+
+def unchanged(task: Task, q: GaussianMixture, previous: Belief) -> tuple[GaussianMixture, Array]:
+    """p-hat = q: the pooled proposals are treated as uniform."""
+    return q, jnp.asarray(0)
+
+
+def times_reference(task: Task, q: GaussianMixture, previous: Belief) -> tuple[GaussianMixture, Array]:
+    """p-hat proportional to (p_i / p~) q, to the letter of line 14, reduced to as many components as q has.
+
+    p~ is the prior: uniform, and then a constant, or a Gaussian that the task brings, which is divided out.
+    """
+    posterior, _ = product(q, previous.mixture)
+    bad = jnp.asarray(0)
+    if task.inference.prior is not None:
+        posterior, info = quotient(posterior, gaussian_prior(task.inference.prior), policy="skip")
+        bad = info.not_positive_definite
+    posterior = reduce(posterior, q.logits.shape[-1])
+    posterior = jax.tree.map(lambda new, old: jnp.where(previous.informed, new, old), posterior, q)
+    return posterior, jnp.where(previous.informed, bad, 0)
+
+
+def importance_weights(
+    task: Task,
+    dataset: Dataset,
+    proposals: Belief,
+    round: Int[Array, ""] | int,
+    defensive: Float[Array, ""] | float = 0.0,
+) -> Array:
+    """w(theta) = p(theta) / p~(theta), with p~ the equally weighted mixture of all rounds' proposals.
+
+    The balance heuristic of multiple importance sampling (Veach 1997): a simulation that any round was likely to draw
+    has a bounded weight, as the first round drew from the prior itself. Weights are truncated at sqrt(n) times their
+    mean (Ionides 2008). Clipped proposals have atoms on the bounds, which a density leaves out. The defensive fraction
+    of a round's proposals, drawn from the prior over its support, is part of its density.
+    """
+    rounds = proposals.informed.shape[0]
+    used = jnp.arange(rounds) <= round
+
+    def log_density(proposal: Belief) -> Array:
+        draws = proposal.mixture.sample(jax.random.key(0), MASS_DRAWS)
+        inside = jnp.mean(proposal.support.contains(draws)) + 1.0 / MASS_DRAWS
+        informed = proposal.mixture.log_prob(dataset.theta) - jnp.log(inside)
+        prior = log_prior(task, proposal.support, dataset.theta)
+        mixed = jnp.logaddexp(jnp.log1p(-defensive) + informed, jnp.log(defensive) + prior)
+        log_q = jnp.where(proposal.informed, mixed, prior)
+        return jnp.where(proposal.support.contains(dataset.theta), log_q, -jnp.inf)
+
+    log_each = jnp.where(used[:, None], jax.vmap(log_density)(proposals), -jnp.inf)
+    log_proposal = jax.nn.logsumexp(log_each, axis=0)
+    target = 0.0 if task.inference.prior is None else task.inference.prior.log_prob(dataset.theta)
+    log_weight = jnp.where(dataset.valid & jnp.isfinite(log_proposal), target - log_proposal, -jnp.inf)
+    weight = jnp.exp(log_weight - jnp.max(log_weight, initial=-1e30))
+    size = jnp.maximum(dataset.size, 1)
+    return jnp.minimum(weight, jnp.sqrt(size) * jnp.sum(weight) / size)
+
+
+def log_prior(task: Task, support: Support, theta: Float[Array, "n dim"]) -> Float[Array, " n"]:
+    """Log-density of the prior over a support; a task's own prior is not normalised over it."""
+    if task.inference.prior is None:
+        return jnp.broadcast_to(-jnp.sum(jnp.log(support.width)), theta.shape[:-1])
+    return task.inference.prior.log_prob(theta)
+
+
+def effective_size(weights: Float[Array, " cap"]) -> Float[Array, ""]:
+    """Kish's effective sample size."""
+    return jnp.sum(weights) ** 2 / jnp.maximum(jnp.sum(weights**2), 1e-30)
+
+
+def gaussian_prior(prior) -> GaussianMixture:
+    """A Gaussian prior as a mixture of one component.
+
+    Raises:
+        ValueError: for priors that are not Gaussian.
+    """
+    if isinstance(prior, distrax.MultivariateNormalTri | distrax.MultivariateNormalDiag):
+        covariance = prior.covariance()
+        return GaussianMixture(jnp.zeros(1), prior.mean()[None], jnp.linalg.cholesky(covariance)[None])
+    raise ValueError(
+        f"correction='paper' divides by the prior and needs it uniform (none given) or a distrax multivariate normal, "
+        f"got {type(prior).__name__}; use correction='none' or 'importance'"
+    )
+
+
+CORRECTIONS: dict[str, Correction] = {
+    "none": Correction(equal_weights, unchanged),
+    "paper": Correction(equal_weights, times_reference),
+    "importance": Correction(importance_weights, unchanged),
+}
+"""Corrections by name."""

@@ -1,0 +1,68 @@
+"""The keys of a run: one seed, split by what the numbers are for. No other module splits a run's key."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Int
+
+
+@struct.dataclass
+class RunKeys:
+    """Independent keys derived from one.
+
+    Attributes:
+        observe: simulates the observation, where the truth is known and none was given.
+        run: the inference itself.
+        check: draws and simulations by which posteriors are compared with truth and observation.
+    """
+
+    observe: jax.Array
+    run: jax.Array
+    check: jax.Array
+
+    def of_check(self, index: Int[Array, ""] | int) -> jax.Array:
+        """Of one round's comparison; the last posterior's saved draws come after those of all rounds."""
+        return jax.random.fold_in(self.check, index)
+
+
+class RoundKeys(NamedTuple):
+    """Of one round: proposals, their simulations, and all that comes after."""
+
+    propose: jax.Array
+    simulate: jax.Array
+    update: jax.Array
+
+
+def run_keys(key: jax.Array) -> RunKeys:
+    """The keys of the run that `key` stands for. Runs of the same key share their observation."""
+    return RunKeys(*(jax.random.fold_in(key, purpose) for purpose in range(3)))
+
+
+def init_key(run: jax.Array) -> jax.Array:
+    """By which a run's first network is made."""
+    return jax.random.split(run)[0]
+
+
+def round_keys(run: jax.Array, index: Int[Array, ""] | int) -> RoundKeys:
+    """Of one round of a run."""
+    return RoundKeys(*jax.random.split(jax.random.fold_in(jax.random.split(run)[1], index), 3))
+
+
+def seed_of(key: jax.Array) -> int:
+    """The whole number that a key was made from, or that stands for it: `key_of` leads back.
+
+    Raises:
+        ValueError: for a key of another than JAX's default implementation.
+    """
+    words = np.asarray(jax.random.key_data(key), ">u4")
+    if words.shape != (2,):
+        raise ValueError(f"key: expected one of JAX's default implementation, got {key!r}")
+    return int.from_bytes(words.tobytes(), "big")
+
+
+def key_of(seed: int) -> jax.Array:
+    """The key of a seed: `jax.random.key(seed)`, also for seeds of more than 32 bits."""
+    words = np.frombuffer(int(seed).to_bytes(8, "big"), ">u4").astype(np.uint32)
+    return jax.random.wrap_key_data(words, impl="threefry2x32")

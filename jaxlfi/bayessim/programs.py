@@ -1,0 +1,48 @@
+"""Compiled programs of batches, shared by all engines of equal tasks."""
+
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+KEPT = 64
+"""Programs that are kept, and as many of them compiled for some shapes."""
+
+
+def program(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...] = ()) -> Any:
+    """A function of one run as a jitted function of a batch; the same one for equal arguments.
+
+    Args:
+        one: the function, with its static arguments bound.
+        mesh: of the devices that the runs are divided over, of one axis.
+        in_axes: of the other arguments: 0 for one value a run, None for a value that all share.
+        donate: places of arguments whose memory the results may take.
+    """
+    return _program(one.func, one.args, mesh, in_axes, donate)
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _program(function, bound: tuple, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...]):
+    many = jax.vmap(functools.partial(function, *bound), in_axes=in_axes)
+    if mesh.size > 1:
+        # Runs are divided by shard_map, as while-loops must not get predicates that cross devices.
+        split = PartitionSpec(mesh.axis_names[0])
+        specs = tuple(PartitionSpec() if axis is None else split for axis in in_axes)
+        many = jax.shard_map(many, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
+    return jax.jit(many, donate_argnums=donate)
+
+
+_EXECUTABLES: dict[Any, Any] = {}
+
+
+def compiled(many: Any, arguments: tuple) -> Any:
+    """A jitted function compiled for arguments of these shapes: ahead of its first call, and once."""
+    leaves, structure = jax.tree.flatten(arguments)
+    signature = many, structure, tuple((np.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves)
+    if signature not in _EXECUTABLES:
+        while len(_EXECUTABLES) >= KEPT:
+            del _EXECUTABLES[next(iter(_EXECUTABLES))]
+        _EXECUTABLES[signature] = many.lower(*arguments).compile()
+    return _EXECUTABLES[signature]

@@ -1,0 +1,133 @@
+"""Records: what each round did, as named arrays, and the ledger that is derived from them."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxlfi.bayessim.algorithm import Round
+from jaxlfi.diagnostics.discrepancy import Discrepancy
+
+EVIDENCE = "evidence/"
+"""Prefix of the heuristic's evidence among the named arrays."""
+FINAL = "final_"
+"""Prefix of the named arrays of which only the last round's are kept."""
+PER_SIMULATION = ("theta", "counted", "kept", "failure")
+"""Named arrays whose first axis is the simulations of a round."""
+
+
+def record(info: Round, seen: Discrepancy) -> dict[str, jax.Array]:
+    """One round as named arrays: the rows of history.npz, and all that the ledger is made from."""
+    proposal, belief = info.proposal.support, info.belief.support
+    return {
+        "theta": info.simulations.theta,
+        "counted": info.simulations.counted,
+        "kept": info.simulations.kept,
+        "failure": info.simulations.failure,
+        "attempted": info.simulations.attempted,
+        "succeeded": info.simulations.succeeded,
+        "failed": info.failed,
+        "proposal_low": proposal.low,
+        "proposal_high": proposal.high,
+        "support_low": belief.low,
+        "support_high": belief.high,
+        "low_shift": info.adaptation.low_shift,
+        "high_shift": info.adaptation.high_shift,
+        **{EVIDENCE + name: seen_ for name, seen_ in info.adaptation.evidence.items()},
+        "logits": info.belief.mixture.logits,
+        "means": info.belief.mixture.means,
+        "scale_tril": info.belief.mixture.scale_tril,
+        "loss": info.fit.loss,
+        "validation_loss": info.fit.validation_loss,
+        "chosen_epoch": info.fit.chosen_epoch,
+        "nonfinite": info.fit.nonfinite,
+        "effective_size": info.correction.effective_size,
+        "not_positive_definite": info.correction.not_positive_definite,
+        "mass_inside": info.correction.mass_inside,
+        "predictive_simulations": seen.simulated,
+        "sample_theta": seen.theta,
+        "sample_theta_error": seen.theta_error,
+        "sample_trajectory_error": seen.trajectory_error,
+        FINAL + "trajectory": seen.trajectory,
+        FINAL + "x": seen.x,
+    }
+
+
+def apart(row: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A record in two: what is kept of every round, and what is kept of the last one only."""
+    final = {name: value for name, value in row.items() if name.startswith(FINAL)}
+    return {name: value for name, value in row.items() if name not in final}, final
+
+
+def own_evidence(row: Mapping[str, Any], place: int | None) -> dict[str, Any]:
+    """A run's record without the evidence of the heuristics that other runs of its batch follow.
+
+    Args:
+        row: a record of one run.
+        place: which rule of a `Choice` the run follows; None where all runs follow the same.
+    """
+    if place is None:
+        return dict(row)
+    own = f"{EVIDENCE}{place}/"
+    kept = {name: value for name, value in row.items() if not name.startswith(EVIDENCE)}
+    return kept | {EVIDENCE + name[len(own) :]: value for name, value in row.items() if name.startswith(own)}
+
+
+def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, ...], seconds: float) -> dict[str, Any]:
+    """A round's line of the ledger.
+
+    Args:
+        index: the round, from 0.
+        row: its record.
+        reasons: names of the reasons of failure.
+        seconds: wall time of the round, divided by the runs that were stepped together.
+    """
+    networks = np.arange(row["chosen_epoch"].shape[0])
+    return {
+        "round": index,
+        "attempted": int(row["attempted"]),
+        "succeeded": int(row["succeeded"]),
+        "failed": {reason: int(count) for reason, count in zip(reasons, row["failed"], strict=True)},
+        **{name: row[name].tolist() for name in ("support_low", "support_high", "proposal_low", "proposal_high")},
+        "evidence": {name[len(EVIDENCE) :]: value.tolist() for name, value in row.items() if name.startswith(EVIDENCE)},
+        "low_shift": row["low_shift"].tolist(),
+        "high_shift": row["high_shift"].tolist(),
+        "loss": float(np.mean(row["loss"][networks, row["chosen_epoch"]])),
+        "validation_loss": float(np.mean(row["validation_loss"][networks, row["chosen_epoch"]])),
+        "nonfinite_steps": int(np.sum(row["nonfinite"])),
+        "effective_size": float(row["effective_size"]),
+        "not_positive_definite": int(row["not_positive_definite"]),
+        "mass_inside": float(row["mass_inside"]),
+        "predictive_simulations": int(row["predictive_simulations"]),
+        "theta_error": theta_error(row),
+        "trajectory_error": trajectory_error(row),
+        "seconds": round(float(seconds), 4),
+    }
+
+
+def theta_error(row: Mapping[str, np.ndarray]) -> float:
+    """|theta - theta_gt| summed over parameters, mean over posterior samples; NaN without a known truth."""
+    return float(np.mean(np.sum(row["sample_theta_error"], axis=-1)))
+
+
+def trajectory_error(row: Mapping[str, np.ndarray]) -> float:
+    """Distance from the observed trajectory, mean over the posterior samples that could be simulated."""
+    valid = row["sample_trajectory_error"][np.isfinite(row["sample_trajectory_error"])]
+    return float(np.mean(valid)) if valid.size else float("nan")
+
+
+def stacked_rounds(rows: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Records of successive rounds, stacked along a new leading axis.
+
+    Rounds of fewer simulations than others (where those of the first were given) are filled up with some that do not
+    count.
+    """
+    most = max(len(row["theta"]) for row in rows)
+
+    def filled(name: str, array: np.ndarray) -> np.ndarray:
+        if name not in PER_SIMULATION:
+            return array
+        return np.concatenate([array, np.zeros((most - len(array), *array.shape[1:]), array.dtype)])
+
+    return {name: np.stack([filled(name, row[name]) for row in rows]) for name in rows[0]}

@@ -1,0 +1,60 @@
+"""Settings: the numbers of one inference run."""
+
+import dataclasses
+
+from jaxtyping import Array, Float
+
+from jaxlfi.bayessim.correction import CORRECTIONS
+from jaxlfi.distributions.belief import RESTRICTIONS
+from jaxlfi.estimators.base import Estimator
+from jaxlfi.estimators.mixture_network import MixtureNetwork
+from jaxlfi.fields import Checked, check_fields, hyperparameter, option
+
+
+class Settings(Checked):
+    """The numbers of one inference run. The defaults are the paper's.
+
+    Attributes:
+        estimator: the density estimator and its training: an instance of one of the families
+            (`jaxlfi.MixtureNetwork`, `jaxlfi.SplineFlow`, `jaxlfi.MaskedFlow`).
+        rounds: inference iterations N_LFI.
+        simulations_per_round: valid simulations added to the dataset each round, at most.
+        simulation_budget: simulations attempted each round, at most, failures included.
+        correction: how q_phi becomes the posterior, "none", "paper" or "importance" (reading A).
+        restriction: how proposals are kept in the support, "clip" or "reject" (reading E).
+        defensive: fraction of each round's proposals drawn from the prior over the current support instead of the
+            posterior. 0 is the paper. A leaf.
+        predictive: whether 20 draws of each round's posterior are simulated besides, to compare them with the
+            observation (section V). These simulations are reported in the ledger; inference does not see them.
+    """
+
+    estimator: Estimator = dataclasses.field(default=MixtureNetwork())
+    rounds: int = option(10, low=1, high=100_000, help="inference rounds, N_LFI")
+    simulations_per_round: int = option(100, low=1, high=100_000_000, help="simulations added each round, at most")
+    simulation_budget: int = option(
+        125, low=1, high=100_000_000, help="simulations attempted each round, at most, failures included"
+    )
+    correction: str = option("none", choices=tuple(CORRECTIONS), help="from the network to the posterior")
+    restriction: str = option("clip", choices=tuple(RESTRICTIONS), help="how proposals are kept in the support")
+    defensive: Float[Array, "*batch"] | float = hyperparameter(
+        0.0, low=0.0, high=1.0, help="fraction of proposals drawn from the prior over the support"
+    )
+    predictive: bool = option(True, help="simulate 20 draws of each round's posterior, to compare with the observation")
+
+    def check(self) -> "Settings":
+        """Refuse settings that cannot work, by name; returns the settings."""
+        if not isinstance(self.estimator, Estimator):
+            raise ValueError(f"estimator: expected one such as jaxlfi.MixtureNetwork(), got {self.estimator!r}")
+        self.estimator.check()
+        check_fields(self)
+        if self.simulation_budget < self.simulations_per_round:
+            raise ValueError(
+                f"simulation_budget: expected at least the {self.simulations_per_round} simulations of a round, "
+                f"got {self.simulation_budget}"
+            )
+        if self.correction == "paper" and not self.estimator.closed_form:
+            raise ValueError(
+                f"correction: expected 'none' or 'importance' for {type(self.estimator).__name__}, as 'paper' multiplies "
+                "mixtures of Gaussians, got 'paper'"
+            )
+        return self

@@ -1,0 +1,500 @@
+"""The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | diagnose | report`, and those of tasks.
+
+A package adds commands of its own by `[project.entry-points."jaxlfi.commands"]` in pyproject.toml: a name, and a
+function that takes the words after it and returns the exit status.
+
+This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set
+before jax starts can be set after the arguments are known.
+"""
+
+import argparse
+import itertools
+import json
+import math
+import os
+import sys
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import NoReturn
+
+import jaxlfi
+from jaxlfi import flags, source_fields
+
+PRESETS = ("quick", "paper")
+METHODS = ("bayessim", "apt", "npe")
+HEURISTICS = "jaxlfi.heuristics"
+"""The entry-point group of heuristics."""
+FILE_WIDTH = 120
+"""Characters a line where the output is no terminal."""
+
+GLOSSARY = """\
+names and symbols:
+  support         Theta, the box the parameters are drawn from; it is what the heuristics adapt
+  feasible        Phi, the limits that no adapted support leaves
+"""
+"""What `--help` explains before the heuristics' hyperparameters."""
+
+MAIN_EXAMPLES = """\
+examples:
+  jaxlfi tasks                                   what there is to infer
+  jaxlfi infer lotka_volterra --support misspecified --heuristic edge --out runs/edge
+  jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
+  jaxlfi grid lotka_volterra --vary expansion=0.1,0.2,0.4 --out runs/grid
+  jaxlfi resume runs/comparison                  go on after a crash, to the same result bit for bit
+  jaxlfi sample runs/edge -n 1000                draws from the posterior, in natural units
+  jaxlfi diagnose runs/edge                      whether the posterior can be believed
+  jaxlfi report runs/comparison                  draw the pictures again
+
+Bad input ends with one line on stderr and exit status 2; nothing is ever overwritten.
+"""
+
+INFER_EXAMPLES = """\
+examples:
+  jaxlfi infer lotka_volterra --support misspecified --heuristic edge --out runs/edge
+  jaxlfi infer lotka_volterra --mass-threshold 0.01 --expansion 0.1 0.1 0.2 0.2 --out runs/gentle
+  jaxlfi infer spring:task --observation real.csv --support-low 1 0.1 --support-high 10 1 --out runs/spring
+  jaxlfi infer lotka_volterra --preset paper --seeds 4 --out runs/paper
+  jaxlfi infer whip --object dlo-0 --heuristic edge --out runs/dlo-0
+
+"""
+
+COMPARE_EXAMPLES = """\
+A configuration is SUPPORT (kept fixed) or SUPPORT+HEURISTIC. All configurations and seeds run side by side;
+the same seed means the same observation in all of them.
+
+examples:
+  jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
+  jaxlfi compare lotka_volterra --configurations ok broad broad+centre --seeds 20 --out runs/broad
+
+"""
+
+
+GRID_EXAMPLES = """\
+Every combination of values is run with every seed, side by side in chunks that fit the memory; the same seed means
+the same observation in all of them. Hyperparameters on no axis keep the paper's values, or those of their flags.
+
+examples:
+  jaxlfi grid lotka_volterra --support misspecified --out runs/edge-grid \\
+      --vary zone_fraction=0.05,0.1,0.2 mass_threshold=0.001,0.005,0.05 expansion=0.1,0.2,0.4
+  jaxlfi grid lotka_volterra --heuristic mode --vary proximity=0.2,0.4 --vary expansion=0.1,0.2 --out runs/mode-grid
+
+"""
+
+DIAGNOSE_EXAMPLES = """\
+Truths are drawn from the prior over a support and simulated, and the run's method is asked for the posterior of each:
+by its network, where the run had one round and kept it (--method npe, or --rounds 1 --keep-network), else by repeating
+the whole inference side by side, in chunks that are saved as they end. A command that was stopped goes on when it is
+given again. It takes about as long as that many runs; the exit status is 0 whatever comes out.
+
+checks:
+  rank          of each truth among its draws, by parameter (simulation-based calibration)
+  coverage      how often the densest region of a level holds the truth; around random points (TARP)
+  classifier    accuracy at telling truths from draws, given the simulation
+  predictive    whether the run's own observation looks like simulations of its own posterior
+verdicts:
+  over-confident, under-confident: posteriors are too narrow, too wide; biased low, high: they lie below, above
+  the truths. A check fails at p up to 0.01, corrected for the number of parameters.
+
+examples:
+  jaxlfi diagnose runs/npe
+  jaxlfi diagnose runs/edge --reference ok --truths 200
+  jaxlfi diagnose runs/gaussian --against reference.csv
+
+"""
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """A parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """One line on stderr, and exit status 2."""
+        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def parser(heuristics: flags.Families | None = None) -> argparse.ArgumentParser:
+    """The whole command line.
+
+    Args:
+        heuristics: those whose hyperparameters have flags; by default all that are installed.
+    """
+    if heuristics is None:
+        heuristics = {name: source.fields for name, source in source_fields.of_group(HEURISTICS).items()}
+    glossary = GLOSSARY + flags.glossary(heuristics)
+    formatter = argparse.RawDescriptionHelpFormatter
+    top = OneLineParser(
+        prog="jaxlfi",
+        description="Likelihood-free inference that notices when the prior's support is wrong, and moves it.",
+        epilog=MAIN_EXAMPLES,
+        formatter_class=formatter,
+    )
+    top.add_argument("--version", action="version", version=f"jaxlfi {jaxlfi.__version__}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    tasks = commands.add_parser("tasks", help="list tasks, or describe one", description="List tasks, or describe one.")
+    tasks.add_argument("name", nargs="?", metavar="TASK", help="describe this one: parameters, units, supports, truth")
+
+    infer = commands.add_parser(
+        "infer",
+        help="infer a task's parameters",
+        description="Infer a task's parameters from one observed trajectory, adapting the support.",
+        epilog=INFER_EXAMPLES + glossary,
+        formatter_class=formatter,
+    )
+    infer.add_argument(
+        "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
+    )
+    infer.add_argument(
+        "--support-low",
+        nargs="+",
+        type=float,
+        metavar="X",
+        help="your own support's lower bounds, one a parameter",
+    )
+    infer.add_argument("--support-high", nargs="+", type=float, metavar="X", help="its upper bounds")
+    infer.add_argument(
+        "--heuristic", default="edge", metavar="NAME", help=_heuristic_help("how the support is adapted", heuristics)
+    )
+    _add_shared(infer, heuristics, seeds=1)
+
+    compare = commands.add_parser(
+        "compare",
+        help="run supports and heuristics side by side",
+        description="Run supports and heuristics side by side, over several seeds, and tabulate the errors.",
+        epilog=COMPARE_EXAMPLES + glossary,
+        formatter_class=formatter,
+    )
+    compare.add_argument(
+        "--configurations",
+        nargs="+",
+        metavar="SUPPORT[+HEURISTIC]",
+        help="what to compare (default: ok, misspecified, broad, and misspecified with edge, mode, centre)",
+    )
+    _add_shared(compare, heuristics, seeds=4)
+
+    grid = commands.add_parser(
+        "grid",
+        help="run a heuristic over a grid of its hyperparameters",
+        description="Run a heuristic over a grid of its hyperparameters, to see how sensitive it is to them.",
+        epilog=GRID_EXAMPLES + glossary,
+        formatter_class=formatter,
+    )
+    grid.add_argument(
+        "--vary",
+        nargs="+",
+        action="extend",
+        required=True,
+        metavar="NAME=V,V,...",
+        help="a hyperparameter and its values, as in expansion=0.1,0.2,0.4; several, or the flag again",
+    )
+    grid.add_argument(
+        "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
+    )
+    grid.add_argument(
+        "--heuristic", default="edge", metavar="NAME", help=_heuristic_help("whose hyperparameters vary", heuristics)
+    )
+    grid.add_argument(
+        "--lanes-per-chunk",
+        type=int,
+        metavar="N",
+        help="runs computed and saved together (default: as many as there is memory for)",
+    )
+    _add_shared(grid, heuristics, seeds=4, networks=False)
+
+    resume = commands.add_parser(
+        "resume",
+        help="go on with a run that was stopped",
+        description="Go on with a run that was stopped or killed.",
+    )
+    resume.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
+    _add_machine(resume)
+
+    sample = commands.add_parser(
+        "sample",
+        help="draw from the posterior of a run",
+        description="Draw parameters from the posterior of a finished run, in natural units.",
+    )
+    sample.add_argument("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
+    sample.add_argument("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
+    sample.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the draws (default: 0)")
+    sample.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="a new .csv or .npz file, or .nc for ArviZ's InferenceData (default: samples.csv in the folder)",
+    )
+
+    diagnose = commands.add_parser(
+        "diagnose",
+        help="check whether the posterior of a run can be believed",
+        description="Check whether the posteriors of a run's method are calibrated, and whether its own fits.",
+        epilog=DIAGNOSE_EXAMPLES,
+        formatter_class=formatter,
+    )
+    diagnose.add_argument("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
+    diagnose.add_argument(
+        "--reference", metavar="NAME", help="the support that truths are drawn over (default: the task's first)"
+    )
+    diagnose.add_argument("--truths", type=int, default=100, metavar="N", help="simulated truths (default: 100)")
+    diagnose.add_argument(
+        "--draws", type=int, default=200, metavar="L", help="draws from the posterior of each (default: 200)"
+    )
+    diagnose.add_argument("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
+    diagnose.add_argument(
+        "--against",
+        type=Path,
+        metavar="FILE",
+        help="samples to compare the run's posterior with, in natural units: a .csv with the parameters' names as "
+        'headings, or an .npz with an array "theta"',
+    )
+    diagnose.add_argument(
+        "--out", type=Path, metavar="DIR", help="a new folder for the results (default: diagnostics in the run's)"
+    )
+    _add_machine(diagnose)
+
+    report = commands.add_parser(
+        "report",
+        help="draw the pictures of a run",
+        description="Draw all pictures of a folder from its saved files.",
+    )
+    report.add_argument("folder", type=Path, metavar="DIR", help="a folder that infer, compare or grid wrote")
+    for name in foreign_commands():
+        commands.add_parser(name, add_help=False, help=f"commands of its own: jaxlfi {name} --help")
+    return top
+
+
+def foreign_commands() -> dict[str, EntryPoint]:
+    """Commands that installed packages add, by name."""
+    return {point.name: point for point in entry_points(group="jaxlfi.commands")}
+
+
+def heuristics_of(words: Sequence[str]) -> dict[str, source_fields.Source]:
+    """All installed heuristics, and those that the words name by `module:Class`, as their sources describe them."""
+    named = [after for word, after in itertools.pairwise([*words, ""]) if word == "--heuristic"]
+    named += [word.removeprefix("--heuristic=") for word in words if word.startswith("--heuristic=")]
+    named += [word.partition("+")[2] for word in words]
+    own = {name: source_fields.of_class(name) for name in named if ":" in name}
+    return source_fields.of_group(HEURISTICS) | own
+
+
+def parse(words: Sequence[str]) -> argparse.Namespace:
+    """The arguments.
+
+    Where the source of a heuristic does not show all its hyperparameters, and there are flags that nothing else knows,
+    the heuristic is imported, and jax with it.
+
+    Raises:
+        ValueError: if that fails.
+    """
+    sources = heuristics_of(words)
+    fields = {name: source.fields for name, source in sources.items()}
+    arguments, unknown = parser(fields).parse_known_args(words)
+    used = _heuristics_used(arguments)
+    if unknown and any(not source.complete for name, source in sources.items() if name in used):
+        prepare_jax(arguments)
+        from jaxlfi.heuristics import registry
+
+        fields |= {name: registry.hyperparameters(registry.load(name)) for name in used}
+    return parser(fields).parse_args(words) if unknown else arguments
+
+
+def _heuristics_used(arguments: argparse.Namespace) -> set[str]:
+    """Names of the heuristics that a command is going to use, right or wrong."""
+    configured = getattr(arguments, "configurations", None) or ()
+    named = [getattr(arguments, "heuristic", None), *(word.partition("+")[2] for word in configured)]
+    return {name for name in named if name}
+
+
+def _heuristic_help(what: str, heuristics: flags.Families) -> str:
+    registered = ", ".join(name for name in heuristics if ":" not in name)
+    return f"{what}: {registered}, or your own as module:Class (default: edge)"
+
+
+def _add_shared(
+    command: argparse.ArgumentParser, heuristics: flags.Families, seeds: int, networks: bool = True
+) -> None:
+    """Arguments that `infer`, `compare` and `grid` have in common; `grid` saves no networks."""
+    command.add_argument(
+        "task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory; NAME,key=value sets options"
+    )
+    command.add_argument(
+        "--object",
+        metavar="NAME",
+        help="what is observed, where the task knows several objects (short for TASK,object=NAME)",
+    )
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results")
+    command.add_argument(
+        "--method",
+        choices=METHODS,
+        default="bayessim",
+        help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: flows, one round (default: bayessim)",
+    )
+    command.add_argument(
+        "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"
+    )
+    command.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})")
+    command.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first run's seed (default: 0)")
+    command.add_argument(
+        "--observation",
+        type=Path,
+        metavar="FILE",
+        help="the observed trajectory, .csv (a row a record, a column a channel) or .npz "
+        "(default: the task's own, or one simulated at the known truth)",
+    )
+    _add_machine(command)
+    if networks:
+        command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
+
+    rounds = command.add_argument_group("rounds (default: the preset's)")
+    rounds.add_argument("--rounds", type=int, metavar="N", help="inference rounds, N_LFI")
+    rounds.add_argument("--simulations-per-round", type=int, metavar="N", help="simulations added each round, at most")
+    rounds.add_argument(
+        "--simulation-budget", type=int, metavar="N", help="simulations attempted each round, failures included"
+    )
+    rounds.add_argument(
+        "--correction", metavar="NAME", help="from the network to the posterior: none, paper, importance"
+    )
+    rounds.add_argument("--restriction", metavar="NAME", help="how draws are kept in the support: clip, reject")
+    rounds.add_argument(
+        "--defensive",
+        type=float,
+        metavar="X",
+        help="share of proposals drawn from the prior over the support",
+    )
+
+    network = command.add_argument_group("network and training (default: the preset's)")
+    network.add_argument("--family", metavar="NAME", help="mdn, or a normalizing flow: maf, nsf")
+    network.add_argument("--loss", metavar="NAME", help="likelihood; atomic, combined: no correction needed")
+    network.add_argument("--transforms", type=int, metavar="N", help="transforms of a flow")
+    network.add_argument("--hidden", type=int, nargs="+", metavar="N", help="units of each hidden layer")
+    network.add_argument("--activation", metavar="NAME", help="relu, tanh or silu")
+    network.add_argument("--components", type=int, metavar="K", help="Gaussians in each network's mixture")
+    network.add_argument("--prune", type=float, metavar="X", help="components of less weight than this are dropped")
+    network.add_argument("--ensemble-size", type=int, metavar="N", help="networks in the ensemble")
+    network.add_argument("--normaliser", metavar="NAME", help="what is done to summaries: zscore, asinh, none")
+    network.add_argument("--epochs", type=int, metavar="N", help="full passes over the data each round")
+    network.add_argument("--steps", type=int, metavar="N", help="gradient steps each round, in place of --epochs")
+    network.add_argument("--batch-size", type=int, metavar="N", help="simulations in a minibatch")
+    network.add_argument("--learning-rate", type=float, metavar="X", help="Adam's step size")
+    network.add_argument("--weight-decay", type=float, metavar="X", help="decoupled weight decay")
+    network.add_argument("--clip-norm", type=float, metavar="X", help="norm the gradients are clipped to (inf: not)")
+    network.add_argument("--schedule", metavar="NAME", help="of the learning rate: constant, cosine")
+    network.add_argument(
+        "--validation", type=float, metavar="X", help="fraction held out to choose the best weights by"
+    )
+    network.add_argument(
+        "--patience", type=int, metavar="N", help="passes without a better validation loss; 0: no limit"
+    )
+    network.add_argument(
+        "--warm-start",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="train on from the last round's weights, or start anew (then mode matches components first)",
+    )
+
+    hyper = command.add_argument_group("heuristics (one number, or one a parameter)")
+    flags.add(hyper, heuristics, into="hyperparameters", several=True)
+    command.set_defaults(hyperparameters={})
+
+
+def _add_machine(command: argparse.ArgumentParser) -> None:
+    """Arguments about how, not what."""
+    command.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
+    command.add_argument("--no-cache", action="store_true", help="compile anew, without the cache of compiled programs")
+
+
+def prepare_jax(arguments: argparse.Namespace) -> None:
+    """Set what must be set before jax starts.
+
+    On CPU jax sees one device, and lanes of small networks do not fill it: with as many devices as cores,
+    each takes its share of the lanes. A single lane stays on one device, whose matrix products then use all
+    cores.
+    """
+    lanes = _lanes(arguments)
+    flags = os.environ.get("XLA_FLAGS", "")
+    if lanes > 1 and "xla_force_host_platform_device_count" not in flags:
+        devices = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, lanes)
+        if recorded := _recorded(arguments).get("devices"):
+            devices = recorded  # the same lanes on the same number of devices repeat bit for bit
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={devices}".strip()
+    if not getattr(arguments, "no_cache", True):
+        from jaxlfi.io import compile_cache
+
+        compile_cache.enable()
+
+
+def _lanes(arguments: argparse.Namespace) -> int:
+    """How many lanes a command is going to have, as far as its arguments tell."""
+    if arguments.command == "resume":
+        recorded = _recorded(arguments)
+        return len(recorded.get("lanes") or ()) + bool(recorded.get("axes")) * 2  # a grid does not list its lanes
+    if arguments.command == "compare":
+        return arguments.seeds * len(arguments.configurations or "default")
+    if arguments.command == "grid":
+        return arguments.seeds * math.prod(axis.count(",") + 1 for axis in arguments.vary)
+    if arguments.command == "diagnose":
+        return arguments.truths
+    return getattr(arguments, "seeds", 1)
+
+
+def _recorded(arguments: argparse.Namespace) -> dict:
+    """What the work to go on with says of itself, where there is some; whether it is sound is checked later."""
+    if arguments.command == "resume":
+        path = arguments.folder / "config.json"
+    elif arguments.command == "diagnose":
+        path = (arguments.out or arguments.folder / "diagnostics") / "plan.json"
+    else:
+        return {}
+    try:
+        config = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return config if isinstance(config, dict) else {}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Returns:
+        0; 2 for bad input; 130 where it was interrupted.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and (foreign := foreign_commands().get(words[0])):
+        return foreign.load()(words[1:])
+    try:
+        arguments = parse(words)
+    except ValueError as error:
+        return _refuse(error)
+    if getattr(arguments, "object", None) is not None:
+        arguments.task = f"{arguments.task},object={arguments.object}"
+    prepare_jax(arguments)
+    prepared = None
+    try:
+        from rich.console import Console
+
+        from jaxlfi.cli.parser import commands
+
+        console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
+        try:
+            prepared = getattr(commands, arguments.command)(arguments, console)
+        except (ValueError, OSError) as error:
+            return _refuse(error)
+        if prepared is not None:
+            try:
+                commands.run(*prepared, arguments, console)
+            except commands.EXPECTED as error:
+                return _refuse(error)
+    except KeyboardInterrupt:
+        advice = f"; continue with: jaxlfi resume {prepared[0]}" if prepared else ""
+        if arguments.command == "diagnose":
+            advice = "; the same command goes on from here"
+        print(f"jaxlfi: interrupted{advice}", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _refuse(error: Exception) -> int:
+    """Tell of an error in one line."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    print(f"jaxlfi: error: {text}", file=sys.stderr)
+    return 2

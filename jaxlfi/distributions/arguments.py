@@ -1,0 +1,39 @@
+"""Checks of arguments at the doors of the library, each a ValueError that names the argument."""
+
+import operator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def require_key(key: Any, name: str = "key") -> jax.Array:
+    """Refuse what is no typed key.
+
+    Raises:
+        ValueError: for an integer, a raw key, or several keys.
+    """
+    dtype = getattr(key, "dtype", None)
+    if dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key) or key.shape != ():
+        raise ValueError(f"{name}: expected one key such as jax.random.key(0), got {key!r}")
+    return key
+
+
+def require_count(value: Any, name: str, least: int = 1) -> int:
+    """Refuse what is no whole number of at least `least`.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    try:
+        count = operator.index(value)
+    except TypeError:
+        count = None
+    if count is None or isinstance(value, bool) or count < least:
+        raise ValueError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+    return count
+
+
+def is_concrete(tree: Any) -> bool:
+    """Whether no leaf of a pytree is being traced."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))

@@ -1,0 +1,86 @@
+"""Space: parameters in natural units, and as inference works with them."""
+
+import dataclasses
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlfi.distributions.support import Support
+
+SpaceName = Literal["natural", "inference"]
+"""In which units an argument or a result is: the parameters' own, or those of inference space."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Space:
+    """Names of the parameters, and which of them are inferred as natural logarithms.
+
+    Everything a user passes in or gets back is in natural units unless asked for otherwise. Networks, mixtures and
+    heuristics work in *inference space*: the logarithm of the parameters in `log`, the parameter itself otherwise.
+
+    Attributes:
+        names: of the D parameters.
+        log: for each, whether it is inferred as its logarithm.
+
+    Example:
+        >>> space = Space(("length", "young"), (False, True))
+        >>> space.labels
+        ('length', 'ln young')
+        >>> [round(float(value), 3) for value in space.to_natural(jnp.array([2.0, 0.0]))]
+        [2.0, 1.0]
+    """
+
+    names: tuple[str, ...]
+    log: tuple[bool, ...]
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters D."""
+        return len(self.names)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the axes of inference space: "ln name" for the parameters inferred as logarithms."""
+        return tuple(f"ln {name}" if log else name for name, log in zip(self.names, self.log, strict=True))
+
+    def to_natural(self, theta: Float[Array | np.ndarray, "*n dim"]) -> Float[Array, "*n dim"]:
+        """From inference space to natural units, shape [..., D]."""
+        if not any(self.log):
+            return jnp.asarray(theta)
+        log = np.asarray(self.log)
+        return jnp.where(log, jnp.exp(jnp.where(log, theta, 0.0)), theta)
+
+    def to_inference(self, theta: Float[Array | np.ndarray, "*n dim"]) -> Float[Array, "*n dim"]:
+        """From natural units to inference space, shape [..., D]; not finite where a logarithm is not."""
+        if not any(self.log):
+            return jnp.asarray(theta)
+        log = np.asarray(self.log)
+        return jnp.where(log, jnp.log(jnp.where(log, theta, 1.0)), theta)
+
+    def box_to_inference(self, box: Support) -> Support:
+        """A box in natural units as the same box in inference space."""
+        return Support(self.to_inference(box.low), self.to_inference(box.high))
+
+    def box_to_natural(self, box: Support) -> Support:
+        """The way back."""
+        return Support(self.to_natural(box.low), self.to_natural(box.high))
+
+    def log_jacobian(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
+        """Logarithm of the volume that a unit of inference space has in natural units, at a point of inference space.
+
+        A log-density over natural units is that over inference space minus this.
+        """
+        return jnp.sum(jnp.where(np.asarray(self.log), theta, 0.0), axis=-1)
+
+
+def is_natural(space: SpaceName) -> bool:
+    """Whether natural units were asked for.
+
+    Raises:
+        ValueError: for another name than "natural" or "inference".
+    """
+    if space not in ("natural", "inference"):
+        raise ValueError(f"space: expected 'natural' or 'inference', got {space!r}")
+    return space == "natural"

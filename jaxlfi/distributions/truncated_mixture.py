@@ -1,0 +1,65 @@
+"""Draws of a mixture of Gaussians truncated to a box, also where next to nothing of it lies inside."""
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import log_ndtr, ndtr, ndtri
+from jaxtyping import Array, Float
+
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+
+CANDIDATES = 32
+"""Weighted candidates from which each draw is picked."""
+TAIL = 4.0
+"""Standard deviations from the mean beyond which a normal's tail counts as exponential."""
+
+
+def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: Support, n: int) -> Array:
+    """`n` draws of a mixture truncated to the support, by importance resampling; rejection has no part in it.
+
+    Candidates are drawn dimension by dimension, each from its normal given the ones before, truncated to the box
+    (Geweke 1991; Hajivassiliou and Keane): all lie inside, however far the mixture is from it. Their weight is the
+    product of the masses that truncation left, and each draw is one of `CANDIDATES` picked by weight, so that it is as
+    good as exact where few dimensions are truncated.
+
+    Args:
+        key: consumed.
+        mixture: of Gaussians.
+        support: the box.
+        n: number of draws.
+    """
+    key_component, key_uniform, key_pick = jax.random.split(key, 3)
+    shape = (n, CANDIDATES)
+    component = jax.random.categorical(key_component, mixture.logits, shape=shape)
+    uniform = jax.random.uniform(key_uniform, (*shape, support.dim), minval=1e-6, maxval=1.0)
+
+    def candidate(component: Array, uniform: Array) -> tuple[Array, Array]:
+        mean, factor = mixture.means[component], mixture.scale_tril[component]
+        z, log_weight = jnp.zeros(support.dim), jnp.zeros(())
+        for d in range(support.dim):
+            given = mean[d] + factor[d] @ z  # entries of z from d on are still zero
+            low, high = (support.low[d] - given) / factor[d, d], (support.high[d] - given) / factor[d, d]
+            value, log_mass = _truncated_normal(uniform[d], low, high)
+            z, log_weight = z.at[d].set(value), log_weight + log_mass
+        return support.clip(mean + factor @ z), log_weight
+
+    theta, log_weight = jax.vmap(jax.vmap(candidate))(component, uniform)
+    picked = jax.random.categorical(key_pick, log_weight)
+    return jnp.take_along_axis(theta, picked[:, None, None], axis=1)[:, 0]
+
+
+def _truncated_normal(
+    uniform: Float[Array, ""], low: Float[Array, ""], high: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """A quantile of the standard normal truncated to [low, high], and the logarithm of the mass in there."""
+    flip = low + high < 0  # to the side of the upper tail, where small masses keep their precision
+    near, far = jnp.where(flip, -high, low), jnp.where(flip, -low, high)
+    log_beyond = log_ndtr(-near)
+    log_mass = log_beyond + jnp.log1p(-jnp.exp(jnp.minimum(log_ndtr(-far) - log_beyond, -1e-7)))
+    beyond_near, beyond_far = ndtr(-near), ndtr(-far)
+    middle = -ndtri(jnp.clip(beyond_near - uniform * (beyond_near - beyond_far), 1e-37, 1.0 - 1e-7))
+    # Beyond a of a few standard deviations the density falls as exp(-a (z - a)).
+    rate = jnp.maximum(near, TAIL)
+    tail = near - jnp.log1p(-uniform * -jnp.expm1(-rate * (far - near))) / rate
+    value = jnp.clip(jnp.where(near > TAIL, tail, middle), near, far)
+    return jnp.where(flip, -value, value), log_mass

@@ -1,0 +1,207 @@
+"""Estimators: the settings a family of density estimators has, and the network that is trained by them."""
+
+import abc
+import math
+from typing import ClassVar, Self
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.mixture_fit import fit_mixture
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.dataset import Dataset, empty
+from jaxlfi.estimators.density import Density, EnsembleDensity
+from jaxlfi.estimators.losses import LOSSES
+from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser
+from jaxlfi.estimators.posterior import Posterior, truncated
+from jaxlfi.fields import Checked, check_fields, hyperparameter, option
+
+FIT_DRAWS = 1000
+"""Draws of a density to which its mixture of Gaussians is fitted."""
+
+SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jnp.cos(jnp.pi * progress))}
+"""The learning rate's factor at a point of progress through the round's fitting, by name."""
+
+
+class Estimator(Checked, abc.ABC):
+    """What all families of density estimators have in common: the ensemble and its training.
+
+    A family is one subclass with the settings that it alone has and one method, `module`; the class is then a frozen
+    dataclass and a pytree, without a decorator. Its Flax module maps a normalised summary to a conditional density: a
+    pytree with `log_prob(theta)`, which broadcasts over axes in front, and `sample(key, n)`. Heuristics and proposals
+    see that density as a mixture of Gaussians fitted to its draws. The defaults are the paper's (section III-C). A
+    package registers its estimators by `[project.entry-points."jaxlfi.estimators"]` in pyproject.toml.
+
+    Attributes:
+        learning_rate: Adam's step size. A leaf, as are the next two: a grid over them is one vmap.
+        weight_decay: decoupled weight decay (AdamW), per step and relative to the learning rate.
+        clip_norm: global norm the gradients are clipped to.
+        components: Gaussians K of each network's mixture, its own or the one fitted to it.
+        ensemble_size: networks E; the posterior is their equally weighted mixture, of E K Gaussians.
+        epochs: full passes over the dataset each round (reading B); 0 where `steps` counts instead.
+        steps: gradient steps each round, rounded up to epochs of equal length; 0 where `epochs` counts.
+        batch_size: simulations in a minibatch, drawn from the filled rows only.
+        schedule: "constant", or "cosine" to zero within the round.
+        validation: fraction of the simulations held out to choose the best weights by; 0 keeps the last weights.
+        patience: stop after so many epochs without a better validation loss; 0 runs all epochs.
+        warm_start: continue from the last round's weights, or start anew each round (reading C).
+        loss: "likelihood", or "atomic" or "combined", which need no correction for the proposals
+            (`jaxlfi.estimators.losses.LOSSES`).
+        normaliser: "zscore", "asinh" or "none" (`jaxlfi.estimators.normaliser.TRANSFORMS`): what is done to the raw
+            summaries. It belongs to the network: computed where the network starts and kept while it is trained on.
+
+    Raises:
+        ValueError: from `check` for settings that contradict each other.
+    """
+
+    learning_rate: Float[Array, "*batch"] | float = hyperparameter(1e-5, above=0.0, help="Adam's step size")
+    weight_decay: Float[Array, "*batch"] | float = hyperparameter(0.0, low=0.0, help="decoupled weight decay")
+    clip_norm: Float[Array, "*batch"] | float = hyperparameter(
+        math.inf, above=0.0, high=math.inf, help="norm the gradients are clipped to; inf: not clipped"
+    )
+    components: int = option(4, low=1, help="Gaussians K in each network's mixture")
+    ensemble_size: int = option(1, low=1, help="networks in the ensemble")
+    epochs: int = option(1000, low=0, help="full passes over the data each round")
+    steps: int = option(0, low=0, help="gradient steps each round, in place of epochs")
+    batch_size: int = option(100, low=1, help="simulations in a minibatch")
+    schedule: str = option("constant", choices=tuple(SCHEDULES), help="of the learning rate within a round")
+    validation: float = option(0.0, low=0.0, high=0.9, help="fraction held out to choose the best weights by")
+    patience: int = option(0, low=0, help="epochs without a better validation loss before training stops; 0: no limit")
+    warm_start: bool = option(True, help="train on from the last round's weights, or start anew")
+    loss: str = option(
+        "likelihood",
+        choices=tuple(LOSSES),
+        help="likelihood; atomic, combined: no correction for the proposals needed",
+    )
+    normaliser: str = option("zscore", choices=tuple(TRANSFORMS), help="what is done to the summaries")
+
+    closed_form: ClassVar[bool] = False
+    """Whether the density is a mixture of Gaussians, which needs no fit and can be corrected in closed form."""
+
+    @abc.abstractmethod
+    def module(self, dim: int) -> nn.Module:
+        """The Flax network of one ensemble member for D parameters."""
+
+    def check(self) -> Self:
+        """Refuse settings that cannot work, by name; returns the settings."""
+        check_fields(self)
+        if (self.epochs > 0) == (self.steps > 0):
+            raise ValueError(f"expected epochs or steps, one of them above 0, got {self.epochs} and {self.steps}")
+        if self.patience and not self.validation:
+            raise ValueError("patience: expected validation above 0 to stop by, got validation=0")
+        return self
+
+    def check_for(self, dim: int) -> None:
+        """Refuse settings that make no network for D parameters.
+
+        Raises:
+            ValueError: in one line.
+        """
+        try:
+            jax.eval_shape(self.module(dim).init, jax.random.key(0), jnp.zeros(1))
+        except ValueError as error:
+            raise ValueError(str(error).splitlines()[0]) from error
+
+    def keys(self, key: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+        """Keys to fit by and to condition by; a mixture of Gaussians is read off the network without one."""
+        return (key, None) if self.closed_form else tuple(jax.random.split(key))
+
+    def initialise(self, key: jax.Array, dim: int, obs: int) -> dict:
+        """Fresh weights for every network of the ensemble."""
+        module = self.module(dim)
+        return jax.vmap(lambda k: module.init(k, jnp.zeros(obs)))(jax.random.split(key, self.ensemble_size))
+
+    def density(self, network: "Network", x: Float[Array, " obs"]) -> Density:
+        """q_phi(theta | x) in inference space, not truncated: the whole ensemble."""
+        module = self.module(network.scale.dim)
+        each = jax.vmap(lambda params: module.apply(params, network.normaliser(x)))(network.params)
+        shift, scale = network.from_network()
+        return EnsembleDensity(each, shift, scale, self.ensemble_size)
+
+    def mixture(self, key: jax.Array | None, density: Density, support: Support) -> GaussianMixture:
+        """The density as E K Gaussians: fitted to its draws inside the support.
+
+        Inside, as a density that was trained by the atomic loss may leak any amount of mass to where no simulation was.
+        """
+        key_draw, key_fit = jax.random.split(jax.random.key(0) if key is None else key)
+        draws = density.sample(key_draw, FIT_DRAWS)
+        inside = support.contains(draws)
+        weights = jnp.where(jnp.any(inside), inside, True).astype(draws.dtype)
+        return fit_mixture(key_fit, draws, weights, self.ensemble_size * self.components)[0]
+
+
+@struct.dataclass
+class Network:
+    """A density estimator: its settings, the weights of the ensemble, and what they were normalised by.
+
+    Attributes:
+        estimator: the settings it was made with.
+        params: Flax parameters with a leading axis of length E.
+        normaliser: what summaries are transformed, centred and scaled by.
+        theta_normaliser: what parameters, scaled to [-1, 1]^D, are centred and scaled by for a density that starts as a
+            standard normal; none for a mixture density network (reading D).
+        scale: the box in inference space that [-1, 1]^D stands for, Phi.
+        space: the map between inference space and natural units.
+    """
+
+    estimator: Estimator
+    params: dict
+    normaliser: Normaliser
+    theta_normaliser: Normaliser | None
+    scale: Support
+    space: Space = struct.field(pytree_node=False)
+
+    def condition(self, x: Float[Array, " obs"], support: Support, key: jax.Array | None = None) -> Posterior:
+        """The posterior of a raw summary (Algorithm 1, line 14), truncated to a support.
+
+        Args:
+            x: the summary, shape [S].
+            support: in inference space; for the posterior under the prior, the box the simulations were drawn from.
+            key: for the mixture fitted to draws; a mixture density network needs none. Always the same by default.
+        """
+        density = self.estimator.density(self, x)
+        return truncated(density, self.estimator.mixture(key, density, support), support, self.space)
+
+    def to_network(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n dim"]:
+        """Parameters in inference space as the network sees them."""
+        unit = self.scale.to_unit(theta)
+        if self.theta_normaliser is None:
+            return unit
+        return self.theta_normaliser(unit)
+
+    def from_network(self) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+        """Shift and scale from what the network sees to inference space."""
+        half = 0.5 * self.scale.width
+        if self.theta_normaliser is None:
+            return self.scale.centre, half
+        return self.scale.centre + half * self.theta_normaliser.mean, half * self.theta_normaliser.scale
+
+    def with_normalisers(self, dataset: Dataset) -> "Network":
+        """The same weights with the normalisers of a network that starts on these simulations."""
+        of_x, of_theta = _normalisers(self.estimator, dataset, self.scale)
+        return self.replace(normaliser=of_x, theta_normaliser=of_theta)
+
+    def restarted(self, key: jax.Array, dataset: Dataset) -> "Network":
+        """Fresh weights, and the normalisers of these simulations."""
+        params = self.estimator.initialise(key, self.scale.dim, dataset.x.shape[-1])
+        return self.replace(params=params).with_normalisers(dataset)
+
+
+def untrained(key: jax.Array, estimator: Estimator, obs: int, scale: Support, space: Space) -> Network:
+    """A network before any training, for summaries of length `obs`."""
+    estimator = jax.tree.map(jnp.asarray, estimator)  # its leaves are carried through loops
+    nothing = empty(1, scale.dim, obs)
+    params = estimator.initialise(key, scale.dim, obs)
+    return Network(estimator, params, *_normalisers(estimator, nothing, scale), scale, space)
+
+
+def _normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tuple[Normaliser, Normaliser | None]:
+    of_x = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid)
+    if estimator.closed_form:
+        return of_x, None
+    return of_x, fit_normaliser("zscore", scale.to_unit(dataset.theta), dataset.valid)

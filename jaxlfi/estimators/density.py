@@ -1,0 +1,51 @@
+"""Densities: q_phi(theta | x) of one x, before it is truncated."""
+
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+
+class Density(Protocol):
+    """A density over inference space: a mixture of Gaussians, or an ensemble of conditional densities."""
+
+    def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
+        """Log-density at theta."""
+        ...
+
+    def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
+        """`n` independent draws."""
+        ...
+
+
+@struct.dataclass
+class EnsembleDensity:
+    """The equally weighted mixture of an ensemble's conditional densities.
+
+    Attributes:
+        each: what the networks put out for one x, stacked along a leading axis of length E: a pytree with `log_prob` and
+            `sample` of parameters as the networks see them.
+        shift: from what the networks see to inference space, shape [D].
+        scale: shape [D].
+        ensemble_size: E.
+    """
+
+    each: Any
+    shift: Float[Array, "*batch dim"]
+    scale: Float[Array, "*batch dim"]
+    ensemble_size: int = struct.field(pytree_node=False)
+
+    def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
+        """Log-density at theta: the mean density of all networks."""
+        inner = (theta - self.shift) / self.scale
+        log_each = jax.vmap(lambda q: q.log_prob(inner))(self.each)
+        return jax.nn.logsumexp(log_each, axis=0) - jnp.log(self.ensemble_size) - jnp.sum(jnp.log(self.scale))
+
+    def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
+        """`n` draws, from the networks in turn; some may leave any support."""
+        keys = jax.random.split(key, self.ensemble_size)
+        draws = jax.vmap(lambda key, q: q.sample(key, n))(keys, self.each)
+        turn = jnp.arange(n) % self.ensemble_size
+        return self.shift + self.scale * draws[turn, jnp.arange(n)]

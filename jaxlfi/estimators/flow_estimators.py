@@ -1,0 +1,67 @@
+"""Conditional normalizing flows as estimators (appendix A): masked autoregressive, and neural spline."""
+
+import flax.linen as nn
+
+from jaxlfi.estimators.base import Estimator
+from jaxlfi.estimators.flows import MAF, NSF
+from jaxlfi.estimators.mdn import ACTIVATIONS
+from jaxlfi.fields import option
+
+
+class FlowEstimator(Estimator):
+    """What both kinds of flow have in common.
+
+    Attributes:
+        hidden: units of each hidden layer of a conditioner, all the same.
+        activation: "relu", "tanh" or "silu".
+        transforms: maps from theta to the base, one after another.
+    """
+
+    hidden: tuple[int, ...] = option((50, 50), low=1, help="units of each hidden layer")
+    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="relu, tanh or silu")
+    transforms: int = option(5, low=1, help="transforms of a flow")
+
+    def check(self) -> "FlowEstimator":
+        """Refuse settings that cannot work, by name; returns the settings."""
+        super().check()
+        if len(set(self.hidden)) != 1:
+            raise ValueError(f"hidden: expected layers of equal width for a flow, got {self.hidden}")
+        return self
+
+    @property
+    def layers(self) -> tuple[int, int, str]:
+        """Units, hidden layers after the first, and activation of a conditioner."""
+        return self.hidden[0], len(self.hidden) - 1, self.activation
+
+
+class MaskedFlow(FlowEstimator):
+    """A masked autoregressive flow (Papamakarios, Pavlakou and Murray 2017).
+
+    Example:
+        >>> MaskedFlow(transforms=3).check().transforms
+        3
+    """
+
+    def module(self, dim: int) -> nn.Module:
+        """The Flax network of one ensemble member for D parameters."""
+        return MAF(dim, self.transforms, *self.layers)
+
+
+class SplineFlow(FlowEstimator):
+    """A neural spline flow of coupling transforms (Durkan et al. 2019).
+
+    Attributes:
+        bins: pieces of each spline.
+        tail_bound: half the splines' range, in standard deviations of theta; beyond, they are the identity.
+
+    Example:
+        >>> SplineFlow(bins=8).check().bins
+        8
+    """
+
+    bins: int = option(10, low=1, high=999, help="pieces of each spline")
+    tail_bound: float = option(5.0, low=0.1, help="half the splines' range, in standard deviations")
+
+    def module(self, dim: int) -> nn.Module:
+        """The Flax network of one ensemble member for D parameters."""
+        return NSF(dim, self.transforms, *self.layers, self.bins, self.tail_bound)

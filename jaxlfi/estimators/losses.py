@@ -1,0 +1,80 @@
+"""What q_phi is trained by, by name: losses of a minibatch."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from jaxlfi.estimators.atomic_loss import atomic, nll
+
+ATOMS = 10
+"""Parameter vectors among which the atomic loss has the right one named, at most (the paper's appendix A)."""
+
+
+@struct.dataclass
+class Rows:
+    """Simulations as the network sees them.
+
+    Attributes:
+        theta: parameters in the network's coordinates, shape [N, D].
+        x: normalised summaries, shape [N, S].
+        weights: weight of each in the loss, shape [N].
+        log_prior: log-density of the prior, up to a constant, shape [N].
+        from_prior: 1 for those drawn from the prior itself, in the first round, 0 for others, shape [N].
+    """
+
+    theta: Float[Array, "n dim"]
+    x: Float[Array, "n obs"]
+    weights: Float[Array, " n"]
+    log_prior: Float[Array, " n"]
+    from_prior: Float[Array, " n"]
+
+    def take(self, rows: Int[Array, " m"]) -> "Rows":
+        """Some of them."""
+        return jax.tree.map(lambda leaf: leaf[rows], self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Loss:
+    """A loss of a minibatch, and of the simulations held out, where rows of weight 0 are padding.
+
+    Attributes:
+        training: (key, q, rows) -> loss. q has one conditional density for each row.
+        held_out: the same, relative to the rows' weights.
+    """
+
+    training: Callable[[jax.Array, Any, Rows], Array]
+    held_out: Callable[[jax.Array, Any, Rows], Array]
+
+
+def likelihood(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
+    """-log q(theta | x), weighted: q becomes the posterior under what the rows were drawn from, or weighted to."""
+    return -jnp.mean(rows.weights * q.log_prob(rows.theta))
+
+
+def held_out_likelihood(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
+    """The same, divided by the weights' sum."""
+    return nll(q.log_prob(rows.theta), rows.weights)
+
+
+def contrastive(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
+    """The atomic loss of APT (`jaxlfi.estimators.atomic_loss`): q becomes the posterior under the prior."""
+    return atomic(key, q.log_prob, rows.theta, rows.log_prior, rows.weights, min(ATOMS, rows.theta.shape[0]))
+
+
+def combined(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
+    """The atomic loss, and -log q of the rows drawn from the prior: they hold q down where no proposal is made."""
+    atoms = min(ATOMS, rows.theta.shape[0])
+    return atomic(key, q.log_prob, rows.theta, rows.log_prior, rows.weights, atoms, rows.from_prior)
+
+
+LOSSES: dict[str, Loss] = {
+    "likelihood": Loss(likelihood, held_out_likelihood),
+    "atomic": Loss(contrastive, contrastive),
+    "combined": Loss(combined, combined),
+}
+"""Losses by name."""

@@ -1,0 +1,133 @@
+"""Posterior: q_phi(theta | x^r) truncated to a support, for mixture density networks and flows alike."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float
+
+from jaxlfi.distributions.arguments import require_count, require_key
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.space import Space, SpaceName, is_natural
+from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.truncated_mixture import truncated_mixture_draws
+from jaxlfi.distributions.truncation import MASS_DRAWS, mass_inside, rejection_sample, truncated_log_prob
+from jaxlfi.estimators.density import Density
+
+MAP_STARTS = 16
+"""Draws of the highest density from which the mode is looked for."""
+MAP_STEPS = 300
+"""Steps of Adam from each."""
+MAP_RATE = 0.02
+"""Their length at first, as a fraction of half the support's width; it falls to zero by the last."""
+
+
+@struct.dataclass
+class Posterior:
+    """What an observation says of the parameters: a density on a box. A pytree.
+
+    It is always the density truncated to the support. Draws are rejected until they lie inside, never moved there; where
+    next to no mass is inside, they are those of the mixture, truncated (`truncated_mixture_draws`).
+    Arguments and results are in natural units, or in inference space (logarithms of log parameters) where
+    `space="inference"` is passed.
+
+    Attributes:
+        density: q before truncation, over inference space: a `GaussianMixture`, or a flow's density.
+        mixture: the same as a mixture of Gaussians, which heuristics and proposals see: itself, or fitted to draws.
+        support: the box, in inference space.
+        mass_inside: of q in the support; the rest has leaked. Shape [].
+        space: the map between natural units and inference space.
+    """
+
+    density: Density
+    mixture: GaussianMixture
+    support: Support
+    mass_inside: Float[Array, "*batch"]
+    space: Space = struct.field(pytree_node=False)
+
+    def sample(self, key: jax.Array, n: int, space: SpaceName = "natural") -> Float[Array, "n dim"]:
+        """`n` independent draws, shape [n, D].
+
+        Raises:
+            ValueError: for what is no key, or a number that is not whole and at least 1.
+        """
+        require_count(n, "n")
+        draws = _sample(require_key(key), self, int(n))
+        return self.space.to_natural(draws) if is_natural(space) else draws
+
+    def log_prob(self, theta: Float[Array, "*n dim"], space: SpaceName = "natural") -> Float[Array, "*n"]:
+        """Log-density at theta, shape [..., D]; -inf outside the support.
+
+        Raises:
+            ValueError: for another number of parameters.
+        """
+        theta = jnp.asarray(theta, jnp.float32)
+        if theta.ndim == 0 or theta.shape[-1] != self.space.dim:
+            raise ValueError(f"theta: expected shape [..., {self.space.dim}], got {list(theta.shape)}")
+        if not is_natural(space):
+            return self._log_prob(theta)
+        inner = self.space.to_inference(theta)
+        finite = jnp.all(jnp.isfinite(inner), axis=-1)
+        inner = jnp.where(finite[..., None], inner, self.support.centre)
+        return jnp.where(finite, self._log_prob(inner) - self.space.log_jacobian(inner), -jnp.inf)
+
+    def mean(self, space: SpaceName = "natural") -> Float[Array, " dim"]:
+        """The mean, over `MASS_DRAWS` draws that are the same each time, shape [D]."""
+        return jnp.mean(self.sample(jax.random.key(0), MASS_DRAWS, space), axis=0)
+
+    def map(self, space: SpaceName = "natural") -> Float[Array, " dim"]:
+        """The point of the highest density inside the support (maximum a posteriori), shape [D].
+
+        Found by gradient ascent from the draws of the highest density. The density over natural units and that over
+        inference space have different maxima where a parameter is inferred as its logarithm: `space` chooses the
+        density, and the units of the result.
+        """
+        point = _maximum(self, is_natural(space))
+        return self.space.to_natural(point) if is_natural(space) else point
+
+    def on(self, support: Support) -> "Posterior":
+        """The same density truncated to another support, in inference space."""
+        return truncated(self.density, self.mixture, support, self.space)
+
+    def _log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
+        return truncated_log_prob(self.density.log_prob(theta), theta, self.support, self.mass_inside)
+
+
+def truncated(density: Density, mixture: GaussianMixture, support: Support, space: Space) -> Posterior:
+    """A density truncated to a support, with the mass it has in there."""
+    return Posterior(density, mixture, support, mass_inside(density.sample, support), space)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _sample(key: jax.Array, posterior: Posterior, n: int) -> Array:
+    box = posterior.support
+    fallback = lambda key, n: truncated_mixture_draws(key, posterior.mixture, box, n)
+    return rejection_sample(key, posterior.density.sample, box, n, fallback)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _maximum(posterior: Posterior, natural: bool) -> Array:
+    """The maximum in inference space, of the density over natural units or over inference space."""
+    box = posterior.support
+
+    def objective(unit: Array) -> Array:
+        theta = box.centre + 0.5 * box.width * unit
+        return posterior.density.log_prob(theta) - (posterior.space.log_jacobian(theta) if natural else 0.0)
+
+    draws = box.to_unit(_sample(jax.random.key(0), posterior, 1000))
+    _, best = jax.lax.top_k(jax.vmap(objective)(draws), MAP_STARTS)
+    adam = optax.adam(optax.cosine_decay_schedule(MAP_RATE, MAP_STEPS))
+
+    def ascend(start: Array) -> tuple[Array, Array]:
+        def step(carry, _):
+            unit, moments = carry
+            updates, moments = adam.update(-jax.grad(objective)(unit), moments)
+            return (jnp.clip(unit + updates, -1.0, 1.0), moments), None
+
+        (unit, _), _ = jax.lax.scan(step, (start, adam.init(start)), length=MAP_STEPS)
+        return unit, objective(unit)
+
+    units, heights = jax.vmap(ascend)(draws[best])
+    return box.clip(box.centre + 0.5 * box.width * units[jnp.argmax(heights)])

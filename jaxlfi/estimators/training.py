@@ -1,0 +1,182 @@
+"""Fitting q_phi to a masked dataset by Adam, as one loop over epochs."""
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from jaxlfi.estimators.base import SCHEDULES, Network
+from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.estimators.losses import LOSSES, Rows
+
+STEPS_PER_EPOCH = 50
+"""Gradient steps in an epoch at most, where steps are counted; the validation loss is computed after each epoch."""
+
+
+@struct.dataclass
+class FitInfo:
+    """What happened while fitting; P epochs, E networks in the ensemble.
+
+    Attributes:
+        loss: mean training loss of each epoch, negative log-density of theta scaled to [-1, 1]^D, shape [E, P].
+        validation_loss: the same over the held-out simulations after each epoch; NaN without any, shape [E, P].
+        chosen_epoch: the epoch the weights were taken from, shape [E].
+        nonfinite: gradient steps skipped because the loss or its gradient was not finite, shape [E].
+    """
+
+    loss: Float[Array, "*batch epochs"]
+    validation_loss: Float[Array, "*batch epochs"]
+    chosen_epoch: Int[Array, "*batch"]
+    nonfinite: Int[Array, "*batch"]
+
+
+@struct.dataclass
+class _Training:
+    params: dict
+    moments: optax.OptState
+    nonfinite: Int[Array, ""]
+
+
+@struct.dataclass
+class _Best:
+    params: dict
+    loss: Float[Array, ""]
+    at: Int[Array, ""]
+
+
+def fit(
+    key: jax.Array,
+    network: Network,
+    dataset: Dataset,
+    weights: Float[Array, " cap"],
+    expected_size: Int[Array, ""] | int,
+    log_prior: Float[Array, " cap"] | None = None,
+) -> tuple[Network, FitInfo]:
+    """Train q_phi over the dataset (Algorithm 1, line 13).
+
+    Args:
+        key: consumed.
+        network: the last round's; its weights are the start under `warm_start`, else replaced by fresh ones. Its
+            normalisers are replaced where the network starts anew.
+        dataset: simulations; only the filled rows are used.
+        weights: weight of each row in the loss, shape [C]; all ones without importance correction.
+        expected_size: filled rows if no simulation had failed. It sets the number of minibatches of an epoch and,
+            unlike the size itself, is the same for all runs of a batch, which then step together.
+        log_prior: log-density of the prior at each row, up to a constant, shape [C]; None for a uniform one. Only
+            the atomic losses ask for it.
+
+    Returns:
+        The trained network and what happened.
+    """
+    estimator = network.estimator
+    key_init, key_fit = jax.random.split(key)
+    if not estimator.warm_start:
+        network = network.restarted(key_init, dataset)
+    x = network.normaliser(dataset.x)
+    theta = network.to_network(dataset.theta)
+    log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
+    data = Rows(theta, x, weights, log_prior, from_prior=(dataset.round == 0).astype(weights.dtype))
+
+    def one(key, params):
+        return _fit_one(key, estimator, params, data, dataset.size, expected_size)
+
+    params, info = jax.vmap(one)(jax.random.split(key_fit, estimator.ensemble_size), network.params)
+    return network.replace(params=params), info
+
+
+def _fit_one(key, estimator, params, data, size, expected_size):
+    """Training of one network: epochs over the data, each a loop over minibatches."""
+    capacity, dim = data.theta.shape
+    module = estimator.module(dim)
+    objective = LOSSES[estimator.loss]
+    epochs = estimator.epochs or -(-estimator.steps // STEPS_PER_EPOCH)
+    batches = -(-expected_size // estimator.batch_size) if estimator.epochs else -(-estimator.steps // epochs)
+
+    def rate(count):
+        return estimator.learning_rate * SCHEDULES[estimator.schedule](count / (epochs * batches))
+
+    adam = optax.adamw(rate, weight_decay=estimator.weight_decay)
+
+    key_split, key_epochs = jax.random.split(key)
+    rows = _shuffled(key_split, jnp.arange(capacity), size)
+    held_out = jnp.floor(estimator.validation * size).astype(jnp.int32)
+    training = jnp.maximum(size - held_out, 1)
+    held_out_places = jnp.arange(max(2, int(estimator.validation * capacity)))
+    held_out_rows = jnp.take(rows, training + held_out_places, mode="clip")
+    mean_weight = jnp.sum(jnp.where(jnp.arange(capacity) < size, data.weights, 0.0)) / jnp.maximum(size, 1)
+    data = data.replace(weights=data.weights / jnp.maximum(mean_weight, 1e-30))
+    held_out_data = data.take(held_out_rows)
+    held_out_data = held_out_data.replace(weights=jnp.where(held_out_places < held_out, held_out_data.weights, 0.0))
+
+    key_loss, key_held_out = jax.random.fold_in(key_epochs, epochs), jax.random.fold_in(key_epochs, epochs + 1)
+
+    def loss_of(params, key, batch):
+        return objective.training(key, module.apply(params, batch.x), batch)
+
+    def gradient_step(key, state, batch):
+        loss, gradient = jax.value_and_grad(loss_of)(state.params, key, batch)
+        norm = optax.tree.norm(gradient)
+        finite = jnp.isfinite(loss) & jnp.isfinite(norm)
+        # A factor, where optax divides each entry: the gradient is gone through once less.
+        factor = jnp.minimum(1.0, estimator.clip_norm / norm)
+        gradient = jax.tree.map(lambda g: jnp.where(finite, factor * g, 0.0), gradient)
+        updates, moments = adam.update(gradient, state.moments, state.params)
+        # A step that is not finite moves nothing, also not by the momentum of the steps before.
+        updates = jax.tree.map(lambda u: jnp.where(finite, u, 0.0), updates)
+        params = optax.apply_updates(state.params, updates)
+        return _Training(params, moments, state.nonfinite + ~finite), jnp.where(finite, loss, 0.0), finite
+
+    def one_epoch(carry, index, order):
+        state, best = carry
+
+        def minibatch(b, loop):
+            state, total, count = loop
+            batch = data.take(order[(b * estimator.batch_size + jnp.arange(estimator.batch_size)) % training])
+            key = jax.random.fold_in(key_loss, index * batches + b)
+            state, loss, finite = gradient_step(key, state, batch)
+            return state, total + loss, count + finite
+
+        state, total, count = jax.lax.fori_loop(0, batches, minibatch, (state, 0.0, 0))
+        loss = total / count  # NaN where no step of the epoch was finite
+        if not estimator.validation:
+            return (state, best), (loss, jnp.nan)
+        nothing_held_out = jnp.sum(held_out_data.weights) == 0
+        # The same key for all epochs: their losses are compared.
+        q = module.apply(state.params, held_out_data.x)
+        validation = objective.held_out(jax.random.clone(key_held_out), q, held_out_data)
+        validation = jnp.where(nothing_held_out, jnp.nan, validation)
+        # With too few simulations to hold any out, the last weights are as good as any.
+        better = (validation < best.loss) | nothing_held_out
+        return (state, _where(better, _Best(state.params, validation, index), best)), (loss, validation)
+
+    def running(carry):
+        index, (_, best), _ = carry
+        unfinished = index < epochs
+        return unfinished & (index - best.at <= estimator.patience) if estimator.patience else unfinished
+
+    def body(carry):
+        index, training_state, curves = carry
+        order = _shuffled(jax.random.fold_in(key_epochs, index), rows, training)
+        training_state, seen = one_epoch(training_state, index, order)
+        return index + 1, training_state, jax.tree.map(lambda curve, now: curve.at[index].set(now), curves, seen)
+
+    state = _Training(params, adam.init(params), jnp.asarray(0))
+    best = _Best(params, jnp.asarray(jnp.inf), jnp.asarray(0)) if estimator.validation else None
+    unseen = jnp.full(epochs, jnp.nan)
+    start = jnp.asarray(0), (state, best), (unseen, unseen)
+    _, (state, best), (training_losses, validation_losses) = jax.lax.while_loop(running, body, start)
+    if best is None:
+        best = _Best(state.params, jnp.asarray(jnp.inf), jnp.asarray(epochs - 1))
+    return best.params, FitInfo(training_losses, validation_losses, best.at, state.nonfinite)
+
+
+def _where(condition, new, old):
+    """One of two pytrees."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def _shuffled(key: jax.Array, rows: Int[Array, " cap"], count: Int[Array, ""]) -> Int[Array, " cap"]:
+    """The first `count` rows in random order, the others behind them."""
+    rank = jnp.where(jnp.arange(rows.shape[0]) < count, jax.random.uniform(key, rows.shape), 2.0)
+    return rows[jnp.argsort(rank)]

@@ -1,0 +1,48 @@
+"""Legends outside of the panels."""
+
+from collections.abc import Mapping, Sequence
+
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jaxlfi.figures.style import Look, grid_shape, is_wide
+
+
+def above(figure: Figure, handles: Sequence[Artist], title: str | None = None, columns: int | None = None) -> None:
+    """A legend above the panels.
+
+    Args:
+        figure: to add it to.
+        handles: its entries.
+        title: a line above the entries.
+        columns: of entries; by default all in one row.
+    """
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=columns or len(handles), title=title, title_fontsize=7
+    )
+
+
+def below(figure: Figure, handles: Sequence[Artist], at_most: int | None = None, **options) -> None:
+    """A legend below the panels.
+
+    Args:
+        figure: to add it to.
+        handles: its entries.
+        at_most: columns of entries; by default all in one row where the figure is wide, else 3.
+        options: of `Figure.legend`.
+    """
+    columns = min(at_most or (len(handles) if is_wide(figure) else 3), len(handles))
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, **{"title_fontsize": 7} | options)
+
+
+def of_configurations(figure: Figure, look: Mapping[str, Look], title: str) -> None:
+    """A legend of configurations drawn as lines, above the panels."""
+    handles = [Line2D([], [], **own.line) for own in look.values()]
+    above(figure, handles, title, balanced(list(look.values()), figure))
+
+
+def balanced(look: Sequence[Look], figure: Figure) -> int:
+    """Columns of a legend that fit into a figure's width and leave rows of equal lengths."""
+    inches = 0.46 + 0.053 * max(len(own.label) for own in look)
+    return grid_shape(len(look), max(1, int(figure.get_size_inches()[0] / inches)))[1]

@@ -1,0 +1,190 @@
+"""Heuristics by name, from installed packages or `module:Class`, made of their hyperparameters and checked."""
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxlfi import plugins
+from jaxlfi.fields import Declared, check_fields, declared
+from jaxlfi.heuristics.base import Heuristic
+
+GROUP = "jaxlfi.heuristics"
+"""The entry-point group; ours are registered in pyproject.toml as a third party's would be."""
+
+
+def names() -> list[str]:
+    """Names of all registered heuristics."""
+    return plugins.names(GROUP)
+
+
+def load(reference: str) -> type[Heuristic]:
+    """The class of a registered name, or of "module:Class".
+
+    Raises:
+        ValueError: for unknown names, modules that cannot be imported and classes that are no heuristics.
+
+    Example:
+        >>> load("jaxlfi.heuristics:Edge").__name__
+        'Edge'
+    """
+    return plugins.load(GROUP, "heuristic", reference, Heuristic)
+
+
+def name_of(rule: Heuristic) -> str:
+    """The registered name of a heuristic, or else "module:Class"."""
+    return plugins.name_of(GROUP, type(rule))
+
+
+def build(reference: str, values: Mapping[str, Any], dim: int) -> Heuristic:
+    """A heuristic with these hyperparameters, and its defaults for the others.
+
+    Args:
+        reference: a registered name, or "module:Class".
+        values: by name; of a hyperparameter one number, or one a dimension.
+        dim: number of parameters D.
+
+    Raises:
+        ValueError: for values it does not have or does not accept.
+
+    Example:
+        >>> build("jaxlfi.heuristics:Edge", {"expansion": [0.1, 0.3], "tail": [0.5]}, dim=2).tail
+        0.5
+    """
+    kind = load(reference)
+    known = declared(kind)
+    refuse_foreign(values, [reference])
+    made = {name: value if known[name].static else _leaf(name, value, dim) for name, value in values.items()}
+    try:
+        rule = kind(**made)
+    except TypeError as error:
+        raise ValueError(f"heuristic: {reference!r} cannot be made of its hyperparameters: {error}") from error
+    check(rule, dim)
+    return rule
+
+
+def _leaf(name: str, value: Any, dim: int) -> Any:
+    numbers = np.atleast_1d(value).tolist()
+    if len(numbers) not in (1, dim) or not np.isfinite(numbers).all():
+        raise ValueError(f"{name}: expected one finite number or {dim}, got {numbers}")
+    return numbers[0] if len(numbers) == 1 else np.asarray(numbers, np.float32)
+
+
+def hyperparameters(rule: Heuristic | type[Heuristic]) -> dict[str, Declared]:
+    """What a heuristic declares, by name: its own and those of the rules it wraps.
+
+    Example:
+        >>> from jaxlfi.heuristics import Matched, Mode
+        >>> hyperparameters(Matched(Mode()))["proximity"].default
+        0.4
+    """
+    found = declared(rule)
+    for inner in [] if isinstance(rule, type) else _wrapped(rule):
+        found = found | {name: field for name, field in hyperparameters(inner).items() if name not in found}
+    return found
+
+
+def replaced(rule: Heuristic, values: Mapping[str, Any]) -> Heuristic:
+    """The heuristic with these hyperparameters, wherever it has them: of its own and of the rules it wraps.
+
+    Raises:
+        ValueError: for values it does not have or does not accept.
+
+    Example:
+        >>> from jaxlfi.heuristics import Matched, Mode
+        >>> replaced(Matched(Mode()), {"proximity": 0.3}).rule.proximity
+        0.3
+    """
+    if foreign := set(values) - set(hyperparameters(rule)):
+        raise ValueError(f"{min(foreign)}: expected a hyperparameter of {name_of(rule)}, got one it does not have")
+    return _replaced(rule, values)
+
+
+def check(rule: Any, dim: int) -> None:
+    """Refuse what is no heuristic, and hyperparameters of another shape or out of range.
+
+    Args:
+        rule: a heuristic; its leaves may be traced.
+        dim: number of parameters D.
+
+    Raises:
+        ValueError: naming what was expected.
+    """
+    if not isinstance(rule, Heuristic):
+        shown = f"the class {rule.__name__}" if inspect.isclass(rule) else " ".join(repr(rule).split())
+        raise ValueError(f"heuristic: expected an instance such as jaxlfi.Edge(), got {shown}")
+    for leaf in jax.tree.leaves(rule):
+        if not isinstance(leaf, bool | int | float | np.generic | np.ndarray | jax.Array):
+            raise ValueError(f"heuristic: expected hyperparameters that are numbers, got {leaf!r}")
+        if np.shape(leaf) not in ((), (dim,)):
+            raise ValueError(
+                f"heuristic: expected hyperparameters that are scalars or {dim} values, got shape {np.shape(leaf)}"
+            )
+    _check_ranges(rule)
+
+
+def refuse_foreign(given: Iterable[str], used: Iterable[str]) -> None:
+    """Refuse a hyperparameter that none of the heuristics in use has: it would silently do nothing.
+
+    Args:
+        given: names of hyperparameters.
+        used: names of heuristics.
+
+    Raises:
+        ValueError: naming the hyperparameter, and those that there are.
+    """
+    used = sorted(set(used))
+    known = sorted({name for reference in used for name in declared(load(reference))})
+    for name in given:
+        if name not in known:
+            raise ValueError(
+                f"{name}: expected a hyperparameter of {' or '.join(used)} ({', '.join(known) or 'none'}), "
+                "got one they do not have"
+            )
+
+
+def own(reference: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the values given that this heuristic has."""
+    known = declared(load(reference))
+    return {name: value for name, value in given.items() if name in known}
+
+
+def _check_ranges(rule: Heuristic) -> None:
+    check_fields(rule)
+    for inner in _wrapped(rule):
+        _check_ranges(inner)
+
+
+def _wrapped(rule: Heuristic) -> list[Heuristic]:
+    """The rules that a heuristic's fields hold."""
+    found: list[Heuristic] = []
+    for field in dataclasses.fields(rule):
+        _map_rules(lambda inner: found.append(inner) or inner, getattr(rule, field.name))
+    return found
+
+
+def _replaced(rule: Heuristic, values: Mapping[str, Any]) -> Heuristic:
+    changes = {name: value for name, value in values.items() if name in declared(rule)}
+    for field in dataclasses.fields(rule):
+        value = getattr(rule, field.name)
+        nested = _map_rules(lambda inner: _replaced(inner, values), value)
+        if nested is not value:
+            changes[field.name] = nested
+    return dataclasses.replace(rule, **changes)
+
+
+def _map_rules(function: Callable[[Heuristic], Heuristic], value: Any) -> Any:
+    """The value with each rule in it replaced, the same object where it holds none."""
+    if isinstance(value, Heuristic):
+        return function(value)
+    if isinstance(value, tuple | list):
+        parts = [_map_rules(function, part) for part in value]
+        unchanged = all(new is old for new, old in zip(parts, value, strict=True))
+        return value if unchanged else type(value)(parts)
+    if isinstance(value, dict):
+        parts = {name: _map_rules(function, part) for name, part in value.items()}
+        return value if all(parts[name] is value[name] for name in value) else parts
+    return value

@@ -1,0 +1,181 @@
+"""Plots of anybody's arrays; matplotlib is imported when the first of them is drawn."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxlfi.figures.style import Figure
+
+__all__ = ["pairs"]
+
+MIN_DRAWS = 20
+"""Smallest number of draws that contours are drawn from."""
+MAX_PARAMETERS = 12
+"""Largest number of parameters that stay legible on the width of a page."""
+MAX_SETS = 8
+"""Largest number of sets of samples that can be distinguished when drawn over one another."""
+
+
+def pairs(
+    samples: Any,
+    *,
+    names: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+    truth: Sequence[float] | None = None,
+    support: Any = None,
+    log: Sequence[bool] | Sequence[str] = (),
+    path: Path | str | None = None,
+    dpi: float = 300.0,
+) -> "Figure":
+    r"""Draw the marginal of every parameter and contours of every pair of them.
+
+    Several sets of samples are drawn over one another, in colours and line styles that differ also to the colour-blind.
+    Where there is a support the draws are assumed to lie in it, and densities do not fade towards its bounds.
+
+    Args:
+        samples: array of draws, shape [n, D], or a dictionary of up to eight such arrays by label.
+        names: of the D parameters; by default their symbols only.
+        units: of the D parameters, such as "N/m"; "" for none.
+        truth: true parameters, shape [D]; NaN where unknown.
+        support: box to mark, an object with `low` and `high` or a pair of them, shape [D] each.
+        log: parameters to be drawn as natural logarithms: their names, or D booleans.
+        path: file to write the figure to as well, .png, .pdf or .svg.
+        dpi: resolution of a .png.
+
+    Returns:
+        A matplotlib figure that pyplot does not hold on to.
+
+    Raises:
+        ValueError: for samples that are no finite [n, D] array or too few, or for other arguments that do not fit them.
+        ImportError: without matplotlib.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> stiffness, damping = rng.lognormal(1.0, 0.2, 500), rng.normal(0.4, 0.1, 500)
+        >>> figure = pairs(
+        ...     np.column_stack([stiffness, damping]), names=("stiffness", "damping"), units=("N/m", "N s/m"),
+        ...     truth=(2.7, 0.4), log=("stiffness",),
+        ... )
+        >>> [axes.get_xlabel().replace("\n", " ") for axes in figure.axes if axes.get_xlabel()]
+        ['ln stiffness [ln(N/m)]', 'damping [N s/m]']
+    """
+    sets = _sets(samples)
+    dim = next(iter(sets.values())).shape[1]
+    names_ = _texts("names", names, dim, "theta_{}")
+    units_ = _texts("units", units, dim, "")
+    is_log = _mask(log, names, dim)
+    to_drawn = lambda what, values: _with_logarithms(what, values, is_log, names_)
+    sets = {label: to_drawn(_called(label), draws) for label, draws in sets.items()}
+    marked = np.full(dim, np.nan) if truth is None else to_drawn("truth", _vector("truth", truth, dim, unknown=True))
+    box = None if support is None else tuple(to_drawn("support", bound) for bound in _bounds(support, dim))
+
+    # Imported here so that `import jaxlfi.plot` does not load matplotlib.
+    from jaxlfi.figures import style
+    from jaxlfi.figures.pairs import Cloud, draw_overlay
+
+    looks = style.set_looks(list(sets))
+    clouds = [Cloud(draws, look, marked, box) for draws, look in zip(sets.values(), looks, strict=True)]
+    texts = [style.symbol(d) if names is None else style.plain(name) for d, name in enumerate(names_)]
+    texts = [f"ln {text}" if logarithm else text for text, logarithm in zip(texts, is_log, strict=True)]
+    labels = [style.with_unit(text, unit) for text, unit in zip(texts, units_, strict=True)]
+    width = style.TEXT_WIDTH if dim > 2 else style.COLUMN_WIDTH
+    with style.context():
+        figure = style.new_figure(width, 0.65 * width + 0.5 if dim == 1 else width + 0.3)
+        draw_overlay(figure, clouds, labels)
+        if path is None:
+            figure.draw_without_rendering()  # makes ticks and layout in this style, before the settings are restored
+        else:
+            style.save(figure, Path(path), dpi)
+    return figure
+
+
+def _sets(samples: Any) -> dict[str, np.ndarray]:
+    """Checked draws by label; a single array has the label ""."""
+    if not isinstance(samples, Mapping):
+        return {"": _draws("samples", samples)}
+    if not 1 <= len(samples) <= MAX_SETS:
+        raise ValueError(f"samples: expected 1 to {MAX_SETS} labelled arrays, got {len(samples)}")
+    sets = {str(label): _draws(_called(str(label)), values) for label, values in samples.items()}
+    if len({draws.shape[1] for draws in sets.values()}) > 1:
+        shapes = ", ".join(f"{label} {list(draws.shape)}" for label, draws in sets.items())
+        raise ValueError(f"samples: expected arrays of equally many parameters, got {shapes}")
+    return sets
+
+
+def _called(label: str) -> str:
+    return f"samples[{label!r}]" if label else "samples"
+
+
+def _draws(what: str, values: Any) -> np.ndarray:
+    draws = _numbers(what, values)
+    if draws.ndim != 2 or not 1 <= draws.shape[1] <= MAX_PARAMETERS:
+        hint = ": choose some of the columns" if draws.ndim == 2 and draws.shape[1] else ""
+        raise ValueError(
+            f"{what}: expected shape [n, D] with 1 <= D <= {MAX_PARAMETERS}, got {list(draws.shape)}{hint}"
+        )
+    if len(draws) < MIN_DRAWS:
+        raise ValueError(f"{what}: expected at least {MIN_DRAWS} draws, got {len(draws)}")
+    if unusable := int((~np.isfinite(draws)).any(1).sum()):
+        raise ValueError(f"{what}: expected finite numbers, got {unusable} of {len(draws)} rows that are not finite")
+    return draws
+
+
+def _numbers(what: str, values: Any) -> np.ndarray:
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what}: expected an array of numbers, got {type(values).__name__}") from error
+
+
+def _vector(what: str, values: Any, dim: int, unknown: bool = False) -> np.ndarray:
+    vector = _numbers(what, values)
+    if vector.shape != (dim,):
+        raise ValueError(f"{what}: expected shape [{dim}], one number for each parameter, got {list(vector.shape)}")
+    if not (np.isfinite(vector) | (unknown & np.isnan(vector))).all():
+        raise ValueError(f"{what}: expected finite numbers{' or NaN' if unknown else ''}, got {vector.tolist()}")
+    return vector
+
+
+def _bounds(support: Any, dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds of a box given as an object with `low` and `high` or as a pair."""
+    if hasattr(support, "low") and hasattr(support, "high"):
+        low, high = support.low, support.high
+    elif isinstance(support, list | tuple | np.ndarray) and len(support) == 2:
+        low, high = support
+    else:
+        raise ValueError(f"support: expected an object with low and high, or (low, high), got {support!r}")
+    low, high = _vector("support low", low, dim), _vector("support high", high, dim)
+    if not (low < high).all():
+        raise ValueError(f"support: expected low < high, got {low.tolist()} and {high.tolist()}")
+    return low, high
+
+
+def _texts(what: str, given: Sequence[str] | None, dim: int, default: str) -> tuple[str, ...]:
+    texts = tuple(default.format(d + 1) for d in range(dim)) if given is None else tuple(given)
+    if isinstance(given, str) or len(texts) != dim or not all(isinstance(text, str) for text in texts):
+        raise ValueError(f"{what}: expected {dim} strings, one for each parameter, got {given!r}")
+    return texts
+
+
+def _mask(log: Sequence[bool] | Sequence[str], names: Sequence[str] | None, dim: int) -> np.ndarray:
+    """Which parameters are drawn as logarithms, shape [D]."""
+    given = [log] if isinstance(log, str) else list(log)
+    if all(isinstance(name, str) for name in given) and (names is not None or not given):
+        if unknown := [name for name in given if name not in names]:
+            raise ValueError(f"log: expected some of {', '.join(names)}, got {', '.join(unknown)}")
+        return np.array([name in given for name in names or [None] * dim])
+    mask = np.asarray(given)
+    if mask.shape != (dim,) or mask.dtype != bool:
+        raise ValueError(f"log: expected names of parameters or {dim} booleans, got {log!r}")
+    return mask
+
+
+def _with_logarithms(what: str, values: np.ndarray, is_log: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Values [..., D] with some parameters replaced by their natural logarithms."""
+    for name, column in zip(np.array(names)[is_log], values[..., is_log].T, strict=True):
+        if np.min(column) <= 0:
+            raise ValueError(f"{what}: expected positive values of {name}, which log names, got {np.min(column):g}")
+    return np.where(is_log, np.log(np.where(is_log, values, 1.0)), values)

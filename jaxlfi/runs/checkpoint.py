@@ -1,0 +1,125 @@
+"""Checkpoint: what a run that was killed needs to go on, written as each round ends.
+
+A folder of .npz files, each replaced as a whole: `start.npz` with the observations (and the first round's simulations,
+where they were given), `round_000.npz` and so on
+with what each round did, and `state.npz` with the last state, which says how many rounds are done. Only the
+state is rewritten, so that a round costs the same early and late. A round that was written but that the state
+does not count yet is done again, to the same end.
+"""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlfi.bayessim.record import FINAL, apart
+from jaxlfi.io import files as atomic
+from jaxlfi.tasks.simulation import Simulations
+
+FOLDER = "checkpoint"
+_DONE = "rounds_done"
+GIVEN = "given/"
+"""Prefix of the arrays of simulations that were given."""
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used; it is left as it is."""
+
+
+class Checkpoint:
+    """The checkpoint of a batch of runs, in `folder/checkpoint`."""
+
+    def __init__(self, folder: Path):
+        """Nothing is read or written yet."""
+        self.folder = folder / FOLDER
+
+    def write_start(self, observed: np.ndarray, x: np.ndarray, first: Simulations | None = None) -> None:
+        """Keep the runs' observations, shape [L, T, C], their summaries, shape [L, S], and given simulations."""
+        self.folder.mkdir(parents=True)
+        given = {} if first is None else {GIVEN + name: leaf for name, leaf in vars(first).items()}
+        atomic.write_arrays(
+            self.folder / "start.npz", {"observed": observed, "x": x} | given, compress=False, durable=True
+        )
+
+    def read_start(self) -> tuple[np.ndarray, np.ndarray, Simulations | None]:
+        """The runs' observations and summaries, and the simulations that were given for the first round."""
+        start = self._read("start.npz")
+        given = {name.removeprefix(GIVEN): jnp.asarray(leaf) for name, leaf in start.items() if name.startswith(GIVEN)}
+        observed, x = (self._named(start, "start.npz", name) for name in ("observed", "x"))
+        try:
+            return observed, x, Simulations(**given) if given else None
+        except TypeError as error:
+            raise CheckpointError(f"{self.folder / 'start.npz'}: expected whole simulations, got: {error}") from error
+
+    def write_round(self, index: int, state: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
+        """Keep a round's record and the state after it; of some arrays, only the last round's (`history.apart`)."""
+        rows, final = apart(rows)
+        atomic.write_arrays(
+            self.folder / _round_name(index),
+            rows | {"seconds": np.asarray(seconds)},
+            compress=False,
+            durable=True,
+        )
+        leaves = {name: np.asarray(leaf) for name, leaf in _named_leaves(state).items()}
+        done = {_DONE: np.asarray(index + 1)}
+        atomic.write_arrays(self.folder / "state.npz", leaves | done | final, compress=False, durable=True)
+
+    def rounds_done(self) -> int:
+        """How many rounds the state has behind it."""
+        if not (self.folder / "state.npz").exists():
+            return 0
+        return int(self._named(self._read("state.npz"), "state.npz", _DONE))
+
+    def read_rounds(self, count: int) -> tuple[list[dict[str, np.ndarray]], list[float], dict[str, np.ndarray]]:
+        """Records of the first rounds, their seconds, and what is kept of the last round only."""
+        rows, seconds = [], []
+        for index in range(count):
+            arrays = self._read(_round_name(index))
+            seconds.append(float(self._named(arrays, _round_name(index), "seconds")))
+            rows.append({name: value for name, value in arrays.items() if name != "seconds"})
+        state = self._read("state.npz") if count else {}
+        return rows, seconds, {name: value for name, value in state.items() if name.startswith(FINAL)}
+
+    def read_state(self, template: Any) -> Any:
+        """The last state.
+
+        Args:
+            template: a state of the same shapes, or of `jax.ShapeDtypeStruct`.
+        """
+        arrays = self._read("state.npz")
+        names = _named_leaves(template)
+        for name, leaf in names.items():
+            array = self._named(arrays, "state.npz", name)
+            if array.shape != leaf.shape or array.dtype != leaf.dtype:
+                raise CheckpointError(
+                    f"{self.folder / 'state.npz'}: expected {name} of shape {leaf.shape} and type "
+                    f"{leaf.dtype}, got {array.shape} and {array.dtype}"
+                )
+        return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in names])
+
+    def remove(self) -> None:
+        """Clean up after a run that is complete."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _read(self, name: str) -> dict[str, np.ndarray]:
+        try:
+            return atomic.read_arrays(self.folder / name)
+        except ValueError as error:
+            raise CheckpointError(str(error)) from error
+
+    def _named(self, arrays: dict[str, np.ndarray], file: str, name: str) -> np.ndarray:
+        if name not in arrays:
+            raise CheckpointError(f"{self.folder / file}: expected an array {name}, got none")
+        return arrays[name]
+
+
+def _round_name(index: int) -> str:
+    return f"round_{index:03d}.npz"
+
+
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}

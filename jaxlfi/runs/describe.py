@@ -1,0 +1,81 @@
+"""Settings, heuristics and supports as plain JSON values, and back."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators import registry as estimators
+from jaxlfi.estimators.base import Estimator
+from jaxlfi.heuristics import Heuristic
+from jaxlfi.heuristics import registry as heuristics
+from jaxlfi.io.serialise import class_name, dataclass_of, fields_to_json, from_json, made_of, to_json
+
+
+def settings_to_json(settings: Settings) -> dict[str, Any]:
+    """All settings by name, and the estimator by its family."""
+    return fields_to_json(settings, _name)
+
+
+def settings_from_json(description: Mapping[str, Any]) -> Settings:
+    """The settings that `settings_to_json` described.
+
+    Raises:
+        ValueError: for a description of anything else, or of an estimator that is not installed.
+    """
+    return made_of(Settings, "settings", description, _loader(estimators))
+
+
+def heuristic_to_json(heuristic: Heuristic) -> dict[str, Any]:
+    """A heuristic's name and hyperparameters; rules that it wraps are described alike.
+
+    Example:
+        >>> from jaxlfi.heuristics import Matched, Mode
+        >>> heuristic_to_json(Matched(Mode()))["hyperparameters"]["rule"]["hyperparameters"]["proximity"]
+        0.4
+    """
+    return to_json(heuristic, _name)
+
+
+def heuristic_from_json(description: Mapping[str, Any]) -> Heuristic:
+    """The heuristic that `heuristic_to_json` described.
+
+    Raises:
+        ValueError: for a description of anything else, or of a heuristic that is not installed.
+    """
+    heuristic = from_json(description, _loader(heuristics))
+    if not isinstance(heuristic, Heuristic):
+        raise ValueError(f"heuristic: expected the description of one, got {description['name']!r}")
+    return heuristic
+
+
+def support_to_json(support: Support) -> dict[str, list[float]]:
+    """A box's bounds, in inference space."""
+    return {"low": np.asarray(support.low).tolist(), "high": np.asarray(support.high).tolist()}
+
+
+def support_from_json(description: Mapping[str, list[float]]) -> Support:
+    """The box that `support_to_json` described."""
+    return Support(list(description["low"]), list(description["high"]))
+
+
+def _name(value: Any) -> str:
+    if isinstance(value, Heuristic):
+        return heuristics.name_of(value)
+    return estimators.name_of(value) if isinstance(value, Estimator) else class_name(value)
+
+
+def _loader(registry: Any):
+    """Classes by their registered names, or by module:Class what a registered class holds."""
+
+    def load(name: str) -> type:
+        if ":" not in name:
+            return registry.load(name)
+        kind = dataclass_of(name)
+        if not issubclass(kind, Heuristic | Estimator):
+            raise ValueError(f"description: expected a heuristic or an estimator, got {name!r}")
+        return kind
+
+    return load

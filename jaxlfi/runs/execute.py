@@ -1,0 +1,335 @@
+"""A batch of runs from its plan to finished runs: in memory, or in a folder that can be resumed at any moment."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxlfi.bayessim.algorithm import State
+from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
+from jaxlfi.bayessim.correction import gaussian_prior
+from jaxlfi.bayessim.drive import drive
+from jaxlfi.bayessim.host import engine_for
+from jaxlfi.bayessim.keys import key_of, run_keys
+from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, theta_error, trajectory_error
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import describe
+from jaxlfi.runs import folder as folders
+from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
+from jaxlfi.runs.folder import COMPARE, RUN, RUNS, StoreError
+from jaxlfi.runs.run import Origin, Run
+from jaxlfi.tasks import priors, registry
+from jaxlfi.tasks.observation import observe
+from jaxlfi.tasks.simulation import Simulations
+from jaxlfi.tasks.task import Task
+
+OWN = ("configuration", "support", "heuristic", "seed")
+"""What the runs of a batch differ in, by the names of config.json."""
+VERSIONS = ("jax", "jaxlib", "jaxlfi")
+"""Packages whose versions a resumed run has to share for the promise of the same bits."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BatchPlan:
+    """What is going to be run.
+
+    Attributes:
+        kind: the format of its folder (`jaxlfi.runs.folder.RUN`, `RUNS` or `COMPARE`).
+        reference: by which the task was found; None for one made in Python.
+        task: the task.
+        preset: the settings were made from; None for others.
+        settings: all of them.
+        specs: the runs.
+        keep_network: leave the trained networks in the folder.
+    """
+
+    kind: str
+    reference: str | None
+    task: Task
+    preset: str | None
+    settings: Settings
+    specs: tuple[RunSpec, ...]
+    keep_network: bool = False
+
+    def folders(self) -> list[str]:
+        """Each run's folder, relative to the plan's."""
+        if self.kind == RUN:
+            return ["."]
+        parts = [f"seed_{spec.seed:03d}" for spec in self.specs]
+        if self.kind == RUNS:
+            return parts
+        return [f"{spec.configuration}/{part}" for spec, part in zip(self.specs, parts, strict=True)]
+
+    def origin(self, spec: RunSpec) -> Origin:
+        """How one of its runs is described."""
+        return Origin(self.reference, spec.configuration, spec.support_name, self.preset)
+
+
+@dataclasses.dataclass(frozen=True)
+class Observed:
+    """What the runs of a plan observe, and simulations given for their first round.
+
+    Attributes:
+        trajectory: of each run, shape [L, T, C] or [L, T].
+        x: their summaries, shape [L, S].
+        first: the same for all runs, or None.
+    """
+
+    trajectory: np.ndarray
+    x: np.ndarray
+    first: Simulations | None = None
+
+
+def prepare(plan: BatchPlan, observation: Any = None, first: Simulations | None = None) -> Observed:
+    """Check all there is to check, and observe.
+
+    Args:
+        plan: what to run.
+        observation: a trajectory for all runs; by default the task's, or one simulated at the truth for each seed.
+        first: simulations that take the place of the first round's.
+
+    Raises:
+        ValueError: for anything that does not fit.
+    """
+    plan.settings.check()
+    plan.settings.estimator.check_for(plan.task.dim)
+    prior = plan.task.inference.prior
+    for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
+        priors.require_mass(prior, box, name)
+    if plan.settings.correction == "paper" and prior is not None:
+        gaussian_prior(prior)
+    seeds = dict.fromkeys(spec.seed for spec in plan.specs)
+    by_seed = {seed: observe(run_keys(key_of(seed)).observe, plan.task, observation) for seed in seeds}
+    observed, x = (np.stack([np.asarray(by_seed[spec.seed][i]) for spec in plan.specs]) for i in range(2))
+    if first is not None and first.x.shape[1] != x.shape[1]:
+        raise ValueError(f"simulations: expected summaries of length {x.shape[1]}, got {first.x.shape[1]}")
+    return Observed(observed, x, first)
+
+
+def execute(
+    plan: BatchPlan,
+    observed: Observed,
+    folder: Path | None = None,
+    on_round: Callable[[int, dict[str, np.ndarray]], Any] = lambda index, row: None,
+    on_compiled: Callable[[float], Any] = lambda seconds: None,
+) -> list[Run]:
+    """Run the rounds that are not done yet.
+
+    Args:
+        plan: what to run.
+        observed: of `prepare`.
+        folder: made by `begin`, at whatever point it was left; None to keep everything in memory.
+        on_round: called as each round ends, with its index and its record.
+        on_compiled: called with the seconds that compiling took.
+
+    Returns:
+        The finished runs, on the host.
+
+    Raises:
+        CheckpointError: for a damaged checkpoint.
+        SimulatorError: for a simulator that breaks its contract or fails always.
+    """
+    inputs, places = stack_inputs(plan.specs, observed.trajectory, observed.x)
+    engine = engine_for(plan.task, plan.settings, inputs, observed.first)
+    checkpoint = None if folder is None else Checkpoint(folder)
+    done = 0 if checkpoint is None else checkpoint.rounds_done()
+    rows, seconds, final = ([], [], {}) if checkpoint is None else checkpoint.read_rounds(done)
+    if folder is not None:
+        _cut_ledgers(folder, plan, done)
+
+    def keep(index: int, state: State, row: dict[str, np.ndarray], elapsed: float) -> None:
+        nonlocal final
+        seconds.append(elapsed / len(plan.specs))
+        if checkpoint is not None:
+            checkpoint.write_round(index, engine.fetch(state), row, seconds[-1])
+        kept, final = apart(row)
+        rows.append(kept)
+        if folder is not None:
+            for run, name in enumerate(plan.folders()):
+                own = run_row(kept, run, places[run])
+                folders.append_ledger(folder / name, index, own, plan.task.reasons, seconds[-1])
+        on_round(index, row)
+
+    state = drive(engine, _state(engine, checkpoint, done), range(done, plan.settings.rounds), keep, on_compiled)
+    state = engine.fetch(state)
+    return [
+        _run(plan, spec, jax.tree.map(lambda leaf, i=i: leaf[i], state), observed, i, rows, seconds, final, places[i])
+        for i, spec in enumerate(plan.specs)
+    ]
+
+
+def _state(engine: BatchEngine, checkpoint: Checkpoint | None, done: int) -> State:
+    """The state after the rounds that are done."""
+    state = engine.start()
+    return engine.place(checkpoint.read_state(engine.fetch(state))) if done else state
+
+
+def _run(plan, spec, state, observed, index, rows, seconds, final, place) -> Run:
+    """One run of a batch out of the arrays of all."""
+    history = stacked_rounds([run_row(row, index, place) for row in rows])
+    return Run(
+        belief=state.belief,
+        history=history
+        | {"seconds": np.asarray(seconds)}
+        | {name: value[index] for name, value in final.items() if name.startswith(FINAL)},
+        dataset=state.dataset,
+        network=state.network,
+        observed=observed.trajectory[index],
+        x=observed.x[index],
+        key=key_of(spec.seed),
+        support=spec.support,
+        feasible=state.network.scale,
+        heuristic=spec.heuristic,
+        settings=plan.settings,
+        space=plan.task.space,
+        task=plan.task,
+        origin=plan.origin(spec),
+    )
+
+
+def run_row(row: Mapping[str, np.ndarray], index: int, place: int | None) -> dict[str, Any]:
+    """One run's record out of those of a batch."""
+    return own_evidence({name: value[index] for name, value in row.items()}, place)
+
+
+def begin(folder: Path, plan: BatchPlan, observed: Observed) -> None:
+    """Bring the plan's folder into being; nothing is written before everything was checked.
+
+    Args:
+        folder: new or empty.
+        plan: what to run.
+        observed: of `prepare`.
+
+    Raises:
+        StoreError: where something is there already.
+    """
+    runs = [folders.run_config(plan.task, plan.origin(spec), spec, plan.settings) for spec in plan.specs]
+    status = {
+        "status": "running",
+        "devices": min(jax.local_device_count(), len(plan.specs)),
+        "keep_network": plan.keep_network,
+        "runs": [
+            {"folder": name} | {field: run[field] for field in OWN}
+            for name, run in zip(plan.folders(), runs, strict=True)
+        ],
+    }
+    shared = {name: value for name, value in runs[0].items() if name not in OWN}
+    config = runs[0] | status if plan.kind == RUN else shared | {"format": plan.kind} | status
+
+    def fill(beside: Path) -> None:
+        Checkpoint(beside).write_start(observed.trajectory, observed.x, observed.first)
+        if plan.kind == RUN:
+            return
+        for name, run in zip(plan.folders(), runs, strict=True):
+            (beside / name).mkdir(parents=True)
+            atomic.write_json(beside / name / "config.json", run)
+
+    folders.create(folder, config, fill)
+
+
+def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]:
+    """The plan of a folder and what its runs observe, at whatever point it was left.
+
+    Args:
+        folder: made by `begin`.
+        task: where it was made in Python and cannot be found by name.
+
+    Raises:
+        StoreError: for a config.json that lacks something, or a task that has changed.
+    """
+    config = folders.read_config(folder)
+    if "runs" not in config:
+        raise StoreError(f"expected the folder a command was given, got {str(folder)!r}, one run of several")
+    try:
+        if task is None and config["task"] is None:
+            raise StoreError(f"{folder}: expected the task, which was made in Python and has no name: pass task=...")
+        plan = BatchPlan(
+            kind=config["format"],
+            reference=config["task"],
+            task=task or registry.load(config["task"]),
+            preset=config["preset"],
+            settings=describe.settings_from_json(config["settings"]),
+            specs=tuple(_spec(run) for run in config["runs"]),
+            keep_network=config["keep_network"],
+        )
+        labels = config["names"]
+    except (KeyError, TypeError, AttributeError) as error:
+        raise StoreError(f"config.json: expected a complete description of the run, got: {error!r}") from error
+    if list(plan.task.space.labels) != labels:
+        raise StoreError(
+            f"{folder}: expected the task as it was when the run was begun, with parameters {labels}, "
+            f"got {list(plan.task.space.labels)}"
+        )
+    return plan, Observed(*Checkpoint(folder).read_start())
+
+
+def changed_versions(folder: Path) -> list[str]:
+    """In words, which packages are of other versions than when a folder was begun: the same bits need the same ones."""
+    recorded = folders.read_config(folder).get("versions", {})
+    now = folders.versions()
+    changed = [name for name in VERSIONS if recorded.get(name) not in (None, now[name])]
+    return [f"{name} {recorded[name]}, now {now[name]}" for name in changed]
+
+
+def _spec(description: dict[str, Any]) -> RunSpec:
+    return RunSpec(
+        configuration=description["configuration"],
+        support_name=description["support"]["name"],
+        support=describe.support_from_json(description["support"]),
+        heuristic=describe.heuristic_from_json(description["heuristic"]),
+        seed=description["seed"],
+    )
+
+
+def _cut_ledgers(folder: Path, plan: BatchPlan, done: int) -> None:
+    """Take back the lines of rounds that the checkpoint does not count: they are done again, to the same end."""
+    for name in plan.folders():
+        try:
+            atomic.keep_lines(folder / name / "ledger.jsonl", done)
+        except ValueError as error:
+            raise CheckpointError(str(error)) from error
+
+
+def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
+    """Write every run's results and a comparison's table, and then that the folder is complete."""
+    for run, name in zip(runs, plan.folders(), strict=True):
+        folders.write_run(folder / name, run, plan.keep_network)
+    if plan.kind == COMPARE:
+        lines = results(plan, runs)
+        order = list(dict.fromkeys(line["configuration"] for line in lines))
+        lines.sort(key=lambda line: (order.index(line["configuration"]), line["seed"]))
+        folders.write_table(folder / "table.csv", lines)
+    atomic.write_json(folder / "config.json", folders.read_config(folder) | {"status": "finished"})
+    Checkpoint(folder).remove()
+
+
+def results(plan: BatchPlan, runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """One line of `jaxlfi.runs.folder.TABLE_COLUMNS` for each run.
+
+    The errors are those of the last round, the success rate is over all rounds, and the seconds are the run's part of
+    the wall time without compiling, divided by the runs that were stepped together.
+    """
+    lines = []
+    for spec, run in zip(plan.specs, runs, strict=True):
+        history = run.history
+        last = {name: history[name][-1] for name in ("sample_theta_error", "sample_trajectory_error")}
+        lines.append(
+            {
+                "configuration": spec.configuration,
+                "seed": spec.seed,
+                "theta_error": theta_error(last),
+                "trajectory_error": trajectory_error(last),
+                "success_rate": float(np.sum(history["succeeded"]) / np.sum(history["attempted"])),
+                "seconds": float(np.sum(history["seconds"])),
+            }
+        )
+    return lines
+
+
+def any_round(folder: Path) -> bool:
+    """Whether a round was done."""
+    return Checkpoint(folder).rounds_done() > 0

@@ -1,0 +1,309 @@
+"""Run folders: what a run leaves behind, in plain files (JSON, .npz without pickles, CSV).
+
+One run:        config.json ledger.jsonl posterior.npz dataset.npz history.npz observation.npz
+Several seeds:  config.json seed_000/ seed_001/ ...                   each one a run folder
+A comparison:   config.json table.csv CONFIGURATION/seed_000/ ...     each one a run folder
+
+While a command runs its folder also holds `checkpoint/` (`jaxlfi.runs.checkpoint`).
+"""
+
+import csv
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import shlex
+import shutil
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxlfi
+from jaxlfi.bayessim.batch import RunSpec
+from jaxlfi.bayessim.record import FINAL, ledger_line
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.io import files as atomic
+from jaxlfi.io.serialise import json_safe
+from jaxlfi.runs import describe
+from jaxlfi.runs.run import Origin, Run
+from jaxlfi.tasks.task import Task
+
+RUN, RUNS, COMPARE = "jaxlfi-run", "jaxlfi-runs", "jaxlfi-compare"
+VERSION = 2
+"""Of the format of all folders; it rises whenever an older one could be misread."""
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "distrax", "numpy")
+TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")
+
+
+class StoreError(ValueError):
+    """A folder that cannot be read, resumed or written to."""
+
+
+def environment() -> dict[str, Any]:
+    """What a run was made with: versions, platform and command line."""
+    return {
+        "versions": versions(),
+        "platform": {
+            "system": platform.platform(),
+            "processor": processor(),
+            "backend": jax.default_backend(),
+            "device": jax.devices()[0].device_kind,
+            "cores": os.cpu_count(),
+        },
+        "command_line": command_line(sys.argv),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def as_json(value: Any) -> Any:
+    """A value as it is read back after it was written."""
+    return json.loads(json.dumps(json_safe(value)))
+
+
+def versions() -> dict[str, str]:
+    """Of Python, jaxlfi and the packages it computes with."""
+    packages = {package: importlib.metadata.version(package) for package in PACKAGES}
+    return {"python": platform.python_version(), "jaxlfi": jaxlfi.__version__} | packages
+
+
+def command_line(argv: Sequence[str]) -> str:
+    """A command as its results tell of it: without the folders of the machine it ran on.
+
+    An absolute path is told from the working folder on where it lies below it, and by its name alone elsewhere.
+
+    Example:
+        >>> command_line(["/usr/bin/jaxlfi", "report", "/elsewhere/runs/edge"])
+        'jaxlfi report edge'
+    """
+
+    def portable(argument: str) -> str:
+        flag, equals, value = argument.partition("=") if argument.startswith("-") else ("", "", argument)
+        path = Path(value)
+        if not path.is_absolute():
+            return argument
+        inside = path.is_relative_to(Path.cwd())
+        return flag + equals + (str(path.relative_to(Path.cwd())) if inside else path.name)
+
+    return shlex.join([Path(argv[0]).name, *(portable(argument) for argument in argv[1:])])
+
+
+def processor() -> str:
+    """The processor's name as the system tells it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def refuse_occupied(folder: Path) -> None:
+    """Refuse to write where something is.
+
+    Raises:
+        StoreError: if the folder exists and is not empty, or is a file.
+    """
+    if not folder.exists():
+        return
+    if not folder.is_dir() or any(folder.iterdir()):
+        raise StoreError(
+            f"out: expected a new or empty folder, got {str(folder)!r} which holds something: "
+            f"take another name, or continue it with 'jaxlfi resume {folder}'"
+        )
+
+
+def create(folder: Path, config: Mapping[str, Any], fill) -> None:
+    """Bring a run folder into being, complete or not at all.
+
+    Args:
+        folder: where; it must not exist or be empty.
+        config: written as config.json.
+        fill: called with the folder's temporary path, to write what a resume needs besides.
+    """
+    refuse_occupied(folder)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    except OSError as error:
+        raise StoreError(f"out: expected a folder that can be written, got {str(folder)!r}: {error}") from error
+    try:
+        beside.chmod(0o755)
+        fill(beside)
+        atomic.write_json(beside / "config.json", config)
+        beside.rename(folder)
+    except BaseException:
+        shutil.rmtree(beside, ignore_errors=True)
+        raise
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """The config.json of a run folder of any kind.
+
+    Raises:
+        StoreError: for folders that are none.
+    """
+    if not folder.is_dir():
+        raise StoreError(f"expected a run folder, got {str(folder)!r} which is no folder")
+    path = folder / "config.json"
+    try:
+        config = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise StoreError(f"expected a run folder, got {str(folder)!r} without a readable config.json") from error
+    kind = config.get("format") if isinstance(config, dict) else None
+    if kind not in (RUN, RUNS, COMPARE):
+        known = isinstance(kind, str) and kind.startswith("jaxlfi-")
+        found = f"is of format {kind!r}" if known else "is not of jaxlfi"
+        raise StoreError(f"expected a run folder, got {str(folder)!r} whose config.json {found}")
+    check_version(path, config)
+    return config
+
+
+def check_version(path: Path, config: Mapping[str, Any]) -> None:
+    """Refuse a folder of another version of the format.
+
+    Raises:
+        StoreError: in one line.
+    """
+    if config.get("version") != VERSION:
+        raise StoreError(
+            f"{path}: expected version {VERSION} of the format, got {config.get('version')}: the folder was written by "
+            f"jaxlfi {config.get('versions', {}).get('jaxlfi', 'of another version')} in another format; run it again"
+        )
+
+
+def append_ledger(folder: Path, index: int, row: Mapping[str, np.ndarray], reasons: Sequence[str], seconds: float):
+    """Add a round's line to ledger.jsonl."""
+    line = atomic.json_line(ledger_line(index, row, tuple(reasons), seconds))
+    atomic.append_line(folder / "ledger.jsonl", line)
+
+
+def write_run(folder: Path, run: Run, keep_network: bool = False) -> None:
+    """Write the arrays of one finished run into its folder, which exists and has its ledger.
+
+    Args:
+        folder: of the run.
+        run: one run, with the task.
+        keep_network: save the network also where the posterior can do without.
+    """
+    task, history = run.task, jax.device_get(run.history)
+    belief, labels = jax.device_get(run.belief), np.asarray(run.space.labels)
+    atomic.write_arrays(
+        folder / "posterior.npz",
+        {
+            "logits": belief.mixture.logits,
+            "means": belief.mixture.means,
+            "scale_tril": belief.mixture.scale_tril,
+            "support_low": belief.support.low,
+            "support_high": belief.support.high,
+            "draws": run.draws(),
+            "parameters": np.asarray(run.space.names),
+            "log": np.asarray(run.space.log),
+            "names": labels,
+        },
+    )
+    dataset = jax.device_get(run.dataset)
+    rows = slice(int(dataset.size))
+    columns = {name: getattr(dataset, name)[rows] for name in ("theta", "x", "round", "weight")}
+    atomic.write_arrays(folder / "dataset.npz", columns | {"names": labels})
+    atomic.write_arrays(folder / "history.npz", history | {"reasons": np.asarray(task.reasons), "names": labels})
+    unknown = np.full(task.dim, np.nan, np.float32)
+    atomic.write_arrays(
+        folder / "observation.npz",
+        {
+            "trajectory": run.observed,
+            "x": run.x,
+            "truth": unknown if task.truth is None else task.inference.truth,
+            "names": labels,
+            "summaries": np.asarray(task.named_summaries(len(run.x)), dtype=str),
+            "channels": np.asarray(task.channels, dtype=str),
+            "times": np.arange(len(run.observed)) if task.times is None else task.times,
+            "record_label": np.asarray(task.record_label or ("record" if task.times is None else "time")),
+        },
+    )
+    if keep_network or run.amortised or not run.settings.estimator.closed_form:
+        atomic.write_arrays(folder / "network.npz", named_leaves(run.network))
+
+
+def save(run: Run, folder: Path) -> Path:
+    """Write one run into a new folder, complete or not at all."""
+
+    def fill(beside: Path) -> None:
+        for index, seconds in enumerate(np.asarray(run.history["seconds"])):
+            row = {name: value[index] for name, value in run.history.items() if not name.startswith(FINAL)}
+            append_ledger(beside, index, jax.device_get(row), run.task.reasons, seconds)
+        write_run(beside, run)
+
+    if run.task is None:
+        raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
+    create(folder, run_config(run.task, run.origin, run.spec, run.settings), fill)
+    return folder
+
+
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """A pytree as named arrays, by the places of its leaves."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
+
+
+def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
+    """Write the table of a comparison, one line a configuration and seed; what is unknown stays empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, TABLE_COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    for line in lines:
+        writer.writerow({name: "" if value != value else value for name, value in line.items()})
+    atomic.write_bytes(path, text.getvalue().encode())
+
+
+def run_config(task: Task, origin: Origin, spec: RunSpec, settings: Settings) -> dict[str, Any]:
+    """The config.json of one run."""
+    feasible = task.inference.feasible
+    return {
+        "format": RUN,
+        "version": VERSION,
+        "task": origin.reference,
+        "task_name": task.name,
+        "parameters": list(task.names),
+        "log": list(task.space.log),
+        "names": list(task.space.labels),
+        "units": list(task.units),
+        "feasible_low": np.asarray(feasible.low).tolist(),
+        "feasible_high": np.asarray(feasible.high).tolist(),
+        "configuration": spec.configuration,
+        "support": {"name": spec.support_name} | describe.support_to_json(spec.support),
+        "heuristic": describe.heuristic_to_json(spec.heuristic),
+        "preset": origin.preset,
+        "settings": describe.settings_to_json(settings),
+        "seed": spec.seed,
+        **environment(),
+    }
+
+
+def read_ledger(folder: Path) -> list[dict[str, Any]]:
+    """The ledger of a run folder, one dictionary a round; numbers that were not known are NaN.
+
+    Raises:
+        StoreError: if it is missing or damaged.
+    """
+    path = folder / "ledger.jsonl"
+    try:
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+    except (OSError, ValueError) as error:
+        raise StoreError(f"expected a ledger, got a missing or damaged {path}") from error
+    return [{name: float("nan") if value is None else value for name, value in line.items()} for line in lines]
+
+
+def read_table(path: Path) -> list[dict[str, Any]]:
+    """The table of a comparison; what was unknown is NaN."""
+    with path.open(newline="") as file:
+        return [
+            {name: value if name == "configuration" else float(value or "nan") for name, value in line.items()}
+            for line in csv.DictReader(file)
+        ]

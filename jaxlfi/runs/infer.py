@@ -1,0 +1,185 @@
+"""infer: one whole inference run as a library call."""
+
+import functools
+import warnings as python_warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from jaxlfi.bayessim.batch import RunInputs, RunSpec, run_one
+from jaxlfi.bayessim.keys import run_keys, seed_of
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.bayessim.record import FINAL
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.distributions.arguments import is_concrete, require_key
+from jaxlfi.distributions.space import SpaceName
+from jaxlfi.distributions.support import Support
+from jaxlfi.heuristics import Edge, Heuristic, registry
+from jaxlfi.io.progress import RoundProgress
+from jaxlfi.runs import execute as executing
+from jaxlfi.runs import folder as folders
+from jaxlfi.runs.execute import BatchPlan
+from jaxlfi.runs.load import load
+from jaxlfi.runs.run import Origin, Run, SupportWarning
+from jaxlfi.tasks.observation import observe
+from jaxlfi.tasks.presimulated import presimulated, read_simulations
+from jaxlfi.tasks.task import Task
+
+Callback = Callable[[int, dict[str, np.ndarray]], Any]
+"""Called as a round ends, with its index and its record (the names of history.npz)."""
+
+
+def infer(
+    key: jax.Array,
+    task: Task,
+    observation: Any = None,
+    *,
+    support: str | Support | None = None,
+    heuristic: Heuristic = Edge(),
+    settings: Settings = QUICK,
+    space: SpaceName = "natural",
+    simulations: Mapping[str, Any] | str | Path | None = None,
+    progress: bool = False,
+    callback: Callback | None = None,
+    out: str | Path | None = None,
+) -> Run:
+    """Infer a task's parameters from one observed trajectory, adapting the support (Algorithm 1).
+
+    The same numbers as `jaxlfi infer` gives for the seed that the key was made from. Compiled on first use for a task
+    and the static part of `settings`; further calls reuse the program. It can be traced: jitted, and vmapped over keys,
+    observations, supports, and the leaves of `heuristic` and `settings`. A traced run is one scan over its rounds, and
+    takes neither a host simulator nor the last four arguments.
+
+    Args:
+        key: consumed.
+        task: simulator, names and bounds.
+        observation: the real trajectory, in the shape the simulator produces. By default the task's own, or,
+            where the truth is known, a fresh simulation at the truth.
+        support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
+            box they fill.
+        heuristic: how the support is adapted.
+        settings: the numbers of the run; `jaxlfi.PAPER` are the paper's.
+        space: whether a box is given in "natural" units or in "inference" space.
+        simulations: pairs of parameters and simulations that take the place of the first round's: a mapping of arrays,
+            or an .npz file (`jaxlfi.tasks.presimulated.presimulated`). With one round nothing is simulated.
+        progress: show a progress bar.
+        callback: called as each round ends.
+        out: a new folder to keep the run in as it goes on. Where it holds the same run, unfinished or not, the run goes
+            on from there, to the same result.
+
+    Returns:
+        The run: `run.posterior`, `run.belief.support`, `run.warnings`, `run.save(folder)`.
+
+    Raises:
+        ValueError: for a support, observation or settings that do not fit the task.
+        SimulatorError: for a simulator that breaks its contract or fails always.
+
+    Example:
+        >>> from jaxlfi.envs.gaussian_linear import task  # doctest: +SKIP
+        >>> run = infer(jax.random.key(0), task(), support="misspecified", heuristic=Edge())  # doctest: +SKIP
+        >>> run.posterior.sample(jax.random.key(1), 1000)  # doctest: +SKIP
+    """
+    require_key(key)
+    if not isinstance(task, Task):
+        raise ValueError(f"task: expected a jaxlfi.Task, got {type(task).__name__}")
+    if not isinstance(settings, Settings):
+        raise ValueError(f"settings: expected jaxlfi.Settings such as jaxlfi.QUICK, got {settings!r}")
+    registry.check(heuristic, task.dim)
+    if not is_concrete((key, observation, support, heuristic, settings)):
+        if task.on_host or simulations is not None or progress or callback is not None or out is not None:
+            raise ValueError(
+                "infer: expected concrete arguments for a host simulator, simulations, progress, callback or out, "
+                "got traced ones"
+            )
+        return _traced(key, task, observation, _traced_support(task, support, space), heuristic, settings)
+    first, name = None, support if isinstance(support, str) else "own"
+    if simulations is not None:
+        arrays = read_simulations(simulations) if isinstance(simulations, str | Path) else simulations
+        box = None if support is None else task.support(support, space)
+        first, box = presimulated(task, arrays, box)
+    else:
+        box = task.support(support, space)
+        name = next(iter(task.supports)) if support is None else name
+    spec = RunSpec("own", name, box, heuristic, seed_of(key))
+    plan = BatchPlan(folders.RUN, None, task, None, settings, (spec,))
+    run = _run(plan, observation, first, progress, callback, None if out is None else Path(out))
+    if not heuristic.grows:
+        for warning in run.warnings:
+            python_warnings.warn(warning, SupportWarning, stacklevel=2)
+    return run
+
+
+def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Callback | None, out: Path | None) -> Run:
+    """A batch of one run, in memory or in a folder."""
+    observed = executing.prepare(plan, observation, first)
+    if out is not None:
+        if not (out / "config.json").exists():
+            executing.begin(out, plan, observed)
+        config = folders.read_config(out)
+        _require_same(out, config, plan)
+        if config.get("status", "finished") == "finished":
+            return load(out, plan.task)
+        _, observed = executing.reopen(out, plan.task)
+    console = Console(quiet=not progress)
+    with RoundProgress(console, plan.settings.rounds, 0, f"{plan.task.name}: 1 run") as bar:
+
+        def each(index: int, row: dict[str, np.ndarray]) -> None:
+            bar.advance()
+            if callback is not None:
+                callback(index, executing.run_row(row, 0, None))
+
+        (run,) = executing.execute(plan, observed, out, each, bar.compiled)
+    if out is not None:
+        executing.finish(out, plan, [run])
+    return run
+
+
+def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
+    """Refuse to go on in the folder of another run."""
+    (spec,) = plan.specs
+    wanted = folders.run_config(plan.task, plan.origin(spec), spec, plan.settings)
+    compared = ("task_name", "names", "units", "feasible_low", "feasible_high", "heuristic", "settings", "seed")
+    if other := [name for name in compared if config.get(name) != folders.as_json(wanted[name])]:
+        raise folders.StoreError(
+            f"out: expected a new folder or one of the same run, got {str(out)!r}, of a run with another "
+            + ", ".join(other)
+        )
+
+
+def _traced_support(task: Task, support: Any, space: SpaceName) -> Support:
+    if not isinstance(support, Support) or is_concrete(support):
+        return task.support(support, space)
+    return support if space == "inference" else task.space.box_to_inference(support)
+
+
+def _traced(key, task: Task, observation, support: Support, heuristic, settings: Settings) -> Run:
+    observed, x = observe(run_keys(key).observe, task, observation, concrete=False)
+    inputs = RunInputs(key, support, heuristic, observed, x)
+    state, records = _scan(task, settings, inputs)
+    history = {name: value[-1] if name.startswith(FINAL) else value for name, value in records.items()}
+    return Run(
+        belief=state.belief,
+        history=history | {"seconds": jnp.full(settings.rounds, jnp.nan)},
+        dataset=state.dataset,
+        network=state.network,
+        observed=observed,
+        x=x,
+        key=key,
+        support=support,
+        feasible=state.network.scale,
+        heuristic=heuristic,
+        settings=settings,
+        space=task.space,
+        task=task,
+        origin=Origin(),
+    )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _scan(task: Task, settings: Settings, inputs: RunInputs):
+    return run_one(task, settings, inputs)

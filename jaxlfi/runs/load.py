@@ -1,0 +1,147 @@
+"""load: a run folder as the run that `infer` returned."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlfi.bayessim.keys import key_of
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.base import Network, untrained
+from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import describe
+from jaxlfi.runs import folder as folders
+from jaxlfi.runs.folder import StoreError
+from jaxlfi.runs.run import Origin, Run
+from jaxlfi.tasks import registry
+from jaxlfi.tasks.task import Task
+
+LABELS = ("reasons", "names")
+"""Arrays of history.npz that are texts, not records."""
+
+
+def load(folder: str | Path, task: Task | None = None) -> Run:
+    """Read a finished run back: what `infer`, `run.save` and the command line wrote, of one seed.
+
+    Args:
+        folder: of one run, such as "runs/edge" or "runs/comparison/misspecified+edge/seed_000".
+        task: what was inferred, where it was made in Python and cannot be found by name.
+
+    Raises:
+        ValueError: for a folder that holds no finished run, or a damaged one, or another task.
+
+    Example:
+        >>> run = load("runs/demo/misspecified+edge/seed_000")  # doctest: +SKIP
+        >>> run.posterior.sample(jax.random.key(0), 1000)  # doctest: +SKIP
+    """
+    folder = Path(folder)
+    config = folders.read_config(folder)
+    if config["format"] != folders.RUN:
+        one = next((run["folder"] for run in config.get("runs", ())), "seed_000")
+        raise StoreError(f"{folder}: expected the folder of one run, such as {folder / one}")
+    if config.get("status", "finished") != "finished" or not (folder / "posterior.npz").exists():
+        raise StoreError(f"{folder}: expected a finished run; go on with it by 'jaxlfi resume'")
+    try:
+        space = Space(tuple(config["parameters"]), tuple(config["log"]))
+        settings = describe.settings_from_json(config["settings"])
+        heuristic = describe.heuristic_from_json(config["heuristic"])
+        support = describe.support_from_json(config["support"])
+        feasible = Support(config["feasible_low"], config["feasible_high"]).hull(support)
+        origin = Origin(config["task"], config["configuration"], config["support"]["name"], config["preset"])
+        key = key_of(config["seed"])
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise StoreError(f"{folder / 'config.json'}: expected a complete description of the run: {error}") from error
+    observation = _arrays(folder / "observation.npz", ("trajectory", "x"))
+    observed, x = jnp.asarray(observation["trajectory"]), jnp.asarray(observation["x"])
+    return Run(
+        belief=_belief(folder / "posterior.npz", space),
+        history={
+            name: value for name, value in _arrays(folder / "history.npz", ("theta",)).items() if name not in LABELS
+        },
+        dataset=_dataset(folder / "dataset.npz", settings),
+        network=_network(folder / "network.npz", settings, x.shape[0], feasible, space),
+        observed=observed,
+        x=x,
+        key=key,
+        support=support,
+        feasible=feasible,
+        heuristic=heuristic,
+        settings=settings,
+        space=space,
+        task=_task(folder, config, task, space),
+        origin=origin,
+    )
+
+
+def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space) -> Task | None:
+    """The task of a run, if it is given or can be found, and is the one the run was made with."""
+    task = given
+    if task is None and config["task"] is not None:
+        try:
+            task = registry.load(config["task"])
+        except ValueError:  # the posterior can be used without it
+            return None
+    if task is not None and (task.space != space or list(task.units) != list(config["units"])):
+        raise StoreError(
+            f"{folder}: expected the task as it was when the run was made, with parameters {list(space.labels)}, "
+            f"got {list(task.space.labels)}"
+        )
+    return task
+
+
+def _belief(path: Path, space: Space) -> Belief:
+    names = ("logits", "means", "scale_tril", "support_low", "support_high")
+    logits, means, scale_tril, low, high = (jnp.asarray(_arrays(path, names)[name]) for name in names)
+    components, dim = len(logits), space.dim
+    if means.shape != (components, dim) or scale_tril.shape != (components, dim, dim) or low.shape != (dim,):
+        raise StoreError(f"{path}: expected a mixture over {dim} parameters, got means of shape {list(means.shape)}")
+    return Belief(GaussianMixture(logits, means, scale_tril), Support(low, high), jnp.asarray(True))
+
+
+def _dataset(path: Path, settings: Settings) -> Dataset:
+    arrays = _arrays(path, ("theta", "x", "round", "weight"))
+    size = len(arrays["theta"])
+    first = int(np.sum(arrays["round"] == 0))
+    room = max(first, settings.simulations_per_round) + (settings.rounds - 1) * settings.simulations_per_round
+    filled = {
+        name: jnp.asarray(np.concatenate([arrays[name], np.zeros((max(room - size, 0), *arrays[name].shape[1:]))]))
+        for name in ("theta", "x", "weight")
+    }
+    rounds = np.concatenate([arrays["round"], np.zeros(max(room - size, 0), arrays["round"].dtype)])
+    return Dataset(round=jnp.asarray(rounds), size=jnp.asarray(size, jnp.int32), **filled)
+
+
+def _network(path: Path, settings: Settings, obs: int, feasible: Support, space: Space) -> Network | None:
+    """The trained network; None where a mixture density network was not kept.
+
+    Raises:
+        StoreError: where it is damaged or another estimator's, or a flow's is missing.
+    """
+    if not path.exists() and settings.estimator.closed_form:
+        return None
+    make: Callable[[], Network] = lambda: untrained(jax.random.key(0), settings.estimator, obs, feasible, space)
+    template = jax.eval_shape(make)
+    expected = folders.named_leaves(template)
+    arrays = _arrays(path, tuple(expected))
+    for name, leaf in expected.items():
+        if arrays[name].shape != leaf.shape:
+            raise StoreError(f"{path}: expected shape {leaf.shape} at {name}, got {arrays[name].shape}")
+    return jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(arrays[name]) for name in expected])
+
+
+def _arrays(path: Path, needed: tuple[str, ...]) -> dict[str, np.ndarray]:
+    try:
+        arrays = atomic.read_arrays(path)
+    except ValueError as error:
+        raise StoreError(str(error)) from error
+    if missing := [name for name in needed if name not in arrays]:
+        raise StoreError(f"{path}: expected an array {missing[0]}, got none")
+    return arrays

@@ -1,0 +1,191 @@
+"""Run: what an inference run found, as `infer` returns it and `load` reads it back."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from jaxlfi.bayessim.batch import RunSpec, posterior_after
+from jaxlfi.bayessim.correction import CORRECTIONS
+from jaxlfi.bayessim.keys import run_keys, seed_of
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.diagnostics.bounds import bound_warnings
+from jaxlfi.distributions.arguments import is_concrete
+from jaxlfi.distributions.belief import Belief, uninformed
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.base import Network
+from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.estimators.posterior import Posterior, truncated
+from jaxlfi.heuristics import Heuristic
+from jaxlfi.tasks.task import Task
+
+DRAWS = 1000
+"""Draws of the posterior that are saved with a run."""
+
+
+class SupportWarning(UserWarning):
+    """A bound of a support that cannot grow looks wrong."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """How a run is described in its config.json.
+
+    Attributes:
+        reference: by which its task can be found (`jaxlfi.tasks.registry.load`); None for a task made in Python.
+        configuration: what the run is called in tables.
+        support_name: of Theta_0.
+        preset: that the settings were made from, or None.
+    """
+
+    reference: str | None = None
+    configuration: str = "own"
+    support_name: str = "own"
+    preset: str | None = None
+
+
+@struct.dataclass
+class Run:
+    """What an inference run found. A pytree: under `vmap`, every array has a leading axis.
+
+    Attributes:
+        belief: the posterior mixture on the last support, in inference space.
+        history: what every round did, by the names of history.npz: arrays with a leading axis of one entry a round, and
+            the last round's simulations of posterior draws (`final_...`).
+        dataset: all simulations.
+        network: the trained density estimator; None where it was not saved.
+        observed: the observed trajectory, shape [T, C] or [T].
+        x: its summary x^r, shape [S].
+        key: the key the run was made with.
+        support: Theta_0, in inference space.
+        feasible: Phi, in inference space, widened by Theta_0.
+        heuristic: how the support was adapted.
+        settings: the numbers of the run.
+        space: the map between natural units and inference space.
+        task: what was inferred; None for a loaded run whose task cannot be found.
+        origin: how the run is described in its config.json: task, configuration, support's name, preset.
+    """
+
+    belief: Belief
+    history: dict[str, Array]
+    dataset: Dataset
+    network: Network | None
+    observed: Float[Array, "*shape"]
+    x: Float[Array, "*batch obs"]
+    key: jax.Array
+    support: Support
+    feasible: Support
+    heuristic: Heuristic
+    settings: Settings
+    space: Space = struct.field(pytree_node=False)
+    task: Task | None = struct.field(pytree_node=False)
+    origin: Origin = struct.field(pytree_node=False)
+
+    @property
+    def posterior(self) -> Posterior:
+        """The posterior of the observation, truncated to the support the run ended with."""
+        if self.network is None:
+            return _truncated(self.belief.mixture, self.belief.mixture, self.belief.support, self.space)
+        return _posterior_after(self.belief, self.network, self.x)
+
+    @property
+    def amortised(self) -> bool:
+        """Whether the network has learnt the posterior of any observation: it was kept, and had one round."""
+        return self.settings.rounds == 1 and self.network is not None
+
+    def posterior_of(self, observation: Any) -> Posterior:
+        """The posterior of another observation, by the network of a run of one round.
+
+        Args:
+            observation: a trajectory in the shape the simulator produces, or its summary [S].
+
+        Raises:
+            ValueError: for a run of several rounds, whose network has learnt the posterior of its own observation only;
+                one whose network was not kept; or an observation of another shape.
+        """
+        if self.settings.rounds != 1:
+            raise ValueError(
+                f"posterior_of: expected a run of one round, got one of {self.settings.rounds}, whose network "
+                "has learnt the posterior of its own observation alone: infer with settings.replace(rounds=1), or --method npe"
+            )
+        if self.network is None:
+            raise ValueError("posterior_of: expected a run whose network was kept (--keep-network), got none")
+        return self.conditioned(self._summary(observation))
+
+    def conditioned(self, x: Float[Array, " obs"], key: jax.Array | None = None) -> Posterior:
+        """The posterior of a summary that a run of one round would have ended with."""
+        settings = self.settings
+        prior = uninformed(self.support, settings.estimator.ensemble_size * settings.estimator.components)
+        heuristic = jax.tree.map(jnp.asarray, self.heuristic)
+        mixture = self.network.condition(x, self.support, key).mixture
+        mixture, _ = CORRECTIONS[settings.correction].change(self.task, mixture, prior)
+        belief, _ = heuristic(prior, mixture, self.feasible)
+        return posterior_after(belief, self.network, x)
+
+    @property
+    def mixture(self) -> GaussianMixture:
+        """The posterior as a mixture of Gaussians, in inference space."""
+        return self.belief.mixture
+
+    @property
+    def warnings(self) -> list[str]:
+        """In words, which bounds of a support that cannot grow look wrong, and what to do."""
+        _require_one(self, "warnings")
+        return bound_warnings(self.space.labels, self.belief, self.feasible)
+
+    @property
+    def spec(self) -> RunSpec:
+        """The run among those of a batch."""
+        return RunSpec(
+            self.origin.configuration, self.origin.support_name, self.support, self.heuristic, seed_of(self.key)
+        )
+
+    def draws(self, n: int = DRAWS) -> Float[Array, "n dim"]:
+        """The posterior draws that are saved with the run, in natural units; the same each time."""
+        return self.posterior.sample(run_keys(self.key).of_check(self.settings.rounds), n)
+
+    def save(self, path: str | Path) -> Path:
+        """Write a run folder, which `jaxlfi.load` reads and the command line's `sample`, `diagnose` and `report` take.
+
+        Args:
+            path: a new or empty folder.
+
+        Returns:
+            The folder.
+
+        Raises:
+            ValueError: if something is there already, or for a run under `vmap`.
+        """
+        from jaxlfi.runs import folder  # which writes runs
+
+        _require_one(self, "save")
+        return folder.save(self, Path(path))
+
+    def _summary(self, observation: Any) -> jax.Array:
+        observation = jnp.asarray(observation, jnp.float32)
+        if observation.shape == self.observed.shape and self.task is not None:
+            return self.task.summary(observation)
+        if observation.shape == self.x.shape:
+            return observation
+        raise ValueError(
+            f"observation: expected a trajectory of shape {list(self.observed.shape)} or a summary of shape "
+            f"{list(self.x.shape)}, got {list(observation.shape)}"
+        )
+
+
+_posterior_after = jax.jit(posterior_after)
+_truncated = jax.jit(truncated, static_argnums=3)
+
+
+def _require_one(run: Run, what: str) -> None:
+    if not is_concrete(run) or run.x.ndim != 1:
+        raise ValueError(
+            f"{what}: expected one run, got a batch of them (from vmap): take one by "
+            "jax.tree.map(lambda leaf: leaf[0], runs)"
+        )

@@ -1,0 +1,137 @@
+"""Folder: the diagnostics of a run, from a plan to complete files, resumable at any chunk."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from jaxlfi import diagnostics
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import describe
+from jaxlfi.runs import folder as run_store
+from jaxlfi.runs.folder import StoreError
+from jaxlfi.runs.run import Run
+from jaxlfi.studies.calibration.checks import Check, against, calibration, predictive
+from jaxlfi.studies.calibration.plan import CalibrationPlan
+from jaxlfi.studies.calibration.repeat import chunk_length, posteriors, read_arrays
+from jaxlfi.studies.calibration.truths import draw_truths
+
+FORMAT, VERSION = "jaxlfi-diagnostics", run_store.VERSION
+
+
+def begin(out: Path, run: Run, plan: CalibrationPlan) -> dict[str, Any]:
+    """Bring the folder of the diagnostics into being, or find it as the same command left it.
+
+    Returns:
+        plan.json.
+
+    Raises:
+        StoreError: where the folder holds something else, or diagnostics that were asked for differently.
+    """
+    wanted = run_store.as_json(description(run, plan))
+    path = out / "plan.json"
+    if path.exists():
+        found = read_plan(path)
+        changed = [name for name in wanted if found.get(name) != wanted[name]]
+        if changed:
+            raise StoreError(
+                f"out: expected diagnostics of the same run and settings in {str(out)!r}, got some with another "
+                f"{', '.join(changed)}: take another folder by --out, or remove that one"
+            )
+        return found
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise StoreError(f"out: expected a new or empty folder, got {str(out)!r} which holds something")
+    out.mkdir(parents=True, exist_ok=True)
+    found = wanted | {"chunk_length": chunk_length(run, plan), "devices": jax.local_device_count()}
+    atomic.write_json(path, found)
+    return found
+
+
+def read_plan(path: Path) -> dict[str, Any]:
+    """The plan.json of a folder of diagnostics.
+
+    Raises:
+        StoreError: for one that is damaged or of another kind.
+    """
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: expected a plan, got a damaged one: {error}") from error
+    if not isinstance(found, dict) or (found.get("format"), found.get("version")) != (FORMAT, VERSION):
+        raise StoreError(f"{path}: expected format {FORMAT!r}, version {VERSION}, got another")
+    return found
+
+
+def description(run: Run, plan: CalibrationPlan) -> dict[str, Any]:
+    """All that the results depend on, as JSON values."""
+    arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((run.belief, run.network))]
+    content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+    config = run_store.run_config(run.task, run.origin, run.spec, run.settings)
+    shared = ("task", "names", "units", "configuration", "support", "heuristic", "settings", "seed")
+    box = run.task.support(plan.reference)
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "run": {name: config[name] for name in shared} | {"arrays": hashlib.sha256(content).hexdigest()[:32]},
+        "reference": {"name": plan.reference} | describe.support_to_json(box),
+        "truths": plan.truths,
+        "draws": plan.draws,
+        "seed": plan.seed,
+    }
+
+
+def diagnose(
+    out: Path, run: Run, plan: CalibrationPlan, console: Console, reference: tuple[str, np.ndarray] | None = None
+) -> list[Check]:
+    """Make all checks, and write their numbers and arrays.
+
+    Args:
+        out: the folder of the diagnostics.
+        run: the run under test.
+        plan: what is asked of it.
+        console: for progress, and for what is left out.
+        reference: the name of reference samples of the run's posterior, and they themselves in inference space [n, D].
+
+    Raises:
+        StoreError: for a folder that holds something else.
+        SimulatorError: for a simulator that breaks its contract or fails always.
+    """
+    found = begin(out, run, plan)
+    fingerprint = hashlib.sha256(json.dumps(found, sort_keys=True).encode()).hexdigest()[:32]
+    truths = _truths(out / "truths.npz", run, plan)
+    failed = dict(zip(run.task.reasons, truths["failed"].tolist(), strict=True))
+    posterior = posteriors(out, run, plan, truths, found["chunk_length"], fingerprint, console)
+    lines, arrays = calibration(run, plan, truths, posterior)
+    arrays |= {name: truths[name] for name in ("theta", "x")} | posterior
+    own, of_own = predictive(run, plan)
+    lines, arrays = [*lines, own], arrays | of_own
+    if reference is not None:
+        lines.append(against(run, plan, *reference))
+    names = {"names": np.asarray(run.task.space.labels), "units": np.asarray(run.task.units)}
+    atomic.write_arrays(out / "diagnostics.npz", arrays | names)
+    atomic.write_json(
+        out / "diagnostics.json",
+        found
+        | {
+            "way": "amortised" if run.amortised else "repeated",
+            "failed_truths": failed,
+            "significance": diagnostics.SIGNIFICANCE,
+            "checks": [dataclasses.asdict(check) for check in lines],
+        }
+        | run_store.environment(),
+    )
+    return lines
+
+
+def _truths(path: Path, run: Run, plan: CalibrationPlan) -> dict[str, np.ndarray]:
+    """The truths of a folder, drawn where they are not there yet."""
+    if path.exists():
+        return read_arrays(path)
+    truths = draw_truths(run, plan)
+    atomic.write_arrays(path, truths, durable=True)
+    return truths

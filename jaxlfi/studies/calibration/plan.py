@@ -1,0 +1,80 @@
+"""Plan: the finished run under test, and what is asked of it."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+
+from jaxlfi.heuristics import registry
+from jaxlfi.runs.folder import StoreError
+from jaxlfi.runs.load import load
+from jaxlfi.runs.run import Run
+from jaxlfi.studies import grid
+from jaxlfi.tasks.observation import simulator_shapes
+from jaxlfi.tasks.task import Task
+
+MIN_COUNT = 20
+"""Fewest truths, and draws for each, that can show a miscalibration."""
+STREAM = 0xD1A6
+"""Sets the keys apart from those of a run of the same seed."""
+TRUTHS, RUNS, DRAWS, TIES, CLASSIFIER, PREDICTIVE, AGAINST = range(7)
+"""Purposes of keys."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationPlan:
+    """What is asked of a run.
+
+    Attributes:
+        reference: name of the support that truths are drawn over.
+        truths: how many, N.
+        draws: from the posterior of each, L.
+        seed: of all random numbers.
+
+    Raises:
+        ValueError: for too few truths or draws.
+    """
+
+    reference: str
+    truths: int = 100
+    draws: int = 200
+    seed: int = 0
+
+    def __post_init__(self):
+        for name in ("truths", "draws"):
+            if getattr(self, name) < MIN_COUNT:
+                raise ValueError(f"{name}: expected at least {MIN_COUNT}, got {getattr(self, name)}")
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"seed: expected at least 0 and less than 2^31, got {self.seed}")
+
+    def key(self, purpose: int) -> jax.Array:
+        """A key for one purpose."""
+        return jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), STREAM), purpose)
+
+
+def read_run(folder: Path, task: Task | None = None) -> Run:
+    """A finished run with its task.
+
+    Args:
+        folder: of the run.
+        task: where it was made in Python and cannot be found by name.
+
+    Raises:
+        ValueError: for a folder that holds no finished run of one seed, a task that cannot be found or has changed, or a
+            heuristic that is not installed.
+    """
+    if grid.is_grid(folder):
+        raise StoreError(f"{folder}: expected the folder of one run, got a grid's, which keeps no posteriors")
+    run = load(folder, task)
+    if run.task is None:
+        raise StoreError(
+            f"{folder}: expected a run whose task can be found by name, got one made in Python: --task module:factory "
+            "names it"
+        )
+    if not run.task.on_host and (simulator_shapes(run.task).summary,) != run.x.shape:
+        raise StoreError(
+            f"{folder}: expected the task as it was when the run was made, with {run.x.shape[0]} summaries, "
+            f"got {simulator_shapes(run.task).summary}"
+        )
+    registry.check(run.heuristic, run.task.dim)
+    return run

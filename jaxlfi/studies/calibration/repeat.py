@@ -1,0 +1,178 @@
+"""Repeat: the posteriors that a run's method finds for many other observations, chunk by chunk."""
+
+import functools
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from jaxlfi.bayessim.batch import RunInputs, posterior_after, stack, start_one
+from jaxlfi.bayessim.drive import drive
+from jaxlfi.bayessim.host import engine_for
+from jaxlfi.estimators.posterior import Posterior
+from jaxlfi.io import files as atomic
+from jaxlfi.io.progress import RoundProgress
+from jaxlfi.runs.folder import StoreError
+from jaxlfi.runs.run import Run
+from jaxlfi.studies.calibration.plan import DRAWS, RUNS, CalibrationPlan
+from jaxlfi.studies.chunk_store import ChunkStore
+from jaxlfi.studies.memory import PROGRAM_PER_STATE, budget, even_length, state_bytes
+
+RUNS_PER_DEVICE = 16
+"""Repeated runs of a chunk on each device: a chunk is what a crash can lose."""
+CONDITIONED = 100
+"""Simulations of a chunk where a network is only conditioned on them."""
+RESULTS = ("draws", "log_prob", "truth_log_prob", "mass_inside", "support_low", "support_high")
+"""What is kept of each truth's posterior."""
+
+
+def chunk_length(run: Run, plan: CalibrationPlan) -> int:
+    """Truths whose posteriors are computed and saved together: as many as there is memory for, and not too many."""
+    if run.amortised:
+        return min(plan.truths, CONDITIONED)
+    devices = jax.local_device_count()
+
+    def start(observed: jax.Array, x: jax.Array):
+        one = jax.tree.map(lambda leaf: leaf[0], run_inputs(run, plan, observed[None], x[None]))
+        return start_one(run.task, None, run.settings, one)
+
+    needed = PROGRAM_PER_STATE * state_bytes(jax.eval_shape(start, run.observed, run.x))
+    most = int(budget() * devices / needed)
+    return even_length(plan.truths, max(1, min(most, RUNS_PER_DEVICE * devices)), devices)
+
+
+def run_inputs(run: Run, plan: CalibrationPlan, observed: jax.Array, x: jax.Array, first: int = 0) -> RunInputs:
+    """Inputs of a batch that repeats the run for observations stacked along the first axis.
+
+    Args:
+        run: the run under test.
+        plan: for keys.
+        observed: shape [n, ...].
+        x: shape [n, S].
+        first: place of the first among all truths; each place has a key of its own.
+    """
+    support = jax.tree.map(jnp.asarray, run.support)
+    support, heuristic = (stack([tree] * len(x)) for tree in (support, run.heuristic))
+    return RunInputs(_keys(plan, RUNS, first, len(x)), support, heuristic, jnp.asarray(observed), jnp.asarray(x))
+
+
+def described(key: jax.Array, truth: jax.Array, posterior: Posterior, draws: int) -> dict[str, jax.Array]:
+    """Draws of one posterior with their densities, and that of the truth (in inference space)."""
+    theta = posterior.sample(key, draws, space="inference")
+    log_prob = posterior.log_prob(jnp.concatenate([truth[None], theta]), space="inference")
+    return {
+        "draws": theta,
+        "log_prob": log_prob[1:],
+        "truth_log_prob": log_prob[0],
+        "mass_inside": posterior.mass_inside,
+        "support_low": posterior.support.low,
+        "support_high": posterior.support.high,
+    }
+
+
+Chunk = Callable[[Mapping[str, np.ndarray], int], tuple[Mapping[str, Any], float]]
+"""From a chunk's truths and its first place to `RESULTS`, and the seconds they took."""
+
+
+def amortised_chunks(run: Run, plan: CalibrationPlan) -> Chunk:
+    """Posteriors by the network of a run of one round."""
+
+    def one(run: Run, key: jax.Array, truth: jax.Array, x: jax.Array):
+        key_condition, key_draw = jax.random.split(key)
+        return described(key_draw, truth, run.conditioned(x, key_condition), plan.draws)
+
+    program = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)))
+
+    def chunk(truths: Mapping[str, np.ndarray], first: int):
+        began = time.perf_counter()
+        keys = _keys(plan, DRAWS, first, len(truths["x"]))
+        return jax.device_get(program(run, keys, truths["theta"], truths["x"])), time.perf_counter() - began
+
+    return chunk
+
+
+def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) -> Chunk:
+    """Posteriors by running the whole inference again for each truth."""
+
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(0, 0, 0, 0))
+    def program(key: jax.Array, truth: jax.Array, x: jax.Array, state: Any):
+        return described(key, truth, posterior_after(state.belief, state.network, x), plan.draws)
+
+    def chunk(truths: Mapping[str, np.ndarray], first: int):
+        began = time.perf_counter()
+        engine = engine_for(run.task, run.settings, run_inputs(run, plan, truths["observed"], truths["x"], first))
+        compiled = lambda seconds: progress.compiled(seconds) if first == 0 else None
+        rounds = range(run.settings.rounds)
+        state = drive(engine, engine.start(), rounds, lambda *_: progress.advance(), compiled)
+        keys = _keys(plan, DRAWS, first, len(truths["x"]))
+        found = jax.device_get(program(keys, truths["theta"], truths["x"], engine.fetch(state)))
+        return found, time.perf_counter() - began
+
+    return chunk
+
+
+def _keys(plan: CalibrationPlan, purpose: int, first: int, count: int) -> jax.Array:
+    return jax.vmap(lambda place: jax.random.fold_in(plan.key(purpose), place))(first + jnp.arange(count))
+
+
+def posteriors(
+    out: Path,
+    run: Run,
+    plan: CalibrationPlan,
+    truths: Mapping[str, np.ndarray],
+    length: int,
+    fingerprint: str,
+    console: Console,
+) -> dict[str, np.ndarray]:
+    """The posteriors of all truths, chunk by chunk; those that are there already are read.
+
+    Args:
+        out: the folder of the diagnostics.
+        run: the run under test.
+        plan: what is asked of it.
+        truths: of `draw_truths`.
+        length: of a chunk. The last one is filled up by its last truth, so that one program serves them all.
+        fingerprint: of all that the results depend on.
+        console: for progress.
+
+    Raises:
+        StoreError: for a damaged chunk, before anything is computed.
+        SimulatorError: for a simulator that fails always.
+    """
+    store = ChunkStore(out / "chunks", plan.truths, length, fingerprint, RESULTS)
+
+    def filled(compute: Chunk):
+        def one(items: range):
+            rows = np.minimum(items.start + np.arange(length), items.stop - 1)
+            return compute({name: truths[name][rows] for name in ("theta", "observed", "x")}, items.start)
+
+        return one
+
+    if run.amortised:
+        console.print(f"{run.task.name}: conditioning the run's network on {plan.truths} simulations")
+        store.compute(filled(amortised_chunks(run, plan)))
+    else:
+        chunks = len(store.chunks)
+        label = f"{run.task.name}: the run again for {plan.truths} simulations, in {chunks} chunks of {length}"
+        rounds = run.settings.rounds
+        with RoundProgress(console, rounds * chunks, rounds * len(store.done()), label) as progress:
+            store.compute(filled(repeated_chunks(run, plan, progress)))
+    return store.results()[0]
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Arrays that an earlier command left.
+
+    Raises:
+        StoreError: where they are damaged; they are left as they are.
+    """
+    try:
+        return atomic.read_arrays(path)
+    except ValueError as error:
+        raise StoreError(f"{error}: delete it, and the same command computes it again") from error

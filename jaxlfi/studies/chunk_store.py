@@ -1,0 +1,99 @@
+"""A resumable store of a study's results, chunk by chunk."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxlfi.io import files as atomic
+from jaxlfi.runs.folder import StoreError
+
+LABELS = ("fingerprint", "seconds")
+"""Arrays of a chunk's file that are no results."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ChunkStore:
+    """Results of N items, computed and saved some at a time; a chunk that is there is not computed again.
+
+    Attributes:
+        folder: of the chunks: 000.npz, 001.npz, ...
+        size: number of items N.
+        length: items in a chunk; the last may have fewer.
+        fingerprint: a hash of all the results depend on. Chunks that bear another belong to another study.
+        names: arrays that every chunk has, with a leading axis of its items.
+    """
+
+    folder: Path
+    size: int
+    length: int
+    fingerprint: str
+    names: tuple[str, ...]
+
+    @property
+    def chunks(self) -> list[range]:
+        """The items of each chunk."""
+        return [range(first, min(first + self.length, self.size)) for first in range(0, self.size, self.length)]
+
+    def path(self, index: int) -> Path:
+        """Where a chunk is kept."""
+        return self.folder / f"{index:03d}.npz"
+
+    def done(self) -> list[int]:
+        """The chunks that are there, each checked.
+
+        Raises:
+            StoreError: for one that is damaged, incomplete or of another study.
+        """
+        there = [index for index in range(len(self.chunks)) if self.path(index).exists()]
+        for index in there:
+            self.read(index)
+        return there
+
+    def write(self, index: int, arrays: Mapping[str, np.ndarray], seconds: float) -> None:
+        """Keep a chunk's results, without what filled it up to its length."""
+        count = len(self.chunks[index])
+        results = {name: np.asarray(arrays[name])[:count] for name in self.names}
+        label = {"fingerprint": np.asarray(self.fingerprint), "seconds": np.asarray(seconds)}
+        self.folder.mkdir(parents=True, exist_ok=True)
+        atomic.write_arrays(self.path(index), results | label, durable=True)
+
+    def read(self, index: int) -> dict[str, np.ndarray]:
+        """A chunk's results, and the seconds they took.
+
+        Raises:
+            StoreError: for a file that is missing, damaged, incomplete or of another study; it is left as it is.
+        """
+        path, count = self.path(index), len(self.chunks[index])
+        try:
+            arrays = atomic.read_arrays(path)
+        except ValueError as error:
+            raise StoreError(f"{error}: delete it, and resuming computes it again") from error
+        if str(arrays.get("fingerprint")) != self.fingerprint:
+            raise StoreError(f"{path}: expected a chunk of this study, got one of another")
+        if not all(name in arrays and len(arrays[name]) == count for name in self.names):
+            raise StoreError(f"{path}: expected {', '.join(self.names)} of {count} runs, got others")
+        return arrays
+
+    def compute(
+        self,
+        one: Callable[[range], tuple[Mapping[str, np.ndarray], float]],
+        own: Sequence[int] | None = None,
+    ) -> None:
+        """Compute the chunks that are not there yet, in their order.
+
+        Args:
+            one: from a chunk's items to its results, and the seconds they took.
+            own: chunks that this process is to compute; all by default.
+        """
+        done = set(self.done())
+        for index, items in enumerate(self.chunks):
+            if index not in done and (own is None or index in own):
+                self.write(index, *one(items))
+
+    def results(self) -> tuple[dict[str, np.ndarray], float]:
+        """The results of all items, and the seconds of all chunks together."""
+        chunks = [self.read(index) for index in range(len(self.chunks))]
+        joined = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in self.names}
+        return joined, float(sum(chunk["seconds"] for chunk in chunks))

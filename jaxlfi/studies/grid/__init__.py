@@ -1,0 +1,32 @@
+"""Grids: how sensitive a heuristic is to its hyperparameters, as a grid of runs in compiled chunks.
+
+Every combination of values and every seed is one run; the same seed means the same observation in all combinations.
+Runs are stepped in chunks of one length (the last is filled up by repeating its last run), so that one compiled program
+serves them all.
+"""
+
+from jaxlfi.studies.grid.chunks import MEASURES, Work, arranged, measure, prepare, run_chunk
+from jaxlfi.studies.grid.folder import GRID, advance, begin, create, is_grid, read_config, reopen
+from jaxlfi.studies.grid.grid import Axis, Grid, combinations, grid_runs, heuristics, parse_axes
+
+__all__ = [
+    "GRID",
+    "MEASURES",
+    "Axis",
+    "Grid",
+    "Work",
+    "advance",
+    "arranged",
+    "begin",
+    "combinations",
+    "create",
+    "grid_runs",
+    "heuristics",
+    "is_grid",
+    "measure",
+    "parse_axes",
+    "prepare",
+    "read_config",
+    "reopen",
+    "run_chunk",
+]

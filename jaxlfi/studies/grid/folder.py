@@ -1,0 +1,243 @@
+"""A grid's folder: begun, resumed and finished.
+
+    config.json            axes, settings, versions, and whether it is finished
+    observation.npz        what each seed observed
+    chunks/000.npz ...     what came out, chunk by chunk; one that is there is not computed again
+    grid.npz               arrays with leading axes [axis..., seed]
+    table.csv              one line a combination and seed
+
+Where several processes were joined by `jax.distributed` they share the chunks out among them, each on its own
+devices, and meet at the end; the folder must be one that all of them see.
+"""
+
+import csv
+import hashlib
+import io
+import itertools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from rich.console import Console
+
+from jaxlfi.bayessim.batch import RunSpec
+from jaxlfi.io import files as atomic
+from jaxlfi.io import serialise
+from jaxlfi.io.progress import RoundProgress
+from jaxlfi.runs import describe
+from jaxlfi.runs import folder as run_store
+from jaxlfi.runs.folder import StoreError
+from jaxlfi.runs.run import Origin
+from jaxlfi.studies.chunk_store import ChunkStore
+from jaxlfi.studies.grid.chunks import MEASURES, Work, arranged, prepare, run_chunk
+from jaxlfi.studies.grid.grid import Axis, Grid, combinations, hyperparameters
+from jaxlfi.tasks import registry as tasks
+
+GRID = "jaxlfi-grid"
+"""The format of a grid's folder."""
+
+
+def description(work: Work) -> dict[str, Any]:
+    """All that the results depend on, as JSON values."""
+    grid = work.grid
+    spec = RunSpec("", grid.support_name, grid.support, grid.rule, 0)
+    origin = Origin(grid.reference, "", grid.support_name, grid.preset)
+    run = run_store.run_config(grid.task, origin, spec, grid.settings)
+    left_out = ("configuration", "seed", "versions", "platform", "command_line", "started")
+    defaults = hyperparameters(grid.rule)
+    return {name: value for name, value in run.items() if name not in left_out} | {
+        "format": GRID,
+        "axes": [
+            {
+                "name": axis.name,
+                "values": list(axis.values),
+                "default": serialise.plain_value(defaults[axis.name]),
+            }
+            for axis in grid.axes
+        ],
+        "seeds": list(grid.seeds),
+        "runs_per_chunk": work.length,
+        "observation": _digest(
+            *(
+                np.ascontiguousarray(a)
+                for a in (
+                    work.observed,
+                    work.x,
+                    np.asarray(np.nan if grid.task.truth is None else grid.task.truth, np.float32),
+                )
+            )
+        ),
+    }
+
+
+def fingerprint(work: Work) -> str:
+    """A hash of the description: chunks that bear another belong to another grid."""
+    return _digest(json.dumps(run_store.as_json(description(work)), sort_keys=True).encode())
+
+
+def _digest(*parts) -> str:
+    whole = hashlib.sha256()
+    for part in parts:
+        whole.update(part)
+    return whole.hexdigest()[:32]
+
+
+def begin(folder: Path, grid: Grid, observation: Any = None, runs_per_chunk: int | None = None) -> Work:
+    """Check all there is to check, compile, then bring the folder into being; nothing is written before.
+
+    Args:
+        folder: new or empty.
+        grid: what to run.
+        observation: see `observations`.
+        runs_per_chunk: see `prepare`.
+
+    Raises:
+        ValueError: for anything that does not fit.
+    """
+    if jax.process_index() == 0:
+        run_store.refuse_occupied(folder)
+        work = prepare(grid, observation, runs_per_chunk)
+        create(folder, work)
+    _meet("begun")
+    return work if jax.process_index() == 0 else reopen(folder)
+
+
+def create(folder: Path, work: Work) -> None:
+    """Bring the folder of a prepared work into being."""
+
+    def fill(beside: Path) -> None:
+        atomic.write_arrays(beside / "observation.npz", {"trajectory": work.observed, "x": work.x}, durable=True)
+
+    run_store.create(
+        folder,
+        description(work)
+        | run_store.environment()
+        | {
+            "status": "running",
+            "devices": jax.local_device_count(),
+            "runs": work.grid.size,
+            "fingerprint": fingerprint(work),
+        },
+        fill,
+    )
+
+
+def is_grid(folder: Path) -> bool:
+    """Whether a folder says that it is a grid's; whether it is sound is checked later."""
+    try:
+        config = json.loads((folder / "config.json").read_text())
+    except (OSError, ValueError):
+        return False
+    return isinstance(config, dict) and config.get("format") == GRID
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """The config.json of a grid.
+
+    Raises:
+        StoreError: if it is missing, damaged or of another version.
+    """
+    if not is_grid(folder):
+        raise StoreError(f"expected the folder of a grid, got {str(folder)!r} whose config.json is not one's")
+    config = json.loads((folder / "config.json").read_text())
+    run_store.check_version(folder / "config.json", config)
+    return config
+
+
+def reopen(folder: Path) -> Work:
+    """The work of a folder, at whatever point it was left; not compiled.
+
+    Raises:
+        StoreError: for a folder that is damaged or whose configuration or task has changed since it was begun.
+    """
+    config = read_config(folder)
+    try:
+        grid = Grid(
+            task=tasks.load(config["task"]),
+            support=describe.support_from_json(config["support"]),
+            rule=describe.heuristic_from_json(config["heuristic"]),
+            axes=tuple(Axis(axis["name"], tuple(axis["values"])) for axis in config["axes"]),
+            seeds=tuple(config["seeds"]),
+            settings=describe.settings_from_json(config["settings"]),
+            reference=config["task"],
+            preset=config["preset"],
+            support_name=config["support"]["name"],
+        )
+        start = atomic.read_arrays(folder / "observation.npz")
+        work = Work(grid, start["trajectory"], start["x"], config["runs_per_chunk"])
+        now = run_store.as_json(description(work))
+        same = fingerprint(work) == config["fingerprint"] and all(config.get(name) == now[name] for name in now)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise StoreError(f"{folder}: expected a complete description of a grid, got: {error}") from error
+    if not same:
+        raise StoreError(
+            f"{folder}: expected config.json, observation.npz and the task as they were when the grid was begun, "
+            "got changed ones: begin another grid in another folder"
+        )
+    return work
+
+
+def store_of(folder: Path, work: Work) -> ChunkStore:
+    """The store of a grid's chunks."""
+    return ChunkStore(folder / "chunks", work.grid.size, work.length, fingerprint(work), MEASURES)
+
+
+def advance(folder: Path, work: Work, console: Console) -> dict[str, np.ndarray]:
+    """Compute the chunks that are not there yet, then write the results.
+
+    Args:
+        folder: made by `begin`, at whatever point it was left.
+        work: the folder's.
+        console: for progress.
+
+    Returns:
+        The arrays of grid.npz.
+
+    Raises:
+        StoreError: for a damaged chunk, before anything is computed.
+        SimulatorError: for a simulator that fails always.
+    """
+    store, rounds = store_of(folder, work), work.grid.settings.rounds
+    own = range(jax.process_index(), len(store.chunks), jax.process_count())
+    done = [index for index in store.done() if index in own]
+    label = f"{work.grid.task.name}: {work.grid.size} runs in {len(store.chunks)} chunks of {work.length}"
+    with RoundProgress(console, rounds * len(own), rounds * len(done), label) as progress:
+        store.compute(lambda places: run_chunk(work, places, progress.advance, progress.compiled), own)
+    _meet("chunks done")
+    results, seconds = store.results()
+    arrays = arranged(work.grid, results)
+    if jax.process_index() == 0:
+        finish(folder, work.grid, arrays, seconds)
+    _meet("finished")
+    return arrays
+
+
+def finish(folder: Path, grid: Grid, arrays: Mapping[str, np.ndarray], seconds: float) -> None:
+    """Write the results, and then that the grid is complete."""
+    atomic.write_arrays(folder / "grid.npz", arrays)
+    atomic.write_bytes(folder / "table.csv", table(grid, arrays).encode())
+    config = read_config(folder)
+    atomic.write_json(folder / "config.json", config | {"status": "finished", "seconds": round(seconds, 3)})
+
+
+def table(grid: Grid, arrays: Mapping[str, np.ndarray]) -> str:
+    """The results as CSV, one line a combination and seed; what is unknown stays empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    measures = ("theta_error", "trajectory_error", "success_rate")
+    writer.writerow([*(axis.name for axis in grid.axes), "seed", *measures])
+    columns = [np.ravel(arrays[name]).tolist() for name in measures]
+    places = itertools.product(combinations(grid.axes), grid.seeds)
+    for (values, seed), *results in zip(places, *columns, strict=True):
+        writer.writerow([*values.values(), seed, *("" if value != value else value for value in results)])
+    return text.getvalue()
+
+
+def _meet(name: str) -> None:
+    """Wait for the other processes, where there are some."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(f"jaxlfi sweep: {name}")

@@ -1,0 +1,241 @@
+"""The observed trajectory x^r: read from a file, checked against the simulator, or simulated at the truth."""
+
+import csv
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlfi.tasks.host import SimulatorError
+from jaxlfi.tasks.simulation import trajectory_and_outcome, with_outcome
+from jaxlfi.tasks.task import Task
+
+TRIES = 16
+"""Simulations at the truth that may fail before a task counts as unable to simulate its own truth."""
+TIME_COLUMNS = ("time", "t", "seconds", "s", "year", "step", "index", "")
+"""Headings, without a unit in brackets, of a first column that is not a channel. pandas' index has an empty one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shapes:
+    """What a task's simulator gives.
+
+    Attributes:
+        trajectory: shape of one trajectory.
+        summary: length S of its summary.
+    """
+
+    trajectory: tuple[int, ...]
+    summary: int
+
+
+@functools.lru_cache(maxsize=64)
+def simulator_shapes(task: Task) -> Shapes:
+    """Trace a JAX simulator and its summary without running them.
+
+    Raises:
+        SimulatorError: if it cannot be traced, or gives something else than a trajectory (and a scalar
+            outcome).
+    """
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    theta = jax.ShapeDtypeStruct((task.dim,), jnp.float32)
+    # A simulator is foreign code; whatever it raises while traced is told in one line.
+    try:
+        result = jax.eval_shape(task.simulate, key, theta)
+    except Exception as error:
+        raise SimulatorError(
+            f"simulate: expected a function JAX can trace (wrap a NumPy simulator in jaxlfi.HostSimulator), "
+            f"got {type(error).__name__}: {_first_line(error)}"
+        ) from error
+    trajectory, outcome = result if isinstance(result, tuple) and len(result) == 2 else (result, None)
+    if not isinstance(trajectory, jax.ShapeDtypeStruct) or trajectory.ndim == 0:
+        raise SimulatorError(
+            f"simulate: expected one array [T] or [T, C], or (array, outcome), got {jax.tree.map(_shape, result)}"
+        )
+    if outcome is not None and getattr(outcome, "shape", None) != ():
+        raise SimulatorError(f"simulate: expected a scalar outcome, got {jax.tree.map(_shape, outcome)}")
+    return Shapes(trajectory.shape, _summary_size(task, trajectory.shape))
+
+
+def observed_shapes(task: Task, observation: np.ndarray) -> Shapes:
+    """The shapes of a host simulator, which only its observation shows before it has run."""
+    if observation.ndim == 0:
+        raise ValueError("observation: expected a trajectory [T] or [T, C], got a single number")
+    return Shapes(observation.shape, _summary_size(task, observation.shape))
+
+
+def _summary_size(task: Task, shape: tuple[int, ...]) -> int:
+    try:
+        summary = jax.eval_shape(task.summary, jax.ShapeDtypeStruct(shape, jnp.float32))
+    except Exception as error:
+        raise SimulatorError(
+            f"summary: expected a function of one trajectory {list(shape)} that JAX can trace, "
+            f"got {type(error).__name__}: {_first_line(error)}"
+        ) from error
+    if getattr(summary, "ndim", None) != 1:
+        raise SimulatorError(f"summary: expected a vector [S] of one trajectory, got {jax.tree.map(_shape, summary)}")
+    return summary.shape[0]
+
+
+def checked(observation, shapes: Shapes) -> jax.Array:
+    """An observation in the shape that the simulator produces.
+
+    Raises:
+        ValueError: for another shape, or numbers that are not finite.
+    """
+    if np.shape(observation) != shapes.trajectory:
+        raise ValueError(
+            f"observation: expected the shape the simulator produces, {list(shapes.trajectory)}, "
+            f"got {list(np.shape(observation))}"
+        )
+    if not isinstance(observation, jax.core.Tracer) and not np.isfinite(np.asarray(observation, float)).all():
+        raise ValueError("observation: expected finite numbers, got some that are not")
+    return jnp.asarray(observation, jnp.float32)
+
+
+def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
+    """One valid trajectory at the task's truth, from the first of a few tries that succeeds.
+
+    Raises:
+        ValueError: where the truth is unknown.
+        SimulatorError: where no try succeeds.
+    """
+    if task.truth is None:
+        raise ValueError("observation: expected one, as the task has neither an observation nor a known truth")
+    for attempt in range(TRIES):
+        trajectory, failure = _at_truth(jax.random.fold_in(key, attempt), task)
+        if failure == 0:
+            return np.asarray(trajectory)
+    raise SimulatorError(f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries")
+
+
+def trace_observation(key: jax.Array, task: Task) -> jax.Array:
+    """As `simulate_observation`, inside a traced function: the first try, whatever comes of it."""
+    if task.truth is None:
+        raise ValueError("observation: expected one, as the task has neither an observation nor a known truth")
+    return trajectory_and_outcome(task, jax.random.fold_in(key, 0), task.inference.truth)[0]
+
+
+def _at_truth(key: jax.Array, task: Task):
+    truth = task.inference.truth
+    if not task.on_host:
+        return _simulate_jit(task, key, truth)
+    trajectory, outcome = task.simulate(key, np.asarray(task.space.to_natural(truth)))
+    return with_outcome(task, jnp.asarray(trajectory), jnp.asarray(outcome))
+
+
+_simulate_jit = jax.jit(trajectory_and_outcome, static_argnums=0)
+
+
+def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True) -> tuple[jax.Array, jax.Array]:
+    """The observed trajectory, checked, and its summary.
+
+    Args:
+        key: simulates it, where none is given and the task has none.
+        task: for the simulator's shapes, and for the default.
+        observation: what was given, or None.
+        concrete: false inside a traced function.
+
+    Raises:
+        ValueError: for an observation that does not fit the simulator, or whose summary is not finite.
+    """
+    if observation is None:
+        observation = task.observation
+    if observation is None:
+        simulate = simulate_observation if concrete else trace_observation
+        observation = simulate(key, task)
+    shapes = observed_shapes(task, np.asarray(observation)) if task.on_host else simulator_shapes(task)
+    observed = checked(observation, shapes)
+    x = jnp.asarray(task.summary(observed), jnp.float32)
+    if not isinstance(x, jax.core.Tracer) and not np.isfinite(np.asarray(x)).all():
+        raise ValueError(f"observation: expected a finite summary, got {np.asarray(x).tolist()}")
+    task.named_summaries(x.shape[-1])  # refuses names that are not the summary's
+    return observed, x
+
+
+def read(path: str | Path) -> np.ndarray:
+    """Read a trajectory from a file.
+
+    Args:
+        path: a .csv with one row a record and one column a channel (a row of headings is allowed, and a first
+            column of times or indices is left out: `TIME_COLUMNS`), or an .npz with an array "trajectory" or one
+            array only.
+
+    Returns:
+        The trajectory, shape [T, C]; of an .npz as it is.
+
+    Raises:
+        ValueError: for files that cannot be read.
+    """
+    path = Path(path)
+    readers = {".csv": _read_csv, ".npz": _read_npz}
+    if path.suffix.lower() not in readers:
+        raise ValueError(f"observation: expected a .csv or .npz file, got {str(path)!r}")
+    try:
+        return readers[path.suffix.lower()](path)
+    except Exception as error:  # zipfile, numpy and the operating system each have their own
+        raise ValueError(f"observation: cannot read {str(path)!r}: {_first_line(error)}") from error
+
+
+def read_for(task: Task, path: str | Path) -> np.ndarray:
+    """A trajectory from a file, in the shape of the task's simulator where that is known before it has run."""
+    trajectory = read(path)
+    if task.on_host:
+        return trajectory
+    shape = simulator_shapes(task).trajectory
+    long = lambda lengths: [length for length in lengths if length != 1]
+    return trajectory.reshape(shape) if long(trajectory.shape) == long(shape) else trajectory
+
+
+def _read_csv(path: Path) -> np.ndarray:
+    with path.open(newline="", encoding="utf-8-sig") as file:  # a byte-order mark is no part of the first cell
+        lines = [line for line in file if not line.startswith("#")]
+        rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(cell.strip() for cell in row)]
+    if not rows:
+        raise ValueError("expected at least one row of numbers, got none")
+    numbers_in_first = [_is_number(cell) for cell in rows[0]]
+    has_heading = not any(numbers_in_first)
+    if not has_heading and not all(numbers_in_first):
+        raise ValueError(f"expected a row of headings or a row of numbers first, got {','.join(rows[0])!r}")
+    width = len(rows[0])
+    for number, row in enumerate(rows[has_heading:], start=1 + has_heading):
+        if len(row) != width or not all(map(_is_number, row)):
+            raise ValueError(f"expected {width} numbers in row {number}, got {','.join(row)!r}")
+    if has_heading and len(rows) == 1:
+        raise ValueError("expected at least one row of numbers, got headings only")
+    table = np.array([[float(cell) for cell in row] for row in rows[has_heading:]], np.float32)
+    return table[:, 1:] if has_heading and _is_time(rows[0][0]) and width > 1 else table
+
+
+def _read_npz(path: Path) -> np.ndarray:
+    with np.load(path, allow_pickle=False) as arrays:
+        if "trajectory" not in arrays and len(arrays.files) != 1:
+            raise ValueError(f"expected an array called 'trajectory', got {arrays.files}")
+        array = arrays["trajectory" if "trajectory" in arrays else arrays.files[0]]
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"expected real numbers, got an array of type {array.dtype}")
+    return np.asarray(array, np.float32)
+
+
+def _is_time(heading: str) -> bool:
+    return heading.partition("(")[0].partition("[")[0].strip().lower() in TIME_COLUMNS
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _shape(array) -> str:
+    return str(getattr(array, "shape", type(array).__name__))
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -1,0 +1,116 @@
+"""Simulations that were made before the run, as its first round."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.simulation import Simulations, summarised_batch
+from jaxlfi.tasks.task import Task
+
+ARRAYS = ("theta", "trajectory", "x", "log_density", "low", "high")
+"""Names of the arrays of a file of simulations."""
+MIN_ROWS = 2
+"""Simulations that a network can be fitted to at all."""
+
+
+def read_simulations(path: str | Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz of simulations; see `presimulated`.
+
+    Raises:
+        ValueError: for a file that cannot be read, or holds other arrays.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except Exception as error:  # zipfile, numpy and the operating system each have their own
+        raise ValueError(f"simulations: cannot read {str(path)!r}: {str(error).splitlines()[0]}") from error
+    if unknown := sorted(set(arrays) - set(ARRAYS)):
+        raise ValueError(f"simulations: expected arrays among {', '.join(ARRAYS)}, got {', '.join(unknown)}")
+    return arrays
+
+
+def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None = None) -> tuple[Simulations, Support]:
+    """Pairs of parameters and simulations as a first round, and the support they fill.
+
+    Without a density they count as uniform over their box. With one, each is weighted by the prior divided by the
+    density it was drawn from; weights are limited to sqrt(n) times their mean (Ionides 2008). Simulations that are not
+    finite count as failures.
+
+    Args:
+        task: for names, summary and prior.
+        arrays: `theta` [N, D] in natural units; `trajectory` [N, ...] or their summaries `x` [N, S]; where they were
+            not drawn uniformly, `log_density` [N], the log-density over natural units that they were drawn from; and
+            `low` and `high` [D], in natural units, of the box they fill: by default that of the parameters.
+        support: Theta_0 in inference space, where the run begins on another box; what lies outside of it is left out.
+
+    Returns:
+        The simulations, and Theta_0 in inference space.
+
+    Raises:
+        ValueError: for arrays that are missing, or of shapes that do not fit.
+    """
+    theta = _array(arrays, "theta", (None, task.dim))
+    rows = len(theta)
+    if rows < MIN_ROWS:
+        raise ValueError(f"simulations: expected at least {MIN_ROWS}, got {rows}")
+    if not np.isfinite(theta).all() or bool(np.any(theta[:, np.asarray(task.space.log)] <= 0)):
+        raise ValueError(f"simulations: expected finite parameters, positive ones of {task.log or 'log parameters'}")
+    inner = task.space.to_inference(jnp.asarray(theta))
+    if support is None:
+        low = _array(arrays, "low", (task.dim,)) if "low" in arrays else theta.min(axis=0)
+        high = _array(arrays, "high", (task.dim,)) if "high" in arrays else theta.max(axis=0)
+        support = task.support(Support(low.tolist(), high.tolist()))
+    x, failure = _summaries(task, arrays, rows)
+    inside = np.asarray(support.contains(inner))
+    kept = inside & (np.asarray(failure) == 0)
+    if not kept.any():
+        raise ValueError(f"simulations: expected some inside the support, got {inside.sum()} of {rows}, none finite")
+    return (
+        Simulations(inner, x, failure, jnp.asarray(inside), jnp.asarray(kept), _weights(task, arrays, inner, kept)),
+        support,
+    )
+
+
+def _summaries(task: Task, arrays: Mapping[str, Any], rows: int) -> tuple[jax.Array, jax.Array]:
+    if ("x" in arrays) == ("trajectory" in arrays):
+        raise ValueError("simulations: expected either 'trajectory' or 'x' (summaries), got both or neither")
+    if "trajectory" in arrays:
+        trajectory = np.asarray(arrays["trajectory"], np.float32)
+        if trajectory.ndim < 2 or len(trajectory) != rows:
+            raise ValueError(f"simulations: expected {rows} trajectories, got shape {list(trajectory.shape)}")
+        _, x, failure = summarised_batch(task, jnp.asarray(trajectory), jnp.zeros(rows, jnp.int32))
+        return x, failure
+    x = jnp.asarray(_array(arrays, "x", (rows, None)))
+    finite = jnp.all(jnp.isfinite(x), axis=1)
+    return jnp.where(finite[:, None], x, 0.0), jnp.where(finite, 0, len(task.reasons)).astype(jnp.int32)
+
+
+def _weights(task: Task, arrays: Mapping[str, Any], inner: jax.Array, kept: np.ndarray) -> jax.Array:
+    """The prior divided by the density that the parameters were drawn from, of mean 1."""
+    rows, prior = len(inner), task.inference.prior
+    log_weight = np.zeros(rows) if prior is None else np.asarray(prior.log_prob(inner), float)
+    if "log_density" in arrays:
+        density = _array(arrays, "log_density", (rows,))
+        log_weight = log_weight - (density + np.asarray(task.space.log_jacobian(inner)))
+    if not np.isfinite(log_weight[kept]).all():
+        raise ValueError("simulations: expected finite log-densities")
+    weight = np.where(kept, np.exp(log_weight - np.max(log_weight[kept])), 0.0)
+    limit = np.sqrt(kept.sum()) * weight[kept].mean()
+    weight = np.minimum(weight, limit)
+    return jnp.asarray(np.where(kept, weight / weight[kept].mean(), 1.0), jnp.float32)
+
+
+def _array(arrays: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    if name not in arrays:
+        raise ValueError(f"simulations: expected an array {name!r}, got {', '.join(arrays) or 'none'}")
+    array = np.asarray(arrays[name])
+    fits = array.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, array.shape, strict=True))
+    if not fits or array.dtype.kind not in "biuf":
+        expected = ["N" if length is None else length for length in shape]
+        raise ValueError(f"simulations: expected numbers {name} of shape {expected}, got shape {list(array.shape)}")
+    return np.asarray(array, np.float32)

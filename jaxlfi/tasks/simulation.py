@@ -1,0 +1,183 @@
+"""Simulating a batch of parameters, with every failure counted by its reason."""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlfi.tasks.host import numpy_generator
+from jaxlfi.tasks.task import Task
+
+
+@struct.dataclass
+class Simulations:
+    """The simulations of one round, in the order of their attempt.
+
+    Attributes:
+        theta: parameters in inference space, shape [A, D].
+        x: summaries, shape [A, S]; zero where failed.
+        failure: 0 for success, else the code of the reason (`Task.reasons`), shape [A].
+        counted: which simulations count as attempted, shape [A]: those up to the last one needed.
+        kept: which are added to the dataset, shape [A].
+        weight: of each in the loss, shape [A]: 1 for simulations drawn by the run itself.
+    """
+
+    theta: Float[Array, "*batch attempts dim"]
+    x: Float[Array, "*batch attempts obs"]
+    failure: Int[Array, "*batch attempts"]
+    counted: Bool[Array, "*batch attempts"]
+    kept: Bool[Array, "*batch attempts"]
+    weight: Float[Array, "*batch attempts"]
+
+    @property
+    def attempted(self) -> Int[Array, "*batch"]:
+        """Number of simulations attempted."""
+        return jnp.sum(self.counted, axis=-1)
+
+    @property
+    def succeeded(self) -> Int[Array, "*batch"]:
+        """Number of simulations added to the dataset."""
+        return jnp.sum(self.kept, axis=-1)
+
+    def failed(self, reasons: int) -> Int[Array, "*batch reason"]:
+        """Number of counted failures for each of the reasons, in the order of their codes from 1."""
+        codes = jnp.arange(1, reasons + 1)
+        return jnp.sum((self.failure[..., None] == codes) & self.counted[..., None], axis=-2)
+
+
+def trajectory_and_outcome(task: Task, key: jax.Array, theta: Float[Array, " dim"]) -> tuple[Array, Int[Array, ""]]:
+    """One simulation at theta [D] in inference space: its trajectory and 0, or the code of the reason it failed for."""
+    result = task.simulate(key, task.space.to_natural(theta))
+    trajectory, outcome = result if isinstance(result, tuple) else (result, jnp.asarray(0))
+    return with_outcome(task, jnp.asarray(trajectory), jnp.asarray(outcome))
+
+
+def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, Int[Array, ""]]:
+    """Turn what a simulator says of one trajectory into a failure code; non-finite numbers are a failure too."""
+    failure = jnp.where(outcome, 0, 1) if outcome.dtype == bool else outcome
+    # A code that stands for no reason is still a failure, and must be counted as one.
+    failure = jnp.where((failure < 0) | (failure > len(task.failures)), 1, failure)
+    finite = jnp.all(jnp.isfinite(trajectory))
+    failure = jnp.where((failure == 0) & ~finite, len(task.reasons), failure).astype(jnp.int32)
+    return trajectory.astype(jnp.float32), failure
+
+
+def summarised(task: Task, trajectory: Array, failure: Int[Array, ""]) -> tuple[Float[Array, " obs"], Int[Array, ""]]:
+    """The summary of one trajectory; one that is not finite turns a success into the failure "non_finite"."""
+    x = task.summary(jnp.where(failure == 0, trajectory, jnp.ones_like(trajectory)))
+    broken = (failure == 0) & ~jnp.all(jnp.isfinite(x))
+    failure = jnp.where(broken, len(task.reasons), failure)
+    return jnp.where(failure == 0, x, 0.0), failure
+
+
+def simulate(
+    key: jax.Array, task: Task, theta: Float[Array, "attempts dim"]
+) -> tuple[Float[Array, "attempts obs"], Int[Array, " attempts"]]:
+    """Simulate every row of theta inside a compiled program: summaries [A, S] and failure codes [A]."""
+
+    def one(key, theta):
+        return summarised(task, *trajectory_and_outcome(task, key, theta))
+
+    return jax.vmap(one)(jax.random.split(key, theta.shape[0]), theta)
+
+
+def within_budget(
+    theta: Float[Array, "attempts dim"],
+    x: Float[Array, "attempts obs"],
+    failure: Int[Array, " attempts"],
+    simulations_per_round: Int[Array, ""] | int,
+) -> Simulations:
+    """Keep the first successes; what was drawn after the last one needed does not count as attempted.
+
+    Args:
+        theta: proposals in the order they are attempted, shape [A, D]; A is the budget of attempts.
+        x: summaries, shape [A, S].
+        failure: failure codes, shape [A].
+        simulations_per_round: how many simulations a round adds at most.
+    """
+    success = failure == 0
+    so_far = jnp.cumsum(success)
+    kept = success & (so_far <= simulations_per_round)
+    # The attempt after the last needed success would not have been made.
+    counted = so_far - success < simulations_per_round
+    return Simulations(theta, x, failure, counted, kept, weight=jnp.ones(theta.shape[0]))
+
+
+def simulate_batch(
+    key: jax.Array,
+    task: Task,
+    theta: Float[Array, "n dim"],
+    shape: Sequence[int],
+    wanted: Bool[np.ndarray, " n"] | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Simulate every row of theta outside of compiled programs, by a simulator in JAX or on the host.
+
+    Args:
+        key: consumed.
+        task: the task.
+        theta: in inference space, shape [N, D].
+        shape: of a trajectory.
+        wanted: rows that are needed, shape [N]; all by default. A simulator on the host is called for these only.
+
+    Returns:
+        Trajectories [N, ...], summaries [N, S] (zero where failed) and failure codes [N], 0 for success.
+
+    Raises:
+        SimulatorError: from a host simulator that breaks its contract.
+    """
+    if task.on_host:
+        rows = np.ones(len(theta), bool) if wanted is None else wanted
+        trajectories, outcomes = np.zeros((len(theta), *shape), np.float32), np.ones(len(theta), int)
+        natural = np.asarray(task.space.to_natural(theta))[rows]
+        trajectories[rows], outcomes[rows] = task.simulate.batch(key, natural, shape)
+        return jax.device_get(summarised_batch(task, trajectories, outcomes))
+    return jax.device_get(_simulate_batch(task, jax.random.split(key, len(theta)), theta))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _simulate_batch(task: Task, keys: jax.Array, theta: Array):
+    return jax.vmap(lambda key, theta: _with_summary(task, *trajectory_and_outcome(task, key, theta)))(keys, theta)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def summarised_batch(task: Task, trajectories: Array, outcomes: Array) -> tuple[Array, Array, Array]:
+    """What a host simulator gave, as trajectories [N, ...], summaries [N, S] and failure codes [N]."""
+    return jax.vmap(lambda *one: _with_summary(task, *with_outcome(task, *one)))(trajectories, outcomes)
+
+
+def _with_summary(task: Task, trajectory: Array, failure: Array):
+    return trajectory, *summarised(task, trajectory, failure)
+
+
+def simulate_in_waves(
+    key: jax.Array, task: Task, theta: Float[Array, "attempts dim"], wanted: int, shape: Sequence[int]
+) -> Simulations:
+    """Simulate on the host, in the order of theta, until enough have succeeded or all are spent.
+
+    The simulator is called for as many parameter vectors as are wanted, then for as many as failed, and so on: nothing
+    is simulated that is not needed.
+
+    Args:
+        key: seeds the simulator's generator.
+        task: one whose simulator runs on the host.
+        theta: proposals in inference space, shape [A, D].
+        wanted: how many successes.
+        shape: of a trajectory.
+    """
+    natural = np.asarray(task.space.to_natural(theta))
+    budget = len(natural)
+    trajectories = np.zeros((budget, *shape), np.float32)
+    outcomes = np.full(budget, 1)  # what was not attempted is no success
+    rng = numpy_generator(key)
+    done, successes = 0, 0
+    while done < budget and successes < wanted:
+        wave = slice(done, min(budget, done + wanted - successes))
+        trajectories[wave], outcomes[wave] = task.simulate.batch(rng, natural[wave], shape)
+        _, x, failure = summarised_batch(task, trajectories, outcomes)
+        done = wave.stop
+        successes = int(np.sum(np.asarray(failure)[:done] == 0))
+    return within_budget(jnp.asarray(theta), x, failure, wanted)

@@ -1,0 +1,268 @@
+"""Task: a simulator with its parameters named, bounded and, where known, observed."""
+
+import dataclasses
+import functools
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlfi.distributions.space import Space, SpaceName, is_natural
+from jaxlfi.distributions.support import Support, check_within
+from jaxlfi.tasks import priors, summaries
+from jaxlfi.tasks.host import HostSimulator
+
+Simulate = Callable[..., Any]
+
+LABEL = re.compile(r"\w[\w .-]*")
+"""What a support may be called: it names folders of a comparison, where "+" joins it with a heuristic."""
+
+
+@dataclasses.dataclass(frozen=True)
+class InferenceView:
+    """What a task declares in natural units, in inference space.
+
+    Attributes:
+        feasible: Phi.
+        supports: boxes Theta_0 by name.
+        truth: theta_gt, shape [D], or None.
+        prior: `sample(seed=key, sample_shape=n)` and `log_prob` over inference space, or None for a uniform prior.
+    """
+
+    feasible: Support
+    supports: Mapping[str, Support]
+    truth: jax.Array | None
+    prior: Any
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Task:
+    """A likelihood-free inference problem.
+
+    Everything about parameters is declared in natural units. Inference works with the logarithms of the parameters
+    named in `log` and with the others as they are: `space` leads there and back, `inference` holds the declared boxes,
+    truth and prior there. Tasks of equal content are equal, so that a task that was made again (in a notebook's cell,
+    by `dataclasses.replace`) finds the programs compiled for the first one.
+
+    Attributes:
+        simulate: one simulation, `simulate(key, theta[D]) -> trajectory` or `-> (trajectory, outcome)`, in JAX and
+            pure. `outcome` is a boolean (true: valid) or an integer (0: valid, i: failed for the reason
+            `failures[i - 1]`; any other integer counts as the first of them). A simulator that JAX cannot trace is
+            wrapped in `jaxlfi.HostSimulator`.
+        names: one name for each of the D parameters.
+        supports: boxes Theta_0 by name; the first is the default. One that is wider than Phi, like the paper's
+            "broadest", is allowed here and widens Phi for its own run.
+        feasible: Phi, the limits that no adapted support leaves.
+        units: one unit for each parameter ("" for none).
+        summary: what the network sees of a trajectory: the name of a summary (`jaxlfi.tasks.summaries.SUMMARIES`) or a
+            function of one trajectory to a vector [S].
+        truth: the parameters of the observation, where they are known, shape [D].
+        observation: a fixed observed trajectory, where the task has one (real data).
+        log: names of the parameters inferred as logarithms.
+        prior: a distrax distribution to draw the first round from, truncated to the support, instead of the uniform
+            one over it.
+        prior_space: whether the prior's variables are parameters in "natural" units or those of "inference" space: a
+            normal prior over the latter is log-normal in a log parameter.
+        failures: names of the reasons for which a simulation can fail.
+        summary_names: names of the summary's numbers, for plots; by default x_1 to x_S.
+        channels: names of the columns of a trajectory, for plots.
+        times: times of the rows of a trajectory, shape [T], for plots.
+        record_label: what the rows of a trajectory are counted by, for plots; by default "time" where there are
+            `times`, else "record".
+        settings: numbers of a run, by the names of `jaxlfi.Settings` and of its estimator's settings, that the command
+            line takes for this task in place of the preset's.
+        hyperparameters: of heuristics, by the heuristic's name, that it takes in place of their defaults.
+        name: what the task is called in files and figures.
+
+    Raises:
+        ValueError: for numbers of names, units and bounds that do not agree, reversed bounds, unknown names in `log`,
+            bounds or a truth of a log parameter that are not positive, or a prior that is not one over D parameters.
+
+    Example:
+        >>> spring = Task(lambda key, theta: theta[:1] / theta[1:], names=("force", "stiffness"), units=("N", "N/m"),
+        ...               supports={"guess": Support([1.0, 0.5], [2.0, 50.0])},
+        ...               feasible=Support([0.1, 0.1], [10.0, 100.0]), log=("stiffness",))
+        >>> spring.space.labels
+        ('force', 'ln stiffness')
+    """
+
+    simulate: Simulate
+    names: Sequence[str]
+    supports: Mapping[str, Support]
+    feasible: Support
+    units: Sequence[str] | None = None
+    summary: str | Callable[[jax.Array], jax.Array] = "identity"
+    truth: Any = None
+    observation: Any = None
+    log: Sequence[str] = ()
+    prior: Any = None
+    prior_space: SpaceName = "natural"
+    failures: Sequence[str] = ("failed",)
+    summary_names: Sequence[str] = ()
+    channels: Sequence[str] = ()
+    times: Any = None
+    record_label: str | None = None
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    hyperparameters: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    name: str = "task"
+
+    def __post_init__(self):
+        store = lambda field, value: object.__setattr__(self, field, value)
+        for field in ("names", "log", "failures", "summary_names", "channels"):
+            value = getattr(self, field)
+            if isinstance(value, str):
+                raise ValueError(f"{field}: expected a sequence of names, got the string {value!r}")
+            store(field, tuple(value))
+        names = self.names
+        store("units", tuple(self.units) if self.units is not None else ("",) * len(names))
+        if not callable(self.simulate):
+            raise ValueError(f"simulate: expected a function, got {type(self.simulate).__name__}")
+        if len(self.units) != len(names):
+            raise ValueError(f"units: expected one for each of the {len(names)} parameters, got {len(self.units)}")
+        if len(set(names)) != len(names) or not names:
+            raise ValueError(f"names: expected at least one name, each once, got {names}")
+        if unknown := set(self.log) - set(names):
+            raise ValueError(f"log: expected names among {names}, got {sorted(unknown)}")
+        if not self.supports:
+            raise ValueError("supports: expected at least one named support, got none")
+        for label in self.supports:
+            if not LABEL.fullmatch(label):
+                raise ValueError(
+                    f"supports: expected names of letters, digits, '_', '.', '-' and spaces, got {label!r}"
+                )
+        for label, box in [("feasible", self.feasible), *self.supports.items()]:
+            self.check_box(box, label if box is self.feasible else f"supports[{label!r}]")
+        if self.truth is not None:
+            truth = _vector(self.truth, len(names), "truth")
+            if bool(np.any(truth[np.asarray(self.space.log)] <= 0)):
+                raise ValueError(f"truth: expected positive values of the log parameters {self.log}, got {truth}")
+            store("truth", truth)
+        if isinstance(self.summary, str):
+            store("summary", summaries.named(self.summary))
+        if self.prior is not None:
+            priors.check_prior(self.prior, len(names))
+        is_natural(self.prior_space)
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters D."""
+        return len(self.names)
+
+    @property
+    def on_host(self) -> bool:
+        """Whether the simulator runs outside of compiled programs (`jaxlfi.HostSimulator`)."""
+        return isinstance(self.simulate, HostSimulator)
+
+    @functools.cached_property
+    def space(self) -> Space:
+        """The map between natural units and inference space."""
+        return Space(self.names, tuple(name in self.log for name in self.names))
+
+    @functools.cached_property
+    def inference(self) -> InferenceView:
+        """Phi, supports, truth and prior in inference space."""
+        with jax.ensure_compile_time_eval():  # it is kept, so it must not be made of tracers
+            boxes = {label: self.space.box_to_inference(box) for label, box in self.supports.items()}
+            truth = None if self.truth is None else self.space.to_inference(jnp.asarray(self.truth))
+            feasible = self.space.box_to_inference(self.feasible)
+        prior = self.prior
+        if prior is not None and is_natural(self.prior_space) and any(self.space.log):
+            prior = priors.InferencePrior(prior, self.space)
+        return InferenceView(feasible, boxes, truth, prior)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """All reasons of failure, in the order of their codes from 1: the task's own, then "non_finite"."""
+        return (*self.failures, "non_finite")
+
+    def named_summaries(self, count: int) -> tuple[str, ...]:
+        """Names of the summary's `count` numbers.
+
+        Raises:
+            ValueError: if the task names another number of them.
+        """
+        if self.summary_names and len(self.summary_names) != count:
+            raise ValueError(
+                f"summary_names: expected one for each of the summary's {count} numbers, got {len(self.summary_names)}"
+            )
+        return self.summary_names or tuple(f"x_{i + 1}" for i in range(count))
+
+    def support(self, choice: str | Support | None = None, space: SpaceName = "natural") -> Support:
+        """A box Theta_0 in inference space, checked.
+
+        Args:
+            choice: a name among `supports`, None for the first of them, or a box of the reader's own.
+            space: in which the reader's own box is given.
+
+        Raises:
+            ValueError: for an unknown name, or a box that is reversed, not finite or outside of Phi.
+        """
+        if isinstance(choice, Support):
+            if is_natural(space):
+                self.check_box(choice, "support")
+                choice = self.space.box_to_inference(choice)
+            return check_within(choice, self.inference.feasible)
+        if choice is None:
+            return next(iter(self.inference.supports.values()))
+        if not isinstance(choice, str) or choice not in self.supports:
+            raise ValueError(
+                f"support: expected one of {sorted(self.supports)} or a box such as jaxlfi.Support([...], [...]), "
+                f"got {choice!r}"
+            )
+        return self.inference.supports[choice]
+
+    def check_box(self, box: Support, label: str) -> None:
+        """Refuse a box in natural units that is reversed, not finite, of another dimension or has no logarithm.
+
+        Raises:
+            ValueError: naming the box by its label.
+        """
+        if not isinstance(box, Support):
+            raise ValueError(f"{label}: expected a jaxlfi.Support, got {type(box).__name__}")
+        if box.dim != self.dim:
+            raise ValueError(f"{label}: expected bounds for {self.dim} parameters, got {box.dim}")
+        check_within(box, box, label)
+        if bool(np.any(np.asarray(box.low)[np.asarray(self.space.log)] <= 0)):
+            raise ValueError(f"{label}: expected positive bounds for the log parameters {self.log}, got {box.low}")
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all fields are the same, arrays by their values and functions by identity."""
+        if self is other:
+            return True
+        if not isinstance(other, Task):
+            return NotImplemented
+        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self))
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.names, self.log, self.failures))
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two values of a field are the same."""
+    if a is b:
+        return True
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, Mapping):
+        return list(a) == list(b) and all(_same(a[name], b[name]) for name in a)
+    if isinstance(a, functools.partial):
+        return a.func == b.func and _same(a.args, b.args) and _same(a.keywords, b.keywords)
+    if isinstance(a, tuple | list):
+        return len(a) == len(b) and all(map(_same, a, b))
+    if isinstance(a, np.ndarray | jax.Array):
+        return a.shape == b.shape and a.dtype == b.dtype and np.array_equal(np.asarray(a), np.asarray(b))
+    leaves, structure = jax.tree.flatten(a)
+    others, other_structure = jax.tree.flatten(b)
+    if len(leaves) == 1 and leaves[0] is a:
+        return bool(a == b)
+    return structure == other_structure and all(map(_same, leaves, others))
+
+
+def _vector(value: Any, length: int, name: str) -> np.ndarray:
+    vector = np.asarray(value, np.float32)
+    if vector.shape != (length,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name}: expected {length} finite numbers, got shape {vector.shape}")
+    return vector

@@ -1,0 +1,182 @@
+"""Pair plots of anybody's arrays: what is drawn is what was given, and what cannot be drawn is refused in one line."""
+
+import subprocess
+import sys
+import types
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from jaxlfi import plot
+
+NAMES, UNITS = ("stiffness", "cost_$", "friction"), ("N/m", "", "1")
+RNG = np.random.default_rng(7)
+DRAWS = np.column_stack([RNG.lognormal(1.0, 0.3, 400), RNG.normal(0.4, 0.1, 400), RNG.uniform(0.2, 0.9, 400)])
+TRUTH = (2.7, np.nan, 0.5)
+BOX = (np.array([0.5, -1.0, 0.2]), np.array([9.0, 2.0, 0.9]))
+
+
+def panels(figure) -> np.ndarray:
+    """The axes of the lower triangle by row and column; None above it."""
+    shown = iter([axes for axes in figure.axes if axes.axison])
+    dim = int(np.sqrt(2 * sum(axes.axison for axes in figure.axes)))
+    found = np.full((dim, dim), None)
+    for row in range(dim):
+        for column in range(row + 1):
+            found[row, column] = next(shown)
+    return found
+
+
+def marked(axes, gid):
+    """The artists drawn under a name."""
+    return [artist for artist in axes.get_children() if artist.get_gid() == gid]
+
+
+def legend(figure) -> list[str]:
+    """The legend's entries."""
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+@pytest.fixture(scope="module")
+def one():
+    """One set of samples with all that can be marked."""
+    before = dict(matplotlib.rcParams)
+    figure = plot.pairs(
+        DRAWS,
+        names=NAMES,
+        units=UNITS,
+        truth=TRUTH,
+        support=types.SimpleNamespace(low=BOX[0], high=BOX[1]),
+        log=[True, False, False],
+    )
+    assert dict(matplotlib.rcParams) == before
+    return panels(figure), figure
+
+
+def test_axes_have_names_and_units_and_round_ticks(one):
+    grid, _ = one
+    assert [axes.get_xlabel() for axes in grid[-1]] == ["ln stiffness\n[ln(N/m)]", r"cost \$", "friction"]
+    assert [axes.get_ylabel() for axes in grid[:, 0]] == ["", r"cost \$", "friction"]
+    for axes in grid[-1]:
+        low, high = axes.get_xlim()
+        assert 2 <= sum(low <= tick <= high for tick in axes.get_xticks()) <= 6
+
+
+def test_a_logarithm_is_taken_of_draws_truth_and_support(one):
+    grid, _ = one
+    (outline,) = marked(grid[0, 0], "marginal")
+    ends = outline.get_xy()[:, 0].min(), outline.get_xy()[:, 0].max()
+    np.testing.assert_allclose(ends, [np.log(DRAWS[:, 0].min()), np.log(DRAWS[:, 0].max())])
+    assert marked(grid[0, 0], "truth")[0].get_xdata()[0] == pytest.approx(np.log(2.7))
+    (point,) = marked(grid[2, 0], "truth")
+    np.testing.assert_allclose(point.get_xydata(), [[np.log(2.7), 0.5]])
+    (box,) = [patch for patch in grid[2, 0].patches if patch.get_zorder() == 2]
+    np.testing.assert_allclose(box.get_xy(), [np.log(0.5), 0.2])
+    np.testing.assert_allclose([box.get_width(), box.get_height()], [np.log(9.0 / 0.5), 0.9 - 0.2])
+    # Nothing marks the parameter whose truth is unknown.
+    assert not any(marked(axes, "truth") for axes in (grid[1, 0], grid[1, 1], grid[2, 1]))
+
+
+def test_the_legend_names_what_is_drawn(one):
+    _, figure = one
+    assert legend(figure) == ["50 % of the draws", "80 % of the draws", "95 % of the draws", "support", "truth"]
+    assert legend(plot.pairs(DRAWS[:, :2], log=[True, False])) == [f"{f} % of the draws" for f in (50, 80, 95)]
+
+
+def test_names_choose_logarithms_as_booleans_do(one):
+    figure = plot.pairs(DRAWS[:, :1], names=("stiffness",), units=("N/m",), log="stiffness")
+    grid, _ = one
+    (axes,) = figure.axes
+    assert axes.get_xlabel() == grid[2, 0].get_xlabel()
+    np.testing.assert_allclose(marked(axes, "marginal")[0].get_xy(), marked(grid[0, 0], "marginal")[0].get_xy())
+    assert not figure.legends
+
+
+def test_several_sets_share_the_axes_in_looks_of_their_own(tmp_path):
+    sets = {"run_1": DRAWS[:, :2], "MCMC": DRAWS[:, :2] + [4.0, 0.0]}
+    path = tmp_path / "new" / "pairs.png"
+    figure = plot.pairs(sets, truth=TRUTH[:2], path=path, dpi=40)
+    grid = panels(figure)
+    assert [axes.get_xlabel() for axes in grid[-1]] == [r"$\theta_{1}$", r"$\theta_{2}$"]
+    assert legend(figure) == ["run 1", "MCMC", "contours: 50, 80, 95 % of the draws", "truth"]
+    lines = figure.legends[0].get_lines()[:2]
+    assert lines[0].get_color() != lines[1].get_color() and lines[0].get_linestyle() != lines[1].get_linestyle()
+    outlines = marked(grid[0, 0], "marginal")
+    starts = [outline.get_xy()[:, 0].min() for outline in outlines]
+    np.testing.assert_allclose(starts, [draws[:, 0].min() for draws in sets.values()])
+    assert len(marked(grid[0, 0], "truth")) == 1  # not once for each set
+    low, high = grid[1, 0].get_xlim()
+    assert all(((draws[:, 0] > low) & (draws[:, 0] < high)).mean() > 0.99 for draws in sets.values())
+    assert imread(path).shape[1] == round(40 * figure.get_size_inches()[0])
+
+
+@pytest.mark.parametrize("place", [0.0, 3.0, -1e-6])
+def test_draws_that_do_not_vary_are_in_sight(place):
+    axes = panels(plot.pairs(np.full((30, 2), place)))[1, 0]
+    low, high = axes.get_xlim()
+    outline = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
+    assert low < outline[:, 0].min() < place < outline[:, 0].max() < high
+
+
+def samples_with(value) -> np.ndarray:
+    """The draws with one value changed."""
+    changed = DRAWS.copy()
+    changed[5, 1] = value
+    return changed
+
+
+WRONG = {
+    "vector": ({"samples": DRAWS[:, 0]}, r"samples: expected shape \[n, D\] with 1 <= D <= 12, got \[400\]"),
+    "transposed": ({"samples": DRAWS.T}, r"got \[3, 400\]: choose some of the columns"),
+    "empty": ({"samples": np.zeros((30, 0))}, r"got \[30, 0\]$"),
+    "words": ({"samples": "draws"}, "samples: expected an array of numbers, got str"),
+    "few": ({"samples": DRAWS[:19]}, "samples: expected at least 20 draws, got 19"),
+    "nan": ({"samples": samples_with(np.nan)}, "samples: expected finite numbers, got 1 of 400 rows"),
+    "no sets": ({"samples": {}}, "samples: expected 1 to 8 labelled arrays, got 0"),
+    "unlike": ({"samples": {"a": DRAWS, "b": DRAWS[:, :2]}}, r"got a \[400, 3\], b \[400, 2\]"),
+    "one of several": ({"samples": {"a": DRAWS, "b": DRAWS[:2]}}, r"samples\['b'\]: expected at least 20 draws"),
+    "names": ({"names": ("a", "b")}, r"names: expected 3 strings, one for each parameter, got \('a', 'b'\)"),
+    "a name": ({"names": "abc"}, "names: expected 3 strings"),
+    "units": ({"units": (1, 2, 3)}, r"units: expected 3 strings, one for each parameter, got \(1, 2, 3\)"),
+    "truth": ({"truth": [1.0]}, r"truth: expected shape \[3\], one number for each parameter, got \[1\]"),
+    "infinite truth": ({"truth": [1, np.inf, 0]}, "truth: expected finite numbers or NaN, got"),
+    "support": ({"support": 3}, "support: expected an object with low and high, or .low, high., got 3"),
+    "bounds": ({"support": ([0, 0], [1, 1])}, r"support low: expected shape \[3\]"),
+    "unknown bound": ({"support": ([0, 0, np.nan], [1, 1, 1])}, "support low: expected finite numbers, got"),
+    "reversed": ({"support": (BOX[1], BOX[0])}, "support: expected low < high, got"),
+    "log": ({"log": (True,)}, r"log: expected names of parameters or 3 booleans, got \(True,\)"),
+    "log of none": ({"log": ("mass",)}, r"log: expected names of parameters or 3 booleans, got \('mass',\)"),
+    "unknown log": ({"names": NAMES, "log": ("mass",)}, "log: expected some of stiffness, .*, got mass"),
+    "negative": (
+        {"samples": samples_with(-2.0), "log": (False, True, False)},
+        "samples: expected positive values of theta_2",
+    ),
+    "negative truth": (
+        {"truth": (-1, 0, 0), "log": (True, False, False)},
+        "truth: expected positive values of theta_1",
+    ),
+    "negative box": (
+        {"support": BOX, "log": (False, True, False)},
+        "support: expected positive values of theta_2, .* got -1",
+    ),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG.values(), ids=WRONG)
+def test_what_cannot_be_drawn_is_refused_in_one_line(arguments, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        plot.pairs(**{"samples": DRAWS} | arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_matplotlib_is_imported_when_something_is_drawn():
+    """And neither JAX nor pyplot is, then."""
+    script = (
+        "import sys, jaxlfi; pairs = jaxlfi.plot.pairs; assert 'matplotlib' not in sys.modules\n"
+        "import numpy as np; pairs(np.random.default_rng(0).normal(size=(50, 1)))\n"
+        "assert 'matplotlib' in sys.modules and not {'jax', 'matplotlib.pyplot'} & sys.modules.keys()"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
