@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+import jaxlfi
 from jaxlfi.cli import parser as cli
 from jaxlfi.envs.whip.episode import OBSERVATION
 from jaxlfi.figures import History, open_collection, samples, style
@@ -84,7 +85,7 @@ def _best(distances: np.ndarray) -> tuple[float, float]:
 
 def domains(history: History) -> np.ndarray:
     """Low-variance draws of the last posterior, clipped to its support, in inference space, shape [12, 2]."""
-    belief = run_store.read_belief(history.folder)
+    belief = jaxlfi.load(history.folder).belief
     draws = belief.mixture.low_variance_sample(jax.random.key(0), DOMAINS)
     return np.asarray(jnp.clip(draws, belief.support.low, belief.support.high))
 
@@ -145,10 +146,9 @@ def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str,
     ]
     lines = []
     for name, configuration, seed, history in every:
-        belief = run_store.read_belief(history.folder)
-        draws = np.asarray(belief.mixture.sample(jax.random.key(1), 4000))
-        draws = np.clip(draws, belief.support.low, belief.support.high)
-        low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
+        run = jaxlfi.load(history.folder)
+        low, middle, high = np.quantile(run.posterior.sample(jax.random.key(1), 4000), [0.05, 0.5, 0.95], axis=0)
+        support = run.space.box_to_natural(run.belief.support)
         gap = gaps(history.folder)
         lines.append(
             {
@@ -156,13 +156,9 @@ def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str,
                 "configuration": configuration,
                 "seed": seed,
                 "length [mm]": f"{middle[0]:.0f} [{low[0]:.0f}, {high[0]:.0f}]",
-                "E [kPa]": " ".join(
-                    [f"{np.exp(middle[1]) / 1e3:.2f}", f"[{np.exp(low[1]) / 1e3:.2f}, {np.exp(high[1]) / 1e3:.2f}]"]
-                ),
-                "support length [mm]": f"[{belief.support.low[0]:.0f}, {belief.support.high[0]:.0f}]",
-                "support E [kPa]": "[{:.2g}, {:.2g}]".format(
-                    *(np.exp(float(b[1])) / 1e3 for b in (belief.support.low, belief.support.high))
-                ),
+                "E [kPa]": " ".join([f"{middle[1] / 1e3:.2f}", f"[{low[1] / 1e3:.2f}, {high[1] / 1e3:.2f}]"]),
+                "support length [mm]": f"[{support.low[0]:.0f}, {support.high[0]:.0f}]",
+                "support E [kPa]": f"[{support.low[1] / 1e3:.2g}, {support.high[1] / 1e3:.2g}]",
                 "summary gap": round(float(gap["summary"][-1, 0]), 3),
                 "pixel gap": round(float(gap["pixels"][-1, 0]), 2),
                 "seconds": round(float(np.sum(history.seconds)), 1),

@@ -25,7 +25,7 @@ from rich.table import Table
 
 import jaxlfi
 from jaxlfi.bayessim.presets import QUICK
-from jaxlfi.distributions.belief import RESTRICTIONS
+from jaxlfi.distributions.belief import rejected
 from jaxlfi.envs.whip.parameters import MEDIAN
 from jaxlfi.envs.whip.physics.chain import elasto_gravity
 from jaxlfi.envs.whip.real2sim import task
@@ -61,7 +61,7 @@ def truths(seed: int = 0) -> np.ndarray:
 def study(out: Path, detector: str, console: Console) -> dict[str, np.ndarray]:
     """Draws of every posterior in inference space, shape [28, 500, 2], and the final bounds, by heuristic."""
     problem = task(detector=detector)
-    theta = np.asarray(problem.to_coordinates(jnp.asarray(truths(), jnp.float32)))
+    theta = np.asarray(problem.space.to_inference(jnp.asarray(truths(), jnp.float32)))
     observe = jax.jit(jax.vmap(lambda key, theta: trajectory_and_outcome(problem, key, theta)))
     observed, failure = observe(jax.random.split(jax.random.key(1), len(theta)), theta)
     if np.any(failure):
@@ -76,8 +76,8 @@ def study(out: Path, detector: str, console: Console) -> dict[str, np.ndarray]:
                 run = jaxlfi.infer(
                     key_run, problem, observed, support="initial", heuristic=heuristic, settings=SETTINGS
                 )
-                draws = RESTRICTIONS["clip"](key_draw, run.belief, DRAWS)
-                failed = jnp.sum(run.info.failed)
+                draws = rejected(key_draw, run.belief, DRAWS)
+                failed = jnp.sum(run.history["failed"])
                 return {
                     "draws": draws, "failed": failed,
                     "low": run.belief.support.low, "high": run.belief.support.high,
