@@ -18,10 +18,12 @@ WIDTH = 120
 """Characters of a line of the glossary."""
 
 
-def add(group: argparse._ArgumentGroup, families: Families, into: str, several: bool = False) -> None:
+def add(
+    group: argparse._ArgumentGroup, families: Families, into: str, several: bool = False, defaults: bool = True
+) -> None:
     """Add a flag for every field, one for all classes that have a field of that name.
 
-    A flag that the parser has already, for something else, begins with `into` without its last letter:
+    Where the parser already has a flag of that name, the new one begins with the singular of `into`:
     `--hyperparameter-steps`.
 
     Args:
@@ -29,19 +31,19 @@ def add(group: argparse._ArgumentGroup, families: Families, into: str, several: 
         families: classes and their fields.
         into: the argument that collects the values; make it an empty dictionary by `set_defaults`.
         several: whether a number can be given for each parameter of the task.
+        defaults: whether the fields' own defaults are those of the command line, and shown.
     """
     for name, owners in by_field(families).items():
         flag = f"--{name.replace('_', '-')}"
         if flag in group._option_string_actions:
             flag = f"--{into.removesuffix('s')}-{flag[2:]}"
-        group.add_argument(
-            flag,
-            dest=name,
-            action=_Collect,
-            into=into,
-            help=_help(owners),
-            **_reading(next(iter(owners.values())), several),
-        )
+        some = next(iter(owners.values()))
+        if some.static and isinstance(some.default, bool):
+            reading = {"action": _Switch, "no": f"--no-{flag[2:]}"}
+            names = (flag, f"--no-{flag[2:]}")
+        else:
+            reading, names = {"action": _Collect} | _reading(some, several), (flag,)
+        group.add_argument(*names, dest=name, into=into, help=_help(owners, defaults), **reading)
 
 
 def by_field(families: Families) -> dict[str, dict[str, Declared]]:
@@ -56,7 +58,7 @@ def by_field(families: Families) -> dict[str, dict[str, Declared]]:
 def glossary(families: Families) -> str:
     """A line for every field that has a symbol."""
     lines = [
-        f"  {name:<15} {next(iter(owners.values())).info.symbol}, {_told(owners)}"
+        f"  {name:<15} {next(iter(owners.values())).info.symbol}, {_described(owners)}"
         for name, owners in by_field(families).items()
         if all(field.info.symbol for field in owners.values())
     ]
@@ -66,13 +68,24 @@ def glossary(families: Families) -> str:
 class _Collect(argparse.Action):
     """Put the value into a dictionary of the arguments, under the field's name."""
 
-    def __init__(self, *args: Any, into: str, **kwargs: Any):
+    def __init__(self, *args: Any, into: str, kind: Callable[[Any], Any] = lambda values: values, **kwargs: Any):
         super().__init__(*args, default=argparse.SUPPRESS, **kwargs)
-        self.into = into
+        self.into, self.kind = into, kind
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
         collected = getattr(namespace, self.into, None) or {}
-        setattr(namespace, self.into, collected | {self.dest: values})
+        setattr(namespace, self.into, collected | {self.dest: self.kind(values)})
+
+
+class _Switch(_Collect):
+    """Collect True for a flag, and False for the one that begins with "no"."""
+
+    def __init__(self, *args: Any, no: str, **kwargs: Any):
+        super().__init__(*args, nargs=0, **kwargs)
+        self.no = no
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        super().__call__(parser, namespace, option_string != self.no)
 
 
 def _reading(field: Declared, several: bool) -> dict[str, Any]:
@@ -82,7 +95,7 @@ def _reading(field: Declared, several: bool) -> dict[str, Any]:
         return reading | ({"nargs": "+"} if several else {})
     example = field.default[0] if isinstance(field.default, tuple) and field.default else field.default
     reading = {"type": _reader(example), "metavar": {bool: "yes|no", int: "N", float: "X"}.get(type(example), "NAME")}
-    return reading | ({"nargs": "+"} if isinstance(field.default, tuple) else {})
+    return reading | ({"nargs": "+", "kind": tuple} if isinstance(field.default, tuple) else {})
 
 
 def _reader(example: Any) -> Callable[[str], Any]:
@@ -95,21 +108,24 @@ def _truth(text: str) -> bool:
     return text == "yes"
 
 
-def _help(owners: Mapping[str, Declared]) -> str:
+def _help(owners: Mapping[str, Declared], with_defaults: bool) -> str:
     """Whose field it is, what it is, its symbol, range and default."""
     some = next(iter(owners.values())).info
     facts = [some.symbol] if some.symbol else []
     ranges = dict.fromkeys(_range(field) for field in owners.values())
     facts += [word for word in ranges if word] if len(ranges) == 1 else []
     defaults = {family: _shown(field.default) for family, field in owners.items()}
-    if len(set(defaults.values())) == 1:
+    if not with_defaults:
+        pass
+    elif len(set(defaults.values())) == 1:
         facts.append(f"default: {next(iter(defaults.values()))}")
     else:
         facts.append("default: " + ", ".join(f"{value} ({family})" for family, value in defaults.items()))
-    return f"{_told(owners, always=True)} ({'; '.join(facts)})".replace("%", "%%")
+    text = _described(owners, always=with_defaults)
+    return (f"{text} ({'; '.join(facts)})" if facts else text).replace("%", "%%")
 
 
-def _told(owners: Mapping[str, Declared], always: bool = False) -> str:
+def _described(owners: Mapping[str, Declared], always: bool = False) -> str:
     """The help texts, each after the classes that it is of; without these where there is one text, unless `always`."""
     texts: dict[str, list[str]] = {}
     for family, field in owners.items():

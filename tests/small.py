@@ -7,9 +7,8 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
+from jaxlfi.bayessim import batch as lanes
 from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim.algorithm import batch as lanes
-from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.estimator import Estimator
 
 TASK = "jaxlfi.envs.gaussian_linear:task"
@@ -52,7 +51,7 @@ class SharedEngine(lanes.LaneEngine):
 def share_engine(monkeypatch) -> None:
     """Let all sessions of a test use one task and one engine: their lanes and observations must be equal."""
     from jaxlfi.runs import session
-    from jaxlfi.tasks.registry import registry as tasks
+    from jaxlfi.tasks import registry as tasks
 
     made = []
 
@@ -67,7 +66,7 @@ def share_engine(monkeypatch) -> None:
 
 def command(*arguments: str) -> int:
     """Run the command line in this process; its exit status."""
-    from jaxlfi.cli.parser import parser as cli
+    from jaxlfi.cli import parser as cli
 
     try:
         return cli.main([str(argument) for argument in arguments])

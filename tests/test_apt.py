@@ -16,9 +16,9 @@ from test_bayessim import EXACT, MODEST, TASK, X, infer, lane, whitened
 
 import jaxlfi
 from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.presets import METHODS, QUICK
-from jaxlfi.cli.parser import parser as cli
+from jaxlfi.cli import parser as cli
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.estimator import Estimator, Network, draw, initialise, normalisers

@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.diagnostics import bound_warnings, edge_mass
 from jaxlfi.distributions.belief import Belief, rejected
 from jaxlfi.distributions.mixture import GaussianMixture
@@ -144,7 +144,7 @@ def test_a_fixed_support_piles_mass_on_the_bound_that_excludes_the_truth(sequent
     chex.assert_trees_all_equal(belief.support, jax.device_get(TASK.supports["misspecified"]))
     low, high = edge_mass(belief)
     assert float(high[0]) > 0.5 and max(float(high[1]), float(low[0]), float(low[1])) < 0.2
-    (warning,) = bound_warnings(TASK, belief)
+    (warning,) = bound_warnings(TASK.coordinates, belief, TASK.feasible)
     assert warning.startswith("first: ") and "upper bound 0" in warning
 
 
@@ -154,7 +154,7 @@ def test_edge_recovers_from_the_wrong_support(sequential):
     mean, _ = whitened(belief.mixture)
     # In five rounds, two of which the truth was outside; a support that stays put is 2.3 to 2.9 off.
     np.testing.assert_allclose(mean, 0, atol=1.6)
-    assert bound_warnings(TASK, belief) == []
+    assert bound_warnings(TASK.coordinates, belief, TASK.feasible) == []
 
 
 def test_edge_moves_the_excluded_bound_only_outwards(sequential):

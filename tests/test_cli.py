@@ -14,13 +14,13 @@ import pytest
 
 import jaxlfi
 from jaxlfi.io import files as atomic
-from jaxlfi.cli.parser import parser as cli
-from jaxlfi.cli.parser import commands
-from jaxlfi.tasks.registry import observation
+from jaxlfi.cli import parser as cli
+from jaxlfi.cli import commands
+from jaxlfi.tasks import observation
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs import session
 from jaxlfi.studies import grid as sweep
-from jaxlfi.tasks.registry import registry as tasks
+from jaxlfi.tasks import registry as tasks
 from jaxlfi.bayessim.algorithm import Settings
 from jaxlfi.estimators.estimator import Estimator
 from jaxlfi.heuristics import Mode, registry
@@ -206,10 +206,10 @@ def test_a_seed_has_one_observation_in_all_configurations(comparison):
     assert not np.array_equal(seen[0], seen[2])
 
 
-def test_compare_tells_of_mass_on_the_bounds_of_fixed_supports(comparison):
+def test_compare_warns_of_posteriors_beyond_the_bounds_of_fixed_supports(comparison):
     plan = session.plan_of(run_store.read_config(comparison))
     told = list(session.support_warnings(comparison, plan))
-    assert any(text.startswith("misspecified:") and "first upper 0 (2 of 2 seeds)" in text for text in told)
+    assert any(text.startswith("misspecified:") and "first upper 0 (2 of 2 runs" in text for text in told)
     assert not any(text.startswith("misspecified+edge") for text in told)
 
 

@@ -199,7 +199,7 @@ def write_run(
         "units": ["1/time"] * dim,
         "configuration": None,
         "support": {"name": support, "low": stacked["proposal_low"][0].tolist()},
-        "heuristic": {"name": heuristic or "none", "matched": False, "hyperparameters": {}},
+        "heuristic": {"name": heuristic or "none", "hyperparameters": {}},
         "preset": "quick",
         "seed": seed,
         "feasible_low": [-6.0] * dim,

@@ -549,8 +549,9 @@ def test_the_order_of_dimensions_does_not_matter(rule, problem, data):
 @given(st.one_of(edges(), modes(), truncations()), problems())
 def test_a_scalar_hyperparameter_is_a_constant_vector(rule, problem):
     dim = problem[0].support.dim
+    assume(decided(rule, *problem, margin=1e-5))
     as_vectors = jax.tree.map(lambda value: jnp.asarray(np.full(dim, value, np.float32)), rule)
-    chex.assert_trees_all_equal(apply(rule, *problem), apply(as_vectors, *problem))
+    chex.assert_trees_all_close(apply(rule, *problem), apply(as_vectors, *problem), rtol=1e-5, atol=1e-5)
 
 
 @given(problems(), vectors(0.25, 0.75, 3))

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
-from jaxlfi.bayessim.algorithm import batch as lanes
+from jaxlfi.bayessim import algorithm as bayessim
+from jaxlfi.bayessim import batch as lanes
 from jaxlfi.bayessim.batch import Lane, LaneEngine, stack_heuristics, stack_inputs
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.bayessim.record import own_evidence

@@ -39,9 +39,9 @@ def test_a_wheel_has_one_top_level_name_and_all_modules_and_data():
     }
     data = [path for path in (ROOT / "envs").rglob("data/*") if path.is_file()]
     assert len(data) >= 11
-    assert {f"jaxlfi/{path.relative_to(ROOT)}" for path in data} | {"jaxlfi/py.typed"} == {
-        name for name in files if not name.endswith(".py")
-    }
+    expected = {f"jaxlfi/{path.relative_to(ROOT)}" for path in data} | {"jaxlfi/py.typed"}
+    expected |= {str(path.relative_to(ROOT)) for path in (ROOT / "jaxlfi").rglob("*.pyi")}
+    assert {name for name in files if not name.endswith(".py")} == expected
 
 
 def test_the_tasks_are_those_of_this_checkout():

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.bayessim.record import posterior_draws
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs import lotka_volterra, lynx_hare, mg1
 from jaxlfi.estimators.posterior import draws_within
-from jaxlfi.heuristics import Centre, Edge, Fixed, Matched, Mode
+from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
 from jaxlfi.io import files as atomic
 from jaxlfi.io.serialise import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json
 from jaxlfi.runs import folder as run_store
@@ -198,6 +198,7 @@ def test_settings_survive_their_description(preset):
         Edge(),
         Edge(expansion=np.array([0.1, 0.3], np.float32)),
         Matched(Mode(proximity=0.3)),
+        Choice(1, (Edge(), Matched(Mode()), Centre())),
         Centre(),
     ],
 )

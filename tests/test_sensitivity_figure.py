@@ -146,7 +146,7 @@ def folder(tmp_path):
     config = {
         "format": "jaxlfi-grid",
         "task": "gaussian_linear",
-        "heuristic": {"name": "edge"},
+        "heuristic": {"name": "x:Wrapper", "hyperparameters": {"rule": {"name": "edge", "hyperparameters": {}}}},
         "support": {"name": "ok"},
         "settings": {"rounds": 2},
         "seeds": [0, 1, 2, 3, 4],

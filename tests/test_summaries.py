@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi.tasks.registry import summaries
+from jaxlfi.tasks import summaries
 
 
 def plain_series(trajectory):

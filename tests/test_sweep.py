@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jaxlfi.bayessim.algorithm import algorithm as bayessim
+from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.diagnostics import discrepancy
 from jaxlfi.envs import gaussian_linear

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from jaxlfi.bayessim.algorithm import prior_draws
 from jaxlfi.distributions.support import Support
-from jaxlfi.tasks.registry import summaries
+from jaxlfi.tasks import summaries
 from jaxlfi.tasks.task import Task
 from tests.strategies import vectors
 

@@ -1,7 +1,9 @@
 """What the command line's commands do; `jaxlfi.cli.parser` parses, this module works."""
 
 import argparse
+import csv
 import dataclasses
+import io
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,37 +12,47 @@ from typing import Any
 import jax
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from jaxlfi import diagnostics
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim.batch import Lane
+from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.presets import METHODS, PRESETS
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.diagnostics.bounds import bound_summary
 from jaxlfi.distributions.support import Support
-from jaxlfi.estimators.estimator import Estimator
-from jaxlfi.heuristics import Heuristic, paired, registry
+from jaxlfi.distributions.truncation import TRIES
+from jaxlfi.estimators import registry as estimators
+from jaxlfi.fields import declared
+from jaxlfi.heuristics import Heuristic, paired
+from jaxlfi.heuristics import registry as heuristics
 from jaxlfi.io import files as atomic
-from jaxlfi.runs import export, session
+from jaxlfi.io.progress import RoundProgress
+from jaxlfi.runs import execute as executing
+from jaxlfi.runs import export
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.checkpoint import CheckpointError
-from jaxlfi.runs.inference import simulator_shapes
-from jaxlfi.runs.load import posterior_samples
-from jaxlfi.runs.session import Plan
-from jaxlfi.studies import calibration as diagnosis
-from jaxlfi.studies import grid as sweep
+from jaxlfi.runs.execute import BatchPlan, Observed
+from jaxlfi.runs.load import load
+from jaxlfi.runs.run import Run
+from jaxlfi.studies import calibration, grid
 from jaxlfi.studies.grid import Work
-from jaxlfi.tasks.observation import SimulatorError
-from jaxlfi.tasks.registry import observation as observations
-from jaxlfi.tasks.registry import registry as task_lookup
+from jaxlfi.tasks import priors
+from jaxlfi.tasks import registry as task_lookup
+from jaxlfi.tasks.host import SimulatorError
+from jaxlfi.tasks.observation import read_for
+from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.task import Task
 
-Prepared = tuple[Path, Plan | Work]
+Prepared = tuple[Path, tuple[BatchPlan, Observed] | Work]
 EXPECTED = (SimulatorError, CheckpointError, run_store.StoreError)
-"""Errors of a run that are the input's, and told in one line."""
-LEAKAGE = 0.01
-"""Share of the posterior inside its support below which draws from it are warned of."""
+"""Errors that the input of a run causes; they are reported in one line."""
+LOW_MASS = 0.01
+"""Mass of the posterior inside its support below which `jaxlfi sample` warns."""
 BOOTSTRAP = 2000
-"""Resamples of an interval."""
+"""Bootstrap resamples for the interval of a mean."""
+CONFIGURATION_DEFAULTS = ("ok", "misspecified", "broad")
+"""Supports that are compared by default, where the task has them."""
 
 
 def tasks(arguments: argparse.Namespace, console: Console) -> None:
@@ -53,10 +65,10 @@ def tasks(arguments: argparse.Namespace, console: Console) -> None:
         try:
             task = task_lookup.load(name)
         except ValueError as error:  # one broken package must not hide the others
-            table.add_row(name, "", "", str(error).splitlines()[0])
+            table.add_row(escape(name), "", "", escape(str(error).splitlines()[0]))
             continue
         given = "given" if task.observation is not None else "simulated at the truth" if task.truth is not None else "-"
-        table.add_row(name, ", ".join(task.coordinates), ", ".join(task.supports), given)
+        table.add_row(*map(escape, (name, ", ".join(task.space.labels), ", ".join(task.supports), given)))
     console.print(table)
     console.print("Details: jaxlfi tasks NAME. Your own: module:factory in place of a name.")
 
@@ -65,28 +77,34 @@ def _describe_task(task: Task, console: Console) -> None:
     columns = ["parameter", "unit", *task.supports, "Phi"]
     if task.truth is not None:
         columns.append("truth")
-    table = Table(*columns, title=task.name)
-    for d, name in enumerate(task.coordinates):
+    table = Table(*map(escape, columns), title=escape(task.name))
+    for d, name in enumerate(task.names):
         boxes = [f"[{float(box.low[d]):g}, {float(box.high[d]):g}]" for box in (*task.supports.values(), task.feasible)]
         truth = [f"{float(task.truth[d]):.4g}"] if task.truth is not None else []
-        table.add_row(name, task.units[d], *boxes, *truth)
+        table.add_row(*map(escape, (name, task.units[d], *boxes, *truth)))
     console.print(table)
-    console.print("Supports and Phi are boxes for the parameters as they are named here; the first is the default.")
+    logs = f" Inferred as logarithms: {', '.join(task.log)}." if task.log else ""
+    console.print(escape(f"Supports, Phi and truth in natural units; the first support is the default.{logs}"))
 
 
 def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi infer`."""
     task = task_lookup.load(arguments.task)
     settings = build_settings(arguments, task)
-    support_name, support = _support(arguments, task)
-    heuristic = build_heuristic(arguments, arguments.heuristic, settings, task)
-    registry.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
+    first = None
+    if arguments.simulations is None:
+        support_name, support = _support(arguments, task)
+    else:
+        own = arguments.support is not None or arguments.support_low is not None or arguments.support_high is not None
+        support_name, support = _support(arguments, task) if own else ("own", None)
+        first, support = presimulated(task, read_simulations(arguments.simulations), support)
+    rule = build_heuristic(arguments, arguments.heuristic, settings, task)
+    heuristics.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
     configuration = support_name if arguments.heuristic == "none" else f"{support_name}+{arguments.heuristic}"
-    lanes = tuple(Lane(configuration, support_name, support, heuristic, seed) for seed in _seeds(arguments))
-    kind = run_store.RUN if len(lanes) == 1 else run_store.RUNS
-    plan = Plan(kind, arguments.task, task, arguments.preset, settings, lanes, arguments.keep_network)
-    session.begin(arguments.out, plan, _observation(arguments, task))
-    return arguments.out, plan
+    specs = tuple(RunSpec(configuration, support_name, support, rule, seed) for seed in _seeds(arguments))
+    kind = run_store.RUN if len(specs) == 1 else run_store.RUNS
+    plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
+    return _begun(arguments, plan, console, first)
 
 
 def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
@@ -97,29 +115,43 @@ def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
     if len(set(configurations)) < len(configurations):
         raise ValueError(f"configurations: expected distinct ones, got {configurations}")
     parts = [_configuration(name) for name in configurations]
-    registry.refuse_foreign(arguments.hyperparameters, [heuristic for _, heuristic in parts])
+    heuristics.refuse_foreign(arguments.hyperparameters, [heuristic for _, heuristic in parts])
     # Seeds are the slow index, so that every device gets all configurations, fast and slow ones.
-    lanes = tuple(
-        Lane(name, support, task.support(support), build_heuristic(arguments, heuristic, settings, task), seed)
+    specs = tuple(
+        RunSpec(name, support, task.support(support), build_heuristic(arguments, heuristic, settings, task), seed)
         for seed in _seeds(arguments)
         for name, (support, heuristic) in zip(configurations, parts, strict=True)
     )
-    plan = Plan(run_store.COMPARE, arguments.task, task, arguments.preset, settings, lanes, arguments.keep_network)
-    session.begin(arguments.out, plan, _observation(arguments, task))
-    return arguments.out, plan
+    kind = run_store.COMPARE
+    plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
+    return _begun(arguments, plan, console, None)
 
 
-def grid(arguments: argparse.Namespace, console: Console) -> Prepared:
+def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, first: Any) -> Prepared:
+    """The folder of a plan, after everything was checked."""
+    run_store.refuse_occupied(arguments.out)
+    observed = executing.prepare(plan, _observation(arguments, plan.task), first)
+    for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
+        if (mass := priors.require_mass(plan.task.inference.prior, box, name)) < priors.LOW_INSIDE:
+            missed = (1 - mass) ** TRIES
+            _warn(
+                console, f"only {mass:.2g} of the prior lies in {name}: {missed:.0%} of its draws are uniform instead"
+            )
+    executing.begin(arguments.out, plan, observed)
+    return arguments.out, (plan, observed)
+
+
+def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi grid`."""
     task = task_lookup.load(arguments.task)
     settings = build_settings(arguments, task)
-    axes = sweep.parse_axes(arguments.vary)
-    registry.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
+    axes = grid.parse_axes(arguments.vary)
+    heuristics.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
     for axis in axes:
         if axis.name in arguments.hyperparameters:
             raise ValueError(f"{axis.name}: expected it on an axis or as a flag of its own, got both")
     name = arguments.support or next(iter(task.supports))
-    plan = sweep.Grid(
+    plan = grid.Grid(
         task=task,
         support=task.support(name),
         rule=build_heuristic(arguments, arguments.heuristic, settings, task),
@@ -132,45 +164,44 @@ def grid(arguments: argparse.Namespace, console: Console) -> Prepared:
     )
     observation = _observation(arguments, task)
     run_store.refuse_occupied(arguments.out)
-    console.print(f"{task.name}: compiling for {plan.size} runs")
-    return arguments.out, sweep.begin(arguments.out, plan, observation, arguments.lanes_per_chunk)
+    _say(console, f"{task.name}: compiling for {plan.size} runs")
+    return arguments.out, grid.begin(arguments.out, plan, observation, arguments.runs_per_chunk)
 
 
 def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     """Prepare `jaxlfi resume`: nothing is left to do where the run is complete."""
     folder = arguments.folder
-    if sweep.is_grid(folder):
+    if grid.is_grid(folder):
         return _resume_grid(folder, console)
     config = run_store.read_config(folder)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
-        console.print(_COMPLETE.format(folder=folder))
+        _say(console, _COMPLETE.format(folder=folder))
         return None
-    if "lanes" not in config:
-        raise run_store.StoreError(f"expected the folder a command was given, got {str(folder)!r}, one run of several")
-    return folder, session.plan_of(config)
+    plan = executing.reopen(folder)
+    if changed := executing.changed_versions(folder):
+        _warn(console, f"begun with {', '.join(changed)}: the result may differ in rounding from an uninterrupted one")
+    return folder, plan
 
 
 _COMPLETE = "{folder} is complete: nothing to resume. Its pictures: jaxlfi report {folder}"
 
 
 def _resume_grid(folder: Path, console: Console) -> Prepared | None:
-    config = sweep.read_config(folder)
+    config = grid.read_config(folder)
     if config.get("status") == "finished":
-        console.print(_COMPLETE.format(folder=folder))
+        _say(console, _COMPLETE.format(folder=folder))
         return None
+    changed = executing.changed_versions(folder)
     if config.get("devices") != (here := jax.local_device_count()):
-        console.print(
-            f"warning: begun on {config.get('devices')} devices and resumed on {here}: results differ by rounding",
-            style="yellow",
-            soft_wrap=True,
-            highlight=False,
-        )
-    return folder, sweep.reopen(folder)
+        changed.append(f"{config.get('devices')} devices, now {here}")
+    if changed:
+        _warn(console, f"begun with {', '.join(changed)}: results differ by rounding")
+    return folder, grid.reopen(folder)
 
 
 def report(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi report`."""
-    (sweep if sweep.is_grid(arguments.folder) else run_store).read_config(arguments.folder)
+    (grid if grid.is_grid(arguments.folder) else run_store).read_config(arguments.folder)
     draw(arguments.folder, console)
 
 
@@ -179,96 +210,136 @@ def sample(arguments: argparse.Namespace, console: Console) -> None:
     out = arguments.out or arguments.folder / "samples.csv"
     if out.suffix not in (".csv", ".npz", ".nc"):
         raise ValueError(f"out: expected a name that ends in .csv or .npz, or .nc for ArviZ, got {out}")
-    if out.exists():
+    if out.exists() or out.is_symlink():
         raise ValueError(f"out: expected a new file, got {out}, which exists")
+    if not 0 <= arguments.seed < 2**63:
+        raise ValueError(f"seed: expected at least 0, got {arguments.seed}")
+    posterior = load(arguments.folder).posterior
     if out.suffix == ".nc":
         export.write_netcdf(out, arguments.folder, arguments.number, arguments.seed)
-        console.print(f"samples: {out}", soft_wrap=True, highlight=False)
-        return
-    draws, names, inside = posterior_samples(arguments.folder, arguments.number, arguments.seed)
-    if out.suffix == ".npz":
-        atomic.write_arrays(out, {"theta": draws, "names": np.asarray(names)})
     else:
-        rows = [",".join(names), *(",".join(f"{value:.8g}" for value in row) for row in draws)]
-        atomic.write_bytes(out, ("\n".join(rows) + "\n").encode())
-    console.print(f"samples: {out}", soft_wrap=True, highlight=False)
-    if inside < LEAKAGE:
-        console.print(
-            f"warning: only {inside:.2g} of the posterior lies in the support it was truncated to; it may be wrong.",
-            style="yellow",
-            soft_wrap=True,
-            highlight=False,
+        draws = np.asarray(posterior.sample(jax.random.key(arguments.seed), arguments.number))
+        names = posterior.space.names
+        if out.suffix == ".npz":
+            atomic.write_arrays(out, {"theta": draws, "names": np.asarray(names)})
+        else:
+            text = io.StringIO()
+            writer = csv.writer(text, lineterminator="\n")
+            writer.writerows([names, *([f"{value:.8g}" for value in row] for row in draws)])
+            atomic.write_bytes(out, text.getvalue().encode())
+    _say(console, f"samples: {out}")
+    if posterior.mass_inside < LOW_MASS:
+        _warn(
+            console,
+            f"only {float(posterior.mass_inside):.2g} of the posterior lies in the support it was truncated to; it may "
+            "be wrong.",
         )
 
 
 def diagnose(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi diagnose DIR`."""
-    subject = diagnosis.read_subject(arguments.folder)
-    name = arguments.reference or next(iter(subject.task.supports))
-    if name not in subject.task.supports:
-        raise ValueError(f"reference: expected one of {sorted(subject.task.supports)}, got {name!r}")
-    plan = diagnosis.Plan(name, arguments.truths, arguments.draws, arguments.seed)
+    task = None if arguments.task is None else task_lookup.load(arguments.task)
+    run = calibration.read_run(arguments.folder, task)
+    name = arguments.reference or next(iter(run.task.supports))
+    if name not in run.task.supports:
+        raise ValueError(f"reference: expected one of {sorted(run.task.supports)}, got {name!r}")
+    plan = calibration.CalibrationPlan(name, arguments.truths, arguments.draws, arguments.seed)
     reference = None
     if arguments.against is not None:
-        reference = arguments.against.name, diagnosis.read_reference(arguments.against, subject.task)
+        reference = arguments.against.name, calibration.read_reference(arguments.against, run.task)
     out = arguments.out or arguments.folder / "diagnostics"
-    checks = diagnosis.run(out, subject, plan, console, reference)
+    checks = calibration.diagnose(out, run, plan, console, reference)
     console.print(checks_table(checks))
-    console.print(f"diagnostics: {out}", soft_wrap=True, highlight=False)
+    _say(console, f"diagnostics: {out}")
     if not arguments.no_figures:
         for path in _figures().checks.report(out):
-            console.print(f"picture: {path}", soft_wrap=True, highlight=False)
+            _say(console, f"picture: {path}")
 
 
-def checks_table(checks: Sequence[diagnosis.Check]) -> Table:
+def checks_table(checks: Sequence[calibration.Check]) -> Table:
     """One line a check."""
     table = Table("check", "statistic", "expected", "p-value", "verdict")
     for check in checks:
         p_value = "" if np.isnan(check.p_value) else f"{check.p_value:.2g}"
         colour = {"": "", diagnostics.OK: "green"}.get(check.verdict, "red")
-        table.add_row(check.name, check.statistic, check.expected, p_value, check.verdict, style=colour)
+        cells = map(escape, (check.name, check.statistic, check.expected, p_value, check.verdict))
+        table.add_row(*cells, style=colour)
     return table
 
 
-def run(folder: Path, plan: Plan | Work, arguments: argparse.Namespace, console: Console) -> None:
-    """Run what `infer`, `compare`, `grid` or `resume` prepared, and tell what came of it."""
-    if isinstance(plan, Work):
-        _run_grid(folder, plan, arguments, console)
+def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argparse.Namespace, console: Console) -> None:
+    """Run what `infer`, `compare`, `grid` or `resume` prepared, and print what came of it."""
+    if isinstance(work, Work):
+        _run_grid(folder, work, arguments, console)
         return
+    plan, observed = work
+    count = len(plan.specs)
+    label = f"{plan.task.name}: {count} {'run' if count == 1 else 'runs in a batch'}"
+    done = executing.rounds_done(folder)
     try:
-        session.advance(folder, plan, console)
+        with RoundProgress(console, plan.settings.rounds, done, label) as progress:
+            on_round = lambda index, row: progress.advance()
+            runs = executing.execute(plan, observed, folder, on_round, progress.compiled)
     except SimulatorError:
-        if arguments.command != "resume" and not session.any_round(folder):
+        if arguments.command != "resume" and not executing.rounds_done(folder):
             shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from
         raise
-    console.print(summary_table(folder, plan))
-    for warning in session.support_warnings(folder, plan):
-        console.print(f"warning: {warning}", style="yellow", soft_wrap=True, highlight=False)
-    if plan.kind == run_store.COMPARE:
-        console.print(f"table: {folder / 'table.csv'}", soft_wrap=True, highlight=False)
-    else:
-        console.print(f"results: {folder}", soft_wrap=True, highlight=False)
+    executing.finish(folder, plan, runs)
+    console.print(summary_table(plan, runs))
+    for warning in (*training_warnings(plan, runs), *support_warnings(plan, runs)):
+        _warn(console, warning)
+    kind = "table" if plan.kind == run_store.COMPARE else "results"
+    _say(console, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")
     if not arguments.no_figures:
         draw(folder, console)
 
 
+def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
+    """In words, where the networks of some runs did not learn: gradients that were not finite."""
+    warnings = []
+    settings = plan.settings.estimator
+    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
+        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+        broken = sum(bool(np.any(np.asarray(run.history["nonfinite"]) > 0)) for run in own)
+        if broken:
+            steps = int(np.max([np.max(run.history["nonfinite"]) for run in own]))
+            warnings.append(
+                f"{configuration}: up to {steps} gradient steps of a round were not finite and were left out, in "
+                f"{broken} of {len(own)} runs: lower learning_rate ({settings.learning_rate:g}) or clip_norm "
+                f"({settings.clip_norm:g})."
+            )
+    return warnings
+
+
+def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
+    """In words, where runs whose support cannot grow ended with a bound that looks wrong."""
+    warnings = []
+    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
+        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+        if not own[0].heuristic.grows:
+            beliefs = [run.belief for run in own]
+            found = bound_summary(plan.task.space.labels, beliefs, own[0].feasible)
+            warnings += [f"{configuration}: {text}" for text in found]
+    return warnings
+
+
 def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: Console) -> None:
     try:
-        arrays = sweep.advance(folder, work, console)
+        arrays = grid.advance(folder, work, console)
     except SimulatorError:
         if arguments.command != "resume":
             shutil.rmtree(folder)  # raised in the first chunk only: there is nothing in it to go on from
         raise
     console.print(marginal_table(work.grid, arrays))
-    console.print(f"table: {folder / 'table.csv'}", soft_wrap=True, highlight=False)
+    _say(console, f"table: {folder / 'table.csv'}")
     if not arguments.no_figures:
         draw(folder, console)
 
 
-def marginal_table(grid: sweep.Grid, arrays: Mapping[str, np.ndarray]) -> Table:
+def marginal_table(study: grid.Grid, arrays: Mapping[str, np.ndarray]) -> Table:
     """One line a value of each hyperparameter, over the seeds and the other hyperparameters."""
     table = Table("hyperparameter", "value", "runs", "theta error", "traj. error", "success")
-    for place, axis in enumerate(grid.axes):
+    for place, axis in enumerate(study.axes):
         for index, value in enumerate(axis.values):
             theta, trajectory, success = (
                 np.ravel(np.take(arrays[name], index, axis=place))
@@ -286,7 +357,7 @@ def marginal_table(grid: sweep.Grid, arrays: Mapping[str, np.ndarray]) -> Table:
 
 
 def _mean_and_sd(values: np.ndarray) -> str:
-    """Of those that are known."""
+    """Mean and standard deviation of the values that are known."""
     values = values[np.isfinite(values)]
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=min(1, values.size - 1)):.2f}" if values.size else "-"
 
@@ -294,7 +365,7 @@ def _mean_and_sd(values: np.ndarray) -> str:
 def draw(folder: Path, console: Console) -> None:
     """Draw all pictures of a folder from its saved files, and name them."""
     for path in _figures().report(folder):
-        console.print(f"picture: {path}", soft_wrap=True, highlight=False)
+        _say(console, f"picture: {path}")
 
 
 def _figures():
@@ -308,7 +379,7 @@ def _figures():
 
 def default_configurations(task: Task) -> list[str]:
     """Up to three supports kept fixed, and the misspecified one (or else the first) with every heuristic."""
-    wanted = [name for name in ("ok", "misspecified", "broad") if name in task.supports]
+    wanted = [name for name in CONFIGURATION_DEFAULTS if name in task.supports]
     supports = wanted or list(task.supports)[:3]
     adapted = "misspecified" if "misspecified" in supports else supports[0]
     return [*supports, *(f"{adapted}+{heuristic}" for heuristic in ("edge", "mode", "centre"))]
@@ -316,33 +387,40 @@ def default_configurations(task: Task) -> list[str]:
 
 def build_settings(arguments: argparse.Namespace, task: Task) -> Settings:
     """The preset, with what the task asks for in its place, and what was given in place of both."""
-    preset = METHODS[arguments.method](with_settings(PRESETS[arguments.preset], task.settings))
-    given = {name: value for name, value in vars(arguments).items() if value is not None}
+    preset = with_settings(METHODS[arguments.method](PRESETS[arguments.preset]), task.settings, partly=True)
+    given = dict(arguments.settings)
     if "steps" in given and "epochs" not in given:
         given["epochs"] = 0
     if "epochs" in given and "steps" not in given:
         given["steps"] = 0
-    if "hidden" in given:
-        given["hidden"] = tuple(given["hidden"])
     if "simulation_budget" not in given and "simulations_per_round" in given:
-        # The share of failures that a round can bear stays the preset's.
+        # The fraction of failures that a round can bear stays the preset's.
         given["simulation_budget"] = -(
             -given["simulations_per_round"] * preset.simulation_budget // preset.simulations_per_round
         )
-    settings = with_settings(preset, given)
-    for name in ("learning_rate", "weight_decay", "clip_norm"):
-        value = getattr(settings.estimator, name)
-        if not value >= 0 or (name != "clip_norm" and not np.isfinite(value)):
-            raise ValueError(f"{name}: expected a number of at least 0, got {value}")
-    return settings.check()
+    if arguments.estimator is not None:
+        kind = estimators.load(arguments.estimator)
+        preset = preset.replace(estimator=estimators.converted(preset.estimator, kind, {}))
+    return with_settings(preset, given).check()
 
 
-def with_settings(settings: Settings, given: Mapping[str, Any]) -> Settings:
-    """Settings with those numbers replaced that are named, be they of the run or of its estimator."""
-    named = lambda kind: {f.name: given[f.name] for f in dataclasses.fields(kind) if f.name in given}
-    return dataclasses.replace(
-        settings, estimator=dataclasses.replace(settings.estimator, **named(Estimator)), **named(Settings)
-    )
+def with_settings(settings: Settings, given: Mapping[str, Any], partly: bool = False) -> Settings:
+    """Settings with those numbers replaced that are named, be they of the run or of its estimator.
+
+    Args:
+        settings: to begin with.
+        given: by name.
+        partly: leave out what this estimator does not have, as a task's wishes may be for another one.
+
+    Raises:
+        ValueError: for a name that neither has.
+    """
+    own = {name: value for name, value in given.items() if name in declared(settings)}
+    others = {name: value for name, value in given.items() if name not in own}
+    if partly:
+        others = {name: value for name, value in others.items() if name in declared(settings.estimator)}
+    estimator = estimators.converted(settings.estimator, type(settings.estimator), others)
+    return dataclasses.replace(settings, estimator=estimator, **own)
 
 
 def build_heuristic(arguments: argparse.Namespace, name: str, settings: Settings, task: Task) -> Heuristic:
@@ -350,18 +428,18 @@ def build_heuristic(arguments: argparse.Namespace, name: str, settings: Settings
 
     Components that it compares are matched first where networks start anew every round.
     """
-    values = {**task.hyperparameters.get(name, {}), **registry.own(name, arguments.hyperparameters)}
-    return paired(registry.build(name, values, task.dim), settings.estimator.warm_start)
+    values = {**task.hyperparameters.get(name, {}), **heuristics.own(name, arguments.hyperparameters)}
+    return paired(heuristics.build(name, values, task.dim), settings.estimator.warm_start)
 
 
 def _configuration(name: str) -> tuple[str, str]:
     """Support and heuristic of "support" or "support+heuristic"."""
     support, plus, heuristic = name.partition("+")
-    if plus:
-        try:
-            registry.load(heuristic)
-        except ValueError as error:
-            raise ValueError(f"configurations: expected support+heuristic, got {name!r}: {error}") from error
+    if plus and ":" not in heuristic and heuristic not in heuristics.names():
+        known = ", ".join(heuristics.names())
+        raise ValueError(f"configurations: expected support+heuristic with one of {known}, got {name!r}")
+    if ":" in heuristic:
+        raise ValueError(f"configurations: expected a registered heuristic, which names a folder, got {name!r}")
     return support, heuristic or "none"
 
 
@@ -376,10 +454,7 @@ def _support(arguments: argparse.Namespace, task: Task) -> tuple[str, Support]:
 
 
 def _observation(arguments: argparse.Namespace, task: Task) -> np.ndarray | None:
-    if arguments.observation is None:
-        return None
-    trajectory = observations.read(arguments.observation)
-    return trajectory if task.black_box else observations.fitted(trajectory, simulator_shapes(task))
+    return None if arguments.observation is None else read_for(task, arguments.observation)
 
 
 def _seeds(arguments: argparse.Namespace) -> range:
@@ -390,28 +465,28 @@ def _seeds(arguments: argparse.Namespace) -> range:
     return range(arguments.first_seed, arguments.first_seed + arguments.seeds)
 
 
-def summary_table(folder: Path, plan: Plan) -> Table:
+def summary_table(plan: BatchPlan, runs: Sequence[Run]) -> Table:
     """What came out: one line a configuration, over its seeds."""
-    beliefs = [run_store.read_belief(folder / name) for name in plan.folders()]
-    lines = session.results(folder, plan)
+    lines = executing.results(plan, runs)
     table = Table("configuration", "seeds", "theta error [95 %]", "median", "traj. error", "success", "final support")
     for column in table.columns[:-1]:
         column.no_wrap = True
-    for configuration in dict.fromkeys(lane.configuration for lane in plan.lanes):
-        own = [i for i, lane in enumerate(plan.lanes) if lane.configuration == configuration]
+    natural = [plan.task.space.box_to_natural(run.belief.support) for run in runs]
+    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
+        own = [i for i, spec in enumerate(plan.specs) if spec.configuration == configuration]
         column = lambda name, own=own: np.array([lines[i][name] for i in own])
         error = column("theta_error")
         trajectory = column("trajectory_error")
-        low = np.median([np.asarray(beliefs[i].support.low) for i in own], axis=0)
-        high = np.median([np.asarray(beliefs[i].support.high) for i in own], axis=0)
+        low = np.median([np.asarray(natural[i].low) for i in own], axis=0)
+        high = np.median([np.asarray(natural[i].high) for i in own], axis=0)
         table.add_row(
-            configuration,
+            escape(configuration),
             str(len(own)),
             _with_interval(error),
             "-" if np.isnan(error).any() else f"{np.median(error):.2f}",
             "-" if np.isnan(trajectory).all() else f"{np.nanmean(trajectory):.2f}",
             f"{np.mean(column('success_rate')):.0%}",
-            " ".join(f"[{a:.2g}, {b:.2g}]" for a, b in zip(low, high, strict=True)),
+            escape(" ".join(f"[{a:.2g}, {b:.2g}]" for a, b in zip(low, high, strict=True))),
         )
     return table
 
@@ -432,3 +507,25 @@ def bootstrap_interval(values: np.ndarray, level: float = 0.95) -> tuple[float, 
     means = np.mean(rng.choice(values, (BOOTSTRAP, len(values))), axis=1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
+
+
+def _say(console: Console, text: str) -> None:
+    """A line as it is: names of folders and tasks are no markup."""
+    console.print(escape(text), soft_wrap=True, highlight=False)
+
+
+def _warn(console: Console, text: str) -> None:
+    console.print(escape(f"warning: {text}"), style="yellow", soft_wrap=True, highlight=False)
+
+
+COMMANDS = {
+    "tasks": tasks,
+    "infer": infer,
+    "compare": compare,
+    "grid": grid_command,
+    "resume": resume,
+    "sample": sample,
+    "diagnose": diagnose,
+    "report": report,
+}
+"""The function of each command, by its name."""

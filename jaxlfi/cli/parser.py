@@ -8,32 +8,37 @@ before jax starts can be set after the arguments are known.
 """
 
 import argparse
+import dataclasses
 import itertools
 import json
 import math
 import os
 import sys
-from collections.abc import Sequence
+import traceback
+from collections.abc import Mapping, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import NoReturn
 
 import jaxlfi
 from jaxlfi import flags, source_fields
+from jaxlfi.fields import Declared
 
 PRESETS = ("quick", "paper")
 METHODS = ("bayessim", "apt", "npe")
-HEURISTICS = "jaxlfi.heuristics"
-"""The entry-point group of heuristics."""
+HEURISTICS, ESTIMATORS = "jaxlfi.heuristics", "jaxlfi.estimators"
+"""The entry-point groups of classes whose fields have flags."""
+SETTINGS = "jaxlfi.bayessim.settings:Settings"
+"""The class whose fields are the settings of a run."""
 FILE_WIDTH = 120
-"""Characters a line where the output is no terminal."""
+"""Characters in a line of output that goes to a file or a pipe."""
 
 GLOSSARY = """\
 names and symbols:
   support         Theta, the box the parameters are drawn from; it is what the heuristics adapt
   feasible        Phi, the limits that no adapted support leaves
 """
-"""What `--help` explains before the heuristics' hyperparameters."""
+"""The part of the glossary in `--help` that is not made from the heuristics' hyperparameters."""
 
 MAIN_EXAMPLES = """\
 examples:
@@ -85,12 +90,12 @@ DIAGNOSE_EXAMPLES = """\
 Truths are drawn from the prior over a support and simulated, and the run's method is asked for the posterior of each:
 by its network, where the run had one round and kept it (--method npe, or --rounds 1 --keep-network), else by repeating
 the whole inference side by side, in chunks that are saved as they end. A command that was stopped goes on when it is
-given again. It takes about as long as that many runs; the exit status is 0 whatever comes out.
+given again. It takes about as long as that many runs; the exit status is 0 whatever the verdicts.
 
 checks:
   rank          of each truth among its draws, by parameter (simulation-based calibration)
   coverage      how often the densest region of a level holds the truth; around random points (TARP)
-  classifier    accuracy at telling truths from draws, given the simulation
+  classifier    accuracy of a classifier that separates truths from draws, given the simulation
   predictive    whether the run's own observation looks like simulations of its own posterior
 verdicts:
   over-confident, under-confident: posteriors are too narrow, too wide; biased low, high: they lie below, above
@@ -112,15 +117,58 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
-def parser(heuristics: flags.Families | None = None) -> argparse.ArgumentParser:
+@dataclasses.dataclass(frozen=True)
+class Families:
+    """Classes whose fields have flags, by the names they are registered by or as `module:Class`.
+
+    Attributes:
+        heuristics: their sources.
+        estimators: their sources.
+    """
+
+    heuristics: Mapping[str, source_fields.Source]
+    estimators: Mapping[str, source_fields.Source]
+
+    @staticmethod
+    def of(words: Sequence[str]) -> "Families":
+        """All that are installed, and those that the words name, as their sources describe them."""
+        heuristics = [*_values(words, "--heuristic"), *(word.partition("+")[2] for word in words)]
+        return Families(
+            *(
+                source_fields.of_group(group) | {name: source_fields.of_class(name) for name in named if ":" in name}
+                for group, named in ((HEURISTICS, heuristics), (ESTIMATORS, _values(words, "--estimator")))
+            )
+        )
+
+    @property
+    def rules(self) -> flags.Families:
+        """Fields of the heuristics."""
+        return {name: source.fields for name, source in self.heuristics.items()}
+
+    @property
+    def networks(self) -> flags.Families:
+        """Fields of the estimators."""
+        return {name: source.fields for name, source in self.estimators.items()}
+
+
+def _values(words: Sequence[str], flag: str) -> list[str]:
+    """What the words give for a flag."""
+    after = [value for word, value in itertools.pairwise([*words, ""]) if word == flag]
+    return after + [word.removeprefix(f"{flag}=") for word in words if word.startswith(f"{flag}=")]
+
+
+def _run_fields() -> Mapping[str, Declared]:
+    return source_fields.of_class(SETTINGS).fields
+
+
+def parser(families: Families | None = None) -> argparse.ArgumentParser:
     """The whole command line.
 
     Args:
-        heuristics: those whose hyperparameters have flags; by default all that are installed.
+        families: classes whose fields have flags; by default all that are installed.
     """
-    if heuristics is None:
-        heuristics = {name: source.fields for name, source in source_fields.of_group(HEURISTICS).items()}
-    glossary = GLOSSARY + flags.glossary(heuristics)
+    families = Families.of(()) if families is None else families
+    glossary = GLOSSARY + flags.glossary(families.rules)
     formatter = argparse.RawDescriptionHelpFormatter
     top = OneLineParser(
         prog="jaxlfi",
@@ -149,13 +197,23 @@ def parser(heuristics: flags.Families | None = None) -> argparse.ArgumentParser:
         nargs="+",
         type=float,
         metavar="X",
-        help="your own support's lower bounds, one a parameter",
+        help="your own support's lower bounds, one a parameter, in natural units",
     )
     infer.add_argument("--support-high", nargs="+", type=float, metavar="X", help="its upper bounds")
     infer.add_argument(
-        "--heuristic", default="edge", metavar="NAME", help=_heuristic_help("how the support is adapted", heuristics)
+        "--simulations",
+        type=Path,
+        metavar="FILE",
+        help="an .npz of simulations made before, in place of the first round's: theta [N, D] in natural units, "
+        "trajectory [N, ...] or summaries x [N, S], and where they were not drawn uniformly log_density [N]",
     )
-    _add_shared(infer, heuristics, seeds=1)
+    infer.add_argument(
+        "--heuristic",
+        default="edge",
+        metavar="NAME",
+        help=_registered("how the support is adapted", families.rules, "edge"),
+    )
+    _add_shared(infer, families, seeds=1)
 
     compare = commands.add_parser(
         "compare",
@@ -170,7 +228,7 @@ def parser(heuristics: flags.Families | None = None) -> argparse.ArgumentParser:
         metavar="SUPPORT[+HEURISTIC]",
         help="what to compare (default: ok, misspecified, broad, and misspecified with edge, mode, centre)",
     )
-    _add_shared(compare, heuristics, seeds=4)
+    _add_shared(compare, families, seeds=4)
 
     grid = commands.add_parser(
         "grid",
@@ -191,15 +249,18 @@ def parser(heuristics: flags.Families | None = None) -> argparse.ArgumentParser:
         "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
     )
     grid.add_argument(
-        "--heuristic", default="edge", metavar="NAME", help=_heuristic_help("whose hyperparameters vary", heuristics)
+        "--heuristic",
+        default="edge",
+        metavar="NAME",
+        help=_registered("whose hyperparameters vary", families.rules, "edge"),
     )
     grid.add_argument(
-        "--lanes-per-chunk",
+        "--runs-per-chunk",
         type=int,
         metavar="N",
         help="runs computed and saved together (default: as many as there is memory for)",
     )
-    _add_shared(grid, heuristics, seeds=4, networks=False)
+    _add_shared(grid, families, seeds=4, networks=False)
 
     resume = commands.add_parser(
         "resume",
@@ -241,6 +302,11 @@ def parser(heuristics: flags.Families | None = None) -> argparse.ArgumentParser:
     )
     diagnose.add_argument("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
     diagnose.add_argument(
+        "--task",
+        metavar="TASK",
+        help="what was inferred, for a run that was made in Python (default: the task recorded with the run)",
+    )
+    diagnose.add_argument(
         "--against",
         type=Path,
         metavar="FILE",
@@ -268,51 +334,55 @@ def foreign_commands() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group="jaxlfi.commands")}
 
 
-def heuristics_of(words: Sequence[str]) -> dict[str, source_fields.Source]:
-    """All installed heuristics, and those that the words name by `module:Class`, as their sources describe them."""
-    named = [after for word, after in itertools.pairwise([*words, ""]) if word == "--heuristic"]
-    named += [word.removeprefix("--heuristic=") for word in words if word.startswith("--heuristic=")]
-    named += [word.partition("+")[2] for word in words]
-    own = {name: source_fields.of_class(name) for name in named if ":" in name}
-    return source_fields.of_group(HEURISTICS) | own
-
-
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """The arguments.
 
-    Where the source of a heuristic does not show all its hyperparameters, and there are flags that nothing else knows,
-    the heuristic is imported, and jax with it.
+    Where the source of a class does not show all its fields, and there are flags that nothing else knows, the class is
+    imported, and jax with it.
 
     Raises:
         ValueError: if that fails.
     """
-    sources = heuristics_of(words)
-    fields = {name: source.fields for name, source in sources.items()}
-    arguments, unknown = parser(fields).parse_known_args(words)
-    used = _heuristics_used(arguments)
-    if unknown and any(not source.complete for name, source in sources.items() if name in used):
+    families = Families.of(words)
+    arguments, unknown = parser(families).parse_known_args(words)
+    if not unknown:
+        return arguments
+    rules, networks = _rules_used(arguments), {getattr(arguments, "estimator", None)} - {None}
+    if any(not families.heuristics[name].complete for name in rules & set(families.heuristics)) or any(
+        not families.estimators[name].complete for name in networks & set(families.estimators)
+    ):
         prepare_jax(arguments)
-        from jaxlfi.heuristics import registry
-
-        fields |= {name: registry.hyperparameters(registry.load(name)) for name in used}
-    return parser(fields).parse_args(words) if unknown else arguments
+        families = _imported(families, rules, networks)
+    return parser(families).parse_args(words)
 
 
-def _heuristics_used(arguments: argparse.Namespace) -> set[str]:
+def _imported(families: Families, rules: set[str], networks: set[str]) -> Families:
+    """The families with what some classes really declare."""
+    from jaxlfi.estimators import registry as estimators
+    from jaxlfi.fields import declared
+    from jaxlfi.heuristics import registry as heuristics
+
+    real = lambda registry, names: {
+        name: source_fields.Source(declared(registry.load(name)), complete=True) for name in names
+    }
+    return Families(
+        {**families.heuristics, **real(heuristics, rules)}, {**families.estimators, **real(estimators, networks)}
+    )
+
+
+def _rules_used(arguments: argparse.Namespace) -> set[str]:
     """Names of the heuristics that a command is going to use, right or wrong."""
     configured = getattr(arguments, "configurations", None) or ()
     named = [getattr(arguments, "heuristic", None), *(word.partition("+")[2] for word in configured)]
     return {name for name in named if name}
 
 
-def _heuristic_help(what: str, heuristics: flags.Families) -> str:
-    registered = ", ".join(name for name in heuristics if ":" not in name)
-    return f"{what}: {registered}, or your own as module:Class (default: edge)"
+def _registered(what: str, families: flags.Families, default: str) -> str:
+    names = ", ".join(name for name in families if ":" not in name)
+    return f"{what}: {names}, or your own as module:Class (default: {default})"
 
 
-def _add_shared(
-    command: argparse.ArgumentParser, heuristics: flags.Families, seeds: int, networks: bool = True
-) -> None:
+def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int, networks: bool = True) -> None:
     """Arguments that `infer`, `compare` and `grid` have in common; `grid` saves no networks."""
     command.add_argument(
         "task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory; NAME,key=value sets options"
@@ -346,76 +416,36 @@ def _add_shared(
         command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
 
     rounds = command.add_argument_group("rounds (default: the preset's)")
-    rounds.add_argument("--rounds", type=int, metavar="N", help="inference rounds, N_LFI")
-    rounds.add_argument("--simulations-per-round", type=int, metavar="N", help="simulations added each round, at most")
-    rounds.add_argument(
-        "--simulation-budget", type=int, metavar="N", help="simulations attempted each round, failures included"
-    )
-    rounds.add_argument(
-        "--correction", metavar="NAME", help="from the network to the posterior: none, paper, importance"
-    )
-    rounds.add_argument("--restriction", metavar="NAME", help="how draws are kept in the support: clip, reject")
-    rounds.add_argument(
-        "--defensive",
-        type=float,
-        metavar="X",
-        help="share of proposals drawn from the prior over the support",
-    )
-
+    flags.add(rounds, {"run": _run_fields()}, into="settings", defaults=False)
     network = command.add_argument_group("network and training (default: the preset's)")
-    network.add_argument("--family", metavar="NAME", help="mdn, or a normalizing flow: maf, nsf")
-    network.add_argument("--loss", metavar="NAME", help="likelihood; atomic, combined: no correction needed")
-    network.add_argument("--transforms", type=int, metavar="N", help="transforms of a flow")
-    network.add_argument("--hidden", type=int, nargs="+", metavar="N", help="units of each hidden layer")
-    network.add_argument("--activation", metavar="NAME", help="relu, tanh or silu")
-    network.add_argument("--components", type=int, metavar="K", help="Gaussians in each network's mixture")
-    network.add_argument("--prune", type=float, metavar="X", help="components of less weight than this are dropped")
-    network.add_argument("--ensemble-size", type=int, metavar="N", help="networks in the ensemble")
-    network.add_argument("--normaliser", metavar="NAME", help="what is done to summaries: zscore, asinh, none")
-    network.add_argument("--epochs", type=int, metavar="N", help="full passes over the data each round")
-    network.add_argument("--steps", type=int, metavar="N", help="gradient steps each round, in place of --epochs")
-    network.add_argument("--batch-size", type=int, metavar="N", help="simulations in a minibatch")
-    network.add_argument("--learning-rate", type=float, metavar="X", help="Adam's step size")
-    network.add_argument("--weight-decay", type=float, metavar="X", help="decoupled weight decay")
-    network.add_argument("--clip-norm", type=float, metavar="X", help="norm the gradients are clipped to (inf: not)")
-    network.add_argument("--schedule", metavar="NAME", help="of the learning rate: constant, cosine")
     network.add_argument(
-        "--validation", type=float, metavar="X", help="fraction held out to choose the best weights by"
+        "--estimator", metavar="NAME", help=_registered("the density estimator", families.networks, "the method's")
     )
-    network.add_argument(
-        "--patience", type=int, metavar="N", help="passes without a better validation loss; 0: no limit"
-    )
-    network.add_argument(
-        "--warm-start",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="train on from the last round's weights, or start anew (then mode matches components first)",
-    )
-
+    flags.add(network, families.networks, into="settings", defaults=False)
     hyper = command.add_argument_group("heuristics (one number, or one a parameter)")
-    flags.add(hyper, heuristics, into="hyperparameters", several=True)
-    command.set_defaults(hyperparameters={})
+    flags.add(hyper, families.rules, into="hyperparameters", several=True)
+    command.set_defaults(settings={}, hyperparameters={})
 
 
 def _add_machine(command: argparse.ArgumentParser) -> None:
     """Arguments about how, not what."""
     command.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
+    command.add_argument("--debug", action="store_true", help="show where an error came from")
     command.add_argument("--no-cache", action="store_true", help="compile anew, without the cache of compiled programs")
 
 
 def prepare_jax(arguments: argparse.Namespace) -> None:
     """Set what must be set before jax starts.
 
-    On CPU jax sees one device, and lanes of small networks do not fill it: with as many devices as cores,
-    each takes its share of the lanes. A single lane stays on one device, whose matrix products then use all
-    cores.
+    On CPU jax sees one device, and runs of small networks do not fill it: with as many devices as cores, each takes
+    its part of a batch. A single run stays on one device, whose matrix products then use all cores.
     """
-    lanes = _lanes(arguments)
+    runs = _runs(arguments)
     flags = os.environ.get("XLA_FLAGS", "")
-    if lanes > 1 and "xla_force_host_platform_device_count" not in flags:
-        devices = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, lanes)
+    if runs > 1 and "xla_force_host_platform_device_count" not in flags:
+        devices = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, runs)
         if recorded := _recorded(arguments).get("devices"):
-            devices = recorded  # the same lanes on the same number of devices repeat bit for bit
+            devices = recorded  # the same batch on the same number of devices repeats bit for bit
         os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={devices}".strip()
     if not getattr(arguments, "no_cache", True):
         from jaxlfi.io import compile_cache
@@ -423,11 +453,13 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
         compile_cache.enable()
 
 
-def _lanes(arguments: argparse.Namespace) -> int:
-    """How many lanes a command is going to have, as far as its arguments tell."""
+def _runs(arguments: argparse.Namespace) -> int:
+    """How many runs a command is going to have, as far as its arguments show."""
     if arguments.command == "resume":
         recorded = _recorded(arguments)
-        return len(recorded.get("lanes") or ()) + bool(recorded.get("axes")) * 2  # a grid does not list its lanes
+        return (
+            len(recorded.get("runs") or ()) if isinstance(recorded.get("runs"), list) else 2
+        )  # a grid does not list its runs
     if arguments.command == "compare":
         return arguments.seeds * len(arguments.configurations or "default")
     if arguments.command == "grid":
@@ -472,18 +504,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         from rich.console import Console
 
-        from jaxlfi.cli.parser import commands
+        from jaxlfi.cli import commands
 
         console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
         try:
-            prepared = getattr(commands, arguments.command)(arguments, console)
+            prepared = commands.COMMANDS[arguments.command](arguments, console)
         except (ValueError, OSError) as error:
-            return _refuse(error)
+            return _refuse(error, getattr(arguments, "debug", False))
         if prepared is not None:
             try:
                 commands.run(*prepared, arguments, console)
             except commands.EXPECTED as error:
-                return _refuse(error)
+                return _refuse(error, getattr(arguments, "debug", False))
     except KeyboardInterrupt:
         advice = f"; continue with: jaxlfi resume {prepared[0]}" if prepared else ""
         if arguments.command == "diagnose":
@@ -493,8 +525,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _refuse(error: Exception) -> int:
-    """Tell of an error in one line."""
+def _refuse(error: Exception, debug: bool = False) -> int:
+    """Report an error in one line, and where it came from on request."""
+    if debug:
+        traceback.print_exception(error)
     text = " ".join(str(error).split()) or type(error).__name__
     print(f"jaxlfi: error: {text}", file=sys.stderr)
     return 2

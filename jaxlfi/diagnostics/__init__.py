@@ -1,6 +1,6 @@
 """Diagnostics: how far a posterior is from the truth, whether it is calibrated, and where it piles up on a bound."""
 
-from jaxlfi.diagnostics.bounds import bound_warnings, edge_mass
+from jaxlfi.diagnostics.bounds import bound_evidence, bound_summary, bound_warnings, edge_mass
 from jaxlfi.diagnostics.c2st import c2st
 from jaxlfi.diagnostics.calibration import (
     OK,
@@ -34,6 +34,8 @@ __all__ = [
     "Histogram",
     "PredictiveCheck",
     "Uniformity",
+    "bound_evidence",
+    "bound_summary",
     "bound_warnings",
     "c2st",
     "compared",

@@ -391,6 +391,14 @@ def _limits(config: Mapping[str, Any], side: str, dim: int) -> np.ndarray | None
     return array if array.shape == (dim,) else None
 
 
+def heuristic_name(description: Any) -> str:
+    """The name of a heuristic that config.json describes: of the rule itself where another one wraps it."""
+    inner = description.get("hyperparameters") if isinstance(description, Mapping) else None
+    if isinstance(inner, Mapping) and isinstance(inner.get("rule"), Mapping):
+        return heuristic_name(inner["rule"])
+    return _name(description, "none")
+
+
 def _name(value: Any, default: str) -> str:
     """A name given as text or as {"name": ...}."""
     if isinstance(value, Mapping):
@@ -401,5 +409,5 @@ def _name(value: Any, default: str) -> str:
 def _configuration(config: Mapping[str, Any]) -> str:
     if isinstance(config.get("configuration"), str) and config["configuration"]:
         return config["configuration"]
-    support, heuristic = _name(config.get("support"), "support"), _name(config.get("heuristic"), "none")
+    support, heuristic = _name(config.get("support"), "support"), heuristic_name(config.get("heuristic"))
     return support if heuristic in ("none", "fixed") else f"{support}+{heuristic}"

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxlfi.figures import statistics
 from jaxlfi.figures.collection import Collection
+from jaxlfi.figures.history import heuristic_name
 from jaxlfi.figures.style import Look, looks, unit_label
 
 
@@ -84,7 +85,9 @@ def render(collection: Collection, pictures: Sequence[Picture]) -> str:
     """
     config = collection.config
     first = next(iter(collection.runs.values()))[0]
-    task = _short(config.get("task") or first.config.get("task") or collection.folder.name)
+    task = _short(
+        config.get("task") or first.config.get("task") or first.config.get("task_name") or collection.folder.name
+    )
     title = f"{task}: {len(collection.table)} run{'s' if len(collection.table) != 1 else ''} of jaxlfi"
     return _document(
         title,
@@ -101,8 +104,9 @@ def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
         config: the grid's config.json.
         pictures: in their order on the page.
     """
-    heuristic = config["heuristic"]["name"]
-    title = f"{_short(config['task'])}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
+    heuristic = heuristic_name(config["heuristic"])
+    task = _short(config["task"] or config["task_name"])
+    title = f"{task}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
     varied = [f"{axis['name']}: {', '.join(f'{v:g}' for v in axis['values'])}" for axis in config["axes"]]
     facts = {
         "Hyperparameters": "; ".join(varied),

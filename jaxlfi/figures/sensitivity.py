@@ -18,7 +18,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.history import read_arrays, read_config
+from jaxlfi.figures.history import heuristic_name, read_arrays, read_config
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH, plain
 
 FORMAT = "jaxlfi-grid"
@@ -103,7 +103,7 @@ def load(folder: Path) -> Grid:
             tuple(tuple(arrays[f"values/{name}"].tolist()) for name in names),
             tuple(float(defaults[name]) for name in names),
             {name: arrays[name] for name in measures},
-            config["heuristic"]["name"],
+            heuristic_name(config["heuristic"]),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{folder}: expected config.json and grid.npz of one grid, got: {error!r}") from error
