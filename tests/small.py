@@ -6,12 +6,11 @@ import functools
 import jax
 import pytest
 
-from envs import gaussian_linear
-from jaxlfi.bayessim.algorithm import Settings
 from jaxlfi.bayessim import batch as lanes
+from jaxlfi.bayessim.algorithm import Settings
 from jaxlfi.estimators.estimator import Estimator
 
-TASK = "envs.gaussian_linear:task"
+TASK = "jaxlfi.envs.gaussian_linear:task"
 # Few and small steps: training amplifies rounding, and runs that ought to be equal are compared to a
 # tolerance.
 SETTINGS = Settings(

@@ -18,7 +18,6 @@ if "XLA_FLAGS" not in os.environ:  # read once, when jax starts
 
 import jax
 
-from envs.lotka_volterra import task as lotka_volterra
 from jaxlfi import QUICK, infer
 from jaxlfi.bayessim.keys import key_of
 from jaxlfi.heuristics import Edge
