@@ -46,11 +46,11 @@ from jaxlfi.tasks.task import Task
 
 Prepared = tuple[Path, tuple[BatchPlan, Observed] | Work]
 EXPECTED = (SimulatorError, CheckpointError, run_store.StoreError)
-"""Errors of a run that are the input's, and reported in one line."""
+"""Errors that the input of a run causes; they are reported in one line."""
 LOW_MASS = 0.01
-"""Mass of the posterior inside its support below which draws from it are warned of."""
+"""Mass of the posterior inside its support below which `jaxlfi sample` warns."""
 BOOTSTRAP = 2000
-"""Resamples of an interval."""
+"""Bootstrap resamples for the interval of a mean."""
 CONFIGURATION_DEFAULTS = ("ok", "misspecified", "broad")
 """Supports that are compared by default, where the task has them."""
 
@@ -175,6 +175,7 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
         return _resume_grid(folder, console)
     config = run_store.read_config(folder)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
+        executing.clean(folder)
         _say(console, _COMPLETE.format(folder=folder))
         return None
     plan = executing.reopen(folder)
@@ -528,4 +529,4 @@ COMMANDS = {
     "diagnose": diagnose,
     "report": report,
 }
-"""What prepares or does a command, by its name."""
+"""The function of each command, by its name."""

@@ -17,11 +17,11 @@ from jaxlfi.distributions.truncation import MASS_DRAWS, mass_inside, rejection_s
 from jaxlfi.estimators.density import Density
 
 MAP_STARTS = 16
-"""Draws of the highest density from which the mode is looked for."""
+"""Number of gradient ascents towards the mode, each from one of the draws of highest density."""
 MAP_STEPS = 300
-"""Steps of Adam from each."""
+"""Steps of Adam in each ascent."""
 MAP_RATE = 0.02
-"""Their length at first, as a fraction of half the support's width; it falls to zero by the last."""
+"""Adam's initial step size, as a fraction of half the support's width; it decays to zero."""
 
 
 @struct.dataclass

@@ -13,20 +13,20 @@ from jaxlfi.io.serialise import json_safe
 
 
 def write_bytes(path: Path, content: bytes, durable: bool = False) -> None:
-    """Write beside the file, then move into its place.
+    """Write a temporary file in the same folder, then move it into place.
 
     Args:
         path: where to.
         content: all of it.
         durable: wait until it is on the disk, so that it also outlives a loss of power.
     """
-    beside = path.with_name(path.name + ".part")
-    with beside.open("wb") as file:
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
         file.write(content)
         if durable:
             file.flush()
             os.fsync(file.fileno())
-    beside.replace(path)
+    part.replace(path)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -45,18 +45,13 @@ def append_line(path: Path, line: str) -> None:
         file.write(line)
 
 
-def keep_lines(path: Path, count: int) -> None:
-    """Cut a file of lines down to its first `count`, where it exists.
-
-    Raises:
-        ValueError: where it has fewer whole lines.
-    """
+def keep_lines(path: Path, count: int) -> int:
+    """Cut a file of lines down to its first `count` whole ones, where it exists; returns how many it has now."""
     content = path.read_bytes() if path.exists() else b""
-    lines = content.splitlines(keepends=True)[:count]
-    if len(lines) < count or (lines and not lines[-1].endswith(b"\n")):
-        raise ValueError(f"{path}: expected at least {count} whole lines, got {len(lines)}")
+    lines = [line for line in content.splitlines(keepends=True)[:count] if line.endswith(b"\n")]
     if content:
         os.truncate(path, sum(map(len, lines)))
+    return len(lines)
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compress: bool = True, durable: bool = False) -> None:
