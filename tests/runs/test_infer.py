@@ -18,6 +18,8 @@ from jaxlfi.runs.load import load
 from jaxlfi.tasks.host import SimulatorError
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
+pytestmark = pytest.mark.filterwarnings("ignore::jaxlfi.SupportWarning")
+
 OBSERVED = np.array([0.8, -0.6], np.float32)
 ARRAYS = ("posterior.npz", "dataset.npz", "history.npz", "observation.npz")
 
