@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import os
 
 import jax
 import pytest
@@ -79,11 +80,12 @@ def command(*arguments: str) -> int:
 def whole_runs(tmp_path_factory):
     """What tests of whole runs need of jax; import this into their module.
 
-    A cache of compiled programs, shared with processes that a test starts: compiling is nearly all that these
-    tests wait for, and is done without most optimisations there too. And no key-reuse checker: it takes a vmapped scan
-    over keys for a reuse (jax 0.9.2). Unbatched runs are checked elsewhere.
+    A cache of compiled programs, shared with processes that a test starts and with the other workers: compiling is
+    nearly all that these tests wait for, and is done without most optimisations there too. And no key-reuse checker:
+    it takes a vmapped scan over keys for a reuse (jax 0.9.2). Unbatched runs are checked elsewhere.
     """
-    folder = str(tmp_path_factory.getbasetemp() / "xla")
+    base = tmp_path_factory.getbasetemp()
+    folder = str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "xla")
     with pytest.MonkeyPatch.context() as patch, jax.debug_key_reuse(False):
         patch.setenv("JAX_COMPILATION_CACHE_DIR", folder)
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
