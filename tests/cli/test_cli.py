@@ -21,7 +21,7 @@ from jaxlfi.runs import folder as run_store
 from jaxlfi.runs import session
 from jaxlfi.studies import grid as sweep
 from jaxlfi.tasks import registry as tasks
-from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.estimators.estimator import Estimator
 from jaxlfi.heuristics import Mode, registry
 from jaxlfi.bayessim.presets import PRESETS

@@ -13,7 +13,8 @@ from scipy import stats
 from scipy.optimize import brentq, linear_sum_assignment
 from scipy.special import ndtr
 
-from jaxlfi.bayessim.algorithm import Settings, propose
+from jaxlfi.bayessim.algorithm import propose
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate, paired, stretch
 from jaxlfi.heuristics.matching import match

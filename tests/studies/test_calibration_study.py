@@ -31,7 +31,7 @@ from jaxlfi.studies import calibration as diagnose
 from jaxlfi.studies import grid as sweep
 from jaxlfi.studies.calibration import Plan, Subject, repeat
 from jaxlfi.studies.calibration import subject as subjects
-from jaxlfi.tasks.observation import SimulatorError
+from jaxlfi.tasks.host import SimulatorError
 from jaxlfi.tasks import registry as tasks
 from tests.small import SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 

@@ -26,7 +26,7 @@ from jaxlfi.studies import grid as sweep
 from jaxlfi.studies.grid import Axis, Grid, chunks
 from jaxlfi.studies.grid import folder as store
 from jaxlfi.studies.grid.grid import observations
-from jaxlfi.tasks.observation import SimulatorError
+from jaxlfi.tasks.host import SimulatorError
 from tests.small import FLAGS, SETTINGS, command, whole_runs  # noqa: F401 - a fixture
 
 REFERENCE = "tests.test_sweep:task"
