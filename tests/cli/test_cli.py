@@ -75,7 +75,7 @@ BAD = {
     "unknown task": (["infer", "nothing"], "task: expected one of"),
     "no such module": (["infer", "no.such:task"], "cannot load 'no.such:task'"),
     "no task": (["infer", "os:getcwd"], "expected 'os:getcwd' to give a jaxlfi.Task, got str"),
-    "unknown support": (["infer", TASK, "--support", "x"], "support: expected one of ['broad', 'misspecified', 'ok'] or a box"),
+    "unknown support": (["infer", TASK, "--support", "x"], "support: expected one of ['broad', 'misspecified', 'ok']"),
     "unknown heuristic": (["infer", TASK, "--heuristic", "x"], "heuristic: expected one of"),
     "unknown preset": (["infer", TASK, "--preset", "x"], "invalid choice: 'x'"),
     "unknown flag": (["infer", TASK, "--nonsense"], "unrecognized arguments"),
