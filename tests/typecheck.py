@@ -1,7 +1,5 @@
 """The checker that pytest's --jaxtyping-packages applies to every annotated function of the numerical core."""
 
-import typing
-
 from beartype import beartype
 
 
@@ -9,9 +7,6 @@ def checked(function):
     """Check a function's annotations at run time with beartype, but not a constructor's.
 
     The constructors are those of pytrees. JAX rebuilds them around whatever the leaves become (NumPy arrays, shapes,
-    vmap axes, boolean masks, one more axis), none of which the annotations mean. `Self` is known only where a whole class
-    is checked.
+    vmap axes, boolean masks, one more axis), none of which the annotations mean.
     """
-    if function.__name__ == "__init__" or typing.Self in function.__annotations__.values():
-        return function
-    return beartype(function)
+    return function if function.__name__ == "__init__" else beartype(function)
