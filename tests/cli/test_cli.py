@@ -15,6 +15,7 @@ import pytest
 import jaxlfi
 from envs.gaussian_linear import MIXING, NOISE
 from jaxlfi import plugins
+from jaxlfi.bayessim import memory
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli import commands
@@ -25,7 +26,7 @@ from jaxlfi.heuristics import Mode, registry
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import folder as run_store
-from jaxlfi.studies import grid, memory
+from jaxlfi.studies import grid
 from jaxlfi.tasks import observation
 from jaxlfi.tasks import registry as tasks
 from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
@@ -236,8 +237,11 @@ def test_a_seed_has_one_observation_in_all_configurations(comparison):
 
 
 def test_compare_warns_of_posteriors_beyond_the_bounds_of_fixed_supports(comparison):
-    plan, _ = executing.reopen(comparison)
-    warnings = commands.support_warnings(plan, [jaxlfi.load(comparison / name) for name in plan.folders()])
+    names = [run["folder"] for run in run_store.read_config(comparison)["runs"]]
+    runs = [jaxlfi.load(comparison / name) for name in names]
+    specs = tuple(run.spec for run in runs)
+    plan = executing.BatchPlan(run_store.COMPARE, TASK, runs[0].task, None, runs[0].settings, specs)
+    warnings = commands.support_warnings(plan, runs)
     assert any(text.startswith("misspecified:") and "first upper 0 (2 of 2 runs" in text for text in warnings)
     assert not any(text.startswith("misspecified+edge") for text in warnings)
 

@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 from envs import gaussian_linear
-from jaxlfi.bayessim import algorithm
+from jaxlfi.bayessim import algorithm, memory
 from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.diagnostics import POSTERIOR_SAMPLES, discrepancy
@@ -25,7 +25,6 @@ from jaxlfi.heuristics import Centre, Edge, Matched, Mode
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.folder import StoreError
 from jaxlfi.studies import grid as study
-from jaxlfi.studies import memory
 from jaxlfi.studies.grid import Axis, Grid, chunks
 from jaxlfi.studies.grid import folder as store
 from jaxlfi.studies.grid.grid import observations
