@@ -9,6 +9,7 @@ from pathlib import Path
 import hypothesis
 import jax
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 # Tests, and the processes they start, run for milliseconds what would be compiled for seconds. Half of that goes into
 # the newer fusions of XLA, which later versions cannot do without.
@@ -53,8 +54,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture
 def key(request: pytest.FixtureRequest) -> jax.Array:
-    """A typed key of the test's own: the same in every run, another in every test."""
-    return jax.random.key(zlib.crc32(request.node.nodeid.encode()))
+    """A typed key of the test's own: the same in every run and folder, another in every test."""
+    test = request.node.nodeid.partition("::")[2]
+    return jax.random.key(zlib.crc32(f"tests/{request.path.name}::{test}".encode()))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def compiled_once(tmp_path_factory: pytest.TempPathFactory):
+    """A cache of compiled programs, shared by the workers and the processes that tests start: they mostly compile."""
+    base = tmp_path_factory.getbasetemp()
+    folder = str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "xla")
+    for name, value in (("jax_compilation_cache_dir", folder), ("jax_persistent_cache_min_compile_time_secs", 0.2)):
+        os.environ[name.upper()] = str(value)
+        jax.config.update(name, value)
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # processes say nothing of programs that they find compiled
+    compilation_cache.reset_cache()  # so that the folder is looked at
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -63,6 +77,9 @@ def compiling(request: pytest.FixtureRequest):
     jax.config.update("jax_disable_most_optimizations", not getattr(request.module, "OPTIMISED", False))
     yield
     if resident() > MEMORY:
+        from jaxlfi.bayessim import programs  # late, so that shapes are checked from its first import on
+
+        programs.forget()
         jax.clear_caches()
         gc.collect()
         getattr(ctypes.CDLL(None), "malloc_trim", int)(0)  # glibc keeps what is freed between blocks still in use
