@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("experiments/results/trajectories"))
     given = parser.parse_args(arguments)
     task = tasks.load(given.task)
-    if task.truth is None or task.black_box:
+    if task.truth is None or task.on_host:
         parser.error(f"--task: expected one in JAX whose truth is known, got {given.task}")
     trajectories = simulations(task)
     atomic.write_arrays(given.out / f"{task.name}.npz", {"trajectories": trajectories})

@@ -23,7 +23,7 @@ RULES = {
     **{f"matched {name}": Matched(registry.load(name)()) for name in registry.names()},
     "choice": Choice(1, tuple(registry.load(name)() for name in registry.names())),
 }
-DIM, COMPONENTS, PROBLEMS = 3, 4, 8
+DIM, COMPONENTS, PROBLEMS = 3, 4, 3
 every_rule = pytest.mark.parametrize("name", RULES)
 
 
@@ -42,6 +42,9 @@ def problem(seed: int) -> tuple[Belief, GaussianMixture, Support]:
 PROBLEM = problem(0)
 
 
+applied = jax.jit(lambda rule, problem: rule(*problem))
+
+
 def close(a, b) -> None:
     """To rounding: two programs may order their sums differently."""
     chex.assert_trees_all_close(a, b, rtol=1e-4, atol=1e-5)
@@ -53,7 +56,7 @@ def test_rules_that_have_to_be_tested_are():
 
 @every_rule
 def test_it_returns_a_belief_and_an_adaptation_of_their_shapes(name):
-    belief, adaptation = RULES[name](*PROBLEM)
+    belief, adaptation = applied(RULES[name], PROBLEM)
     assert isinstance(belief, Belief) and isinstance(adaptation, Adaptation)
     chex.assert_trees_all_equal_shapes_and_dtypes(belief, PROBLEM[0])
     assert all(np.shape(seen)[-1:] == (DIM,) for seen in adaptation.evidence.values())
@@ -64,7 +67,7 @@ def test_it_returns_a_belief_and_an_adaptation_of_their_shapes(name):
 @pytest.mark.parametrize("seed", range(3))
 def test_its_support_is_a_box_within_phi_and_its_shifts_say_how_it_moved(name, seed):
     previous, posterior, feasible = problem(seed)
-    belief, adaptation = RULES[name](previous, posterior, feasible)
+    belief, adaptation = applied(RULES[name], (previous, posterior, feasible))
     low, high = np.asarray(belief.support.low), np.asarray(belief.support.high)
     assert (low < high).all() and (low >= feasible.low).all() and (high <= feasible.high).all()
     np.testing.assert_allclose(adaptation.low_shift, low - previous.support.low, atol=1e-6)
@@ -77,9 +80,8 @@ def test_its_support_is_a_box_within_phi_and_its_shifts_say_how_it_moved(name, s
 def test_its_belief_is_the_posteriors(name):
     """On whatever box: components may be reordered, nothing else."""
     _, posterior, _ = PROBLEM
-    belief, _ = RULES[name](*PROBLEM)
-    assert bool(belief.informed)
-    theta = np.random.default_rng(5).uniform(-2, 2, (20, DIM)).astype(np.float32)
+    belief, _ = applied(RULES[name], PROBLEM)
+    theta = jnp.asarray(np.random.default_rng(5).uniform(-2, 2, (20, DIM)), jnp.float32)
     np.testing.assert_allclose(belief.mixture.log_prob(theta), posterior.log_prob(theta), rtol=1e-4, atol=1e-4)
 
 
@@ -87,28 +89,27 @@ def test_its_belief_is_the_posteriors(name):
 def test_before_the_first_round_too(name):
     """There is no posterior yet that components could be compared with."""
     _, posterior, feasible = PROBLEM
-    belief, adaptation = RULES[name](uninformed(PROBLEM[0].support, COMPONENTS), posterior, feasible)
+    belief, adaptation = applied(RULES[name], (uninformed(PROBLEM[0].support, COMPONENTS), posterior, feasible))
     chex.assert_tree_all_finite((belief, adaptation))
-    assert bool(belief.informed)
 
 
 @every_rule
 def test_compiled_is_eager(name):
-    close(jax.jit(RULES[name])(*PROBLEM), RULES[name](*PROBLEM))
+    close(applied(RULES[name], PROBLEM), RULES[name](*PROBLEM))
 
 
 @every_rule
 def test_a_batch_is_a_loop(name):
     """Over problems, and over the leaves of the rule."""
     rule, problems = RULES[name], [problem(seed) for seed in range(PROBLEMS)]
-    one = jax.jit(lambda rule, problem: rule(*problem))
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
-    batch = jax.jit(jax.vmap(one, in_axes=(None, 0)))(rule, stacked)
-    close(batch, jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one(rule, each) for each in problems)))
-    rules = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * 2), rule)
-    twice = jax.jit(jax.vmap(one, in_axes=(0, None)))(rules, PROBLEM)
-    for place in range(2):
-        close(jax.tree.map(lambda leaf, place=place: leaf[place], twice), one(rule, PROBLEM))
+    batch = jax.jit(jax.vmap(applied, in_axes=(None, 0)))(rule, stacked)
+    close(batch, jax.tree.map(lambda *leaves: jnp.stack(leaves), *(applied(rule, each) for each in problems)))
+    if jax.tree.leaves(rule):
+        rules = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * 2), rule)
+        twice = jax.jit(jax.vmap(applied, in_axes=(0, None)))(rules, PROBLEM)
+        for place in range(2):
+            close(jax.tree.map(lambda leaf, place=place: leaf[place], twice), applied(rule, PROBLEM))
 
 
 @every_rule
@@ -120,7 +121,6 @@ def test_it_is_a_tree_of_its_hyperparameters(name):
     assert jax.tree.leaves(again) == leaves
     if not isinstance(rule, Matched | Choice):
         assert len(leaves) == sum(not field.static for field in declared(rule).values())
-    assert hash(structure) == hash(jax.tree.structure(registry.load(name)() if name in registry.names() else rule))
 
 
 @every_rule
@@ -143,7 +143,7 @@ def test_its_leaves_can_be_one_value_for_each_parameter(name):
     vector = lambda leaf: jnp.full(DIM, leaf, jnp.float32) if isinstance(leaf, float) else leaf
     rule = jax.tree.map(vector, RULES[name])
     registry.check(rule, DIM)
-    close(jax.jit(rule)(*PROBLEM), jax.jit(RULES[name])(*PROBLEM))
+    close(applied(rule, PROBLEM), applied(RULES[name], PROBLEM))
 
 
 @every_rule
@@ -152,7 +152,7 @@ def test_it_is_written_and_read_back(name):
     text = json.dumps(describe.heuristic_to_json(rule), allow_nan=False)
     again = describe.heuristic_from_json(json.loads(text))
     assert again == rule and type(again) is type(rule)
-    close(again(*PROBLEM), rule(*PROBLEM))
+    close(applied(again, PROBLEM), applied(rule, PROBLEM))
 
 
 @pytest.mark.parametrize("name", registry.names())
