@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from envs import gaussian_linear
 from jaxlfi.bayessim.algorithm import Settings
 from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.diagnostics import bound_warnings, edge_mass
 from jaxlfi.distributions.belief import Belief, rejected
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.estimator import Estimator
 from jaxlfi.heuristics import Choice, Edge, Fixed
 from jaxlfi.tasks.task import Task

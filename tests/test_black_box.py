@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from envs.gaussian_linear import MIXING, NOISE, posterior
 from jaxlfi.bayessim.host import simulate_within_budget
+from jaxlfi.envs.gaussian_linear import MIXING, NOISE, posterior
 from jaxlfi.heuristics import Edge, Fixed
 from jaxlfi.tasks.observation import SimulatorError
 from tests.small import SETTINGS, command, gaussian, whole_runs  # noqa: F401 - a fixture

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from envs.gaussian_linear import MIXING, NOISE
 from jaxlfi import plugins
 from jaxlfi.bayessim import memory
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli import commands
 from jaxlfi.cli import parser as cli
+from jaxlfi.envs.gaussian_linear import MIXING, NOISE
 from jaxlfi.estimators import registry as estimators
 from jaxlfi.fields import declared
 from jaxlfi.heuristics import Mode, registry
@@ -356,7 +356,7 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, monkeypatch, capsys):
 def registered(monkeypatch):
     """One task that works and one whose package is broken."""
     points = [
-        EntryPoint("linear", "envs.gaussian_linear:task", tasks.GROUP),
+        EntryPoint("linear", "jaxlfi.envs.gaussian_linear:task", tasks.GROUP),
         EntryPoint("broken", "no.such.module:task", tasks.GROUP),
     ]
     monkeypatch.setattr(tasks, "entry_points", lambda group: points)
@@ -399,7 +399,7 @@ def test_tasks_take_options():
     with pytest.raises(ValueError, match="failed: ValueError: heat: expected a value of type float, got 'much'"):
         tasks.load("tests.cli.test_cli:oven,heat=much")
     with pytest.raises(ValueError, match="expected options among none"):
-        tasks.load("envs.gaussian_linear:task,object=dlo-0")
+        tasks.load("jaxlfi.envs.gaussian_linear:task,object=dlo-0")
     for wrong in (
         "tests.cli.test_cli:oven,heat",
         "tests.cli.test_cli:oven,heat=",

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import gaussian_linear
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.base import untrained
 from jaxlfi.estimators.flow_estimators import MaskedFlow, SplineFlow
 from jaxlfi.estimators.mixture_network import MixtureNetwork

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from envs import gaussian_linear
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.cli import parser as cli
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.base import untrained
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.normaliser import Normaliser

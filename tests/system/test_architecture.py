@@ -15,14 +15,14 @@ import jaxlfi
 
 ROOT = pathlib.Path(jaxlfi.__file__).parents[1]
 PACKAGES = ("jaxlfi", "envs", "experiments")
-ENVS = "envs"
+ENVS = "jaxlfi.envs"
 """What the folder envs/ is imported as."""
 FORBIDDEN = {
     "jaxlfi": {ENVS, "envs", "experiments", "tests"},
-    "envs": {"experiments", "tests"},
-    "experiments": set(),
+    "envs": {"envs", "experiments", "tests"},
+    "experiments": {"envs"},
 }
-"""Strictly downward: experiments -> envs -> jaxlfi."""
+"""Strictly downward: experiments -> envs -> jaxlfi; the folder envs/ is the package jaxlfi.envs, and nothing else."""
 LAYERS = (
     ("distributions",),
     ("tasks",),
@@ -35,7 +35,7 @@ LAYERS = (
 """Packages of jaxlfi, from the ground up: each imports those below it, and none beside or above it."""
 LEAVES = ("io", "fields", "plugins", "source_fields", "flags")
 """Modules that every layer may import, and that import no layer."""
-BESIDE = {"figures": {"figures"}, "plot": {"figures"}, "__main__": {"cli"}, "counter_rng": set()}
+BESIDE = {"figures": {"figures"}, "plot": {"figures"}, "__main__": {"cli"}}
 """Modules that are no part of the layers, and all of jaxlfi that they import."""
 NETWORKS = ("jaxlfi.estimators", "jaxlfi.bayessim", "flax.linen", "optax")
 
