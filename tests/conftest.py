@@ -40,8 +40,8 @@ MEMORY = 1000 * 2**20
 
 
 LONG = (
-    "test_lotka_volterra_mjp", "test_sweep", "test_whip_engines", "test_whip_real2sim", "test_cli", "test_apt",
-    "test_figures", "test_heuristics", "test_flows", "test_diagnose", "test_bayessim", "test_run_store",
+    "test_lotka_volterra_mjp", "test_grid", "test_whip_engines", "test_whip_real2sim", "test_cli", "test_apt",
+    "test_figures", "test_heuristics", "test_flows", "test_calibration_study", "test_bayessim", "test_run_store",
     "test_lynx_hare", "test_fitting",
 )  # fmt: skip
 """Files of half a minute and more."""

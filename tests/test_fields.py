@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import cli, describe, fields, flags, plugins, source_fields
-from jaxlfi.estimator import Estimator
+from jaxlfi import fields, flags, plugins, source_fields
+from jaxlfi.bayessim.presets import PRESETS
+from jaxlfi.cli import parser as cli
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.fields import Checked, hyperparameter, option
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate, registry
-from jaxlfi.presets import PRESETS
-from jaxlfi.support import Support
+from jaxlfi.runs import describe
 from tests import small
 
 OWN = {"centre": Centre, "edge": Edge, "mode": Mode, "none": Fixed, "truncate": Truncate}
@@ -245,7 +247,7 @@ def run_help(folder, *words: str) -> str:
     script = (
         "import atexit, sys; heavy = {'jax', 'numpy', 'swelling'}; "
         "atexit.register(lambda: print('imported:', [name for name in sys.modules if name in heavy])); "
-        f"sys.path.insert(0, {str(folder)!r}); import jaxlfi.cli as c; c.main(sys.argv[1:])"
+        f"sys.path.insert(0, {str(folder)!r}); import jaxlfi.cli.parser as c; c.main(sys.argv[1:])"
     )
     done = subprocess.run([sys.executable, "-c", script, *words, "--help"], capture_output=True, text=True, check=True)
     *told, last = done.stdout.splitlines()
@@ -451,7 +453,7 @@ def test_another_packages_rule_survives_its_description(swelling):
 BAD_DESCRIPTIONS = {
     "an old one": {"name": "edge", "matched": False, "hyperparameters": {}},
     "not installed": {"name": "gone", "hyperparameters": {}},
-    "no heuristic": {"name": "jaxlfi.estimator:Estimator", "hyperparameters": {}},
+    "no heuristic": {"name": "jaxlfi.estimators.mixture_network:MixtureNetwork", "hyperparameters": {}},
     "unknown values": {"name": "edge", "hyperparameters": {"gain": 1}},
     "wrong values": {"name": "edge", "hyperparameters": {"tail": 2}},
     "missing values": {"name": "jaxlfi.heuristics.matching:Matched", "hyperparameters": {}},
@@ -474,9 +476,11 @@ def test_what_cannot_be_written_is_refused_by_name():
 @pytest.mark.parametrize("preset", PRESETS)
 def test_settings_hold_their_estimator_by_name(preset):
     described = json.loads(json.dumps(describe.settings_to_json(PRESETS[preset]), allow_nan=False))
-    assert described["estimator"]["name"] == "jaxlfi.estimator:Estimator"
+    assert described["estimator"]["name"] == "mdn"
     assert identical(describe.settings_from_json(described), PRESETS[preset])
-    assert set(described["estimator"]["hyperparameters"]) == {field.name for field in dataclasses.fields(Estimator)}
+    assert set(described["estimator"]["hyperparameters"]) == {
+        field.name for field in dataclasses.fields(MixtureNetwork)
+    }
 
 
 def test_name_of_a_class_leads_back_to_it():

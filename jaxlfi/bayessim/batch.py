@@ -143,7 +143,7 @@ def update_one(
 
 def check_draws(run: RunInputs, state: State, index: Int[Array, ""] | int) -> tuple[Float[Array, "samples dim"], Array]:
     """Draws of the posterior after a round, in inference space, and the key of their simulations."""
-    key_draw, key_simulate = jax.random.split(run_keys(run.key).of_check(index))
+    key_draw, key_simulate = run_keys(run.key).of_predictive(index)
     posterior = posterior_after(state.belief, state.network, run.x)
     return posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference"), key_simulate
 

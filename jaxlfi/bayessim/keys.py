@@ -30,6 +30,11 @@ class RunKeys:
         """Of one round's comparison; the last posterior's saved draws come after those of all rounds."""
         return jax.random.fold_in(self.check, index)
 
+    def of_predictive(self, index: Int[Array, ""] | int) -> tuple[jax.Array, jax.Array]:
+        """Of one round's posterior draws, and of their simulations."""
+        draw, simulate = jax.random.split(self.of_check(index))
+        return draw, simulate
+
 
 class RoundKeys(NamedTuple):
     """Of one round: proposals, their simulations, and all that comes after."""

@@ -281,7 +281,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
         with RoundProgress(console, plan.settings.rounds, done, label) as progress:
             on_round = lambda index, row: progress.advance()
             runs = executing.execute(plan, observed, folder, on_round, progress.compiled)
-    except SimulatorError:
+    except Exception:
         if arguments.command != "resume" and not executing.rounds_done(folder):
             shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from
         raise
@@ -327,9 +327,9 @@ def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: Console) -> None:
     try:
         arrays = grid.advance(folder, work, console)
-    except SimulatorError:
-        if arguments.command != "resume":
-            shutil.rmtree(folder)  # raised in the first chunk only: there is nothing in it to go on from
+    except Exception:
+        if arguments.command != "resume" and not (folder / "chunks").exists():
+            shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from
         raise
     console.print(marginal_table(work.grid, arrays))
     _say(console, f"table: {folder / 'table.csv'}")

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
@@ -52,10 +53,10 @@ def discrepancy(key: jax.Array, task: Task, theta: Float[Array, "samples dim"], 
 def compared(
     task: Task,
     theta: Float[Array, "samples dim"],
-    trajectory: Array,
-    x: Float[Array, "samples obs"],
-    failure: Int[Array, " samples"],
-    observed: Array,
+    trajectory: Array | np.ndarray,
+    x: Float[Array | np.ndarray, "samples obs"],
+    failure: Int[Array | np.ndarray, " samples"],
+    observed: Array | np.ndarray,
 ) -> Discrepancy:
     """Simulations of posterior draws, compared with truth and observation.
 

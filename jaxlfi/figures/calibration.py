@@ -120,7 +120,7 @@ def _draw_curve(figure: Figure, arrays: Arrays, name: str, xlabel: str, ylabel: 
         low, high = (_with_ends(side) for side in arrays[band])
         axes.fill_between(level, low, high, color=BAND, alpha=opacity, linewidth=0)
     axes.plot([0, 1], [0, 1], color="#555555", linewidth=0.6)
-    axes.plot(level, _with_ends(arrays[name]), color=COLOUR, gid="share")
+    axes.plot(level, _with_ends(arrays[name]), color=COLOUR, gid="fraction")
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel=xlabel, ylabel=ylabel)
     axes.set_aspect("equal")
     axes.grid(True)

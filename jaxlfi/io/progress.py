@@ -36,7 +36,7 @@ class RoundProgress:
         self._label = label = escape(label)  # names of tasks are no markup
         self._began = time.monotonic()
         columns = (
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("rounds,"),
@@ -53,7 +53,9 @@ class RoundProgress:
         if self._bar:
             self._bar.start()
         else:
-            self._console.print(f"{self._label}: {self._rounds - self._done} of {self._rounds} rounds to do")
+            self._console.print(
+                f"{self._label}: {self._rounds - self._done} of {self._rounds} rounds to do", markup=False
+            )
         return self
 
     def __exit__(

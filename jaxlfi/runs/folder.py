@@ -110,8 +110,12 @@ def refuse_occupied(folder: Path) -> None:
     """Refuse to write where something is.
 
     Raises:
-        StoreError: if the folder exists and is not empty, or is a file.
+        StoreError: if the folder exists and is not empty, or is a file, or a link to nothing.
     """
+    if folder.is_symlink() and not folder.exists():
+        raise StoreError(
+            f"out: expected a new or empty folder, got {str(folder)!r}, a symbolic link to something that is not there"
+        )
     if folder.is_symlink() and not folder.exists():
         raise StoreError(f"out: expected a new folder, got {str(folder)!r}, a link that leads nowhere")
     if not folder.exists():

@@ -155,7 +155,7 @@ def posteriors(
         return one
 
     if run.amortised:
-        console.print(f"{run.task.name}: conditioning the run's network on {plan.truths} simulations")
+        console.print(f"{run.task.name}: conditioning the run's network on {plan.truths} simulations", markup=False)
         store.compute(filled(amortised_chunks(run, plan)))
     else:
         chunks = len(store.chunks)

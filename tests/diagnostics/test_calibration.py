@@ -95,7 +95,7 @@ def test_the_p_value_of_calibrated_ranks_is_what_it_says(count, draws):
     p_values = np.array([result.p_value for result in results])
     for level in (0.05, 0.3):
         assert np.mean(p_values <= level) == pytest.approx(level, abs=0.015 + 3 * np.sqrt(level / 400))
-    z = np.array([[result.shift, result.spread] for result in results])
+    z = np.array([[result.shift, result.dispersion] for result in results])
     np.testing.assert_allclose(z.mean(0), 0, atol=0.2)
     np.testing.assert_allclose(z.std(0), 1, atol=0.15)
 
@@ -106,7 +106,7 @@ def test_the_simultaneous_band_is_the_test():
     for scale in np.linspace(0.4, 1.6, 200):
         result = uniformity(np.floor(101 * stats.norm.cdf(scale * rng.normal(size=80))).astype(int), 100, tests=3)
         low, high = result.simultaneous
-        outside = np.any((result.share < low - 1e-9) | (result.share > high + 1e-9))
+        outside = np.any((result.fraction < low - 1e-9) | (result.fraction > high + 1e-9))
         left.append((outside, result.p_value <= SIGNIFICANCE))
     outside, rejected = np.array(left).T
     np.testing.assert_array_equal(outside, rejected)
@@ -171,7 +171,7 @@ def test_a_truth_outside_the_support_is_a_miss():
     rank = np.asarray(density_ranks(jax.random.key(0), truth, draws))
     assert (rank[:50] == 50).all()
     assert coverage_verdict(uniformity(rank, 50)) == module.OVER
-    assert uniformity(rank, 50).share_at(0.9) == pytest.approx(0.9 * 0.75, abs=0.06)
+    assert uniformity(rank, 50).fraction_at(0.9) == pytest.approx(0.9 * 0.75, abs=0.06)
 
 
 def test_ranks_are_the_same_compiled_and_in_a_loop():

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from jaxlfi.diagnostics import bound_evidence, bound_summary, bound_warnings, edge_mass
+from jaxlfi.diagnostics.bounds import MASS_BEYOND
 from jaxlfi.distributions.belief import Belief
-from jaxlfi.diagnostics import MASS_BEYOND, bound_evidence, bound_summary, bound_warnings, edge_mass
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 from tests.strategies import boxes, mixtures, shapes, vectors

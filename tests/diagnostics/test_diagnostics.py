@@ -4,14 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi.bayessim.algorithm import host as black_box
+import jaxlfi
+from jaxlfi.diagnostics import POSTERIOR_SAMPLES, compared, discrepancy, not_simulated, trajectory_distance
 from jaxlfi.distributions.belief import Belief
-from jaxlfi.diagnostics import discrepancy, trajectory_distance
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.posterior import truncated
+from jaxlfi.tasks.simulation import simulate_batch
 from jaxlfi.tasks.task import Task
 
-see = jax.jit(discrepancy, static_argnames=("task", "restriction", "n"))
+compare = jax.jit(discrepancy, static_argnames="task")
 BOX = Support([0.0, -2.0], [4.0, 6.0])
 PHI = Support([-10.0, -2.0], [10.0, 10.0])
 
@@ -24,6 +26,17 @@ def belief(means=((1.0, 0.0), (3.5, 1.0)), scales=((0.5, 1.0), (0.4, 0.3)), logi
 def task(simulate=lambda key, theta: theta, **changes) -> Task:
     arguments = {"names": ("mass", "drag"), "supports": {"guess": BOX}, "feasible": PHI, "truth": [1.0, 2.0]}
     return Task(simulate, **(arguments | changes))
+
+
+def draws(key, task: Task, belief: Belief, n: int) -> jax.Array:
+    """Draws of a belief's posterior, in inference space."""
+    return truncated(belief.mixture, belief.mixture, belief.support, task.space).sample(key, n, space="inference")
+
+
+def see(key, task: Task, belief: Belief, observed, n: int = POSTERIOR_SAMPLES):
+    """The discrepancy of a belief."""
+    key_draw, key_simulate = jax.random.split(key)
+    return compare(key_simulate, task, draws(key_draw, task, belief, n), observed)
 
 
 # ------------------------------------------------------------------------------------------------ distances
@@ -95,18 +108,18 @@ def test_summaries_are_those_of_the_trajectories_and_nan_where_there_are_none(ke
     assert bool(jnp.isnan(seen.x[~usable]).all()) and seen.x.shape == (50, 3)
 
 
-def test_summaries_of_a_black_box(key, monkeypatch):
+def test_summaries_of_a_host_simulator(key):
     def simulate(rng, theta):
         return np.arange(5.0)[:, None] * theta[:, None], theta[:, 0] > 1.0
 
-    problem = task(simulate, black_box=True, summary=lambda trajectory: jnp.sum(trajectory, axis=0))
-    drawn = jnp.asarray(np.random.default_rng(0).uniform(0, 3, (2, 20, 2)), jnp.float32)
-    monkeypatch.setattr(black_box, "_draw", lambda restriction, key, place: (drawn[place], key))
-    seen = black_box.discrepancies(jax.random.split(key, 2), problem, jnp.arange(2), jnp.zeros((2, 5, 2)), "clip")
-    failed = np.asarray(drawn[..., 0] <= 1.0)
-    assert seen.x.shape == (2, 20, 2) and 0 < failed.sum() < 40
+    problem = task(jaxlfi.HostSimulator(simulate), summary=lambda trajectory: jnp.sum(trajectory, axis=0))
+    theta = jnp.asarray(np.random.default_rng(0).uniform(0, 3, (20, 2)), jnp.float32)
+    seen = compared(problem, theta, *simulate_batch(key, problem, theta, (5, 2)), jnp.zeros((5, 2)))
+    failed = np.asarray(theta[:, 0] <= 1.0)
+    assert seen.x.shape == (20, 2) and 0 < failed.sum() < 20
     np.testing.assert_allclose(seen.x[~failed], 10 * seen.theta[~failed], rtol=1e-5)
     assert bool(jnp.isnan(seen.x[failed]).all()) and bool(jnp.isnan(seen.trajectory_error[failed]).all())
+    assert bool(jnp.isfinite(seen.trajectory_error[~failed]).all()) and int(seen.simulated) == 20
 
 
 def test_trajectories_that_are_not_finite_have_no_distance(key):
@@ -123,7 +136,7 @@ def test_without_a_truth_parameters_have_no_error(key):
     assert bool(jnp.isfinite(seen.trajectory_error).all())
 
 
-def test_errors_are_in_coordinates_and_trajectories_in_natural_units(key):
+def test_errors_are_in_inference_space_and_trajectories_in_natural_units(key):
     log_task = task(
         log=("drag",),
         supports={"guess": Support([0.0, 0.5], [4.0, 6.0])},
@@ -134,10 +147,18 @@ def test_errors_are_in_coordinates_and_trajectories_in_natural_units(key):
     np.testing.assert_allclose(seen.theta_error[:, 1], np.abs(seen.theta[:, 1] - np.log(2.0)), rtol=1e-4, atol=1e-6)
 
 
-def test_the_restriction_is_chosen_by_name(key):
-    """Far above the box, clipping puts all draws on the bound and rejection none."""
+def test_without_simulations_only_the_truth_is_compared_with(key):
+    theta, observed = draws(key, task(), belief(), 6), jnp.outer(jnp.arange(5.0), jnp.array([1.0, 2.0]))
+    seen = not_simulated(task(moving), theta, observed, obs=3)
+    np.testing.assert_allclose(seen.theta_error, np.abs(np.asarray(theta) - [1.0, 2.0]), rtol=1e-5, atol=1e-6)
+    assert (seen.trajectory_error.shape, seen.trajectory.shape, seen.x.shape) == ((6,), (6, 5, 2), (6, 3))
+    for unknown in (seen.trajectory_error, seen.trajectory, seen.x):
+        assert bool(jnp.isnan(unknown).all())
+    assert int(seen.simulated) == 0
+
+
+def test_draws_outside_of_the_box_are_neither_kept_nor_moved_to_its_bound(key):
+    """Nearly all of the mixture lies above the box."""
     far = belief(means=((1.0, 20.0), (1.0, 20.0)))
-    again, problem, observed = jax.random.clone(key), task(), jnp.array([1.0, 2.0])
-    clipped = see(key, problem, far, observed, restriction="clip", n=10).theta
-    rejected = see(again, problem, far, observed, restriction="reject", n=10).theta
-    assert (np.asarray(clipped[:, 1]) == 6.0).all() and (np.asarray(rejected[:, 1]) < 6.0).all()
+    theta = see(key, task(), far, jnp.array([1.0, 2.0]), n=10).theta
+    assert (np.asarray(theta[:, 1]) < 6.0).all() and bool(BOX.contains(theta).all())

@@ -1,9 +1,10 @@
-"""Sensitivity grids: every lane is the run it stands for, however the grid is cut, stopped or shared out."""
+"""Sensitivity grids: every run is the one it stands for, however the grid is cut, stopped or shared out."""
 
 import csv
 import dataclasses
 import json
 import os
+import pathlib
 import shutil
 import socket
 import subprocess
@@ -15,26 +16,28 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jaxlfi.bayessim import algorithm as bayessim
+from jaxlfi.bayessim import algorithm, memory
+from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.keys import run_keys
-from jaxlfi.diagnostics import discrepancy
+from jaxlfi.diagnostics import POSTERIOR_SAMPLES, discrepancy
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Centre, Edge, Matched, Mode
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.folder import StoreError
-from jaxlfi.studies import grid as sweep
+from jaxlfi.studies import grid as study
 from jaxlfi.studies.grid import Axis, Grid, chunks
 from jaxlfi.studies.grid import folder as store
 from jaxlfi.studies.grid.grid import observations
-from jaxlfi.tasks.observation import SimulatorError
+from jaxlfi.tasks.host import HostSimulator, SimulatorError
 from tests.small import FLAGS, SETTINGS, command, whole_runs  # noqa: F401 - a fixture
 
-REFERENCE = "tests.test_sweep:task"
+REFERENCE = "tests.studies.test_grid:task"
 AXES = (Axis("mass_threshold", (0.005, 0.9)), Axis("expansion", (0.1, 0.5)))
 SEEDS = (3, 0, 1)
 LENGTH = 5
-"""Lanes in a chunk: twelve lanes make three chunks, of which the last is more padding than lanes."""
+"""Runs in a chunk: twelve runs make three chunks, of which the last is more padding than runs."""
 QUIET = Console(quiet=True)
+CHUNKS = pathlib.Path("nowhere")
 
 
 def task():
@@ -68,23 +71,24 @@ def make_grid(**changes) -> Grid:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
     """A whole grid: its folder, its work with the compiled engine, its arrays."""
-    folder = tmp_path_factory.mktemp("sweep") / "grid"
-    work = sweep.begin(folder, make_grid(), lanes_per_chunk=LENGTH)
-    return folder, work, sweep.advance(folder, work, QUIET)
+    folder = tmp_path_factory.mktemp("grids") / "grid"
+    work = study.begin(folder, make_grid(), runs_per_chunk=LENGTH)
+    return folder, work, study.advance(folder, work, QUIET)
 
 
 @jax.jit
 def alone(key, rule, observed, x):
     """One run by itself as one program, and its posterior's discrepancies."""
     support = TASK.support("misspecified")
-    _, info = bayessim.run(run_keys(key).run, TASK, SETTINGS, rule, x, support)
-    belief = jax.tree.map(lambda leaf: leaf[-1], info.belief)
-    last = jax.random.fold_in(run_keys(key).diagnose, SETTINGS.rounds - 1)
-    return info, discrepancy(last, TASK, belief, observed)
+    state, info = algorithm.run(run_keys(key).run, TASK, SETTINGS, rule, x, support)
+    key_draw, key_simulate = jax.random.split(run_keys(key).of_check(SETTINGS.rounds - 1))
+    posterior = posterior_after(state.belief, state.network, x)
+    theta = posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference")
+    return info, discrepancy(key_simulate, TASK, theta, observed)
 
 
-def test_every_lane_is_the_run_of_its_values_and_seed(finished):
-    """By `bayessim.run`, summed up in plain NumPy. Tolerances are for batched arithmetic, as in test_lanes."""
+def test_every_run_is_that_of_its_values_and_seed(finished):
+    """By `algorithm.run`, summed up in plain NumPy. Tolerances are for batched arithmetic."""
     _, work, arrays = finished
     for i, threshold in enumerate(AXES[0].values):
         for j, expansion in enumerate(AXES[1].values):
@@ -115,7 +119,7 @@ def test_shapes_and_axes_of_the_arrays(finished):
     folder, _, arrays = finished
     stored = atomic.read_arrays(folder / "grid.npz")
     assert set(stored) == set(arrays) == {
-        "axes", "values/mass_threshold", "values/expansion", "seeds", "names", *sweep.MEASURES,
+        "axes", "values/mass_threshold", "values/expansion", "seeds", "names", *study.MEASURES,
     }  # fmt: skip
     assert stored["axes"].tolist() == ["mass_threshold", "expansion"]
     assert stored["values/expansion"].tolist() == [0.1, 0.5] and stored["seeds"].tolist() == [3, 0, 1]
@@ -138,54 +142,55 @@ def test_the_table_has_a_line_for_each_combination_and_seed(finished):
             assert float(line[name]) == arrays[name][place]
 
 
-def test_a_lane_does_not_depend_on_its_chunk(finished):
+def test_a_run_does_not_depend_on_its_chunk(finished):
     """The same program with other neighbours, at another place in the chunk: the same bits."""
     _, work, arrays = finished
     turned = make_grid(axes=AXES[::-1], seeds=SEEDS[::-1])
-    observed, x = work.observed[::-1], work.x[::-1]
-    other = sweep.Work(turned, observed, x, LENGTH, work.engine)
-    again = sweep.assemble(turned, [sweep.run_chunk(other, i) for i in range(3)])
-    for name in sweep.MEASURES:
+    other = study.Work(turned, work.observed[::-1], work.x[::-1], LENGTH)
+    parts = [(study.run_chunk(other, places)[0], len(places)) for places in store.store_of(CHUNKS, other).chunks]
+    results = {name: np.concatenate([part[name][:count] for part, count in parts]) for name in study.MEASURES}
+    again = study.arranged(turned, results)
+    for name in study.MEASURES:
         np.testing.assert_array_equal(np.swapaxes(again[name], 0, 1)[:, :, ::-1], arrays[name], err_msg=name)
 
 
 def test_one_chunk_gives_what_several_give(finished):
     """Another length is another program: equal to what training makes of rounding."""
     _, _, arrays = finished
-    whole = sweep.measure(make_grid())
-    for name in sweep.MEASURES:
+    whole = study.measure(make_grid())
+    for name in study.MEASURES:
         np.testing.assert_allclose(whole[name], arrays[name], rtol=5e-3, atol=5e-3, err_msg=name)
 
 
 def interrupted(folder, work, monkeypatch, after: int) -> None:
     """Run until a chunk is about to begin."""
-    original = sweep.run_chunk
+    original = study.run_chunk
 
-    def stop(work, index, *rest):
-        if index == after:
+    def stop(work, places, *rest):
+        if places.start == after * LENGTH:
             raise KeyboardInterrupt
-        return original(work, index, *rest)
+        return original(work, places, *rest)
 
     with monkeypatch.context() as patch:
         patch.setattr(store, "run_chunk", stop)
         with pytest.raises(KeyboardInterrupt):
-            sweep.advance(folder, work, QUIET)
+            study.advance(folder, work, QUIET)
 
 
 def test_a_resumed_grid_computes_what_is_missing_to_the_same_bits(finished, tmp_path, monkeypatch):
     folder, work, _ = finished
     broken = tmp_path / "broken"
-    sweep.create(broken, work)
+    study.create(broken, work)
     interrupted(broken, work, monkeypatch, after=2)
     (broken / "chunks" / "000.npz").unlink()  # as if another machine had lost it
     kept = (broken / "chunks" / "001.npz").read_bytes()
     assert not (broken / "grid.npz").exists()
-    computed, original = [], sweep.run_chunk
+    computed, original = [], study.run_chunk
     monkeypatch.setattr(
-        store, "run_chunk", lambda work, index, *rest: computed.append(index) or original(work, index, *rest)
+        store, "run_chunk", lambda work, places, *rest: computed.append(places) or original(work, places, *rest)
     )
     assert command("resume", broken, "--no-figures") == 0
-    assert computed == [0, 2] and (broken / "chunks" / "001.npz").read_bytes() == kept
+    assert computed == [range(5), range(10, 12)] and (broken / "chunks" / "001.npz").read_bytes() == kept
     for name in ("grid.npz", "table.csv", "observation.npz"):
         assert (broken / name).read_bytes() == (folder / name).read_bytes(), name
     ours, theirs = (json.loads((f / "config.json").read_text()) for f in (broken, folder))
@@ -236,15 +241,16 @@ SPOILED = {
     "settings": (lambda _, config: config["settings"].update(rounds=3), "got changed ones"),
     "axis": (lambda _, config: config["axes"][0]["values"].reverse(), "got changed ones"),
     "seeds": (lambda _, config: config["seeds"].append(9), "got changed ones"),
-    "chunk length": (lambda _, config: config.update(lanes_per_chunk=4), "got changed ones"),
+    "chunk length": (lambda _, config: config.update(runs_per_chunk=4), "got changed ones"),
     "task": (lambda _, config: config.update(task="jaxlfi.envs.gaussian_linear:broken"), "complete description"),
     "parameters": (lambda _, config: config.update(names=["a", "b"]), "got changed ones"),
     "missing part": (lambda _, config: config.pop("axes"), "complete description"),
-    "version": (lambda _, config: config.update(version=9), "expected version 1"),
+    "an older version": (lambda _, config: config.update(version=1), "in another format; run it again"),
+    "version": (lambda _, config: config.update(version=9), "expected version 2 of the format, got 9"),
     "observation": (_truncate("observation.npz"), "expected a whole .npz"),
     "damaged chunk": (_truncate("chunks/001.npz"), "delete it, and resuming computes it again"),
     "chunk of another grid": (_chunk_of_another, "got one of another"),
-    "chunk in the wrong place": (_chunk_in_the_wrong_place, "of 2 lanes"),
+    "chunk in the wrong place": (_chunk_in_the_wrong_place, "of 2 runs"),
 }  # fmt: skip
 
 
@@ -263,68 +269,81 @@ def test_a_task_that_has_changed_is_not_resumed(finished, monkeypatch):
     changed = dataclasses.replace(TASK, truth=np.array([1.0, 0.5]))
     monkeypatch.setattr(store.tasks, "load", lambda reference: changed)
     with pytest.raises(StoreError, match="the task as they were"):
-        sweep.reopen(finished[0])
+        study.reopen(finished[0])
 
 
 def test_nothing_is_overwritten(finished):
     with pytest.raises(StoreError, match="new or empty folder"):
-        sweep.begin(finished[0], make_grid())
+        study.begin(finished[0], make_grid())
 
 
-def test_a_simulator_that_always_fails_is_refused(finished):
+def test_a_simulator_that_always_fails_is_refused(finished, monkeypatch):
     _, work, _ = finished
 
     class Hopeless:
         """An engine whose simulations fail."""
 
-        load = start = lambda *_: None
+        task = TASK
+        start = compile = lambda *_: None
 
         def round(self, state, index):
             """One round."""
-            return None, {
-                "attempted": np.full(LENGTH, 25),
-                "succeeded": np.zeros(LENGTH, int),
-                "failed": np.full((LENGTH, len(TASK.reasons)), 25),
-            }
+            failed = np.full((LENGTH, len(TASK.reasons)), 25)
+            return None, {"attempted": np.full(LENGTH, 25), "succeeded": np.zeros(LENGTH, int), "failed": failed}
 
+    monkeypatch.setattr(chunks, "engine_for", lambda *_: Hopeless())
     with pytest.raises(SimulatorError, match="got none"):
-        sweep.run_chunk(dataclasses.replace(work, engine=Hopeless()), 0)
+        study.run_chunk(work, range(LENGTH))
+
+
+def test_a_grid_of_a_host_simulator(whole_runs):  # noqa: F811 - the fixture
+    def simulate(rng, theta):
+        return theta @ gaussian_linear.MIXING.T + gaussian_linear.NOISE * rng.normal(size=theta.shape)
+
+    problem = dataclasses.replace(gaussian_linear.task(), simulate=HostSimulator(simulate))
+    settings = SETTINGS.replace(rounds=1)
+    axes, rule = (Axis("expansion", (0.1, 0.5)),), Edge(zone_fraction=1.0, mass_threshold=0.1)  # every bound moves
+    arrays = study.measure(make_grid(task=problem, rule=rule, axes=axes, seeds=(4,), settings=settings))
+    np.testing.assert_allclose(arrays["support_high"][:, 0, 0], [0.3, 1.5], rtol=1e-5)
+    np.testing.assert_array_equal(arrays["success_rate"], 1.0)
+    assert np.isfinite(arrays["theta_error"]).all() and np.isfinite(arrays["trajectory_error"]).all()
 
 
 def test_chunks_are_cut_to_the_memory(monkeypatch):
-    """Without compiling: an engine is said to need `each` bytes for each lane of a device."""
+    """Without compiling: a program is said to need `each` bytes for each run of a device."""
     tried, each = [], 0
 
-    def compiled(work):
-        tried.append(work.length)
-        return work, each * work.length
+    def program_bytes(engine):
+        tried.append(engine.runs)
+        return each * engine.runs
 
-    monkeypatch.setattr(chunks, "compiled", compiled)
-    lane = chunks.lane_bytes(sweep.Work(make_grid(), *observations(make_grid()), 1))
-    monkeypatch.setattr(chunks, "free_memory", lambda devices: 1e12)
-    assert sweep.prepare(make_grid()).length == 12
-    assert sweep.prepare(make_grid(), lanes_per_chunk=100).length == 12
-    monkeypatch.setattr(chunks, "free_memory", lambda devices: 7.5 * chunks.PROGRAM_PER_STATE * lane / chunks.SHARE)
-    assert sweep.prepare(make_grid(), lanes_per_chunk=3).length == 3
-    assert sweep.prepare(make_grid()).length == 6  # 7 fit, and two chunks of 6 need no padding
-    # The program turns out to need four times what was estimated: 1.9 lanes fit.
-    each = 4 * chunks.PROGRAM_PER_STATE * lane
+    monkeypatch.setattr(chunks, "program_bytes", program_bytes)
+    one = chunks.run_bytes(study.Work(make_grid(), *observations(make_grid()), 1))
+    monkeypatch.setattr(memory, "free_memory", lambda devices: 1e12)
+    assert study.prepare(make_grid()).length == 12
+    assert study.prepare(make_grid(), runs_per_chunk=100).length == 12
+    room = 7.5 * memory.PROGRAM_PER_STATE * one / memory.FRACTION
+    monkeypatch.setattr(memory, "free_memory", lambda devices: room)
+    assert study.prepare(make_grid(), runs_per_chunk=3).length == 3
+    assert study.prepare(make_grid()).length == 6  # 7 fit, and two chunks of 6 need no padding
+    # The program turns out to need four times what was estimated: 1.9 runs fit.
+    each = 4 * memory.PROGRAM_PER_STATE * one
     tried.clear()
-    assert sweep.prepare(make_grid()).length == 1 and tried == [6, 1]
-    with pytest.raises(ValueError, match="lanes_per_chunk: expected fewer lanes"):
-        sweep.prepare(make_grid(), lanes_per_chunk=12)
+    assert study.prepare(make_grid()).length == 1 and tried == [6, 1]
+    with pytest.raises(ValueError, match="runs_per_chunk: expected fewer runs"):
+        study.prepare(make_grid(), runs_per_chunk=12)
     # Not even the states fit: refused without compiling.
     tried.clear()
-    monkeypatch.setattr(chunks, "free_memory", lambda devices: lane)
+    monkeypatch.setattr(memory, "free_memory", lambda devices: one)
     for given in (None, 2):
         with pytest.raises(ValueError, match="fill the memory"):
-            sweep.prepare(make_grid(), lanes_per_chunk=given)
+            study.prepare(make_grid(), runs_per_chunk=given)
     assert tried == []
 
 
 def test_free_memory_is_shared_by_the_devices_of_a_cpu():
     (device,) = jax.local_devices()[:1]
-    one, two = chunks.free_memory([device]), chunks.free_memory([device] * 2)
+    one, two = memory.free_memory([device]), memory.free_memory([device] * 2)
     assert 2**20 < one < os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     assert two == pytest.approx(one / 2, rel=0.2)
 
@@ -333,7 +352,7 @@ def test_free_memory_is_shared_by_the_devices_of_a_cpu():
 def test_even_lengths_are_the_fewest_equal_chunks(devices):
     for size in range(1, 40):
         for most in range(1, 45):
-            length = chunks.even_length(size, most, devices)
+            length = memory.even_length(size, most, devices)
             step = devices if most >= devices else 1
             assert 1 <= length <= min(most, size)
             assert -(-size // length) == -(-size // min(size, most // step * step))
@@ -341,14 +360,14 @@ def test_even_lengths_are_the_fewest_equal_chunks(devices):
 
 
 def test_heuristics_are_the_product_of_the_axes():
-    assert [(e.mass_threshold, e.expansion) for e in sweep.heuristics(Edge(tail=0.5), AXES)] == [
+    assert [(e.mass_threshold, e.expansion) for e in study.heuristics(Edge(tail=0.5), AXES)] == [
         (0.005, 0.1), (0.005, 0.5), (0.9, 0.1), (0.9, 0.5),
     ]  # fmt: skip
-    matched = sweep.heuristics(Matched(Mode()), [Axis("proximity", (0.2, 0.3))])
+    matched = study.heuristics(Matched(Mode()), [Axis("proximity", (0.2, 0.3))])
     assert [rule.rule.proximity for rule in matched] == [0.2, 0.3]
-    lanes = sweep.grid_lanes(make_grid())
-    assert [lane.seed for lane in lanes[:4]] == [3, 0, 1, 3]
-    assert lanes[3].configuration == "mass_threshold=0.005 expansion=0.5"
+    runs = study.grid_runs(make_grid())
+    assert [run.seed for run in runs[:4]] == [3, 0, 1, 3]
+    assert runs[3].configuration == "mass_threshold=0.005 expansion=0.5"
 
 
 BAD_AXES = {
@@ -378,8 +397,8 @@ def test_other_things_that_are_refused():
     for seeds in ((), (1, 1)):
         with pytest.raises(ValueError, match="seeds: expected"):
             make_grid(seeds=seeds)
-    with pytest.raises(ValueError, match="simulator is in JAX"):
-        make_grid(task=dataclasses.replace(TASK, black_box=True))
+    with pytest.raises(ValueError, match=r"rounds: expected a whole number in \[1, 100000\]"):
+        make_grid(settings=SETTINGS.replace(rounds=0))
 
 
 TWO_DEVICES = """
@@ -406,16 +425,16 @@ def start(script: str, *arguments, devices: int) -> subprocess.Popen:
 
 
 def test_two_devices_give_what_one_gives(finished, tmp_path):
-    """Through the command line; chunks of five on two devices: one lane of each chunk is padding."""
+    """Through the command line; chunks of five on two devices: one run of each chunk is padding."""
     vary = [f"{axis.name}={','.join(map(str, axis.values))}" for axis in AXES]
-    given = ["--vary", *vary, "--support", "misspecified", "--lanes-per-chunk", LENGTH, "--seeds", 2, "--prune", 0]
+    given = ["--vary", *vary, "--support", "misspecified", "--runs-per-chunk", LENGTH, "--seeds", 2, "--prune", 0]
     out = tmp_path / "out"
     process = start(TWO_DEVICES, "grid", REFERENCE, *given, *FLAGS, "--out", out, devices=2)
-    told, _ = process.communicate(timeout=150)
-    assert process.returncode == 0, told
-    assert "in 2 chunks of 5" in told and json.loads((out / "config.json").read_text())["devices"] == 2
+    output, _ = process.communicate(timeout=150)
+    assert process.returncode == 0, output
+    assert "in 2 chunks of 5" in output and json.loads((out / "config.json").read_text())["devices"] == 2
     arrays = atomic.read_arrays(out / "grid.npz")
-    for name in sweep.MEASURES:  # seeds 0 and 1 here, 3, 0 and 1 there
+    for name in study.MEASURES:  # seeds 0 and 1 here, 3, 0 and 1 there
         np.testing.assert_allclose(arrays[name], finished[2][name][:, :, 1:], rtol=5e-3, atol=5e-3, err_msg=name)
 
 
@@ -426,12 +445,12 @@ import jax
 jax.config.update("jax_cpu_collectives_implementation", "gloo")
 jax.distributed.initialize(sys.argv[1], num_processes=2, process_id=int(sys.argv[2]))
 from rich.console import Console
-from jaxlfi.studies import grid as sweep
-from tests.test_sweep import LENGTH, make_grid
+from jaxlfi.studies import grid as study
+from tests.studies.test_grid import LENGTH, make_grid
 assert jax.process_count() == 2 and jax.local_device_count() == 1 and jax.device_count() == 2
 folder = Path(sys.argv[3])
-work = sweep.begin(folder, make_grid(), lanes_per_chunk=LENGTH)
-sweep.advance(folder, work, Console())
+work = study.begin(folder, make_grid(), runs_per_chunk=LENGTH)
+study.advance(folder, work, Console())
 """
 
 
@@ -442,8 +461,8 @@ def test_two_processes_share_the_chunks(finished, tmp_path):
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     processes = [start(TWO_PROCESSES, address, i, tmp_path / "out", devices=1) for i in range(2)]
-    told = [process.communicate(timeout=170)[0] for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], told
-    assert "4 of 4 rounds to do" in told[0] and "2 of 2 rounds to do" in told[1]
+    outputs = [process.communicate(timeout=170)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], outputs
+    assert "4 of 4 rounds to do" in outputs[0] and "2 of 2 rounds to do" in outputs[1]
     for name in ("grid.npz", "table.csv"):
         assert (tmp_path / "out" / name).read_bytes() == (folder / name).read_bytes(), name

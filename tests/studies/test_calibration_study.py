@@ -5,34 +5,30 @@ import json
 import os
 import shutil
 import sys
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi.bayessim import algorithm as bayessim
+import jaxlfi
+from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.cli import parser as cli
-from jaxlfi.distributions.belief import Belief, uninformed
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
-from jaxlfi.estimators.estimator import Estimator, Network, initialise
+from jaxlfi.estimators.base import untrained
+from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.normaliser import Normaliser
-from jaxlfi.estimators.posterior import truncated_draws, truncated_log_prob
 from jaxlfi.figures import calibration, checks, style
 from jaxlfi.heuristics import Edge, Fixed
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import folder as run_store
-from jaxlfi.runs.inference import Run
-from jaxlfi.runs.load import network_arrays, read_run
-from jaxlfi.studies import calibration as diagnose
-from jaxlfi.studies import grid as sweep
-from jaxlfi.studies.calibration import Plan, Subject, repeat
-from jaxlfi.studies.calibration import subject as subjects
-from jaxlfi.tasks import registry as tasks
-from jaxlfi.tasks.observation import SimulatorError
+from jaxlfi.runs.run import Origin
+from jaxlfi.studies import calibration as study
+from jaxlfi.studies import grid
+from jaxlfi.studies.calibration import CalibrationPlan, plan
+from jaxlfi.tasks.host import SimulatorError
 from tests.small import SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 X = np.array([-0.6, -0.3], np.float32)
@@ -46,23 +42,26 @@ def make(out, support: str, heuristic, rounds: int, scale: float = 1.0, shift: f
 
     The network is one that nobody has trained; `pretend` looks only at the wrong scale and shift in its normaliser.
     """
-    box, small = gaussian().supports[support], settings(rounds=rounds, estimator=FAST)
-    made = run_store.run_config(
-        task=gaussian(), reference=TASK, support_name=support, support=box, heuristic=heuristic, preset=None,
-        settings=small, seed=0, configuration=support,
-    )  # fmt: skip
+    task, box, small = gaussian(), gaussian().supports[support], settings(rounds=rounds, estimator=FAST)
+    spec = RunSpec(support, support, box, heuristic, seed=0)
+    config = run_store.run_config(task, Origin(TASK, support, support), spec, small)
 
     def fill(beside):
         posterior = gaussian_linear.posterior(X)
         belief = {"logits": posterior.logits, "means": posterior.means, "scale_tril": posterior.scale_tril}
         atomic.write_arrays(beside / "posterior.npz", belief | {"support_low": box.low, "support_high": box.high})
         atomic.write_arrays(beside / "observation.npz", {"trajectory": X, "x": X})
-        state = jax.eval_shape(lambda: bayessim.init(jax.random.key(0), gaussian(), box, small, jnp.asarray(X)))
-        network = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), state.network)
-        wrong = Normaliser(np.full(2, shift, np.float32), np.full(2, scale, np.float32))
-        atomic.write_arrays(beside / "network.npz", network_arrays(network.replace(normaliser=wrong)))
+        nothing = np.zeros((0, 2), np.float32)
+        atomic.write_arrays(beside / "history.npz", {"theta": nothing})
+        empty = {"theta": nothing, "x": nothing, "round": np.zeros(0, np.int32), "weight": np.zeros(0, np.float32)}
+        atomic.write_arrays(beside / "dataset.npz", empty)
+        network = untrained(jax.random.key(0), FAST, len(X), task.inference.feasible, task.space)
+        wrong = Normaliser(np.full(2, shift, np.float32), np.full(2, scale, np.float32), network.normaliser.name)
+        atomic.write_arrays(
+            beside / "network.npz", run_store.named_leaves(jax.device_get(network.replace(normaliser=wrong)))
+        )
 
-    run_store.create(out, made, fill)
+    run_store.create(out, config, fill)
     return out
 
 
@@ -77,13 +76,12 @@ def folder(tmp_path_factory):
 def pretend(monkeypatch):
     """Let networks say the exact posterior, wider by a factor and off by a number of deviations."""
 
-    def posterior(key, estimator, network, x, *_):
+    def density(estimator, network, x):
         wrong, exact = network.normaliser, gaussian_linear.posterior(x)
         offset = wrong.mean * exact.marginal_scales * jnp.array([1.0, -1.0])
-        means, scale_tril = exact.means + offset, wrong.scale[0] * exact.scale_tril
-        return exact.replace(means=means, scale_tril=scale_tril), jnp.asarray(1.0)
+        return exact.replace(means=exact.means + offset, scale_tril=wrong.scale[0] * exact.scale_tril)
 
-    monkeypatch.setattr(repeat, "posterior", posterior)
+    monkeypatch.setattr(MixtureNetwork, "density", density)
 
 
 @pytest.fixture(autouse=True)
@@ -117,8 +115,9 @@ def test_posteriors_are_called_what_they_are(case, pretend, tmp_path, capsys):
     assert (found["final support"]["numbers"]["truths_inside"], found["final support"]["verdict"]) == (100, "")
     # The run's own posterior is exact, whatever is pretended of others.
     assert found["posterior predictive"]["verdict"] == "ok"
-    told = capsys.readouterr().out
-    assert "over-confident" in told if case == "narrow" else "rank of first" in told
+    output = capsys.readouterr().out
+    assert "over-confident" in output if case == "narrow" else "rank of first" in output
+    assert json.loads((folder / "diagnostics" / "diagnostics.json").read_text())["way"] == "amortised"
     arrays = atomic.read_arrays(folder / "diagnostics" / "diagnostics.npz")
     assert arrays["draws"].shape == (100, 60, 2) and arrays["ranks"].shape == (100, 2)
     assert np.asarray(BOX.contains(arrays["draws"])).all()
@@ -139,9 +138,9 @@ def repeated(folder):
 
 
 def test_a_run_of_several_rounds_is_repeated_for_each_truth(repeated, folder):
-    plan, told = (json.loads((repeated / f"{name}.json").read_text()) for name in ("plan", "diagnostics"))
-    assert told["way"] == "repeated" and plan["chunk_length"] == 10 and told["versions"]["jax"]
-    assert told["reference"]["name"] == "ok" and told["run"]["support"]["name"] == "misspecified"
+    begun, found = (json.loads((repeated / f"{name}.json").read_text()) for name in ("plan", "diagnostics"))
+    assert found["way"] == "repeated" and begun["chunk_length"] == 10 and found["versions"]["jax"]
+    assert found["reference"]["name"] == "ok" and found["run"]["support"]["name"] == "misspecified"
     arrays = atomic.read_arrays(repeated / "diagnostics.npz")
     theta = arrays["theta"]
     # Truths are drawn over the task's first support, also where the run's own does not reach.
@@ -177,13 +176,13 @@ def test_pictures_show_the_saved_arrays(repeated):
         upper = np.sum(arrays["ranks"][:, 1] >= 10)  # 21 ranks in two bins: 0 to 9, and 10 to 20
         np.testing.assert_array_equal(arrays["bin_edges"], [0, 10, 21])
         np.testing.assert_array_equal(stairs.get_data().values, [20 - upper, upper])
-        share = line(below, "difference").get_ydata()[1:-1] + arrays["level"]
-        np.testing.assert_allclose(share, [np.mean(arrays["ranks"][:, 1] < k) for k in range(1, 21)])
+        fraction = line(below, "difference").get_ydata()[1:-1] + arrays["level"]
+        np.testing.assert_allclose(fraction, [np.mean(arrays["ranks"][:, 1] < k) for k in range(1, 21)])
         for draw, rank in ((calibration.draw_coverage, "density_ranks"), (calibration.draw_tarp, "distance_ranks")):
             figure = style.new_figure(3.5, 3.9)
             draw(figure, arrays)
-            share = line(figure.axes[0], "share").get_ydata()[1:-1]
-            np.testing.assert_allclose(share, [np.mean(arrays[rank] < k) for k in range(1, 21)])
+            fraction = line(figure.axes[0], "fraction").get_ydata()[1:-1]
+            np.testing.assert_allclose(fraction, [np.mean(arrays[rank] < k) for k in range(1, 21)])
         figure = style.new_figure(7.0, 2.3)
         checks.draw(figure, arrays)
         assert line(figure.axes[1], "observed").get_xdata()[0] == arrays["observed_distance"]
@@ -243,7 +242,7 @@ def test_bad_input_is_one_line(folder, tmp_path, capsys):
         (tmp_path / name).write_text(text)
     np.savez(tmp_path / "shape.npz", theta=np.zeros((30, 3)))
     np.savez(tmp_path / "other.npz", x=np.zeros((30, 2)))
-    for given, told in (
+    for given, expected in (
         (["--truths", 19], "truths: expected at least 20, got 19"),
         (["--draws", 0], "draws: expected at least 20, got 0"),
         (["--seed", -1], "seed: expected at least 0"),
@@ -256,52 +255,57 @@ def test_bad_input_is_one_line(folder, tmp_path, capsys):
         (["--against", tmp_path / "shape.npz"], "shape [n, 2], got [30, 3]"),
         (["--against", tmp_path / "other.npz"], "against: cannot read"),
     ):
-        assert told in refused(capsys, folder, *given)
+        assert expected in refused(capsys, folder, *given)
     assert not (folder / "diagnostics").exists()
 
 
-@pytest.mark.parametrize("kind", ["none", "foreign", "unfinished", "runs", "compare", "grid", "changed"])
+@pytest.mark.parametrize(
+    "kind", ["none", "foreign", "unfinished", "runs", "compare", "grid", "changed", "older", "made in Python"]
+)
 def test_folders_that_cannot_be_diagnosed(kind, folder, tmp_path, capsys):
     if kind == "none":
         assert "no folder" in refused(capsys, tmp_path / "nothing")
         return
     config = json.loads((folder / "config.json").read_text())
-    changes, told = {
+    changes, expected = {
         "foreign": ({"format": "other"}, "not of jaxlfi"),
         "unfinished": ({"status": "running"}, "expected a finished run"),
-        "runs": ({"format": run_store.RUNS, "lanes": [{"folder": "seed_003"}]}, "one/seed_003"),
-        "compare": ({"format": run_store.COMPARE, "lanes": [{"folder": "ok/seed_000"}]}, "one/ok/seed_000"),
-        "grid": ({"format": sweep.GRID}, "got a grid's"),
-        "changed": ({"names": ["other", "second"]}, "expected the task as it was when the run was made"),
+        "runs": ({"format": run_store.RUNS, "runs": [{"folder": "seed_003"}]}, "one/seed_003"),
+        "compare": ({"format": run_store.COMPARE, "runs": [{"folder": "ok/seed_000"}]}, "one/ok/seed_000"),
+        "grid": ({"format": grid.GRID}, "got a grid's"),
+        "changed": ({"parameters": ["other", "second"]}, "expected the task as it was when the run was made"),
+        "older": ({"version": 1}, "in another format; run it again"),
+        "made in Python": ({"task": None}, "--task module:factory names it"),
     }[kind]
     copy = tmp_path / "one"
     shutil.copytree(folder, copy)
     atomic.write_json(copy / "config.json", config | changes)
-    assert told in refused(capsys, copy)
+    assert expected in refused(capsys, copy)
     assert not (copy / "diagnostics").exists()
 
 
 # -------------------------------------------------------------------------------------------------------- truths
 
 
-def subject(folder, **changes) -> Subject:
-    return Subject(read_run(folder), dataclasses.replace(gaussian(), **changes), None)
+def with_task(folder, **changes) -> jaxlfi.Run:
+    """The run, of a task that differs."""
+    return jaxlfi.load(folder).replace(task=dataclasses.replace(gaussian(), **changes))
 
 
 def test_truths_that_fail_are_drawn_again_and_counted(folder):
     def simulate(key, theta):
         return gaussian_linear.simulate(key, theta), theta[0] < 0
 
-    truths = diagnose.draw_truths(subject(folder, simulate=simulate), Plan("ok", truths=200, seed=1))
+    truths = study.draw_truths(with_task(folder, simulate=simulate), CalibrationPlan("ok", truths=200, seed=1))
     assert np.all(truths["theta"][:, 0] < 0) and np.all(truths["theta"][:, 0] > -3)
     residual = truths["x"] - truths["theta"] @ gaussian_linear.MIXING.T
     np.testing.assert_allclose(residual.std(0), gaussian_linear.NOISE, rtol=0.2)
     np.testing.assert_array_equal(truths["observed"], truths["x"])
     # Every success takes two tries on average.
     assert truths["failed"][1] == 0 and 140 < truths["failed"][0] < 270
-    never = subject(folder, simulate=lambda key, theta: (theta, theta[0] > 9))
+    never = with_task(folder, simulate=lambda key, theta: (theta, theta[0] > 9))
     with pytest.raises(SimulatorError, match="got none in 16 tries for 20 of 20"):
-        diagnose.draw_truths(never, Plan("ok", truths=20))
+        study.draw_truths(never, CalibrationPlan("ok", truths=20))
 
 
 def test_reference_samples_are_read_in_natural_units(tmp_path):
@@ -311,29 +315,31 @@ def test_reference_samples_are_read_in_natural_units(tmp_path):
     )  # fmt: skip
     theta = np.random.default_rng(0).uniform(0.5, 2.0, (30, 2))
     np.savez(tmp_path / "theta.npz", theta=theta)
-    read = diagnose.read_reference(tmp_path / "theta.npz", task)
+    read = study.read_reference(tmp_path / "theta.npz", task)
     np.testing.assert_allclose(read, np.stack([theta[:, 0], np.log(theta[:, 1])], axis=1), rtol=1e-5)
     np.savez(tmp_path / "negative.npz", theta=theta * np.array([1.0, -1.0]))
     with pytest.raises(ValueError, match="positive ones of second"):
-        diagnose.read_reference(tmp_path / "negative.npz", task)
+        study.read_reference(tmp_path / "negative.npz", task)
 
 
-def test_a_network_may_first_be_read_while_a_function_is_traced(folder):
-    run = read_run(folder)
-    scale = jax.jit(lambda factor: factor * run.network.normaliser.scale)
-    np.testing.assert_allclose(scale(2.0), 2 * np.asarray(run.network.normaliser.scale))
+def on_host():
+    """The Gaussian task with a host simulator."""
 
-
-def test_a_black_box_is_told_what_is_left_out(folder, tmp_path, monkeypatch, capsys):
     def simulate(rng, theta):
         return theta @ gaussian_linear.MIXING.T + gaussian_linear.NOISE * rng.normal(size=theta.shape)
 
-    monkeypatch.setattr(tasks, "load", lambda name: dataclasses.replace(gaussian(), simulate=simulate, black_box=True))
+    return dataclasses.replace(gaussian(), simulate=jaxlfi.HostSimulator(simulate))
+
+
+def test_a_run_of_a_host_simulator_is_repeated(folder, tmp_path):
     out = tmp_path / "out"
-    assert command("diagnose", folder, "--no-figures", "--out", out) == 0
-    assert "A black box is not repeated for other truths" in capsys.readouterr().out
-    assert list(results(out)) == ["posterior predictive"]
-    assert json.loads((out / "diagnostics.json").read_text())["way"] is None
+    asked = ("--task", "tests.studies.test_calibration_study:on_host", "--truths", 20, "--draws", 20)
+    assert command("diagnose", folder, *asked, "--no-figures", "--out", out) == 0
+    assert json.loads((out / "diagnostics.json").read_text())["way"] == "repeated"
+    arrays = atomic.read_arrays(out / "diagnostics.npz")
+    residual = arrays["x"] - arrays["theta"] @ gaussian_linear.MIXING.T
+    np.testing.assert_allclose(residual.std(0), gaussian_linear.NOISE, rtol=0.6)
+    assert np.corrcoef(arrays["draws"].mean(1)[:, 1], arrays["theta"][:, 1])[0, 1] > 0.7
 
 
 def test_chunks_are_divided_over_as_many_devices_as_they_were_begun_with(tmp_path, monkeypatch):
@@ -344,58 +350,8 @@ def test_chunks_are_divided_over_as_many_devices_as_they_were_begun_with(tmp_pat
     assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=7"
 
 
-@pytest.mark.parametrize("purpose", [subjects.TRUTHS, subjects.DRAWS])
+@pytest.mark.parametrize("purpose", [plan.TRUTHS, plan.RUNS, plan.DRAWS])
 def test_keys_are_not_those_of_a_run_of_the_same_seed(purpose):
-    own = jax.random.key_data(Plan("ok", seed=0).key(purpose))
+    own = jax.random.key_data(CalibrationPlan("ok", seed=0).key(purpose))
     for key in jax.tree.leaves(run_keys(jax.random.key(0))):
         assert not np.array_equal(own, jax.random.key_data(key))
-
-
-# ----------------------------------------------------------------------------------------------------- densities
-
-
-def check_density(key, log_prob, draws, box: Support, points: int = 120) -> float:
-    """It is 1 over the box (midpoint rule), nothing outside, and the draws are its own; what else came with them."""
-    low, high = np.asarray(box.low, np.float64), np.asarray(box.high, np.float64)
-    axes = [low[d] + (high[d] - low[d]) * (np.arange(points) + 0.5) / points for d in range(2)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    outside = np.array([low - 0.1, [high[0], high[1] + 0.1]])
-    drawn, inside = jax.jit(draws)(key)
-    theta = jnp.asarray(np.concatenate([grid, outside, drawn]), jnp.float32)
-    value = np.asarray(jax.jit(log_prob)(theta), np.float64)
-    within, beyond, seen = np.split(value, [len(grid), len(grid) + 2])
-    cell = np.prod((high - low) / points)
-    assert np.sum(np.exp(within)) * cell == pytest.approx(1.0, abs=0.03)
-    assert np.all(np.isneginf(beyond))
-    mean = np.sum(np.exp(within) * within) * cell
-    assert np.mean(seen) == pytest.approx(mean, abs=0.03 + 4 * np.std(seen) / np.sqrt(len(seen)))
-    return float(inside)
-
-
-def test_the_density_of_a_flow_is_that_of_its_draws():
-    """An ensemble of two perturbed flows, seen through both affine maps, in a box that cuts it."""
-    flow = Estimator(family="maf", hidden=(8, 8), transforms=1, ensemble_size=2, epochs=1)
-    scale, box = Support([-10.0, 0.0], [10.0, 4.0]), Support([0.0, 0.5], [4.0, 2.5])
-    params = initialise(jax.random.key(0), flow, 2, 3)
-    leaves, structure = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    noisy = [leaf + 0.3 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
-    network = Network(
-        jax.tree.unflatten(structure, noisy),
-        Normaliser(jnp.array([1.0, 0.0, -1.0]), jnp.array([2.0, 1.0, 0.5])),
-        Normaliser(jnp.array([0.2, -0.3]), jnp.array([0.15, 0.5])),
-    )
-    belief = Belief(uninformed(box, 1).mixture, box, jnp.asarray(True))
-    x = jnp.array([0.4, 0.5, -0.7])
-    log_prob = lambda theta: truncated_log_prob(flow, network, x, scale, belief, theta)
-    draws = lambda key: truncated_draws(key, flow, network, x, scale, belief, 1000)
-    inside = check_density(jax.random.key(4), log_prob, draws, box)
-    assert 0.1 < inside < 0.9  # a box that cuts nothing would test nothing
-
-
-def test_the_density_of_a_run_is_its_mixtures_within_the_support():
-    box = Support([-1.0, -2.0], [0.5, 0.5])
-    belief = Belief(gaussian_linear.posterior(X), box, jnp.asarray(True))
-    first = SimpleNamespace(proposal=SimpleNamespace(support=jax.tree.map(lambda leaf: leaf[None], box)))
-    run = Run(belief, first, None, None, X, jnp.asarray(X), None, Fixed(), settings(restriction="reject"), gaussian())
-    check_density(jax.random.key(0), run.log_prob, lambda key: (run.sample(key, 1000), 1.0), box)

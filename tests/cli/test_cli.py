@@ -13,19 +13,22 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi.io import files as atomic
-from jaxlfi.cli import parser as cli
+from jaxlfi import plugins
+from jaxlfi.bayessim import memory
+from jaxlfi.bayessim.presets import METHODS, PRESETS
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli import commands
-from jaxlfi.tasks import observation
-from jaxlfi.runs import folder as run_store
-from jaxlfi.runs import session
-from jaxlfi.studies import grid as sweep
-from jaxlfi.tasks import registry as tasks
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.estimators.estimator import Estimator
+from jaxlfi.cli import parser as cli
+from jaxlfi.envs.gaussian_linear import MIXING, NOISE
+from jaxlfi.estimators import registry as estimators
+from jaxlfi.fields import declared
 from jaxlfi.heuristics import Mode, registry
-from jaxlfi.bayessim.presets import PRESETS
-from tests import test_black_box
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import execute as executing
+from jaxlfi.runs import folder as run_store
+from jaxlfi.studies import grid
+from jaxlfi.tasks import observation
+from jaxlfi.tasks import registry as tasks
 from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
 
@@ -51,13 +54,17 @@ def test_every_setting_and_hyperparameter_has_a_documented_flag():
     choices = cli.parser()._subparsers._group_actions[0].choices
     for name in ("infer", "compare", "grid"):
         documented = {action.dest for action in choices[name]._actions if action.help}
-        fields = {field.name for kind in (Settings, Estimator) for field in dataclasses.fields(kind)} - {"estimator"}
-        rules = [registry.load(rule) for rule in registry.names()]
-        assert fields | {name for rule in rules for name in registry.hyperparameters(rule)} <= documented
+        kinds = [
+            Settings,
+            *(estimators.load(name) for name in plugins.names(estimators.GROUP)),
+            *(registry.load(rule) for rule in registry.names()),
+        ]
+        fields = {field for kind in kinds for field in declared(kind)}
+        assert len(kinds) >= 9 and {"rounds", "hidden", "bins", "expansion"} <= fields <= documented
 
 
 def test_names_known_without_jax_are_the_real_ones():
-    assert set(cli.PRESETS) == set(PRESETS)
+    assert set(cli.PRESETS) == set(PRESETS) and set(cli.METHODS) == set(METHODS)
 
 
 def test_version(capsys):
@@ -69,7 +76,7 @@ BAD = {
     "unknown task": (["infer", "nothing"], "task: expected one of"),
     "no such module": (["infer", "no.such:task"], "cannot load 'no.such:task'"),
     "no task": (["infer", "os:getcwd"], "expected 'os:getcwd' to give a jaxlfi.Task, got str"),
-    "unknown support": (["infer", TASK, "--support", "x"], "expected one of ['broad', 'misspecified', 'ok'], got 'x'"),
+    "unknown support": (["infer", TASK, "--support", "x"], "support: expected one of ['broad', 'misspecified', 'ok']"),
     "unknown heuristic": (["infer", TASK, "--heuristic", "x"], "heuristic: expected one of"),
     "unknown preset": (["infer", TASK, "--preset", "x"], "invalid choice: 'x'"),
     "unknown flag": (["infer", TASK, "--nonsense"], "unrecognized arguments"),
@@ -83,14 +90,14 @@ BAD = {
         ["infer", TASK, "--support", "ok", "--support-low", "0", "0", "--support-high", "1", "1"],
         "expected --support NAME, or",
     ),
-    "no rounds": (["infer", TASK, "--rounds", "0"], "at least 1 round"),
+    "no rounds": (["infer", TASK, "--rounds", "0"], "rounds: expected a whole number in [1, 100000], got 0"),
     "small budget": (
         ["infer", TASK, "--simulation-budget", "5", "--simulations-per-round", "9"],
         "simulation_budget: expected at least the 9",
     ),
     "correction": (["infer", TASK, "--correction", "x"], "correction: expected one of"),
     "activation": (["infer", TASK, "--activation", "x"], "activation: expected one of"),
-    "learning rate": (["infer", TASK, "--learning-rate", "nan"], "learning_rate: expected a number"),
+    "learning rate": (["infer", TASK, "--learning-rate", "nan"], "learning_rate: expected a number in (0, inf)"),
     "epochs and steps": (["infer", TASK, "--epochs", "5", "--steps", "5"], "epochs or steps"),
     "seeds": (["infer", TASK, "--seeds", "0"], "seeds: expected at least 1"),
     "hyperparameter length": (["infer", TASK, "--expansion", "1", "2", "3"], "expansion: expected one finite number or 2"),  # noqa: E501
@@ -114,9 +121,32 @@ BAD = {
     "axis and flag": (["grid", TASK, "--vary", "tail=0,1", "--tail", "1"], "on an axis or as a flag of its own"),
     "grid's support": (["grid", TASK, "--vary", "tail=0,1", "--support", "x"], "support: expected one of"),
     "grid's seeds": (["grid", TASK, "--vary", "tail=0,1", "--seeds", "0"], "seeds: expected at least 1"),
-    "no lanes": (["grid", TASK, "--vary", "tail=0,1", "--lanes-per-chunk", "0"], "lanes_per_chunk: expected at least 1"),  # noqa: E501
-    "black box": (["grid", "tests.test_black_box:failing", "--vary", "tail=0,1"], "simulator is in JAX"),
+    "no runs": (["grid", TASK, "--vary", "tail=0,1", "--runs-per-chunk", "0"], "runs_per_chunk: expected at least 1"),
+    "unknown estimator": (["infer", TASK, "--estimator", "x"], "estimator: expected one of"),
+    "another family's setting": (["infer", TASK, "--bins", "4"], "bins: expected a setting of MixtureNetwork"),
+    "no parameters of a flow": (["infer", TASK, "--estimator", "nsf", "--transforms", "0"], "transforms: expected a whole number in [1, inf), got 0"),  # noqa: E501
 }  # fmt: skip
+
+
+def host_simulate(rng, theta):
+    """The Gaussian task in NumPy."""
+    return theta @ MIXING.T + NOISE * rng.normal(size=theta.shape)
+
+
+def on_host(simulate=host_simulate, **changes):
+    """The Gaussian task with a host simulator."""
+    return dataclasses.replace(gaussian(), simulate=jaxlfi.HostSimulator(simulate), **changes)
+
+
+def wrong_shape():
+    """Gives one trajectory too few."""
+    return on_host(lambda rng, theta: host_simulate(rng, theta)[1:], truth=None, observation=[0.8, -0.6])
+
+
+def failing():
+    """Never succeeds."""
+    simulate = lambda rng, theta: (host_simulate(rng, theta), np.zeros(len(theta), bool))
+    return on_host(simulate, truth=None, observation=[0.8, -0.6])
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -126,25 +156,25 @@ def test_bad_input_is_one_line_and_writes_nothing(case, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_more_lanes_than_memory_are_refused_before_anything_is_written(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sweep.chunks, "free_memory", lambda devices: 2e4)
-    arguments = ("grid", TASK, *FLAGS, "--vary", "tail=0,0.5,1", "--lanes-per-chunk", "9", "--out", tmp_path / "out")
-    assert "lanes_per_chunk: expected fewer lanes than fill the memory: 9 need" in error_line(capsys, *arguments)
+def test_more_runs_than_memory_are_refused_before_anything_is_written(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(memory, "free_memory", lambda devices: 2e4)
+    arguments = ("grid", TASK, *FLAGS, "--vary", "tail=0,0.5,1", "--runs-per-chunk", "9", "--out", tmp_path / "out")
+    assert "runs_per_chunk: expected fewer runs than fill the memory: 9 need" in error_line(capsys, *arguments)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_grid_has_as_many_devices_as_it_was_begun_with(tmp_path, monkeypatch):
     vary = ["--vary", "tail=0,1", "expansion=1,2,3"]
     begun = cli.parser().parse_args(["grid", TASK, *vary, "--vary", "zone_width=0", "--seeds", "4", "--out", "x"])
-    assert cli._lanes(begun) == 24
-    atomic.write_json(tmp_path / "config.json", {"format": sweep.GRID, "axes": [{}], "devices": 7})
+    assert cli._runs(begun) == 24
+    atomic.write_json(tmp_path / "config.json", {"format": grid.GRID, "axes": [{}], "devices": 7})
     monkeypatch.setenv("XLA_FLAGS", "")
     cli.prepare_jax(cli.parser().parse_args(["resume", str(tmp_path), "--no-cache"]))
     assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=7"
 
 
 def test_report_refuses_a_grid_that_is_not_finished(tmp_path, capsys):
-    atomic.write_json(tmp_path / "config.json", {"format": sweep.GRID, "version": run_store.VERSION})
+    atomic.write_json(tmp_path / "config.json", {"format": grid.GRID, "version": run_store.VERSION})
     assert "expected a finished grid, found no grid.npz" in error_line(capsys, "report", tmp_path)
 
 
@@ -166,7 +196,7 @@ def test_foreign_folders_are_refused(verb, tmp_path, capsys):
     (tmp_path / "file.txt").write_text("mine")
     assert "expected a run folder" in error_line(capsys, verb, tmp_path)
     assert "no folder" in error_line(capsys, verb, tmp_path / "nowhere")
-    (tmp_path / "config.json").write_text('{"format": "jaxlfi-run", "version": 1, "lanes": [{}]}')
+    (tmp_path / "config.json").write_text('{"format": "jaxlfi-run", "version": 2, "runs": [{}]}')
     if verb == "resume":
         assert "complete description" in error_line(capsys, verb, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "file.txt"]
@@ -207,10 +237,13 @@ def test_a_seed_has_one_observation_in_all_configurations(comparison):
 
 
 def test_compare_warns_of_posteriors_beyond_the_bounds_of_fixed_supports(comparison):
-    plan = session.plan_of(run_store.read_config(comparison))
-    told = list(session.support_warnings(comparison, plan))
-    assert any(text.startswith("misspecified:") and "first upper 0 (2 of 2 runs" in text for text in told)
-    assert not any(text.startswith("misspecified+edge") for text in told)
+    names = [run["folder"] for run in run_store.read_config(comparison)["runs"]]
+    runs = [jaxlfi.load(comparison / name) for name in names]
+    specs = tuple(run.spec for run in runs)
+    plan = executing.BatchPlan(run_store.COMPARE, TASK, runs[0].task, None, runs[0].settings, specs)
+    warnings = commands.support_warnings(plan, runs)
+    assert any(text.startswith("misspecified:") and "first upper 0 (2 of 2 runs" in text for text in warnings)
+    assert not any(text.startswith("misspecified+edge") for text in warnings)
 
 
 def test_resuming_what_is_complete_says_so(comparison, capsys):
@@ -272,7 +305,7 @@ def test_npz_files_that_cannot_be_an_observation(tmp_path, capsys):
 
 def test_a_simulator_that_breaks_its_contract_leaves_nothing(tmp_path, capsys):
     for name, expected in (("wrong_shape", "expected numbers of shape"), ("failing", "got none (failed: 25")):
-        task = f"tests.test_black_box:{name}"
+        task = f"tests.cli.test_cli:{name}"
         assert expected in error_line(capsys, "infer", task, *FLAGS, "--out", tmp_path / name)
         assert not list(tmp_path.iterdir())
 
@@ -282,13 +315,13 @@ def slow():
 
     def simulate(rng, theta):
         time.sleep(0.7 if len(theta) == 20 else 0)
-        return test_black_box.numpy_simulate(rng, theta)
+        return host_simulate(rng, theta)
 
-    return test_black_box.boxed(simulate)
+    return on_host(simulate)
 
 
 def test_a_killed_process_resumes_to_the_same_bits(tmp_path):
-    arguments = ["infer", "tests.test_cli:slow", *FLAGS]
+    arguments = ["infer", "tests.cli.test_cli:slow", *FLAGS]
     program = [sys.executable, "-m", "jaxlfi"]
     process = subprocess.Popen(
         [*program, *arguments, "--out", str(tmp_path / "killed")],
@@ -314,7 +347,7 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, monkeypatch, capsys):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(session, "advance", interrupted)
+    monkeypatch.setattr(executing, "execute", interrupted)
     assert command("infer", TASK, *FLAGS, "--out", tmp_path / "out") == 130
     assert f"jaxlfi resume {tmp_path / 'out'}" in capsys.readouterr().err
 
@@ -341,33 +374,37 @@ def shouting(words):
 
 
 def test_packages_add_commands(monkeypatch, capsys):
-    point = EntryPoint("shout", "tests.test_cli:shouting", "jaxlfi.commands")
+    point = EntryPoint("shout", "tests.cli.test_cli:shouting", "jaxlfi.commands")
     monkeypatch.setattr(cli, "entry_points", lambda group: [point])
     assert cli.main(["shout", "whip", "--help"]) == 7
     assert capsys.readouterr().out == "WHIP --HELP\n"
     assert "shout" in cli.parser().format_help()
 
 
-def oven(heat="1.5", rounds="3"):
+def oven(heat: float = 1.5, rounds: int = 3):
     """A task with options, which asks for a setting and a hyperparameter."""
     return dataclasses.replace(
         gaussian(),
-        name=f"oven at {float(heat)}",
-        settings={"rounds": int(rounds), "learning_rate": 0.25},
+        name=f"oven at {heat}",
+        settings={"rounds": rounds, "learning_rate": 0.25},
         hyperparameters={"edge": {"mass_threshold": (0.125, 0.5), "expansion": 0.75}},
     )
 
 
 def test_tasks_take_options():
-    assert tasks.load("tests.test_cli:oven").name == "oven at 1.5"
-    assert tasks.load("tests.test_cli:oven,heat=3,rounds=4").name == "oven at 3.0"
-    with pytest.raises(ValueError, match=r"expected options among heat, rounds, got 'tests.test_cli:oven,colour=red'"):
-        tasks.load("tests.test_cli:oven,colour=red")
-    with pytest.raises(ValueError, match="failed: ValueError: could not convert"):
-        tasks.load("tests.test_cli:oven,heat=much")
+    assert tasks.load("tests.cli.test_cli:oven").name == "oven at 1.5"
+    assert tasks.load("tests.cli.test_cli:oven,heat=3,rounds=4").name == "oven at 3.0"
+    with pytest.raises(ValueError, match=r"expected options among heat, rounds, got 'tests.cli.test_cli:oven,colour="):
+        tasks.load("tests.cli.test_cli:oven,colour=red")
+    with pytest.raises(ValueError, match="failed: ValueError: heat: expected a value of type float, got 'much'"):
+        tasks.load("tests.cli.test_cli:oven,heat=much")
     with pytest.raises(ValueError, match="expected options among none"):
         tasks.load("jaxlfi.envs.gaussian_linear:task,object=dlo-0")
-    for wrong in ("tests.test_cli:oven,heat", "tests.test_cli:oven,heat=", "tests.test_cli:oven,heat=1,heat=2"):
+    for wrong in (
+        "tests.cli.test_cli:oven,heat",
+        "tests.cli.test_cli:oven,heat=",
+        "tests.cli.test_cli:oven,heat=1,heat=2",
+    ):
         with pytest.raises(ValueError, match="expected options as NAME,key=value"):
             tasks.load(wrong)
 

@@ -13,13 +13,14 @@ from scipy import stats
 from scipy.optimize import brentq, linear_sum_assignment
 from scipy.special import ndtr
 
-from jaxlfi.bayessim.algorithm import Settings, propose
+from jaxlfi.bayessim.algorithm import propose
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate, paired, stretch
 from jaxlfi.heuristics.matching import match
 from jaxlfi.heuristics.truncate import MIN_WIDTH
-from jaxlfi.distributions.mixture import GaussianMixture
-from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.task import Task
 from tests.oracles import heuristics as oracle
 from tests.strategies import floats, problems, vectors
