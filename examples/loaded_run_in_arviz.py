@@ -1,0 +1,37 @@
+"""A run that was saved, read back, and handed to ArviZ for its summaries and plots.
+
+    pip install 'jaxlfi[arviz]'
+    python examples/loaded_run_in_arviz.py
+"""
+
+import tempfile
+from pathlib import Path
+
+import arviz
+import jax
+
+import jaxlfi
+from jaxlfi.envs.gaussian_linear import task
+from jaxlfi.runs.export import to_inference_data
+
+SETTINGS = jaxlfi.QUICK.replace(rounds=2)
+
+
+def main():
+    """Save, load, export."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "gaussian"
+        run = jaxlfi.infer(jax.random.key(0), task(), support="misspecified", settings=SETTINGS)
+        run.save(folder)  # `jaxlfi infer ... --out DIR` writes the same files
+        print("kept:", ", ".join(sorted(path.name for path in folder.iterdir())))
+
+        loaded = jaxlfi.load(folder, task())
+        print("the same posterior mean:", run.posterior.mean(), loaded.posterior.mean())
+        data = to_inference_data(folder, n=2000)  # on the command line: jaxlfi sample DIR -n 2000 --out draws.nc
+    summary = arviz.summary(data, kind="stats")
+    print(f"truth: {dict(zip(task().names, task().truth.tolist(), strict=True))}\n{summary}")
+    return run, loaded, summary
+
+
+if __name__ == "__main__":
+    main()
