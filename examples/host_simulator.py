@@ -12,7 +12,7 @@ import jaxlfi
 
 TRUTH = np.array([0.5, 0.2])
 DAYS, PEOPLE = 60, 1000
-SETTINGS = jaxlfi.QUICK.replace(rounds=5)
+SETTINGS = jaxlfi.QUICK.replace(rounds=4, simulations_per_round=300, simulation_budget=400)
 
 
 def epidemic(rng, theta):

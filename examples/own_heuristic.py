@@ -15,7 +15,7 @@ from jaxlfi.envs.gaussian_linear import posterior, task
 from jaxlfi.fields import hyperparameter
 from jaxlfi.heuristics import Heuristic, adapted
 
-SETTINGS = jaxlfi.QUICK.replace(rounds=5)
+SETTINGS = jaxlfi.QUICK.replace(rounds=4)
 
 
 class Surround(Heuristic):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jaxlfi
 
 TRUTH = jnp.array([6.0, 0.5])
-SETTINGS = jaxlfi.QUICK.replace(rounds=6)
+SETTINGS = jaxlfi.QUICK.replace(rounds=5)
 
 
 def simulate(key, theta):
