@@ -2,8 +2,8 @@
 
     python examples/amortised.py
 
-200 truths are drawn from the prior and simulated; the network is asked for the posterior of each. Intervals of 90 % ought
-to hold nine in ten of the truths.
+200 truths are drawn from the prior and simulated; the network is asked for the posterior of each. Intervals of 90 %
+ought to hold nine in ten of the truths.
 """
 
 import jax

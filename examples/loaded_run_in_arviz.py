@@ -1,7 +1,7 @@
 """A run that was saved, read back, and handed to ArviZ for its summaries and plots.
 
-    pip install 'jaxlfi[arviz]'
-    python examples/loaded_run_in_arviz.py
+pip install 'jaxlfi[arviz]'
+python examples/loaded_run_in_arviz.py
 """
 
 import tempfile
@@ -27,7 +27,7 @@ def main():
 
         loaded = jaxlfi.load(folder, task())
         print("the same posterior mean:", run.posterior.mean(), loaded.posterior.mean())
-        data = to_inference_data(folder, n=2000)  # on the command line: jaxlfi sample DIR -n 2000 --out draws.nc
+        data = to_inference_data(folder, n=1000)  # on the command line: jaxlfi sample DIR -n 1000 --out draws.nc
     summary = arviz.summary(data, kind="stats")
     print(f"truth: {dict(zip(task().names, task().truth.tolist(), strict=True))}\n{summary}")
     return run, loaded, summary

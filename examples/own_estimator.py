@@ -3,13 +3,14 @@
     python examples/own_estimator.py
     jaxlfi infer gaussian_linear --estimator examples.own_estimator:Laplace --steps 1000 --out runs/laplace
 
-The module maps a normalised summary to a conditional density: any pytree with `log_prob` and `sample`. The ensemble, its
-training and the mixture that heuristics see come with the base class. Here: independent Laplace distributions.
+The module maps a normalised summary to a conditional density: any pytree with `log_prob` and `sample`. The ensemble,
+its training and the mixture that heuristics see come with the base class. Here: independent Laplace distributions.
 """
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 import jaxlfi
@@ -66,16 +67,16 @@ class Laplace(Estimator):
 def main():
     """The family beside the exact posterior, which it can match in location and scale but not in correlation."""
     problem = task()
-    observed = problem.simulate(jax.random.key(3), problem.truth)
+    observed = problem.simulate(jax.random.key(1), problem.truth)
     estimator = Laplace(ensemble_size=2, epochs=0, steps=1000, learning_rate=3e-3, components=2)
     settings = jaxlfi.Settings(
         estimator, rounds=1, simulations_per_round=2000, simulation_budget=2000, restriction="reject"
     )
     run = jaxlfi.infer(jax.random.key(0), problem, observed, heuristic=jaxlfi.Fixed(), settings=settings)
-    draws, exact = run.posterior.sample(jax.random.key(1), 2000), posterior(observed)
+    draws, exact = run.posterior.sample(jax.random.key(1), 1000), posterior(observed)
     print(f"truth                {problem.truth}")
-    print(f"exact posterior      {exact.mean.round(2)} +- {jnp.sqrt(jnp.diag(exact.covariance)).round(2)}")
-    print(f"inferred posterior   {draws.mean(0).round(2)} +- {draws.std(0).round(2)}")
+    print(f"exact posterior      {np.round(exact.mean, 2)} +- {np.round(np.sqrt(np.diag(exact.covariance)), 2)}")
+    print(f"inferred posterior   {np.mean(draws, axis=0).round(2)} +- {np.std(draws, axis=0).round(2)}")
     print(f"mass of the density inside the support: {run.posterior.mass_inside:.3f}")
     return exact, draws
 

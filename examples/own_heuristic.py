@@ -3,12 +3,13 @@
     python examples/own_heuristic.py
     jaxlfi infer gaussian_linear --support misspecified --heuristic examples.own_heuristic:Surround --out runs/surround
 
-`Surround` puts the box around the posterior's central interval, with a margin. The support becomes wider or narrower, as
-the posterior does.
+`Surround` puts the box around the posterior's central interval, with a margin. The support becomes wider or narrower,
+as the posterior does.
 """
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import jaxlfi
 from jaxlfi.envs.gaussian_linear import posterior, task
@@ -44,7 +45,7 @@ class Surround(Heuristic):
 def main():
     """From a box that excludes the truth, on a task whose posterior is known exactly."""
     problem = task()
-    observed = problem.simulate(jax.random.key(3), problem.truth)
+    observed = problem.simulate(jax.random.key(1), problem.truth)
     exact = posterior(observed)
     run = jaxlfi.infer(
         jax.random.key(0), problem, observed, support="misspecified", heuristic=Surround(), settings=SETTINGS
@@ -54,8 +55,8 @@ def main():
     for index, (low, high) in enumerate(zip(run.history["support_low"], run.history["support_high"], strict=True)):
         print(f"  after round {index}: {low.round(2)} to {high.round(2)}")
     print(f"truth                {problem.truth}")
-    print(f"exact posterior      {exact.mean.round(2)} +- {jnp.sqrt(jnp.diag(exact.covariance)).round(2)}")
-    print(f"inferred posterior   {draws.mean(0).round(2)} +- {draws.std(0).round(2)}")
+    print(f"exact posterior      {np.round(exact.mean, 2)} +- {np.round(np.sqrt(np.diag(exact.covariance)), 2)}")
+    print(f"inferred posterior   {np.mean(draws, axis=0).round(2)} +- {np.std(draws, axis=0).round(2)}")
     return exact, draws
 
 

@@ -27,19 +27,20 @@ def main():
     first, second = 6 * rng.beta(1.0, 2.0, PAIRS) - 3, rng.uniform(-3, 3, PAIRS)
     theta = np.stack([first, second], axis=1)
     log_density = np.log(2 * (3 - first) / 36) - np.log(6)
-    trajectory = jax.vmap(problem.simulate)(jax.random.split(jax.random.key(1), PAIRS), jnp.asarray(theta, jnp.float32))
-    observed = problem.simulate(jax.random.key(2), problem.truth)
+    trajectory = jax.vmap(problem.simulate)(jax.random.split(jax.random.key(2), PAIRS), jnp.asarray(theta, jnp.float32))
+    observed = problem.simulate(jax.random.key(1), problem.truth)
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / "simulations.npz"
         np.savez(path, theta=theta, trajectory=trajectory, log_density=log_density, low=[-3, -3], high=[3, 3])
         run = jaxlfi.infer(
             jax.random.key(0), problem, observed, heuristic=jaxlfi.Fixed(), settings=SETTINGS, simulations=path
         )  # on the command line: --simulations simulations.npz --rounds 1
-    draws, exact = run.posterior.sample(jax.random.key(3), 2000), posterior(observed)
-    print(f"pairs used: {int(run.dataset.size)}, of weights {run.dataset.weight.min():.2f} to {run.dataset.weight.max():.2f}")
+    draws, exact = run.posterior.sample(jax.random.key(3), 1000), posterior(observed)
+    weight = run.dataset.weight
+    print(f"pairs used: {int(run.dataset.size)}, of weights {weight.min():.2f} to {weight.max():.2f}")
     print(f"truth                {problem.truth}")
-    print(f"exact posterior      {exact.mean.round(2)} +- {jnp.sqrt(jnp.diag(exact.covariance)).round(2)}")
-    print(f"inferred posterior   {draws.mean(0).round(2)} +- {draws.std(0).round(2)}")
+    print(f"exact posterior      {np.round(exact.mean, 2)} +- {np.round(np.sqrt(np.diag(exact.covariance)), 2)}")
+    print(f"inferred posterior   {np.mean(draws, axis=0).round(2)} +- {np.std(draws, axis=0).round(2)}")
     return exact, draws
 
 

@@ -53,7 +53,7 @@ def main():
     )
     observed = simulate(jax.random.key(3), TRUTH)
     run = jaxlfi.infer(jax.random.key(0), task, observed, heuristic=jaxlfi.Fixed(), settings=SETTINGS)
-    draws = run.posterior.sample(jax.random.key(1), 4000, space="inference")
+    draws = run.posterior.sample(jax.random.key(1), 1000, space="inference")
     mean, sd = exact(observed)
     print(f"{'':10} truth   exact posterior   inferred posterior")
     for d, label in enumerate(task.space.labels):
