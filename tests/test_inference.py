@@ -103,7 +103,7 @@ def test_without_an_observation_one_is_simulated_at_the_truth():
         ({"support": Support([0.0, 0.0], [1.0, 11.0])}, "inside the feasible domain Phi"),
         ({"heuristic": "edge"}, "heuristic: expected an instance such as"),
         ({"heuristic": Edge(expansion=np.ones(3))}, r"scalars or 2 values, got shape \(3,\)"),
-        ({"settings": settings(simulation_budget=5)}, "attempts: expected at least"),
+        ({"settings": settings(simulation_budget=5)}, "simulation_budget: expected at least"),
         (
             {"task": dataclasses.replace(gaussian(), truth=None), "observation": None},
             "observation: expected one",

@@ -105,7 +105,7 @@ class TestDistribution:
         states = trajectory[:, GOLDEN_RECORDS].reshape(len(trajectory), -1)
         ours = np.concatenate([np.asarray(summarise_many(trajectory)), states], axis=1)
         pvalues = [stats.ks_2samp(*columns).pvalue for columns in zip(ours.T, expected.T, strict=True)]
-        assert min(pvalues) > 1e-3, pvalues
+        assert min(pvalues) > 1e-3 / len(pvalues), pvalues
 
     def test_pure_prey_birth_is_a_yule_process(self):
         rate, initial, count = 0.7, 20, 8192

@@ -60,13 +60,13 @@ def test_a_fixed_support_misses_the_reference(posteriors):
 
 
 def test_edge_finds_the_reference(posteriors):
-    """Every log-rate within 2.5 of the reference posterior's standard deviations.
+    """Every log-rate within 3 of the reference posterior's standard deviations.
 
-    Measured for seeds 0, 1 and 2: at most 1.3, 1.0 and 0.9, where the fixed support is 5.3 to 5.9 off.
+    Measured for seeds 0 to 6: at most 1.3, 1.0, 0.9, 0.2, 1.3, 0.3 and 2.0, where the fixed support is 5.3 to 5.9 off.
     """
     means, support = posteriors
     off = (means[1] - REFERENCE) / REFERENCE_SD
-    assert np.abs(off).max() < 2.5, off
+    assert np.abs(off).max() < 3, off
     assert support.high[1, DEATH] > REFERENCE[DEATH] > -0.8
 
 

@@ -167,7 +167,8 @@ def test_the_solver_goes_on_where_single_precision_ends():
     model = mjx.put_model(base_model(SCENE))
     start = reset(SCENE, median())
     data = mjx.make_data(base_model(SCENE)).replace(qpos=start.qpos, ctrl=start.target)
-    data = functools.reduce(lambda data, part: part(model, data), PARTS, kinematics(SCENE, model, data))
+    forward = lambda data: functools.reduce(lambda data, part: part(model, data), PARTS, kinematics(SCENE, model, data))
+    data = jax.jit(forward)(data)  # as one program: thousands of operations are compiled one by one otherwise
     inertia = np.asarray(data._impl.M, np.float64)
     scale = 1 / np.sqrt(np.diag(inertia))
     values, vectors = np.linalg.eigh(scale[:, None] * inertia * scale)

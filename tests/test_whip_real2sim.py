@@ -53,8 +53,8 @@ def test_a_simulation_is_the_trajectory_of_its_parameters(problem, key):
     found, failure = jax.jit(lambda k, t: trajectory_and_outcome(problem, k, t))(key, theta)
     scene = median(0.270, 4e3)
     clean = DETECTORS["clean"]
-    other = jax.random.key(0)  # a clean detector has no use for it
-    expected, valid = trajectory(other, NATIVE, clean, side_camera(scene), scene, exploratory_actions())
+    directly = jax.jit(lambda key: trajectory(key, NATIVE, clean, side_camera(scene), scene, exploratory_actions()))
+    expected, valid = directly(jax.random.key(0))  # a clean detector has no use for it
     assert failure == 0 and valid
     assert found.shape == (16, 30) == (16, len(CHANNELS))
     np.testing.assert_allclose(found, expected, atol=2e-4)  # parameters went through a logarithm
@@ -84,14 +84,15 @@ def test_unstable_simulations_are_told_of(key):
     shaky = NativeEngine(Scene(chain=Chain(elements=16, retardation=0.0, viscosity=0.0), timestep=0.005))
     made = whip_task(shaky, DETECTORS["clean"], NUISANCES["fixed"], exploratory_actions(), truth=(0.23, 8e3))
     stiff = made.to_coordinates(jnp.array([[100.0, 5e5], [120.0, 4e5]]))
-    _, failure = jax.vmap(lambda t: trajectory_and_outcome(made, key, t))(stiff)
+    _, failure = jax.jit(jax.vmap(lambda t: trajectory_and_outcome(made, key, t)))(stiff)
     assert failure.tolist() == [1, 1] and made.reasons[0] == "unstable"
 
 
 def test_random_nuisances_differ_from_key_to_key(key):
     made = task(detector="clean", nuisances="random", engine="native")
     theta = made.to_coordinates(jnp.array([250.0, 5e3]))
-    found, _ = jax.vmap(lambda k: trajectory_and_outcome(made, k, theta))(jax.random.split(key, 3))
+    simulate = jax.jit(jax.vmap(lambda k: trajectory_and_outcome(made, k, theta)))
+    found, _ = simulate(jax.random.split(key, 3))
     assert len(np.unique(np.asarray(found[:, 0, 20]))) == 3  # the top cube, seen from elsewhere
 
 
@@ -118,16 +119,23 @@ def test_objects_may_be_files_and_unknown_ones_are_refused(tmp_path):
 
 
 def test_length_and_stiffness_are_inferred(problem):
-    """The initial support is 110 mm wide, and 3.9 in ln E (measured for six seeds: at most 1.2 mm and 0.06 off)."""
+    """The initial support is 110 mm wide, and 3.9 in ln E.
+
+    The middle one of three runs: measured for ten seeds, the errors of one by itself are mostly below 1 mm and 0.03,
+    but one in ten is 2 to 3 mm.
+    """
     settings = SETTINGS.replace(
-        rounds=3, simulations_per_round=40, simulation_budget=44,
-        estimator=SETTINGS.estimator.replace(normaliser="asinh", activation="tanh", steps=400, hidden=(32, 32)),
+        rounds=3, simulations_per_round=80, simulation_budget=88,
+        estimator=SETTINGS.estimator.replace(normaliser="asinh", activation="tanh", steps=800, hidden=(32, 32)),
     )  # fmt: skip
-    run = jaxlfi.infer(jax.random.key(3), problem, settings=settings, heuristic=jaxlfi.Edge())
-    draws = run.sample(jax.random.key(4), 1000)
-    error = np.abs(np.median(draws, axis=0) - np.asarray(problem.truth))
-    assert error[0] < 5 and error[1] < 0.3
-    assert int(np.sum(run.info.failed)) == 0
+    errors = []
+    for seed in range(3):
+        run = jaxlfi.infer(jax.random.key(seed), problem, settings=settings, heuristic=jaxlfi.Edge())
+        assert int(np.sum(run.info.failed)) == 0
+        draws = run.sample(jax.random.key(100 + seed), 1000)
+        errors.append(np.abs(np.median(draws, axis=0) - np.asarray(problem.truth)))
+    length, stiffness = np.median(errors, axis=0)
+    assert length < 5 and stiffness < 0.3
 
 
 def test_a_run_from_the_command_line(tmp_path, capsys):

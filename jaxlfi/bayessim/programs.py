@@ -8,7 +8,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 KEPT = 64
-"""Programs that are kept, and as many of them compiled for some shapes."""
+"""Number of jitted functions that are kept, and number of their compiled versions for some shapes of arguments."""
 
 
 def program(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...] = ()) -> Any:
@@ -46,3 +46,9 @@ def compiled(many: Any, arguments: tuple) -> Any:
             del _EXECUTABLES[next(iter(_EXECUTABLES))]
         _EXECUTABLES[signature] = many.lower(*arguments).compile()
     return _EXECUTABLES[signature]
+
+
+def forget() -> None:
+    """Drop all compiled programs, and the memory they hold; they are compiled anew when they are needed."""
+    _EXECUTABLES.clear()
+    _program.cache_clear()

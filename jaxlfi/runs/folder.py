@@ -20,7 +20,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -32,8 +32,10 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.io import files as atomic
 from jaxlfi.io.serialise import json_safe
 from jaxlfi.runs import describe
-from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks.task import Task
+
+if TYPE_CHECKING:  # runs know how to save themselves
+    from jaxlfi.runs.run import Origin, Run
 
 RUN, RUNS, COMPARE = "jaxlfi-run", "jaxlfi-runs", "jaxlfi-compare"
 VERSION = 2
@@ -74,9 +76,9 @@ def versions() -> dict[str, str]:
 
 
 def command_line(argv: Sequence[str]) -> str:
-    """A command as its results tell of it: without the folders of the machine it ran on.
+    """A command as it is recorded with its results: without the folders of the machine it ran on.
 
-    An absolute path is told from the working folder on where it lies below it, and by its name alone elsewhere.
+    An absolute path is written relative to the working folder where it lies below it, and by its name alone elsewhere.
 
     Example:
         >>> command_line(["/usr/bin/jaxlfi", "report", "/elsewhere/runs/edge"])
@@ -95,7 +97,7 @@ def command_line(argv: Sequence[str]) -> str:
 
 
 def processor() -> str:
-    """The processor's name as the system tells it."""
+    """The processor's name as the system reports it."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text().splitlines():
@@ -110,6 +112,8 @@ def refuse_occupied(folder: Path) -> None:
     Raises:
         StoreError: if the folder exists and is not empty, or is a file.
     """
+    if folder.is_symlink() and not folder.exists():
+        raise StoreError(f"out: expected a new folder, got {str(folder)!r}, a link that leads nowhere")
     if not folder.exists():
         return
     if not folder.is_dir() or any(folder.iterdir()):
@@ -125,21 +129,21 @@ def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any])
     Args:
         folder: where; it must not exist or be empty.
         config: written as config.json.
-        fill: called with the folder's temporary path, to write what a resume needs besides.
+        fill: called with the folder's temporary path, to write what a resume needs stagings.
     """
     refuse_occupied(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        staging = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     except OSError as error:
         raise StoreError(f"out: expected a folder that can be written, got {str(folder)!r}: {error}") from error
     try:
-        beside.chmod(0o755)
-        fill(beside)
-        atomic.write_json(beside / "config.json", config)
-        beside.rename(folder)
+        staging.chmod(0o755)
+        fill(staging)
+        atomic.write_json(staging / "config.json", config)
+        staging.rename(folder)
     except BaseException:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(staging, ignore_errors=True)
         raise
 
 
@@ -174,7 +178,7 @@ def check_version(path: Path, config: Mapping[str, Any]) -> None:
     if config.get("version") != VERSION:
         raise StoreError(
             f"{path}: expected version {VERSION} of the format, got {config.get('version')}: the folder was written by "
-            f"jaxlfi {config.get('versions', {}).get('jaxlfi', 'of another version')} in another format; run it again"
+            "another version of jaxlfi; run its command again"
         )
 
 
@@ -184,7 +188,7 @@ def append_ledger(folder: Path, index: int, row: Mapping[str, np.ndarray], reaso
     atomic.append_line(folder / "ledger.jsonl", line)
 
 
-def write_run(folder: Path, run: Run, keep_network: bool = False) -> None:
+def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
     """Write the arrays of one finished run into its folder, which exists and has its ledger.
 
     Args:
@@ -231,14 +235,14 @@ def write_run(folder: Path, run: Run, keep_network: bool = False) -> None:
         atomic.write_arrays(folder / "network.npz", named_leaves(run.network))
 
 
-def save(run: Run, folder: Path) -> Path:
+def save(run: "Run", folder: Path) -> Path:
     """Write one run into a new folder, complete or not at all."""
 
-    def fill(beside: Path) -> None:
+    def fill(staging: Path) -> None:
         for index, seconds in enumerate(np.asarray(run.history["seconds"])):
             row = {name: value[index] for name, value in run.history.items() if not name.startswith(FINAL)}
-            append_ledger(beside, index, jax.device_get(row), run.task.reasons, seconds)
-        write_run(beside, run)
+            append_ledger(staging, index, jax.device_get(row), run.task.reasons, seconds)
+        write_run(staging, run)
 
     if run.task is None:
         raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
@@ -262,7 +266,7 @@ def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     atomic.write_bytes(path, text.getvalue().encode())
 
 
-def run_config(task: Task, origin: Origin, spec: RunSpec, settings: Settings) -> dict[str, Any]:
+def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) -> dict[str, Any]:
     """The config.json of one run."""
     feasible = task.inference.feasible
     return {

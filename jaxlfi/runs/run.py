@@ -23,6 +23,7 @@ from jaxlfi.estimators.base import Network
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Heuristic
+from jaxlfi.runs import folder as folders
 from jaxlfi.tasks.task import Task
 
 DRAWS = 1000
@@ -112,7 +113,8 @@ class Run:
         if self.settings.rounds != 1:
             raise ValueError(
                 f"posterior_of: expected a run of one round, got one of {self.settings.rounds}, whose network "
-                "has learnt the posterior of its own observation alone: infer with settings.replace(rounds=1), or --method npe"
+                "has learnt the posterior of its own observation alone: infer with settings.replace(rounds=1), or "
+                "--method npe"
             )
         if self.network is None:
             raise ValueError("posterior_of: expected a run whose network was kept (--keep-network), got none")
@@ -162,10 +164,8 @@ class Run:
         Raises:
             ValueError: if something is there already, or for a run under `vmap`.
         """
-        from jaxlfi.runs import folder  # which writes runs
-
         _require_one(self, "save")
-        return folder.save(self, Path(path))
+        return folders.save(self, Path(path))
 
     def _summary(self, observation: Any) -> jax.Array:
         observation = jnp.asarray(observation, jnp.float32)
