@@ -2,7 +2,7 @@
 
     python examples/amortised.py
 
-200 truths are drawn from the prior and simulated; the network is asked for the posterior of each. Intervals of 90 %
+100 truths are drawn from the prior and simulated; the network is asked for the posterior of each. Intervals of 90 %
 ought to hold nine in ten of the truths.
 """
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jaxlfi
 from jaxlfi.envs.gaussian_linear import task
 
-TRUTHS = 200
+TRUTHS = 100
 SETTINGS = jaxlfi.QUICK.replace(rounds=1, simulations_per_round=4000, simulation_budget=4000)
 
 
@@ -25,7 +25,7 @@ def main():
     observations = jax.vmap(problem.simulate)(jax.random.split(key_simulate, TRUTHS), truths)
 
     def interval(key, observation):
-        draws = run.posterior_of(observation).sample(key, 500)
+        draws = run.posterior_of(observation).sample(key, 200)
         return jnp.quantile(draws, jnp.array([0.05, 0.5, 0.95]), axis=0)
 
     low, median, high = jnp.moveaxis(jax.vmap(interval)(jax.random.split(key_draw, TRUTHS), observations), 1, 0)
