@@ -21,14 +21,14 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
-from envs import gaussian_linear as gaussian
-from envs import lotka_volterra as predators
-from envs import lynx_hare as pelts
-from envs import mg1 as queue
 from jaxlfi.diagnostics.bounds import MASS_BEYOND, bound_evidence, edge_mass
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear as gaussian
+from jaxlfi.envs import lotka_volterra as predators
+from jaxlfi.envs import lynx_hare as pelts
+from jaxlfi.envs import mg1 as queue
 from jaxlfi.io import files as atomic
 from jaxlfi.tasks.task import Task
 

@@ -15,12 +15,12 @@ from scipy.stats import ks_2samp
 from test_bayessim import EXACT, MODEST, TASK, X, infer, lane, whitened
 
 import jaxlfi
-from envs import gaussian_linear
 from jaxlfi.bayessim.algorithm import Settings
 from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.presets import METHODS, QUICK
 from jaxlfi.cli import parser as cli
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.estimator import Estimator, Network, draw, initialise, normalisers
 from jaxlfi.estimators.posterior import draws_within, posterior
 from jaxlfi.heuristics import Fixed

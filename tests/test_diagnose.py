@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import gaussian_linear
 from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.cli import parser as cli
 from jaxlfi.distributions.belief import Belief, uninformed
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.estimator import Estimator, Network, initialise
 from jaxlfi.estimators.normaliser import Normaliser
 from jaxlfi.estimators.posterior import truncated_draws, truncated_log_prob
@@ -31,8 +31,8 @@ from jaxlfi.studies import calibration as diagnose
 from jaxlfi.studies import grid as sweep
 from jaxlfi.studies.calibration import Plan, Subject, repeat
 from jaxlfi.studies.calibration import subject as subjects
-from jaxlfi.tasks.observation import SimulatorError
 from jaxlfi.tasks import registry as tasks
+from jaxlfi.tasks.observation import SimulatorError
 from tests.small import SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 X = np.array([-0.6, -0.3], np.float32)

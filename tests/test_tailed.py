@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from envs import gaussian_linear
 from jaxlfi.bayessim.algorithm import prior_draws
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.tasks.observation import simulate_observation
 from jaxlfi.tasks.priors import TailedUniform, with_tails
 from jaxlfi.tasks.task import Task
