@@ -17,7 +17,7 @@ TIMES = jnp.arange(10.0)
 BOX = jaxlfi.Support([0.05, 1.0], [2.0, 20.0])
 # A normal prior over the logarithms is log-normal over the parameters.
 PRIOR = distrax.MultivariateNormalDiag(jnp.log(jnp.array([0.5, 6.0])), jnp.array([0.7, 0.4]))
-SETTINGS = jaxlfi.QUICK.replace(rounds=1, simulations_per_round=2000, simulation_budget=2000)
+SETTINGS = jaxlfi.QUICK.replace(rounds=1, simulations_per_round=2000, simulation_budget=2000, predictive=False)
 
 
 def simulate(key, theta):

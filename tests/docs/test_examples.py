@@ -61,7 +61,7 @@ def test_a_host_simulator_is_inferred(capsys):
 def test_an_own_heuristic_finds_the_exact_posterior():
     exact, draws = ran("own_heuristic")
     sd = np.sqrt(np.diag(exact.covariance))
-    np.testing.assert_array_less(np.abs(np.mean(draws, axis=0) - exact.mean) / sd, 1.5)
+    np.testing.assert_array_less(np.abs(np.mean(draws, axis=0) - exact.mean) / sd, 2.0)
 
 
 def test_an_own_estimator_finds_the_exact_posterior():
@@ -86,7 +86,7 @@ def test_simulations_made_before_give_the_exact_posterior():
 def test_a_loaded_run_is_the_same_and_arviz_summarises_it():
     pytest.importorskip("arviz")
     run, loaded, summary = ran("loaded_run_in_arviz")
-    np.testing.assert_allclose(run.posterior.mean(), loaded.posterior.mean(), rtol=1e-4)
+    np.testing.assert_allclose(run.mixture.means, loaded.mixture.means, rtol=1e-5)
     assert list(summary.index) == ["first", "second"]
 
 
