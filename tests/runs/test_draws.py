@@ -4,6 +4,8 @@ import csv
 import warnings
 
 import jax
+import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from scipy import stats
@@ -38,7 +40,7 @@ def task() -> Task:
         supports={"ok": box},
         feasible=box,
         log=("first",),
-        observation=gaussian_linear.MIXING @ np.array([0.6, 0.9], np.float32),
+        observation=gaussian_linear.MIXING @ np.array([0.5, 1.0], np.float32),
         name="corner",
     )
 
@@ -105,13 +107,15 @@ def test_no_draw_lies_on_a_bound(ways):
 @pytest.mark.parametrize("space", ["natural", "inference"])
 def test_the_draws_have_the_density_that_log_prob_says(ways, space):
     run, draws = ways
-    theta = draws["infer"] if space == "natural" else np.asarray(run.space.to_inference(draws["infer"]))
+    theta = draws["infer"] if space == "natural" else np.asarray(run.space.to_inference(jnp.asarray(draws["infer"])))
     box = run.belief.support if space == "inference" else run.space.box_to_natural(run.belief.support)
     low, high, cells = np.asarray(box.low, float), np.asarray(box.high, float), 240
     edges = np.linspace(low, high, cells + 1)
     middle = 0.5 * (edges[1:] + edges[:-1])
     grid = np.stack(np.meshgrid(middle[:, 0], middle[:, 1], indexing="ij"), axis=-1)
-    mass = np.exp(np.asarray(run.posterior.log_prob(grid, space=space), float)) * np.prod((high - low) / cells)
+    mass = np.exp(np.asarray(run.posterior.log_prob(jnp.asarray(grid), space=space), float)) * np.prod(
+        (high - low) / cells
+    )
     np.testing.assert_allclose(mass.sum(), 1.0, atol=0.03)
     for d in range(2):
         distribution = np.concatenate([[0.0], np.cumsum(mass.sum(axis=1 - d))])
@@ -120,7 +124,7 @@ def test_the_draws_have_the_density_that_log_prob_says(ways, space):
         )
         assert stats.kstest(theta[:, d], cdf).statistic < 2.3 / np.sqrt(N), d
     outside = np.stack([low - 0.01, high + 0.01, [low[0] - 0.01, middle[0, 1]]])
-    assert np.isneginf(np.asarray(run.posterior.log_prob(outside, space=space))).all()
+    assert np.isneginf(np.asarray(run.posterior.log_prob(jnp.asarray(outside), space=space))).all()
 
 
 def test_the_mean_and_the_maximum_are_those_of_the_draws(ways):
@@ -128,9 +132,18 @@ def test_the_mean_and_the_maximum_are_those_of_the_draws(ways):
     posterior, theta = run.posterior, draws["infer"]
     np.testing.assert_allclose(posterior.mean(), theta.mean(0), atol=5 * theta.std(0).max() / np.sqrt(N))
     best = posterior.map()
-    assert float(posterior.log_prob(best)) >= float(np.max(posterior.log_prob(theta))) - 1e-3
+    assert float(posterior.log_prob(best)) >= float(np.max(posterior.log_prob(jnp.asarray(theta)))) - 1e-3
 
 
+@pytest.fixture
+def unchecked():
+    """Arguments as users pass them: signatures are not checked, which they are in tests only."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("n", [-1, 0, 2.5, True, "10"])
 def test_a_number_of_draws_is_whole_and_positive(ways, n):
     run, _ = ways
@@ -139,6 +152,7 @@ def test_a_number_of_draws_is_whole_and_positive(ways, n):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_bad_arguments_are_named(ways):
     posterior = ways[0].posterior
     with pytest.raises(ValueError, match=r"^theta: expected shape \[\.\.\., 2\], got \[3\]$"):
