@@ -24,7 +24,8 @@ SMALL = jaxlfi.QUICK.replace(
 """The blocks say nothing of settings; with these they take seconds."""
 RUN = {
     "jaxlfi tasks": "",
-    "jaxlfi infer decay:task": "--rounds 2 --simulations-per-round 60 --simulation-budget 80 --epochs 5 --transforms 1 --no-figures",
+    "jaxlfi infer decay:task": "--rounds 2 --simulations-per-round 60 --simulation-budget 80 --epochs 5 --transforms 1 "
+    "--no-figures",
     "jaxlfi sample runs/decay": "-n 50",
 }
 """Commands that are run, and what is appended to make them quick; all others are parsed."""
