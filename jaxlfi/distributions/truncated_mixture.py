@@ -19,7 +19,7 @@ def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: S
 
     Candidates are drawn dimension by dimension, each from its normal given the ones before, truncated to the box
     (Geweke 1991; Hajivassiliou and Keane): all lie inside, however far the mixture is from it. Their weight is the
-    product of the masses that truncation left, and each draw is one of `CANDIDATES` picked by weight, so that it is as
+    product of the masses that truncation left, divided by what their component was favoured by, and each draw is one of `CANDIDATES` picked by weight, so that it is as
     good as exact where few dimensions are truncated.
 
     Args:
@@ -30,12 +30,13 @@ def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: S
     """
     key_component, key_uniform, key_pick = jax.random.split(key, 3)
     shape = (n, CANDIDATES)
-    component = jax.random.categorical(key_component, mixture.logits, shape=shape)
+    logits, log_share = _by_marginals(mixture, support)
+    component = jax.random.categorical(key_component, logits, shape=shape)
     uniform = jax.random.uniform(key_uniform, (*shape, support.dim), minval=1e-6, maxval=1.0)
 
     def candidate(component: Array, uniform: Array) -> tuple[Array, Array]:
         mean, factor = mixture.means[component], mixture.scale_tril[component]
-        z, log_weight = jnp.zeros(support.dim), jnp.zeros(())
+        z, log_weight = jnp.zeros(support.dim), -log_share[component]
         for d in range(support.dim):
             given = mean[d] + factor[d] @ z  # entries of z from d on are still zero
             low, high = (support.low[d] - given) / factor[d, d], (support.high[d] - given) / factor[d, d]
@@ -46,6 +47,18 @@ def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: S
     theta, log_weight = jax.vmap(jax.vmap(candidate))(component, uniform)
     picked = jax.random.categorical(key_pick, log_weight)
     return jnp.take_along_axis(theta, picked[:, None, None], axis=1)[:, 0]
+
+
+def _by_marginals(mixture: GaussianMixture, support: Support) -> tuple[Array, Array]:
+    """Logits to draw candidates' components by, and what they have in addition to the mixture's own.
+
+    The mass inside, dimension by dimension: a component far from the box is rarely worth a candidate.
+    """
+    scales = mixture.marginal_scales
+    one = lambda low, high: _truncated_normal(jnp.float32(0.5), low, high)[1]
+    log_mass = jax.vmap(jax.vmap(one))((support.low - mixture.means) / scales, (support.high - mixture.means) / scales)
+    log_share = jnp.sum(log_mass, axis=-1)
+    return mixture.logits + log_share, log_share
 
 
 def _truncated_normal(
