@@ -3,7 +3,7 @@
     python -m experiments.ablation --seeds 20 --out experiments/results/ablation
 
 Every variant runs the same configurations (supports and heuristics) on the same seeds, each seed with its own
-observation. All lanes of a variant are one vmapped program, sharded over the processor's cores. A variant whose array
+observation. All runs of a variant are one vmapped program, sharded over the processor's cores. A variant whose array
 file exists is not run again; the table is drawn from the saved arrays.
 """
 
@@ -11,7 +11,6 @@ import argparse
 import dataclasses
 import json
 import os
-import time
 from pathlib import Path
 
 from jaxlfi.io import compile_cache
@@ -25,15 +24,16 @@ import numpy as np
 from rich.console import Console
 
 from envs.lotka_volterra import task as lotka_volterra
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim.batch import Lane, LaneEngine, rounds, stack_inputs
-from jaxlfi.bayessim.keys import run_keys
+from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
+from jaxlfi.bayessim.drive import drive
+from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.record import theta_error, trajectory_error
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli.commands import bootstrap_interval
-from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Matched, Mode
+from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Mode, paired
 from jaxlfi.io.progress import RoundProgress
-from jaxlfi.io.serialise import heuristic_to_json, settings_to_json
+from jaxlfi.runs.describe import heuristic_to_json, settings_to_json
 from jaxlfi.runs.folder import environment
 from jaxlfi.tasks.observation import simulate_observation
 
@@ -66,7 +66,7 @@ class Variant:
 
     def heuristic(self, name: str) -> Heuristic:
         """A heuristic with its defaults; MODE pairs components where networks start anew."""
-        mode = Mode() if self.settings.estimator.warm_start else Matched(Mode())
+        mode = paired(Mode(), self.settings.estimator.warm_start)
         return {"none": Fixed(), "edge": self.edge, "mode": mode, "centre": Centre()}[name]
 
 
@@ -113,35 +113,35 @@ def run_variant(variant: Variant, seeds: int) -> dict[str, np.ndarray]:
 
     Returns:
         Arrays with leading axes [configuration, seed]: theta_error, trajectory_error, attempted and succeeded (a round
-        each, trailing axis), final support bounds; and the seconds of all lanes together.
+        each, trailing axis), final support bounds; and the seconds of all runs together.
     """
     task = lotka_volterra()
     matrix = {label: MATRIX[label] for label in variant.configurations}
     # Seeds are the slow index, so that every device gets all configurations, fast and slow ones.
-    lanes = [
-        Lane(label, support, task.support(support), variant.heuristic(heuristic), seed)
+    specs = [
+        RunSpec(label, support, task.support(support), variant.heuristic(heuristic), seed)
         for seed in range(seeds)
         for label, (support, heuristic) in matrix.items()
     ]
-    observed = np.stack([simulate_observation(run_keys(jax.random.key(lane.seed)).observe, task) for lane in lanes])
+    observed = np.stack([simulate_observation(run_keys(key_of(spec.seed)).observe, task) for spec in specs])
     x = np.asarray(jax.vmap(task.summary)(observed))
-    inputs, _ = stack_inputs(lanes, observed, x)
-    engine = LaneEngine(task, variant.settings, inputs)
-    state = engine.start()
-    engine.compile(state)
-    started = time.perf_counter()
-    rows = []
-    with RoundProgress(Console(), variant.settings.rounds, 0, f"{len(lanes)} lanes") as progress:
-        for _, _, row in rounds(engine, state, 0, variant.settings.rounds):
+    inputs, _ = stack_inputs(specs, observed, x)
+    engine, rows, times = BatchEngine(task, variant.settings, inputs), [], []
+    with RoundProgress(Console(), variant.settings.rounds, 0, f"{len(specs)} runs in a batch") as progress:
+
+        def keep(index, state, row, elapsed):
             rows.append(row)
+            times.append(elapsed)
             progress.advance()
-    seconds = time.perf_counter() - started
+
+        drive(engine, engine.start(), range(variant.settings.rounds), keep, progress.compiled)
+    seconds = sum(times)
 
     def arranged(values):
         values = np.asarray(values)
         return values.reshape(seeds, len(matrix), *values.shape[1:]).swapaxes(0, 1)
 
-    last = [{name: value[i] for name, value in rows[-1].items()} for i in range(len(lanes))]
+    last = [{name: value[i] for name, value in rows[-1].items()} for i in range(len(specs))]
     return {
         "theta_error": arranged([theta_error(row) for row in last]),
         "theta_error_by_parameter": arranged([row["sample_theta_error"].mean(0) for row in last]),

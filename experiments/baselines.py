@@ -3,7 +3,7 @@
     python -m experiments.baselines --seeds 20 --out experiments/results/baselines
 
 Every row has the same budget of simulations, the same seeds and, for each seed, the same observation. The seeds of a
-row are lanes of one program, sharded over the processor's cores. A row whose array file exists is not run again; table
+row are runs of one program, sharded over the processor's cores. A row whose array file exists is not run again; table
 and figure are drawn from the saved arrays. `--seeds 2 --rounds 2 --steps 20` is a trial.
 """
 
@@ -11,7 +11,6 @@ import argparse
 import dataclasses
 import json
 import os
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -26,18 +25,19 @@ import numpy as np
 from rich.console import Console
 
 from envs.lotka_volterra import task as lotka_volterra
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim.batch import Lane, LaneEngine, rounds, stack_inputs
-from jaxlfi.bayessim.keys import run_keys
+from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
+from jaxlfi.bayessim.drive import drive
+from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.record import theta_error, trajectory_error
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli.commands import bootstrap_interval
 from jaxlfi.figures import seeds as strips
 from jaxlfi.figures import style
 from jaxlfi.heuristics import Edge, Fixed, Heuristic, Truncate
 from jaxlfi.io import files as atomic
 from jaxlfi.io.progress import RoundProgress
-from jaxlfi.io.serialise import heuristic_to_json, settings_to_json
+from jaxlfi.runs.describe import heuristic_to_json, settings_to_json
 from jaxlfi.runs.folder import environment
 from jaxlfi.tasks.observation import simulate_observation
 from jaxlfi.tasks.priors import with_tails
@@ -117,21 +117,21 @@ def run_row(row: Row, task: Task, settings: Settings, seeds: int) -> dict[str, n
         succeeded (a round each, trailing axis), support_low and support_high at the end; and the seconds of all seeds
         together.
     """
-    observed = np.stack([simulate_observation(run_keys(jax.random.key(seed)).observe, task) for seed in range(seeds)])
+    observed = np.stack([simulate_observation(run_keys(key_of(seed)).observe, task) for seed in range(seeds)])
     x = np.asarray(jax.vmap(task.summary)(observed))
     task, settings = row.task(task), row.settings(settings)
-    lanes = [Lane(row.support, row.support, task.support(row.support), row.heuristic, seed) for seed in range(seeds)]
-    inputs, _ = stack_inputs(lanes, observed, x)
-    engine = LaneEngine(task, settings, inputs)
-    state = engine.start()
-    engine.compile(state)
-    started = time.perf_counter()
-    seen = []
+    specs = [RunSpec(row.support, row.support, task.support(row.support), row.heuristic, seed) for seed in range(seeds)]
+    inputs, _ = stack_inputs(specs, observed, x)
+    engine, seen, times = BatchEngine(task, settings, inputs), [], []
     with RoundProgress(Console(), settings.rounds, 0, f"{seeds} seeds") as progress:
-        for _, _, line in rounds(engine, state, 0, settings.rounds):
+
+        def keep(index, state, line, elapsed):
             seen.append(line)
+            times.append(elapsed)
             progress.advance()
-    seconds = time.perf_counter() - started
+
+        drive(engine, engine.start(), range(settings.rounds), keep, progress.compiled)
+    seconds = sum(times)
     last = [{name: value[seed] for name, value in seen[-1].items()} for seed in range(seeds)]
     return {
         "theta_error": np.array([theta_error(line) for line in last]),

@@ -25,11 +25,11 @@ from envs import gaussian_linear as gaussian
 from envs import lotka_volterra as predators
 from envs import lynx_hare as pelts
 from envs import mg1 as queue
-from jaxlfi.io import files as atomic
-from jaxlfi.distributions.belief import Belief
 from jaxlfi.diagnostics.bounds import MASS_BEYOND, bound_evidence, edge_mass
+from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
+from jaxlfi.io import files as atomic
 from jaxlfi.tasks.task import Task
 
 # ------------------------------------------------------------------------------------------- tasks with more supports

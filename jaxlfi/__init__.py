@@ -34,8 +34,10 @@ _HOMES = {
     "SupportWarning": "jaxlfi.runs.run",
     "Task": "jaxlfi.tasks.task",
     "Truncate": "jaxlfi.heuristics",
+    "hyperparameter": "jaxlfi.fields",
     "infer": "jaxlfi.runs.infer",
     "load": "jaxlfi.runs.load",
+    "option": "jaxlfi.fields",
     "stack": "jaxlfi.bayessim.batch",
     "with_tails": "jaxlfi.tasks.priors",
 }

@@ -39,7 +39,7 @@ def load(group: str, word: str, reference: str, base: type) -> type:
         base: what it must derive from.
 
     Raises:
-        ValueError: for unknown names, modules that cannot be imported, and other things than such classes.
+        ValueError: for unknown names, modules that cannot be imported, and objects that are no such classes.
     """
     if ":" in reference:
         kind = _loaded(word, reference, reference)

@@ -27,11 +27,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.lotka_volterra import task as lotka_volterra
-from jaxlfi.bayessim import algorithm as bayessim
+from jaxlfi.bayessim import algorithm
+from jaxlfi.bayessim.keys import init_key, round_keys
 from jaxlfi.bayessim.presets import PRESETS
 from jaxlfi.estimators import dataset
-from jaxlfi.estimators.estimator import Estimator, Network, initialise
-from jaxlfi.estimators.normaliser import fit_normaliser
+from jaxlfi.estimators.base import untrained
+from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.training import fit
 from jaxlfi.heuristics import Edge
 from jaxlfi.tasks.simulation import simulate, within_budget
@@ -53,7 +54,7 @@ def measure(calls: dict[str, Callable[[], object]], repeats: int = REPEATS) -> d
     return {name: (min(of), statistics.median(of)) for name, of in seconds.items()}
 
 
-def products(estimator: Estimator) -> int:
+def products(estimator: MixtureNetwork) -> int:
     """Floating-point operations of a step's matrix products: forward, and twice that backward."""
     heads = estimator.components * (1 + DIM + DIM * (DIM + 1) // 2)
     layers = (OBS, *estimator.hidden, heads)
@@ -68,24 +69,24 @@ def matrix_rate() -> float:
     return 2 * 2048**3 / best
 
 
-def our_steps(estimator: Estimator, steps: int) -> Callable[[], object]:
+def our_steps(estimator: MixtureNetwork, steps: int) -> Callable[[], object]:
     """A call of so many of our gradient steps, a fit."""
-    passes = steps * BATCH // ROWS
-    estimator = estimator.replace(epochs=passes, steps=0, ensemble_size=1)
+    estimator = estimator.replace(epochs=steps * BATCH // ROWS, steps=0, ensemble_size=1)
     task = lotka_volterra()
     key = jax.random.key(0)
     data = dataset.Dataset(
         theta=task.feasible.sample(key, ROWS),
         x=jax.random.normal(key, (ROWS, OBS)),
         round=jnp.zeros(ROWS, jnp.int32),
+        weight=jnp.ones(ROWS),
         size=jnp.asarray(ROWS),
     )
-    network = Network(initialise(key, estimator, DIM, OBS), fit_normaliser(estimator.normaliser, data.x, data.valid))
-    run = jax.jit(lambda key: fit(key, estimator, network, data, jnp.ones(ROWS), task.feasible, ROWS)[1].loss)
+    network = untrained(key, estimator, OBS, task.inference.feasible, task.space).with_normalisers(data)
+    run = jax.jit(lambda key: fit(key, network, data, jnp.ones(ROWS), ROWS)[1].loss)
     return lambda: jax.block_until_ready(run(key))
 
 
-def torch_steps(estimator: Estimator, steps: int, fused: bool) -> Callable[[], object]:
+def torch_steps(estimator: MixtureNetwork, steps: int, fused: bool) -> Callable[[], object]:
     """The same steps as a PyTorch user writes them, with Adam as it comes or by its fused kernel."""
     import torch
 
@@ -151,24 +152,23 @@ def run_table() -> None:
     observed = jax.jit(lambda key: task.summary(task.simulate(key, task.truth)[0]))(jax.random.key(1))
     key = jax.random.key(0)
 
-    whole = jax.jit(lambda key: bayessim.run(key, task, settings, heuristic, observed, support))
-    start = jax.jit(lambda key: bayessim.init(key, task, support, settings, observed))
-    step = jax.jit(lambda key, state, i: bayessim.step(key, task, settings, heuristic, observed, state, i))
-    propose = jax.jit(lambda key, belief: bayessim.propose(key, task, settings, belief))
+    whole = jax.jit(lambda key: algorithm.run(key, task, settings, heuristic, observed, support))
+    start = jax.jit(lambda key: algorithm.init(key, task, support, settings, observed))
+    step = jax.jit(lambda keys, state, i: algorithm.step(keys, task, settings, heuristic, observed, state, i))
+    propose = jax.jit(lambda key, belief: algorithm.propose(key, task, settings, belief))
     attempt = jax.jit(lambda key, theta: simulate(key, task, theta))
 
     @jax.jit
     def update(key, state, i, theta, x, failure):
-        attempts = within_budget(theta, x, failure, settings.simulations_per_round)
-        return bayessim.update(key, task, settings, heuristic, observed, state, i, attempts)
+        simulations = within_budget(theta, x, failure, settings.simulations_per_round)
+        return algorithm.update(key, task, settings, heuristic, observed, state, i, simulations)
 
     spent = dict.fromkeys(("proposals", "simulation", "update"), 0.0)
 
     def stepwise():
-        key_init, key_rounds = jax.random.split(key)
-        state = start(key_init)
+        state = start(init_key(key))
         for i in range(settings.rounds):
-            state, _ = step(jax.random.fold_in(key_rounds, i), state, i)
+            state, _ = step(round_keys(key, i), state, i)
         jax.block_until_ready(state)
 
     def timed(name, call, *arguments):
@@ -179,15 +179,14 @@ def run_table() -> None:
 
     def by_parts():
         spent.update(dict.fromkeys(spent, 0.0))
-        key_init, key_rounds = jax.random.split(key)
-        state = start(key_init)
+        state = start(init_key(key))
         for i in range(settings.rounds):
-            key_propose, key_simulate, key_update = jax.random.split(jax.random.fold_in(key_rounds, i), 3)
-            theta = timed("proposals", propose, key_propose, state.belief)
-            x, failure = timed("simulation", attempt, key_simulate, theta)
-            state, _ = timed("update", update, key_update, state, i, theta, x, failure)
+            keys = round_keys(key, i)
+            theta = timed("proposals", propose, keys.propose, state.belief)
+            x, failure = timed("simulation", attempt, keys.simulate, theta)
+            state, _ = timed("update", update, keys.update, state, i, theta, x, failure)
 
-    print(f"{'a whole run of quick, one lane':<40}{'best, s':>10}{'median, s':>11}")
+    print(f"{'a whole run of quick, by itself':<40}{'best, s':>10}{'median, s':>11}")
     calls = {
         "one compiled program": lambda: jax.block_until_ready(whole(key)),
         "its rounds, one call each": stepwise,
@@ -204,11 +203,11 @@ from jaxlfi.io import compile_cache
 compile_cache.enable()
 import jax, jax.numpy as jnp
 from envs.lotka_volterra import task as factory
-from jaxlfi.bayessim import algorithm as bayessim
+from jaxlfi.bayessim import algorithm
 from jaxlfi.heuristics import Edge
 from jaxlfi.bayessim.presets import QUICK
 task = factory()
-run = jax.jit(lambda key: bayessim.run(key, task, QUICK, Edge(), jnp.zeros(9), task.support("ok")))
+run = jax.jit(lambda key: algorithm.run(key, task, QUICK, Edge(), jnp.zeros(9), task.support("ok")))
 lowered = run.lower(jax.random.key(0))
 start = time.perf_counter()
 lowered.compile()

@@ -21,15 +21,16 @@ from rich.console import Console
 
 from experiments.sbibm.c2st import c2st
 from experiments.sbibm.tasks import TASKS, observation, reference
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim import algorithm as bayessim
+from jaxlfi.bayessim import algorithm
+from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.presets import FLOW, METHODS
-from jaxlfi.distributions.belief import rejected
-from jaxlfi.estimators.posterior import draws_within
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.estimators.mixture_network import MixtureNetwork
+from jaxlfi.estimators.registry import converted
 from jaxlfi.heuristics import Fixed
 from jaxlfi.io import compile_cache
 from jaxlfi.io import files as atomic
-from jaxlfi.io.serialise import settings_to_json
+from jaxlfi.runs.describe import settings_to_json
 from jaxlfi.runs.folder import environment
 
 OBSERVATIONS = (1, 2, 3)
@@ -40,13 +41,13 @@ DRAWS = 10_000
 
 def mdn(settings: Settings) -> Settings:
     """The method with mixture networks of ten Gaussians in place of flows: many, for bent posteriors."""
-    return settings.replace(estimator=settings.estimator.replace(family="mdn", components=10))
+    return settings.replace(estimator=converted(settings.estimator, MixtureNetwork, {"components": 10}))
 
 
 def gaussian(settings: Settings) -> Settings:
     """The method with eight small networks of one Gaussian each, for posteriors in many dimensions."""
-    one = settings.estimator.replace(family="mdn", components=1, hidden=(32,), activation="tanh")
-    return settings.replace(estimator=one.replace(ensemble_size=8, learning_rate=2e-3))
+    one = {"components": 1, "hidden": (32,), "activation": "tanh", "ensemble_size": 8, "learning_rate": 2e-3}
+    return settings.replace(estimator=converted(settings.estimator, MixtureNetwork, one))
 
 
 NETWORKS = {"": lambda settings: settings, "-mdn": mdn, "-gaussian": gaussian}
@@ -65,18 +66,16 @@ def settings_of(method: str, simulations: int) -> Settings:
 
 
 def posterior_draws(task_name: str, settings: Settings, seed: int) -> dict[str, np.ndarray]:
-    """Every observation's `draws` of the posterior, the share of q `inside` the box, and `seconds` to run one's."""
+    """Every observation's `draws` of the posterior, the mass of q `inside` the box, and `seconds` to run one's."""
     task = TASKS[task_name]()
     box = task.support()
     x = np.stack([observation(task_name, number) for number in OBSERVATIONS]).astype(np.float32)
 
     def one(key, x):
         key_run, key_draw = jax.random.split(key)
-        state, _ = bayessim.run(key_run, task, settings, Fixed(), x, box)
-        if settings.estimator.is_flow:
-            return draws_within(key_draw, settings.estimator, state.network, x, state.feasible, box, DRAWS)
-        draws = rejected(key_draw, state.belief, DRAWS)
-        return draws, state.belief.support.contains(state.belief.mixture.sample(key_draw, DRAWS)).mean()
+        state, _ = algorithm.run(key_run, task, settings, Fixed(), x, box)
+        posterior = posterior_after(state.belief, state.network, x)
+        return posterior.sample(key_draw, DRAWS, space="inference"), posterior.mass_inside
 
     keys = jax.random.split(jax.random.key(seed), len(OBSERVATIONS))
     program = jax.jit(jax.vmap(one)).lower(keys, x).compile()

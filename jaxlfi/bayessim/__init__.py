@@ -1,1 +1,1 @@
-"""bayessim."""
+"""Algorithm 1: settings, rounds, batches of runs, and what is recorded of them."""

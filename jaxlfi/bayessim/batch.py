@@ -114,7 +114,7 @@ def stack_inputs(specs: Sequence[RunSpec], observed: np.ndarray, x: np.ndarray) 
 def posterior_after(belief: Belief, network: Network, x: Float[Array, " obs"]) -> Posterior:
     """The posterior a run believes after a round, truncated to the support it adapted.
 
-    Where the density is a mixture of Gaussians it is the belief's own, with whatever correction and heuristic did to it.
+    Where the density is a mixture of Gaussians it is the belief's own, after correction and heuristic.
     """
     density = belief.mixture if network.estimator.closed_form else network.estimator.density(network, x)
     return truncated(density, belief.mixture, belief.support, network.space)

@@ -8,7 +8,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 KEPT = 64
-"""Programs that are kept, and as many of them compiled for some shapes."""
+"""Number of jitted functions that are kept, and number of their compiled versions for some shapes of arguments."""
 
 
 def program(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...] = ()) -> Any:

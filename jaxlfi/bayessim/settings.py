@@ -54,7 +54,7 @@ class Settings(Checked):
             )
         if self.correction == "paper" and not self.estimator.closed_form:
             raise ValueError(
-                f"correction: expected 'none' or 'importance' for {type(self.estimator).__name__}, as 'paper' multiplies "
-                "mixtures of Gaussians, got 'paper'"
+                f"correction: expected 'none' or 'importance' for {type(self.estimator).__name__}, as "
+                "'paper' multiplies mixtures of Gaussians, got 'paper'"
             )
         return self

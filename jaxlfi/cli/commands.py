@@ -46,11 +46,11 @@ from jaxlfi.tasks.task import Task
 
 Prepared = tuple[Path, tuple[BatchPlan, Observed] | Work]
 EXPECTED = (SimulatorError, CheckpointError, run_store.StoreError)
-"""Errors of a run that are the input's, and reported in one line."""
+"""Errors that the input of a run causes; they are reported in one line."""
 LOW_MASS = 0.01
-"""Mass of the posterior inside its support below which draws from it are warned of."""
+"""Mass of the posterior inside its support below which `jaxlfi sample` warns."""
 BOOTSTRAP = 2000
-"""Resamples of an interval."""
+"""Bootstrap resamples for the interval of a mean."""
 CONFIGURATION_DEFAULTS = ("ok", "misspecified", "broad")
 """Supports that are compared by default, where the task has them."""
 
@@ -304,8 +304,8 @@ def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
         if broken:
             steps = int(np.max([np.max(run.history["nonfinite"]) for run in own]))
             warnings.append(
-                f"{configuration}: up to {steps} gradient steps of a round were not finite and were left out, in {broken} "
-                f"of {len(own)} runs: lower learning_rate ({settings.learning_rate:g}) or clip_norm "
+                f"{configuration}: up to {steps} gradient steps of a round were not finite and were left out, in "
+                f"{broken} of {len(own)} runs: lower learning_rate ({settings.learning_rate:g}) or clip_norm "
                 f"({settings.clip_norm:g})."
             )
     return warnings
@@ -528,4 +528,4 @@ COMMANDS = {
     "diagnose": diagnose,
     "report": report,
 }
-"""What prepares or does a command, by its name."""
+"""The function of each command, by its name."""

@@ -31,14 +31,14 @@ HEURISTICS, ESTIMATORS = "jaxlfi.heuristics", "jaxlfi.estimators"
 SETTINGS = "jaxlfi.bayessim.settings:Settings"
 """The class whose fields are the settings of a run."""
 FILE_WIDTH = 120
-"""Characters a line where the output is no terminal."""
+"""Characters in a line of output that goes to a file or a pipe."""
 
 GLOSSARY = """\
 names and symbols:
   support         Theta, the box the parameters are drawn from; it is what the heuristics adapt
   feasible        Phi, the limits that no adapted support leaves
 """
-"""What `--help` explains before the heuristics' hyperparameters."""
+"""The part of the glossary in `--help` that is not made from the heuristics' hyperparameters."""
 
 MAIN_EXAMPLES = """\
 examples:
@@ -90,12 +90,12 @@ DIAGNOSE_EXAMPLES = """\
 Truths are drawn from the prior over a support and simulated, and the run's method is asked for the posterior of each:
 by its network, where the run had one round and kept it (--method npe, or --rounds 1 --keep-network), else by repeating
 the whole inference side by side, in chunks that are saved as they end. A command that was stopped goes on when it is
-given again. It takes about as long as that many runs; the exit status is 0 whatever comes out.
+given again. It takes about as long as that many runs; the exit status is 0 whatever the verdicts.
 
 checks:
   rank          of each truth among its draws, by parameter (simulation-based calibration)
   coverage      how often the densest region of a level holds the truth; around random points (TARP)
-  classifier    accuracy at telling truths from draws, given the simulation
+  classifier    accuracy of a classifier that separates truths from draws, given the simulation
   predictive    whether the run's own observation looks like simulations of its own posterior
 verdicts:
   over-confident, under-confident: posteriors are too narrow, too wide; biased low, high: they lie below, above
@@ -204,8 +204,8 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
         "--simulations",
         type=Path,
         metavar="FILE",
-        help="an .npz of simulations made before, in place of the first round's: theta [N, D] in natural units, trajectory "
-        "[N, ...] or summaries x [N, S], and where they were not drawn uniformly log_density [N]",
+        help="an .npz of simulations made before, in place of the first round's: theta [N, D] in natural units, "
+        "trajectory [N, ...] or summaries x [N, S], and where they were not drawn uniformly log_density [N]",
     )
     infer.add_argument(
         "--heuristic",

@@ -13,10 +13,10 @@ UNITS_A_DIMENSION = 10
 BATCH = 200
 LEARNING_RATE = 1e-3
 WEIGHT_PENALTY = 1e-4
-"""Half of this times the sum of the squared weights, over the rows of a minibatch, is added to its loss."""
+"""Strength of the L2 penalty: half of it times the sum of squared weights, divided by the rows of a minibatch."""
 TOLERANCE = 1e-4
 PATIENCE = 10
-"""Training ends after so many passes that did not lower the least loss by more than `TOLERANCE`."""
+"""Training ends after this many epochs that did not lower the least loss by more than `TOLERANCE`."""
 MIN_EPOCHS, MAX_EPOCHS = 50, 10_000
 
 
@@ -24,7 +24,7 @@ MIN_EPOCHS, MAX_EPOCHS = 50, 10_000
 class _Training:
     params: list
     moments: optax.OptState
-    passes: Int[Array, ""]
+    epochs: Int[Array, ""]
     least: Float[Array, ""]
     idle: Int[Array, ""]
 
@@ -37,7 +37,7 @@ def c2st(key: jax.Array, first: Float[Array, "n dim"], second: Float[Array, "n d
     the moments of the first. Adam's settings, the penalty and when training ends are those of scikit-learn, which
     that definition relies on.
 
-    Departs in two things. Training does not end in the first 50 passes: where samples are hard to tell apart the loss
+    Departs in two things. Training does not end in the first 50 epochs: where samples are hard to tell apart the loss
     lies on a plateau at first, where the definition's classifier stops from some starts, as if the samples were alike.
     Longer plateaus end it still, so a small accuracy is weaker evidence than a large one. And the folds have as many
     rows of either sample, row i of both in the same: rows that belong together, such as two parameters of one
@@ -78,8 +78,8 @@ def _labels(size: int) -> Array:
 
 
 def _train(key: jax.Array, rows: Array, labels: Array) -> list:
-    """Weights after as many passes of minibatches as training takes."""
-    key_start, key_passes = jax.random.split(key)
+    """Weights after as many epochs of minibatches as training takes."""
+    key_start, key_epochs = jax.random.split(key)
     count, dim = rows.shape
     params = _start(key_start, (dim, UNITS_A_DIMENSION * dim, UNITS_A_DIMENSION * dim, 1))
     adam = optax.adam(LEARNING_RATE)
@@ -92,18 +92,18 @@ def _train(key: jax.Array, rows: Array, labels: Array) -> list:
         updates, moments = adam.update(gradient, moments)
         return (optax.apply_updates(params, updates), moments), loss
 
-    def one_pass(state: _Training) -> _Training:
-        order = jnp.argsort(jax.random.uniform(jax.random.fold_in(key_passes, state.passes), (count,)))
+    def one_epoch(state: _Training) -> _Training:
+        order = jnp.argsort(jax.random.uniform(jax.random.fold_in(key_epochs, state.epochs), (count,)))
         # Where minibatches of one length take more rows than there are, the first ones are used twice.
         places = jnp.resize(order, (batches, batch))
         (params, moments), losses = jax.lax.scan(step, (state.params, state.moments), places)
         loss = jnp.mean(losses)
         idle = jnp.where(loss > state.least - TOLERANCE, state.idle + 1, 0)
-        return _Training(params, moments, state.passes + 1, jnp.minimum(loss, state.least), idle)
+        return _Training(params, moments, state.epochs + 1, jnp.minimum(loss, state.least), idle)
 
     start = _Training(params, adam.init(params), jnp.asarray(0), jnp.asarray(jnp.inf), jnp.asarray(0))
-    unfinished = lambda s: (s.passes < MIN_EPOCHS) | (s.idle <= PATIENCE) & (s.passes < MAX_EPOCHS)
-    return jax.lax.while_loop(unfinished, one_pass, start).params
+    unfinished = lambda s: (s.epochs < MIN_EPOCHS) | (s.idle <= PATIENCE) & (s.epochs < MAX_EPOCHS)
+    return jax.lax.while_loop(unfinished, one_epoch, start).params
 
 
 def _start(key: jax.Array, sizes: tuple[int, ...]) -> list:

@@ -18,9 +18,9 @@ SIGNIFICANCE = 0.01
 POINTWISE = 0.95
 """Probability that one point of a calibrated curve, or one bar of its histogram, lies in its pointwise band."""
 POINTS = 50
-"""Most points at which a curve is looked at."""
+"""Maximum number of points at which a calibration curve is evaluated."""
 NULL_DRAWS = 10_000
-"""Simulated calibrated curves, from which the simultaneous band and the p-value come."""
+"""Number of simulated calibrated curves that the simultaneous band and the p-value are computed from."""
 OK = "ok"
 OVER, UNDER = "miscalibrated: over-confident", "miscalibrated: under-confident"
 LOW, HIGH = "miscalibrated: biased low", "miscalibrated: biased high"

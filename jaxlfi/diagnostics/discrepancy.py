@@ -9,7 +9,7 @@ from jaxlfi.tasks.simulation import summarised, trajectory_and_outcome
 from jaxlfi.tasks.task import Task
 
 POSTERIOR_SAMPLES = 20
-"""Posterior draws a discrepancy is averaged over (section V)."""
+"""Number of posterior draws that a discrepancy is averaged over (section V)."""
 
 
 @struct.dataclass
@@ -92,13 +92,13 @@ def _theta_error(task: Task, theta: Float[Array, "samples dim"]) -> Float[Array,
 
 
 def trajectory_distance(trajectory: Array, observed: Array) -> Float[Array, ""]:
-    """Euclidean distance of two trajectories in units of the observed one's spread, per record.
+    """Euclidean distance of two trajectories in units of the observed one's standard deviation, per record.
 
     Each channel is divided by its observed standard deviation, and the square root of the mean square is taken over
     records and channels: a distance of 1 is as far as the observed trajectory is from its own mean. The plain
     Euclidean distance that the paper names would make exp(-distance) zero for any two trajectories of a population.
     """
     observed = observed.reshape(observed.shape[0], -1)
-    spread = jnp.std(observed, axis=0)
-    scale = jnp.where(spread > 0, spread, 1.0)
+    deviation = jnp.std(observed, axis=0)
+    scale = jnp.where(deviation > 0, deviation, 1.0)
     return jnp.sqrt(jnp.mean(((trajectory.reshape(observed.shape) - observed) / scale) ** 2))

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 MIN_SIMULATIONS = 20
-"""Fewest simulations that are compared with."""
+"""Minimum number of finite simulations that a posterior predictive check needs."""
 REACH = 2.0
-"""Robust deviations, after drawing in the tails, beyond which rows count no more for means and correlations."""
+"""Robust standard deviations at which values are clipped before means and correlations are taken."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,7 +17,7 @@ class PredictiveCheck:
 
     Attributes:
         tails: two-sided tail probability of each summary by itself, shape [S].
-        p_value: share of the observation and the simulations that are as far from all of them as the observation.
+        p_value: fraction of the observation and the simulations that are as far from all of them as the observation.
         distance: of the observation from all, about 1 for a typical one.
         distances: of the simulations, shape [N].
         failed: simulations left out because they were not finite.
@@ -77,8 +77,8 @@ def _distances(rows: np.ndarray) -> np.ndarray:
     count, size = rows.shape
     centred = rows - np.median(rows, axis=0)
     scale = 1.4826 * np.median(np.abs(centred), axis=0)
-    spread = np.std(rows, axis=0)
-    scale = np.where(scale > 0, scale, np.where(spread > 0, spread, 1.0))
+    deviation = np.std(rows, axis=0)
+    scale = np.where(scale > 0, scale, np.where(deviation > 0, deviation, 1.0))
     z = np.arcsinh(centred / scale)
     near = np.clip(z, -REACH, REACH)
     mean, deviation = np.mean(near, axis=0), np.std(near, axis=0)

@@ -1,1 +1,1 @@
-"""distributions."""
+"""Boxes, spaces, mixtures of Gaussians, beliefs, and truncation to a box."""

@@ -9,7 +9,7 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Int
 
 HALVINGS = 40
-"""Steps of bisection to a quantile: 2^-40 of the components' spread is below the spacing of float32."""
+"""Bisections that find a quantile: 2^-40 of the interval it is known to lie in is below the spacing of float32."""
 
 
 @struct.dataclass

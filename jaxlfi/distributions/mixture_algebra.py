@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlfi.distributions.mixture import GaussianMixture
 
 FLOOR = 0.01
-"""Least precision the "floor" policy leaves to a quotient, as a fraction of the dividend's."""
+"""Minimum precision of a quotient under the "floor" policy, as a fraction of the dividend's."""
 
 RESOLUTION = 1e-5
-"""A whitened precision difference below this, relative to its terms, has no sign that float32 can tell."""
+"""Relative difference of two whitened precisions below which float32 cannot decide its sign."""
 
 
 @struct.dataclass
@@ -133,7 +133,7 @@ def quotient(a: GaussianMixture, b: GaussianMixture, policy: str = "floor") -> t
 
 
 def pool(mixtures: GaussianMixture) -> GaussianMixture:
-    """The equal-weight union of a stacked batch of mixtures, as of an ensemble's members.
+    """The equal-weight union of a stacked batch of mixtures, as of an ensemble of networks.
 
     Args:
         mixtures: E mixtures of K components in D dimensions, stacked on a leading axis: logits [E, K].
@@ -197,7 +197,7 @@ def reduce(mixture: GaussianMixture, components: int) -> GaussianMixture:
 
 @struct.dataclass
 class _Pairs:
-    """All pairs in the whitened coordinates y = L_1^-1 (theta - m_1), turned to b's principal axes."""
+    """All pairs in the whitened variables y = L_1^-1 (theta - m_1), turned to b's principal axes."""
 
     log_weight: Float[Array, " pairs"]  # log w_i v_j
     absent: Bool[Array, " pairs"]

@@ -11,7 +11,7 @@ from jaxlfi.distributions.mixture import GaussianMixture
 
 @struct.dataclass
 class _Components:
-    """A mixture by its covariances' eigendecompositions, in standardised coordinates; fields [K], [K, D], [K, D, D]."""
+    """A mixture by its covariances' eigendecompositions, of standardised samples; fields [K], [K, D], [K, D, D]."""
 
     log_weights: Array
     means: Array
@@ -27,7 +27,7 @@ def fit_mixture(
     iterations: int = 50,
     floor: Float[Array, ""] | float = 1e-4,
     restarts: int = 4,
-) -> tuple[GaussianMixture, Float[Array, " passes"]]:
+) -> tuple[GaussianMixture, Float[Array, " iterates"]]:
     """Maximum-likelihood mixture of K Gaussians with full covariances (Dempster et al. 1977; Bishop 2006, 9.2.2).
 
     It lets what knows mixtures only, such as the support heuristics, act on draws of a flow's posterior.
@@ -43,7 +43,7 @@ def fit_mixture(
         weights: of the samples, not negative, of any sum above 0, shape [N].
         components: K.
         iterations: of expectation maximisation.
-        floor: least variance of a component in any direction, in standardised coordinates: 1e-4 is a hundredth of the
+        floor: least variance of a component in any direction, of standardised samples: 1e-4 is a hundredth of the
             samples' standard deviations. It keeps components from collapsing on single samples, and must be above 0.
         restarts: seedings.
 
@@ -62,10 +62,10 @@ def fit_mixture(
     # Twice, as the rounding of a mean far from zero is much larger than that of a mean of residuals.
     shift = weights @ theta
     shift = shift + weights @ (theta - shift)
-    spread = jnp.sqrt(weights @ (theta - shift) ** 2)
-    # Equal samples have a spread of 0 or of rounding errors: the resolution of float32 is the least that has a meaning.
+    deviation = jnp.sqrt(weights @ (theta - shift) ** 2)
+    # Equal samples have a deviation of 0 or of rounding errors: the resolution of float32 is the least that means much.
     largest = jnp.max(jnp.where((weights > 0)[:, None], jnp.abs(theta), 0.0), axis=0)
-    scale = jnp.maximum(spread, jnp.maximum(1e-6 * largest, 1e-12))
+    scale = jnp.maximum(deviation, jnp.maximum(1e-6 * largest, 1e-12))
     z = jnp.where((weights > 0)[:, None], (theta - shift) / scale, 0.0)
 
     def one(key):
@@ -116,15 +116,15 @@ def _joint_log_prob(current, z):
 
 
 def _maximised(current, joint, z, weights, floor) -> _Components:
-    """The most likely components given who stands for which sample."""
-    shares = weights[:, None] * jax.nn.softmax(joint, axis=-1)
-    mass = jnp.sum(shares, axis=0)
+    """The maximisation step: the most likely components given their responsibilities for the samples."""
+    responsibilities = weights[:, None] * jax.nn.softmax(joint, axis=-1)
+    mass = jnp.sum(responsibilities, axis=0)
     alive = mass > 1e-12
     safe = jnp.where(alive, mass, 1.0)
-    means = jnp.where(alive[:, None], shares.T @ z / safe[:, None], current.means)
+    means = jnp.where(alive[:, None], responsibilities.T @ z / safe[:, None], current.means)
     offset = z[:, None] - means
     # Whole matrix products: [D, N] by [N, D] for each component.
-    scatter = jnp.einsum("nki,nkj->kij", shares[..., None] * offset, offset) / safe[:, None, None]
+    scatter = jnp.einsum("nki,nkj->kij", responsibilities[..., None] * offset, offset) / safe[:, None, None]
     variances, axes = _floored(jnp.where(alive[:, None, None], scatter, jnp.eye(z.shape[-1])), floor)
     return _Components(jnp.where(alive, jnp.log(safe), -jnp.inf), means, variances, axes)
 

@@ -9,9 +9,9 @@ from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 
 CANDIDATES = 32
-"""Weighted candidates from which each draw is picked."""
+"""Number of weighted candidates that each draw is resampled from."""
 TAIL = 4.0
-"""Standard deviations from the mean beyond which a normal's tail counts as exponential."""
+"""Standard deviations from the mean beyond which the tail of a normal is approximated by an exponential."""
 
 
 def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: Support, n: int) -> Array:

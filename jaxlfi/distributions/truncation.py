@@ -9,16 +9,16 @@ from jaxtyping import Array, Bool, Float
 from jaxlfi.distributions.support import Support
 
 Sampler = Callable[[jax.Array, int], Float[Array, "n dim"]]
-"""Draws of a distribution that is not truncated: (key, n) -> [n, D]."""
+"""A function that draws from a distribution before truncation: (key, n) -> [n, D]."""
 
 TRIES = 32
-"""Candidates for each draw. With a mass m inside, a share (1 - m)^32 of the draws finds none: 3 % at m = 0.1."""
+"""Candidates for each draw. With a mass m inside, a fraction (1 - m)^32 of the draws finds none: 3 % at m = 0.1."""
 BLOCK = 8192
-"""Draws made at a time, which bounds the memory for their candidates."""
+"""Number of draws made at a time, which bounds the memory for their candidates."""
 MASS_DRAWS = 10_000
 """Monte Carlo draws for the truncation constant (1 % error at mass 0.5)."""
 MIN_MASS = 1e-6
-"""A smaller truncation constant counts as this much, so that a log-density stays finite where no draw was inside."""
+"""Minimum truncation constant, which keeps log-densities finite where no Monte Carlo draw was inside."""
 
 
 def rejection_sample(

@@ -1,1 +1,1 @@
-"""estimators."""
+"""Density estimators: families and their settings, training, and the posterior of an observation."""

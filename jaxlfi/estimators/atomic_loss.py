@@ -91,7 +91,7 @@ def atomic(
             weight is positive.
         weights: of the rows, not negative, shape [B]. A row of weight 0 is not an atom of others either.
         atoms: M.
-        combined: weight of a row's -log q beside its atomic loss: 1 (sbi's) for rows drawn from the prior and 0 for
+        combined: weight of a row's -log q, which is added to its atomic loss: 1 (as in sbi) for rows drawn from the prior and 0 for
             others, or 0 for the atomic loss alone.
 
     Returns:
@@ -114,7 +114,7 @@ def atomic(
 
 
 def _weighted_mean(values: Float[Array, " batch"], weights: Float[Array, " batch"]) -> Float[Array, ""]:
-    """The mean over rows of positive weight, whatever the values of others."""
+    """The mean over rows of positive weight, the values of others have no effect."""
     total = jnp.sum(weights)
     sum_ = jnp.sum(weights * jnp.where(weights > 0, values, 0.0))
     return jnp.where(total > 0, sum_ / jnp.where(total > 0, total, 1.0), 0.0)

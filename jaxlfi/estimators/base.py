@@ -22,7 +22,7 @@ from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.fields import Checked, check_fields, hyperparameter, option
 
 FIT_DRAWS = 1000
-"""Draws of a density to which its mixture of Gaussians is fitted."""
+"""Number of draws of a density that its mixture of Gaussians is fitted to."""
 
 SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jnp.cos(jnp.pi * progress))}
 """The learning rate's factor at a point of progress through the round's fitting, by name."""

@@ -25,7 +25,7 @@ class EnsembleDensity:
     """The equally weighted mixture of an ensemble's conditional densities.
 
     Attributes:
-        each: what the networks put out for one x, stacked along a leading axis of length E: a pytree with `log_prob` and
+        each: the networks' outputs for one x, stacked along a leading axis of length E: a pytree with `log_prob` and
             `sample` of parameters as the networks see them.
         shift: from what the networks see to inference space, shape [D].
         scale: shape [D].

@@ -13,16 +13,16 @@ from jaxtyping import Array, Float
 from jaxlfi.estimators.mdn import ACTIVATIONS, Dense
 
 LOG_SCALE_BOUND = 3.0
-"""Most one affine step can stretch, in nats. Ten of them take |theta| = 1e3 to 1e16; float32 still holds its square."""
+"""Maximum log-scale of one affine transform, in nats. Ten of them take 1e3 to 1e16, whose square float32 holds."""
 
 MIN_BIN = 1e-3
-"""Least width of a spline's bin, as a fraction of its range."""
+"""Minimum width of a spline's bin, as a fraction of its range."""
 
 MIN_SLOPE = 1e-3
-"""Least slope of a spline at a knot."""
+"""Minimum slope of a spline at a knot."""
 
 _UNIT_SLOPE = float(np.log(np.expm1(1 - MIN_SLOPE)))
-"""What softplus turns into a slope of 1, less the least slope."""
+"""Raw value of a slope for which softplus and the minimum slope add up to 1."""
 
 
 @struct.dataclass

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from jaxlfi.estimators.atomic_loss import atomic, nll
 
 ATOMS = 10
-"""Parameter vectors among which the atomic loss has the right one named, at most (the paper's appendix A)."""
+"""Parameter vectors M that the atomic loss compares for each simulation, at most (the paper's appendix A)."""
 
 
 @struct.dataclass
@@ -20,7 +20,7 @@ class Rows:
     """Simulations as the network sees them.
 
     Attributes:
-        theta: parameters in the network's coordinates, shape [N, D].
+        theta: parameters as the network sees them, shape [N, D].
         x: normalised summaries, shape [N, S].
         weights: weight of each in the loss, shape [N].
         log_prior: log-density of the prior, up to a constant, shape [N].

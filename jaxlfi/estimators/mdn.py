@@ -100,7 +100,7 @@ class MDN(nn.Module):
             out, np.cumsum([components, components * dim, components * dim]), axis=-1
         )
         shape = (*x.shape[:-1], components)
-        # The start, a diagonal of e^1, is a spread of 0.37 in [-1, 1]; the floor on the spread is e^-7.
+        # The start, a diagonal of e^1, is a standard deviation of 0.37 in [-1, 1]; the least one is e^-7.
         diagonal = jnp.exp(jnp.clip(log_diagonal.reshape(*shape, dim) + 1.0, -7.0, 7.0))
         whitening = _lower_triangular(diagonal, lower.reshape(*shape, below))
         return MixtureHead(logits, means.reshape(*shape, dim), whitening)

@@ -17,19 +17,19 @@ from jaxlfi.distributions.truncation import MASS_DRAWS, mass_inside, rejection_s
 from jaxlfi.estimators.density import Density
 
 MAP_STARTS = 16
-"""Draws of the highest density from which the mode is looked for."""
+"""Number of gradient ascents towards the mode, each from one of the draws of highest density."""
 MAP_STEPS = 300
-"""Steps of Adam from each."""
+"""Steps of Adam in each ascent."""
 MAP_RATE = 0.02
-"""Their length at first, as a fraction of half the support's width; it falls to zero by the last."""
+"""Adam's initial step size, as a fraction of half the support's width; it decays to zero."""
 
 
 @struct.dataclass
 class Posterior:
     """What an observation says of the parameters: a density on a box. A pytree.
 
-    It is always the density truncated to the support. Draws are rejected until they lie inside, never moved there; where
-    next to no mass is inside, they are those of the mixture, truncated (`truncated_mixture_draws`).
+    It is always the density truncated to the support. Draws are rejected until they lie inside, never moved there;
+    where next to no mass is inside, they are those of the mixture, truncated (`truncated_mixture_draws`).
     Arguments and results are in natural units, or in inference space (logarithms of log parameters) where
     `space="inference"` is passed.
 

@@ -11,7 +11,7 @@ from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.losses import LOSSES, Rows
 
 STEPS_PER_EPOCH = 50
-"""Gradient steps in an epoch at most, where steps are counted; the validation loss is computed after each epoch."""
+"""Maximum gradient steps in an epoch, where steps are counted; the validation loss is computed after each epoch."""
 
 
 @struct.dataclass

@@ -85,7 +85,9 @@ def render(collection: Collection, pictures: Sequence[Picture]) -> str:
     """
     config = collection.config
     first = next(iter(collection.runs.values()))[0]
-    task = _short(config.get("task") or first.config.get("task") or collection.folder.name)
+    task = _short(
+        config.get("task") or first.config.get("task") or first.config.get("task_name") or collection.folder.name
+    )
     title = f"{task}: {len(collection.table)} run{'s' if len(collection.table) != 1 else ''} of jaxlfi"
     return _document(
         title,
@@ -103,7 +105,8 @@ def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
         pictures: in their order on the page.
     """
     heuristic = heuristic_name(config["heuristic"])
-    title = f"{_short(config['task'])}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
+    task = _short(config["task"] or config["task_name"])
+    title = f"{task}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
     varied = [f"{axis['name']}: {', '.join(f'{v:g}' for v in axis['values'])}" for axis in config["axes"]]
     facts = {
         "Hyperparameters": "; ".join(varied),

@@ -11,7 +11,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics.base import Adaptation, Heuristic
 
 MAX_EXACT = 6
-"""Up to 6! = 720 permutations are tried; more components are matched greedily."""
+"""Maximum number of components that are matched exactly, over 6! = 720 permutations; more are matched greedily."""
 
 
 class Matched(Heuristic):

@@ -53,7 +53,7 @@ class Mode(Heuristic):
         weights = posterior.weights[:, None]
         weight_left = jnp.sum(jnp.where(leftwards, weights, 0.0), axis=0)
         weight_right = jnp.sum(jnp.where(rightwards, weights, 0.0), axis=0)
-        # The first round has nothing to compare with: no weight, whatever the thresholds.
+        # The first round has nothing to compare with, so no weight, also where thresholds are negative.
         weight_left, weight_right = (jnp.where(previous.informed, w, 0.0) for w in (weight_left, weight_right))
         support = stretch(
             box, feasible, weight_left > self.mass_threshold, weight_right > self.mass_threshold, self.expansion

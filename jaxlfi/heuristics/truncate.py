@@ -9,7 +9,7 @@ from jaxlfi.fields import hyperparameter
 from jaxlfi.heuristics.base import Adaptation, Heuristic, Value, adapted
 
 MIN_WIDTH = 1e-3
-"""Fraction of Phi's width below which no support is truncated."""
+"""Minimum width of a truncated support, as a fraction of Phi's."""
 
 
 class Truncate(Heuristic):

@@ -1,1 +1,1 @@
-"""io."""
+"""Files, serialisation, progress and the compile cache."""

@@ -16,7 +16,7 @@ import platform
 from pathlib import Path
 
 FEATURE_LINES = ("model name", "flags", "Features", "CPU implementer", "CPU part")
-"""Lines of /proc/cpuinfo that tell what machine code a processor runs, on x86 and on Arm."""
+"""Lines of /proc/cpuinfo that identify which machine code a processor runs, on x86 and on Arm."""
 
 
 def enable() -> Path | None:

@@ -13,20 +13,20 @@ from jaxlfi.io.serialise import json_safe
 
 
 def write_bytes(path: Path, content: bytes, durable: bool = False) -> None:
-    """Write beside the file, then move into its place.
+    """Write a temporary file in the same folder, then move it into place.
 
     Args:
         path: where to.
         content: all of it.
         durable: wait until it is on the disk, so that it also outlives a loss of power.
     """
-    beside = path.with_name(path.name + ".part")
-    with beside.open("wb") as file:
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
         file.write(content)
         if durable:
             file.flush()
             os.fsync(file.fileno())
-    beside.replace(path)
+    part.replace(path)
 
 
 def write_json(path: Path, value: Any) -> None:

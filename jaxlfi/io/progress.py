@@ -4,6 +4,7 @@ import time
 from types import TracebackType
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -18,7 +19,7 @@ class RoundProgress:
     """Shows how many rounds are done; a context manager.
 
     Example:
-        >>> with RoundProgress(Console(quiet=True), rounds=3, done=0, label="2 lanes") as progress:
+        >>> with RoundProgress(Console(quiet=True), rounds=3, done=0, label="2 runs") as progress:
         ...     progress.advance()
     """
 
@@ -31,7 +32,8 @@ class RoundProgress:
             done: how many were done before, by a run that is resumed.
             label: what is going on.
         """
-        self._console, self._rounds, self._first, self._done, self._label = console, rounds, done, done, label
+        self._console, self._rounds, self._first, self._done = console, rounds, done, done
+        self._label = label = escape(label)  # names of tasks are no markup
         self._began = time.monotonic()
         columns = (
             TextColumn("{task.description}"),

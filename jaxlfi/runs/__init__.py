@@ -1,1 +1,1 @@
-"""runs."""
+"""Inference runs: executed, saved, resumed and loaded."""

@@ -1,6 +1,7 @@
 """A batch of runs from its plan to finished runs: in memory, or in a folder that can be resumed at any moment."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,12 @@ import jax
 import numpy as np
 
 from jaxlfi.bayessim.algorithm import State
-from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
+from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs, start_one
 from jaxlfi.bayessim.correction import gaussian_prior
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.keys import key_of, run_keys
+from jaxlfi.bayessim.memory import budget, state_bytes
 from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.io import files as atomic
@@ -107,7 +109,29 @@ def prepare(plan: BatchPlan, observation: Any = None, first: Simulations | None 
     observed, x = (np.stack([np.asarray(by_seed[spec.seed][i]) for spec in plan.specs]) for i in range(2))
     if first is not None and first.x.shape[1] != x.shape[1]:
         raise ValueError(f"simulations: expected summaries of length {x.shape[1]}, got {first.x.shape[1]}")
-    return Observed(observed, x, first)
+    given = Observed(observed, x, first)
+    _require_memory(plan, given)
+    return given
+
+
+def _require_memory(plan: BatchPlan, given: Observed) -> None:
+    """Refuse a batch whose states alone would not fit into the memory.
+
+    Raises:
+        ValueError: naming the settings that set its size.
+    """
+    (spec, *_), observed = plan.specs, given.trajectory[:1]
+    inputs, _ = stack_inputs([spec], observed, given.x[:1])
+    first = None if given.first is None else len(given.first.theta)
+    one = jax.tree.map(lambda leaf: leaf[0], inputs)
+    state = jax.eval_shape(functools.partial(start_one, plan.task, first), plan.settings, one)
+    needed, free = len(plan.specs) * state_bytes(state), budget() * jax.local_device_count()
+    if needed > free:
+        raise ValueError(
+            f"settings: expected runs that fit into the memory, got {len(plan.specs)} of "
+            f"{needed / 2**30:.3g} GiB in all, where {free / 2**30:.3g} GiB are free: lower simulations_per_round, "
+            "rounds, seeds or the network's size"
+        )
 
 
 def execute(
@@ -122,7 +146,7 @@ def execute(
     Args:
         plan: what to run.
         observed: of `prepare`.
-        folder: made by `begin`, at whatever point it was left; None to keep everything in memory.
+        folder: made by `begin`, finished or not; None to keep everything in memory.
         on_round: called as each round ends, with its index and its record.
         on_compiled: called with the seconds that compiling took.
 
@@ -220,19 +244,19 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed) -> None:
     shared = {name: value for name, value in runs[0].items() if name not in OWN}
     config = runs[0] | status if plan.kind == RUN else shared | {"format": plan.kind} | status
 
-    def fill(beside: Path) -> None:
-        Checkpoint(beside).write_start(observed.trajectory, observed.x, observed.first)
+    def fill(staging: Path) -> None:
+        Checkpoint(staging).write_start(observed.trajectory, observed.x, observed.first)
         if plan.kind == RUN:
             return
         for name, run in zip(plan.folders(), runs, strict=True):
-            (beside / name).mkdir(parents=True)
-            atomic.write_json(beside / name / "config.json", run)
+            (staging / name).mkdir(parents=True)
+            atomic.write_json(staging / name / "config.json", run)
 
     folders.create(folder, config, fill)
 
 
 def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]:
-    """The plan of a folder and what its runs observe, at whatever point it was left.
+    """The plan of a folder and what its runs observe, finished or not.
 
     Args:
         folder: made by `begin`.

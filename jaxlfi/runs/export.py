@@ -68,12 +68,12 @@ def write_netcdf(path: Path, folder: Path, n: int, seed: int = 0) -> None:
     Raises:
         MissingLibrary: where ArviZ is not installed.
     """
-    beside = path.with_name(path.name + ".part")
+    part = path.with_name(path.name + ".part")
     try:
-        to_inference_data(folder, n, seed).to_netcdf(str(beside))
-        os.replace(beside, path)
+        to_inference_data(folder, n, seed).to_netcdf(str(part))
+        os.replace(part, path)
     finally:
-        beside.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
 
 
 def _arviz() -> Any:

@@ -74,9 +74,9 @@ def versions() -> dict[str, str]:
 
 
 def command_line(argv: Sequence[str]) -> str:
-    """A command as its results tell of it: without the folders of the machine it ran on.
+    """A command as it is recorded with its results: without the folders of the machine it ran on.
 
-    An absolute path is told from the working folder on where it lies below it, and by its name alone elsewhere.
+    An absolute path is written relative to the working folder where it lies below it, and by its name alone elsewhere.
 
     Example:
         >>> command_line(["/usr/bin/jaxlfi", "report", "/elsewhere/runs/edge"])
@@ -95,7 +95,7 @@ def command_line(argv: Sequence[str]) -> str:
 
 
 def processor() -> str:
-    """The processor's name as the system tells it."""
+    """The processor's name as the system reports it."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text().splitlines():
@@ -110,6 +110,8 @@ def refuse_occupied(folder: Path) -> None:
     Raises:
         StoreError: if the folder exists and is not empty, or is a file.
     """
+    if folder.is_symlink() and not folder.exists():
+        raise StoreError(f"out: expected a new folder, got {str(folder)!r}, a link that leads nowhere")
     if not folder.exists():
         return
     if not folder.is_dir() or any(folder.iterdir()):
@@ -125,21 +127,21 @@ def create(folder: Path, config: Mapping[str, Any], fill) -> None:
     Args:
         folder: where; it must not exist or be empty.
         config: written as config.json.
-        fill: called with the folder's temporary path, to write what a resume needs besides.
+        fill: called with the folder's temporary path, to write what a resume needs stagings.
     """
     refuse_occupied(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        staging = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     except OSError as error:
         raise StoreError(f"out: expected a folder that can be written, got {str(folder)!r}: {error}") from error
     try:
-        beside.chmod(0o755)
-        fill(beside)
-        atomic.write_json(beside / "config.json", config)
-        beside.rename(folder)
+        staging.chmod(0o755)
+        fill(staging)
+        atomic.write_json(staging / "config.json", config)
+        staging.rename(folder)
     except BaseException:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(staging, ignore_errors=True)
         raise
 
 
@@ -234,11 +236,11 @@ def write_run(folder: Path, run: Run, keep_network: bool = False) -> None:
 def save(run: Run, folder: Path) -> Path:
     """Write one run into a new folder, complete or not at all."""
 
-    def fill(beside: Path) -> None:
+    def fill(staging: Path) -> None:
         for index, seconds in enumerate(np.asarray(run.history["seconds"])):
             row = {name: value[index] for name, value in run.history.items() if not name.startswith(FINAL)}
-            append_ledger(beside, index, jax.device_get(row), run.task.reasons, seconds)
-        write_run(beside, run)
+            append_ledger(staging, index, jax.device_get(row), run.task.reasons, seconds)
+        write_run(staging, run)
 
     if run.task is None:
         raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")

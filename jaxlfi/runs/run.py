@@ -112,7 +112,8 @@ class Run:
         if self.settings.rounds != 1:
             raise ValueError(
                 f"posterior_of: expected a run of one round, got one of {self.settings.rounds}, whose network "
-                "has learnt the posterior of its own observation alone: infer with settings.replace(rounds=1), or --method npe"
+                "has learnt the posterior of its own observation alone: infer with settings.replace(rounds=1), or "
+                "--method npe"
             )
         if self.network is None:
             raise ValueError("posterior_of: expected a run whose network was kept (--keep-network), got none")

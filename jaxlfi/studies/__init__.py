@@ -1,1 +1,1 @@
-"""studies."""
+"""Studies of many runs: grids of hyperparameters, and calibration."""

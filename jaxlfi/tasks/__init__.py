@@ -1,1 +1,1 @@
-"""tasks."""
+"""Tasks: simulators with named, bounded parameters, their priors, summaries and observations."""

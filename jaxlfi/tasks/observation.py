@@ -43,7 +43,7 @@ def simulator_shapes(task: Task) -> Shapes:
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
     theta = jax.ShapeDtypeStruct((task.dim,), jnp.float32)
-    # A simulator is foreign code; whatever it raises while traced is told in one line.
+    # A simulator is foreign code; what it raises while traced is reported in one line.
     try:
         result = jax.eval_shape(task.simulate, key, theta)
     except Exception as error:
@@ -114,7 +114,7 @@ def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
 
 
 def trace_observation(key: jax.Array, task: Task) -> jax.Array:
-    """As `simulate_observation`, inside a traced function: the first try, whatever comes of it."""
+    """As `simulate_observation`, inside a traced function: the first try, which may have failed."""
     if task.truth is None:
         raise ValueError("observation: expected one, as the task has neither an observation nor a known truth")
     return trajectory_and_outcome(task, jax.random.fold_in(key, 0), task.inference.truth)[0]

@@ -16,7 +16,7 @@ def identity(trajectory: Float[Array, "..."]) -> Float[Array, " obs"]:
 
 
 def series(trajectory: Float[Array, "time channels"]) -> Float[Array, " obs"]:
-    """Level, spread, memory and coupling of a time series, shape [4 C + C (C - 1) / 2]; of two channels, nine numbers.
+    """Means, variances and correlations of a time series, shape [4 C + C (C - 1) / 2]: nine numbers for two channels.
 
     In this order: the means; log(variance + 1), the variances with divisor T - 1; for each channel its autocorrelations
     at lags 1 and 2; the correlations of each pair of channels. Lagged products of the standardised series are summed
@@ -42,13 +42,13 @@ def series(trajectory: Float[Array, "time channels"]) -> Float[Array, " obs"]:
 
 
 def cross_correlation(trajectory: Float[Array, "time columns"], actions: int) -> Float[Array, " obs"]:
-    """How states go with actions, and their level and spread: psi of section VI-F, shape [Ds Da + 2 Ds].
+    """Products of states and actions, moments of states: psi of section VI-F, shape [Ds Da + 2 Ds].
 
     In this order: the dot products <S_i, A_j> over time, j fastest; the means of the states; their standard deviations
     (reading L: what the paper writes as Var).
 
     Args:
-        trajectory: states [T, Ds] beside actions [T, Da], shape [T, Ds + Da].
+        trajectory: states [T, Ds] followed by actions [T, Da], shape [T, Ds + Da].
         actions: Da, the number of columns at the end that are actions.
 
     Raises:

@@ -139,7 +139,11 @@ def _classifier_check(run: Run, plan: CalibrationPlan, truths: Mapping[str, np.n
     # Held-out rows are nearly independent where there is nothing to learn.
     deviation = 0.5 / math.sqrt(2 * plan.truths)
     p_value = 0.5 * math.erfc((accuracy - 0.5) / deviation / math.sqrt(2))
-    verdict = diagnostics.OK if p_value > diagnostics.SIGNIFICANCE else "miscalibrated: draws can be told from truths"
+    verdict = (
+        diagnostics.OK
+        if p_value > diagnostics.SIGNIFICANCE
+        else "miscalibrated: a classifier separates draws from truths"
+    )
     expected = f"at most {0.5 + 2.33 * deviation:.2f}"
     return Check("classifier, draws or truths", f"{accuracy:.2f}", expected, p_value, verdict, {"accuracy": accuracy})
 
@@ -190,7 +194,7 @@ def _draws(run: Run, key: jax.Array, n: int) -> jax.Array:
 
 
 def against(run: Run, plan: CalibrationPlan, name: str, reference: np.ndarray) -> Check:
-    """Whether the run's posterior can be told from reference samples [n, D] in inference space."""
+    """How well a classifier separates the run's posterior from reference samples [n, D] in inference space."""
     n = min(len(reference), MAX_ROWS)
     draws = _draws(run, jax.random.fold_in(plan.key(AGAINST), 0), n)
     accuracy = _accuracy(jax.random.fold_in(plan.key(AGAINST), 1), reference[:n], draws)

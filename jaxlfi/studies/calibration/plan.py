@@ -60,8 +60,8 @@ def read_run(folder: Path, task: Task | None = None) -> Run:
         task: where it was made in Python and cannot be found by name.
 
     Raises:
-        ValueError: for a folder that holds no finished run of one seed, a task that cannot be found or has changed, or a
-            heuristic that is not installed.
+        ValueError: for a folder that holds no finished run of one seed, a task that cannot be found or has changed, or
+            a heuristic that is not installed.
     """
     if grid.is_grid(folder):
         raise StoreError(f"{folder}: expected the folder of one run, got a grid's, which keeps no posteriors")

@@ -14,6 +14,7 @@ from rich.console import Console
 from jaxlfi.bayessim.batch import RunInputs, posterior_after, stack, start_one
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
+from jaxlfi.bayessim.memory import PROGRAM_PER_STATE, budget, even_length, state_bytes
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.io import files as atomic
 from jaxlfi.io.progress import RoundProgress
@@ -21,7 +22,6 @@ from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.run import Run
 from jaxlfi.studies.calibration.plan import DRAWS, RUNS, CalibrationPlan
 from jaxlfi.studies.chunk_store import ChunkStore
-from jaxlfi.studies.memory import PROGRAM_PER_STATE, budget, even_length, state_bytes
 
 RUNS_PER_DEVICE = 16
 """Repeated runs of a chunk on each device: a chunk is what a crash can lose."""

@@ -12,9 +12,9 @@ import numpy as np
 from jaxlfi.bayessim.batch import BatchEngine, RunInputs, stack_inputs, start_one
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
+from jaxlfi.bayessim.memory import FRACTION, PROGRAM_PER_STATE, budget, even_length, state_bytes
 from jaxlfi.bayessim.record import theta_error, trajectory_error
 from jaxlfi.studies.grid.grid import Grid, grid_runs, observations
-from jaxlfi.studies.memory import FRACTION, PROGRAM_PER_STATE, budget, even_length, state_bytes
 
 MEASURES = (
     "theta_error",

@@ -109,8 +109,8 @@ def begin(folder: Path, grid: Grid, observation: Any = None, runs_per_chunk: int
 def create(folder: Path, work: Work) -> None:
     """Bring the folder of a prepared work into being."""
 
-    def fill(beside: Path) -> None:
-        atomic.write_arrays(beside / "observation.npz", {"trajectory": work.observed, "x": work.x}, durable=True)
+    def fill(staging: Path) -> None:
+        atomic.write_arrays(staging / "observation.npz", {"trajectory": work.observed, "x": work.x}, durable=True)
 
     run_store.create(
         folder,
@@ -149,7 +149,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def reopen(folder: Path) -> Work:
-    """The work of a folder, at whatever point it was left; not compiled.
+    """The work of a folder, finished or not; not compiled.
 
     Raises:
         StoreError: for a folder that is damaged or whose configuration or task has changed since it was begun.
@@ -190,7 +190,7 @@ def advance(folder: Path, work: Work, console: Console) -> dict[str, np.ndarray]
     """Compute the chunks that are not there yet, then write the results.
 
     Args:
-        folder: made by `begin`, at whatever point it was left.
+        folder: made by `begin`, finished or not.
         work: the folder's.
         console: for progress.
 

@@ -11,7 +11,7 @@ import jax
 PROGRAM_PER_STATE = 10
 """Bytes a compiled round needs for each byte of its runs' states: 7 for the `quick` preset on Lotka-Volterra."""
 FRACTION = 0.6
-"""Of the free memory that a batch may take; other processes want some, and the estimate is one."""
+"""Fraction of the free memory that a batch may take: other processes need some, and its size is an estimate."""
 
 
 def state_bytes(tree: Any) -> int:
