@@ -1,6 +1,5 @@
-"""What the tests of whole runs share: settings that take milliseconds, and one engine for many runs."""
+"""What the tests of whole runs share: settings that take milliseconds, and one task for many runs."""
 
-import dataclasses
 import functools
 
 import jax
@@ -8,21 +7,21 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from envs import gaussian_linear
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim import batch as lanes
-from jaxlfi.estimators.estimator import Estimator
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.estimators.mixture_network import MixtureNetwork
 
 TASK = "envs.gaussian_linear:task"
 # Few and small steps: training amplifies rounding, and runs that ought to be equal are compared to a
 # tolerance.
 SETTINGS = Settings(
-    estimator=Estimator(hidden=(16,), learning_rate=1e-3, epochs=0, steps=100, batch_size=20, warm_start=False),
+    estimator=MixtureNetwork(hidden=(16,), learning_rate=1e-3, epochs=0, steps=100, batch_size=20, warm_start=False),
     rounds=2,
     simulations_per_round=20,
     simulation_budget=25,
 )
 FLAGS = (
-    "--hidden 16 --activation tanh --normaliser zscore --learning-rate 1e-3 --steps 100 --batch-size 20 "
+    "--estimator mdn --hidden 16 --activation tanh --normaliser zscore "
+    "--learning-rate 1e-3 --steps 100 --batch-size 20 "
     "--validation 0 --patience 0 --ensemble-size 1 --components 4 --prune 0 --weight-decay 0 --clip-norm inf "
     "--schedule constant --no-warm-start --correction none --restriction clip "
     "--rounds 2 --simulations-per-round 20 --simulation-budget 25 --no-figures"
@@ -32,37 +31,12 @@ FLAGS = (
 CACHE_SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 gaussian = functools.cache(gaussian_linear.task)
-"""One task object, so that programs compiled for it are found again."""
+"""The task that `TASK` names."""
 
 
 def settings(**changes) -> Settings:
     """The small settings with some of them replaced."""
-    return dataclasses.replace(SETTINGS, **changes)
-
-
-class SharedEngine(lanes.LaneEngine):
-    """An engine that compiles once however many runs use it."""
-
-    def compile(self, state) -> None:
-        """Compile the first time only."""
-        if hasattr(self._round, "lower"):
-            super().compile(state)
-
-
-def share_engine(monkeypatch) -> None:
-    """Let all sessions of a test use one task and one engine: their lanes and observations must be equal."""
-    from jaxlfi.runs import session
-    from jaxlfi.tasks import registry as tasks
-
-    made = []
-
-    def engine(task, settings, inputs):
-        if not made:
-            made.append(SharedEngine(task, settings, inputs))
-        return made[0]
-
-    monkeypatch.setattr(session, "LaneEngine", engine)
-    monkeypatch.setattr(tasks, "load", lambda reference: gaussian())
+    return SETTINGS.replace(**changes)
 
 
 def command(*arguments: str) -> int:

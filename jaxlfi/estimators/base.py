@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import flax.linen as nn
 import jax
@@ -87,7 +87,7 @@ class Estimator(Checked, abc.ABC):
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one ensemble member for D parameters."""
 
-    def check(self) -> Self:
+    def check(self) -> "Estimator":
         """Refuse settings that cannot work, by name; returns the settings."""
         check_fields(self)
         if (self.epochs > 0) == (self.steps > 0):

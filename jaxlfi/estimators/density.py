@@ -1,6 +1,6 @@
 """Densities: q_phi(theta | x) of one x, before it is truncated."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 
+@runtime_checkable
 class Density(Protocol):
     """A density over inference space: a mixture of Gaussians, or an ensemble of conditional densities."""
 
