@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 
-CANDIDATES = 32
+CANDIDATES = 64
 """Number of weighted candidates that each draw is resampled from."""
 TAIL = 4.0
 """Standard deviations from the mean beyond which the tail of a normal is approximated by an exponential."""
@@ -18,9 +18,10 @@ def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: S
     """`n` draws of a mixture truncated to the support, by importance resampling; rejection has no part in it.
 
     Candidates are drawn dimension by dimension, each from its normal given the ones before, truncated to the box
-    (Geweke 1991; Hajivassiliou and Keane): all lie inside, however far the mixture is from it. Their weight is the
-    product of the masses that truncation left, divided by what their component was favoured by, and each draw is one of `CANDIDATES` picked by weight, so that it is as
-    good as exact where few dimensions are truncated.
+    (Geweke 1991; Hajivassiliou and Keane): all lie inside, however far the mixture is from it. Components that have
+    little mass in the box are chosen as rarely. The weight of a candidate is the product of the masses that truncation
+    left, divided by what its component was favoured by, and each draw is one of `CANDIDATES` picked by weight, so that
+    it is as good as exact where few dimensions are truncated.
 
     Args:
         key: consumed.

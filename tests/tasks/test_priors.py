@@ -10,10 +10,9 @@ import pytest
 from scipy import integrate, stats
 
 from envs import gaussian_linear
-from jaxlfi.bayessim.algorithm import prior_draws
 from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.observation import simulate_observation
-from jaxlfi.tasks.priors import TailedUniform, with_tails
+from jaxlfi.tasks.priors import MIN_INSIDE, TailedUniform, prior_draws, prior_mass, require_mass, with_tails
 from jaxlfi.tasks.task import Task
 
 LOW, HIGH, SIGMA = np.array([-3.0, 0.5, -0.1]), np.array([2.0, 0.6, 4.0]), np.array([1.0, 0.03, 0.41])
@@ -97,19 +96,19 @@ def test_it_is_a_distrax_distribution(key):
 
 def test_the_first_round_is_drawn_from_the_box_and_its_tails(key):
     task = with_tails(gaussian_linear.task(), "misspecified", tail=0.2)
-    draws = np.asarray(prior_draws(key, task, task.support(), 4000), np.float64)
+    draws = np.asarray(prior_draws(key, task.inference.prior, task.support(), 4000), np.float64)
     height, sigma = 1 / (3 + 0.6 * np.sqrt(2 * np.pi)), 0.6  # of the first dimension, whose box is [-3, 0]
     beyond = draws[draws[:, 0] > 0, 0]
     assert abs(beyond.size / 4000 - height * sigma * np.sqrt(np.pi / 2)) < 5 * 0.5 / np.sqrt(4000)
     assert stats.kstest(beyond / sigma, stats.halfnorm.cdf).pvalue > 1e-3
-    assert bool(task.feasible.contains(jnp.asarray(draws, jnp.float32)).all())
+    assert bool(task.inference.feasible.contains(jnp.asarray(draws, jnp.float32)).all())
 
 
 def test_only_prior_and_support_change():
     plain = gaussian_linear.task()
     task = with_tails(plain, "misspecified")
     assert list(task.supports) == ["tailed"]
-    for mine, its in ((task.support(), plain.feasible), (task.feasible, plain.feasible)):
+    for mine, its in ((task.supports["tailed"], plain.feasible), (task.feasible, plain.feasible)):
         np.testing.assert_array_equal(mine.low, its.low)
         np.testing.assert_array_equal(mine.high, its.high)
     np.testing.assert_array_equal(task.truth, plain.truth)
@@ -133,28 +132,30 @@ def logarithmic() -> Task:
     )
 
 
-def test_logarithmic_parameters_have_their_tails_in_coordinates():
+def test_logarithmic_parameters_have_their_tails_in_inference_space():
     plain = logarithmic()
     task = with_tails(plain, "guess", tail=0.1)
-    np.testing.assert_allclose(task.feasible.low, [-5.0, np.log(0.1)], rtol=1e-6)
-    np.testing.assert_allclose(task.truth, plain.truth, rtol=1e-6)
+    np.testing.assert_allclose(task.inference.feasible.low, [-5.0, np.log(0.1)], rtol=1e-6)
+    np.testing.assert_array_equal(task.truth, plain.truth)
+    assert task.log == ("rate",) and task.prior_space == "inference"
     decade = np.log(10.0)
     theta = jnp.array([1.0, decade + 0.2 * decade])  # two tails' scales beyond the rate's upper bound
     inside = jnp.array([1.0, 1.0])
-    np.testing.assert_allclose(task.prior.log_prob(theta) - task.prior.log_prob(inside), -2.0, rtol=1e-4)
-    own = with_tails(plain, plain.support("guess"), tail=0.1)
+    np.testing.assert_allclose(task.inference.prior.log_prob(theta) - task.inference.prior.log_prob(inside), -2.0, rtol=1e-4)
+    own = with_tails(plain, plain.supports["guess"], tail=0.1)  # a box of natural units
     np.testing.assert_array_equal(own.prior.log_prob(theta), task.prior.log_prob(theta))
 
 
 def test_a_box_wider_than_phi_widens_the_support():
     task = with_tails(logarithmic(), "wide")
+    np.testing.assert_allclose(task.supports["tailed"].low, [-9.0, 0.01], rtol=1e-5)
     np.testing.assert_allclose(task.support().low, [-9.0, np.log(0.01)], rtol=1e-5)
     np.testing.assert_allclose(task.support().high, [5.0, np.log(1e4)], rtol=1e-5)
 
 
 @pytest.mark.parametrize("tail", [0.0, -0.1, float("nan")])
 def test_a_tail_that_is_none_is_refused(tail):
-    with pytest.raises(ValueError, match=r"^tail: expected a positive share of the width, got"):
+    with pytest.raises(ValueError, match=r"^tail: expected a positive fraction of the width, got"):
         with_tails(logarithmic(), "guess", tail)
 
 
