@@ -1,5 +1,6 @@
-"""TailedUniform against SciPy, and tasks whose first round is drawn from it."""
+"""Priors of a task in either space, and TailedUniform against SciPy."""
 
+import dataclasses
 import itertools
 
 import distrax
@@ -9,11 +10,13 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+import jaxlfi
 from envs import gaussian_linear
 from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.observation import simulate_observation
 from jaxlfi.tasks.priors import MIN_INSIDE, TailedUniform, prior_draws, prior_mass, require_mass, with_tails
 from jaxlfi.tasks.task import Task
+from tests import small
 
 LOW, HIGH, SIGMA = np.array([-3.0, 0.5, -0.1]), np.array([2.0, 0.6, 4.0]), np.array([1.0, 0.03, 0.41])
 """Three boxes of unlike place, width and tails."""
@@ -91,7 +94,115 @@ def test_it_is_a_distrax_distribution(key):
     np.testing.assert_allclose(jax.jit(lambda prior, x: prior.log_prob(x))(PRIOR, theta), log_prob, rtol=1e-6)
 
 
-# ------------------------------------------------------------------------------------------------------- tasks
+# ------------------------------------------------------------------------------------------- priors of a task
+
+
+def simulate(key, theta):
+    return theta
+
+
+def decade(prior=None, prior_space="natural") -> Task:
+    """A parameter that is inferred as its logarithm, beside one that is not."""
+    box = Support([0.1, -3.0], [20.0, 3.0])
+    return Task(simulate, ("rate", "shift"), {"box": box}, box, log=("rate",), prior=prior, prior_space=prior_space)
+
+
+class _Exp(distrax.Bijector):
+    """The exponential of the first of two numbers."""
+
+    def __init__(self):
+        super().__init__(event_ndims_in=1)
+
+    def forward_and_log_det(self, x):
+        return jnp.stack([jnp.exp(x[..., 0]), x[..., 1]], axis=-1), x[..., 0]
+
+    def inverse_and_log_det(self, y):
+        return jnp.stack([jnp.log(y[..., 0]), y[..., 1]], axis=-1), -jnp.log(y[..., 0])
+
+
+LOCATION, SCALES = np.array([0.7, -0.5]), np.array([0.4, 1.0])
+INNER = distrax.MultivariateNormalDiag(jnp.asarray(LOCATION, jnp.float32), jnp.asarray(SCALES, jnp.float32))
+"""Over inference space: normal in ln rate and in shift."""
+NATURAL = distrax.Transformed(INNER, _Exp())
+"""The same distribution over natural units: log-normal in rate."""
+
+
+def test_a_log_normal_prior_is_the_same_from_either_space(key):
+    """The same density over inference space, and the same draws by the same key."""
+    natural, inner = decade(NATURAL).inference.prior, decade(INNER, "inference").inference.prior
+    assert inner is INNER
+    theta = jnp.array([[0.7, -0.5], [0.0, 1.0], [2.0, -2.5]])
+    np.testing.assert_allclose(natural.log_prob(theta), inner.log_prob(theta), rtol=1e-5, atol=1e-5)
+    support = decade().support()
+    of = lambda prior, key: np.asarray(prior_draws(key, prior, support, 4000))
+    draws, same = of(natural, key), of(inner, jax.random.clone(key))
+    np.testing.assert_allclose(draws, same, rtol=1e-4, atol=1e-5)
+    low, high = (np.asarray(bound) for bound in (support.low, support.high))
+    for d in range(2):
+        ends = (np.array([low[d], high[d]]) - LOCATION[d]) / SCALES[d]
+        assert stats.kstest(draws[:, d], stats.truncnorm(*ends, LOCATION[d], SCALES[d]).cdf).pvalue > 1e-3
+
+
+def test_a_prior_over_natural_units_is_transformed_with_its_jacobian():
+    """A normal one over natural units, in ln rate: density times rate; it integrates to the same mass."""
+    normal = distrax.MultivariateNormalDiag(jnp.array([3.0, 0.0]), jnp.array([1.0, 1.0]))
+    inner = decade(normal).inference.prior
+    theta = np.array([[np.log(2.5), 0.3], [0.0, -1.0]], np.float32)
+    expected = stats.norm(3, 1).logpdf(np.exp(theta[:, 0])) + theta[:, 0] + stats.norm.logpdf(theta[:, 1])
+    np.testing.assert_allclose(inner.log_prob(theta), expected, rtol=1e-4)
+    # Without any logarithm there is nothing to transform.
+    plain = dataclasses.replace(decade(normal), log=())
+    assert plain.inference.prior is normal
+
+
+def test_draws_that_have_no_logarithm_are_in_no_support(key):
+    """Half of this prior's rates are negative: they are rejected, not moved."""
+    half = distrax.MultivariateNormalDiag(jnp.array([0.0, 0.0]), jnp.array([5.0, 1.0]))
+    task = decade(half)
+    draws = np.asarray(prior_draws(key, task.inference.prior, task.support(), 2000))
+    assert np.isfinite(draws).all() and bool(task.support().contains(jnp.asarray(draws)).all())
+    assert stats.kstest(np.exp(draws[:, 0]), stats.truncnorm(0.02, 4.0, scale=5.0).cdf).pvalue > 1e-3
+    expected = np.diff(stats.norm.cdf([0.02, 4.0]))[0] * np.diff(stats.norm.cdf([-3, 3]))[0]
+    assert float(prior_mass(task.inference.prior, task.support())) == pytest.approx(expected, abs=0.025)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_draws_of_a_prior_are_kept_in_the_support(seed):
+    """Half of the prior's mass is outside in one dimension, nearly all of it in another box."""
+    normal = distrax.MultivariateNormalDiag(jnp.array([0.0, 2.0]), jnp.array([1.0, 0.5]))
+    for box in (Support([0.0, -2.0], [1.0, 3.0]), Support([-2.0, -5.0], [-1.9, -4.0])):
+        draws = prior_draws(jax.random.key(seed), normal, box, 20)
+        assert draws.shape == (20, 2) and bool(box.contains(draws).all())
+
+
+def test_without_a_prior_draws_are_uniform(key):
+    box = Support([0.0, -2.0], [1.0, 3.0])
+    draws = np.asarray(prior_draws(key, None, box, 4000))
+    for d, (low, width) in enumerate([(0.0, 1.0), (-2.0, 5.0)]):
+        assert stats.kstest(draws[:, d], stats.uniform(low, width).cdf).pvalue > 1e-3
+    assert float(prior_mass(None, box)) == 1.0 and require_mass(None, box, "box") == 1.0
+
+
+def test_a_prior_with_next_to_no_mass_inside_is_refused():
+    """As one in natural units is where it counts as one over logarithms; all draws would be uniform."""
+    box = decade().support()
+    elsewhere = distrax.MultivariateNormalDiag(jnp.array([40.0, 800.0]), jnp.array([0.05, 0.05]))
+    for prior_space in ("natural", "inference"):
+        prior = decade(elsewhere, prior_space).inference.prior
+        with pytest.raises(ValueError, match=r"^prior: expected some of its mass inside the support 'box', got 0 of it"):
+            require_mass(prior, box, "'box'")
+    mass = require_mass(INNER, box, "'box'")
+    assert mass == pytest.approx(0.99, abs=0.02) and mass > MIN_INSIDE
+
+
+def test_a_run_does_not_start_on_a_prior_outside_its_box():
+    elsewhere = distrax.MultivariateNormalDiag(jnp.array([40.0, 800.0]), jnp.array([0.05, 0.05]))
+    with pytest.raises(ValueError, match=r"^prior: expected some of its mass inside the support") as told:
+        jaxlfi.infer(jax.random.key(0), decade(elsewhere), jnp.array([1.0, 0.0]), settings=small.SETTINGS)
+    assert "\n" not in str(told.value)
+
+
+# ------------------------------------------------------------------------------------------------ tailed priors
 
 
 def test_the_first_round_is_drawn_from_the_box_and_its_tails(key):
