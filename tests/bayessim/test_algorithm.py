@@ -332,7 +332,8 @@ def uniform_fraction(settings: Settings, key) -> float:
 @pytest.mark.parametrize("fraction", [0.0, 0.1, 0.35, 1.0])
 def test_the_defensive_fraction_of_proposals_is_uniform(fraction, key):
     deviation = np.sqrt(fraction * (1 - fraction) / 4000)
-    assert abs(uniform_fraction(MANY.replace(defensive=fraction), key) - fraction) <= 5 * deviation + 2e-4
+    chance = 1e-3 * fraction  # uniform draws that lie near the posterior: 9e-5 of them are expected to
+    assert abs(uniform_fraction(MANY.replace(defensive=fraction), key) - fraction) <= 5 * deviation + chance
 
 
 def test_the_defensive_draws_are_those_of_the_current_support(key):

@@ -1,108 +1,53 @@
-"""Black boxes: nothing simulated that is not needed, the same posterior, and contracts enforced."""
+"""Runs of host simulators: the same posterior, nothing simulated that is not recorded, and contracts enforced."""
 
 import dataclasses
+import re
 
 import jax
 import numpy as np
 import pytest
 
 import jaxlfi
-from envs.gaussian_linear import MIXING, NOISE, posterior
-from jaxlfi.bayessim.host import simulate_within_budget
-from jaxlfi.heuristics import Edge, Fixed
-from jaxlfi.tasks.observation import SimulatorError
-from tests.small import SETTINGS, command, gaussian, whole_runs  # noqa: F401 - a fixture
+from envs.gaussian_linear import posterior
+from jaxlfi.runs.folder import read_ledger
+from jaxlfi.tasks.host import HostSimulator, SimulatorError
+from tests.small import FLAGS, SETTINGS, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
+from tests.tasks.test_host import Counting, numpy_simulate
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
 
 
-def numpy_simulate(rng, theta):
-    """The Gaussian task in NumPy."""
-    return theta @ MIXING.T + NOISE * rng.normal(size=theta.shape)
+def hosted(simulate=numpy_simulate, **changes):
+    """The Gaussian task with a simulator that JAX cannot trace."""
+    return dataclasses.replace(gaussian(), simulate=HostSimulator(simulate), **changes)
 
 
-def boxed(simulate=numpy_simulate, **changes):
-    """The Gaussian task as a black box."""
-    return dataclasses.replace(
-        gaussian(), simulate=simulate, black_box=True, summary=lambda trajectory: trajectory, **changes
-    )
+COUNTING = Counting(0.1)
 
 
 def task():
     """For the command line."""
-    return boxed()
+    return hosted()
 
 
-def wrong_shape():
-    """Gives one trajectory too few."""
-    return boxed(lambda rng, theta: numpy_simulate(rng, theta)[1:], truth=None, observation=OBSERVED)
-
-
-def failing():
-    """Never succeeds."""
-    return boxed(
-        lambda rng, theta: (numpy_simulate(rng, theta), np.zeros(len(theta), bool)),
-        truth=None,
-        observation=OBSERVED,
-    )
-
-
-class Counting:
-    """A simulator that fails a share of the time and notes what it was asked for."""
-
-    def __init__(self, failing_share):
-        self.share, self.calls = failing_share, []
-
-    def __call__(self, rng, theta):
-        self.calls.append(len(theta))
-        return numpy_simulate(rng, theta), rng.uniform(size=len(theta)) >= self.share
-
-
-@pytest.mark.parametrize(("share", "expected"), [(0.0, 100), (0.1, None), (0.6, 125), (1.0, 125)])
-def test_attempts_stop_exactly_at_the_additions_or_the_budget(share, expected):
-    simulator = Counting(share)
-    theta = gaussian().support("ok").sample(jax.random.key(1), 125)
-    attempts = simulate_within_budget(boxed(simulator), jax.random.key(2), theta, 100, (2,))
-    assert sum(simulator.calls) == int(attempts.attempted)
-    assert int(attempts.succeeded) + int(attempts.failed(2).sum()) == int(attempts.attempted)
-    if expected is None:
-        assert int(attempts.succeeded) == 100 and 100 < int(attempts.attempted) <= 125
-        assert simulator.calls[0] == 100 and len(simulator.calls) > 1
-    else:
-        assert int(attempts.attempted) == expected
-    kept = np.asarray(attempts.kept)
-    assert np.all(np.asarray(attempts.x)[kept] != 0)
-
-
-def test_simulations_that_are_not_finite_fail_by_that_name():
-    def simulate(rng, theta):
-        x = numpy_simulate(rng, theta)
-        x[::2] = np.nan
-        return x
-
-    theta = gaussian().support("ok").sample(jax.random.key(1), 40)
-    attempts = simulate_within_budget(boxed(simulate), jax.random.key(2), theta, 40, (2,))
-    assert attempts.failed(2).tolist() == [0, 20]
+def counting():
+    """Fails one time in ten; the module notes what it was asked for."""
+    COUNTING.calls.clear()
+    return hosted(COUNTING, truth=None, observation=OBSERVED)
 
 
 def test_the_posterior_is_the_exact_one():
-    settings = dataclasses.replace(
-        SETTINGS,
-        simulations_per_round=300,
-        simulation_budget=300,
-        estimator=dataclasses.replace(SETTINGS.estimator, steps=1500, batch_size=100, learning_rate=1e-2, components=1),
-    )
-    run = jaxlfi.infer(jax.random.key(3), boxed(), OBSERVED, support="ok", heuristic=Edge(), settings=settings)
+    estimator = SETTINGS.estimator.replace(steps=1500, batch_size=100, learning_rate=1e-2, components=1)
+    enough = settings(simulations_per_round=300, simulation_budget=300, estimator=estimator, predictive=False)
+    run = jaxlfi.infer(jax.random.key(3), hosted(), OBSERVED, support="ok", heuristic=jaxlfi.Edge(), settings=enough)
     exact = posterior(OBSERVED)
-    spread = np.sqrt(np.diag(exact.covariance))
-    assert np.all(np.abs(run.mixture.mean - exact.mean) < 0.6 * spread)
-    np.testing.assert_allclose(np.sqrt(np.diag(run.mixture.covariance)), spread, rtol=0.4)
+    deviation = np.sqrt(np.diag(exact.covariance))
+    assert np.all(np.abs(run.mixture.mean - exact.mean) < 0.6 * deviation)
+    np.testing.assert_allclose(np.sqrt(np.diag(run.mixture.covariance)), deviation, rtol=0.4)
 
 
 def test_it_is_deterministic_and_leaves_the_same_files(tmp_path):
-    arguments = ["infer", "tests.test_black_box:task", "--support", "misspecified"]
-    from tests.small import FLAGS
-
+    arguments = ["infer", "tests.bayessim.test_host_engine:task", "--support", "misspecified"]
     for name in ("a", "b"):
         assert command(*arguments, *FLAGS, "--out", tmp_path / name) == 0
     assert (tmp_path / "a" / "posterior.npz").read_bytes() == (tmp_path / "b" / "posterior.npz").read_bytes()
@@ -111,23 +56,33 @@ def test_it_is_deterministic_and_leaves_the_same_files(tmp_path):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(("flags", "simulated"), [((), 20), (("--no-predictive",), 0)])
+def test_every_simulation_is_in_the_ledger(tmp_path, flags, simulated):
+    reference = "tests.bayessim.test_host_engine:counting"
+    assert command("infer", reference, "--support", "ok", *FLAGS, *flags, "--out", tmp_path / "run") == 0
+    ledger = read_ledger(tmp_path / "run")
+    assert [line["predictive_simulations"] for line in ledger] == [simulated] * 2
+    assert all(line["attempted"] == line["succeeded"] + sum(line["failed"].values()) for line in ledger)
+    assert sum(COUNTING.calls) == sum(line["attempted"] + line["predictive_simulations"] for line in ledger)
+    assert sum(line["failed"]["failed"] for line in ledger) > 0  # so that failures are seen to be counted
+
+
 @pytest.mark.parametrize(
     ("simulate", "message"),
     [
         (lambda rng, theta: numpy_simulate(rng, theta)[1:], r"expected numbers of shape \[20, 2\]"),
-        (lambda rng, theta: numpy_simulate(rng, theta)[:, :1], r"got float64 of shape \[20, 1\]"),
         (lambda rng, theta: (numpy_simulate(rng, theta), np.ones(3, bool)), "expected an outcome for each of 20"),
-        (lambda rng, theta: (numpy_simulate(rng, theta), np.zeros(len(theta), bool)), r"got none \(failed: 25, non_finite: 0\)"),  # noqa: E501
+        (lambda rng, theta: (theta, np.zeros(len(theta), bool)), r"got none \(failed: 25, non_finite: 0\)$"),
         (lambda rng, theta: 1 / 0, "ZeroDivisionError"),
     ],
-)  # fmt: skip
-def test_a_broken_contract_is_told(simulate, message):
-    with pytest.raises(SimulatorError, match=message):
-        jaxlfi.infer(jax.random.key(0), boxed(simulate), OBSERVED, heuristic=Fixed(), settings=SETTINGS)
+)
+def test_a_broken_contract_ends_the_run_in_one_line(simulate, message):
+    with pytest.raises(SimulatorError, match=message) as refused:
+        jaxlfi.infer(jax.random.key(0), hosted(simulate), OBSERVED, heuristic=jaxlfi.Fixed(), settings=SETTINGS)
+    assert "\n" not in str(refused.value)
 
 
 def test_it_cannot_be_vmapped():
-    with pytest.raises(ValueError, match="black box"):
-        jax.vmap(lambda key: jaxlfi.infer(key, boxed(), OBSERVED, settings=SETTINGS))(
-            jax.random.split(jax.random.key(0), 2)
-        )
+    keys = jax.random.split(jax.random.key(0), 2)
+    with pytest.raises(ValueError, match=re.escape("infer: expected concrete arguments for a host simulator")):
+        jax.vmap(lambda key: jaxlfi.infer(key, hosted(), OBSERVED, settings=SETTINGS))(keys)
