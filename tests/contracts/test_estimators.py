@@ -21,7 +21,7 @@ from jaxlfi.estimators.base import Estimator, Network, untrained
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.estimators.training import fit
 from jaxlfi.fields import declared, option
-from jaxlfi.io.serialise import estimator_from_json, estimator_to_json
+from jaxlfi.io.serialise import from_json, to_json
 
 # --------------------------------------------------------------------------------- an estimator of another package
 
@@ -124,11 +124,13 @@ def test_ours_are_registered():
     assert {"mdn", "maf", "nsf"} <= set(KINDS)
 
 
-def test_families_are_found_by_their_names_and_from_json(case):
+def test_families_are_found_by_their_names_and_written_to_json(case):
     name = registry.name_of(case.estimator)
-    if name in plugins.names(registry.GROUP):
-        assert registry.load(name) is type(case.estimator)
-    assert estimator_from_json(estimator_to_json(case.estimator)) == case.estimator or name not in KINDS
+    if isinstance(case.estimator, OneFile):
+        assert name.endswith("test_estimators:OneFile")
+        return
+    assert registry.load(name) is type(case.estimator)
+    assert from_json(to_json(case.estimator, registry.name_of), registry.load) == case.estimator
 
 
 def test_conditioning_is_the_same_compiled_and_not(case):
