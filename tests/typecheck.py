@@ -9,9 +9,9 @@ def checked(function):
     """Check a function's annotations at run time with beartype, but not a constructor's.
 
     The constructors are those of pytrees. JAX rebuilds them around whatever the leaves become (NumPy arrays, shapes,
-    vmap axes, boolean masks, one more axis), none of which the annotations mean. `Self` is known only where a whole class
-    is checked. Counts and words of a choice are not checked here: the library refuses wrong ones by a ValueError, which
-    is tested.
+    vmap axes, boolean masks, one more axis), none of which the annotations mean. `Self` is known only where a whole
+    class is checked. Counts and words of a choice are not checked here: the library refuses wrong ones by a ValueError,
+    which is tested.
     """
     if function.__name__ == "__init__" or typing.Self in function.__annotations__.values():
         return function

@@ -11,7 +11,7 @@ from jaxlfi.distributions.support import Support
 CANDIDATES = 64
 """Number of weighted candidates that each draw is resampled from."""
 TAIL = 4.0
-"""Standard deviations from the mean beyond which the tail of a normal is approximated by an exponential."""
+"""Standard deviations from the mean beyond which the tail of a normal is drawn from as an exponential, and weighted."""
 
 
 def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: Support, n: int) -> Array:
@@ -65,15 +65,20 @@ def _by_marginals(mixture: GaussianMixture, support: Support) -> tuple[Array, Ar
 def _truncated_normal(
     uniform: Float[Array, ""], low: Float[Array, ""], high: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """A quantile of the standard normal truncated to [low, high], and the logarithm of the mass in there."""
+    """A draw by a uniform number of the standard normal truncated to [low, high], and the logarithm of its weight.
+
+    The weight is the mass in there, and in the tail, where draws are exponential, the normal density over theirs.
+    """
     flip = low + high < 0  # to the side of the upper tail, where small masses keep their precision
     near, far = jnp.where(flip, -high, low), jnp.where(flip, -low, high)
     log_beyond = log_ndtr(-near)
     log_mass = log_beyond + jnp.log1p(-jnp.exp(jnp.minimum(log_ndtr(-far) - log_beyond, -1e-7)))
     beyond_near, beyond_far = ndtr(-near), ndtr(-far)
     middle = -ndtri(jnp.clip(beyond_near - uniform * (beyond_near - beyond_far), 1e-37, 1.0 - 1e-7))
-    # Beyond a of a few standard deviations the density falls as exp(-a (z - a)).
+    # Beyond a of a few standard deviations the density falls about as exp(-a (z - a)).
     rate = jnp.maximum(near, TAIL)
-    tail = near - jnp.log1p(-uniform * -jnp.expm1(-rate * (far - near))) / rate
-    value = jnp.clip(jnp.where(near > TAIL, tail, middle), near, far)
-    return jnp.where(flip, -value, value), log_mass
+    all_beyond = -jnp.expm1(-rate * (far - near))
+    excess = -jnp.log1p(-uniform * all_beyond) / rate
+    log_ratio = jnp.log(all_beyond / rate) - 0.5 * (excess**2 + near**2 + jnp.log(2 * jnp.pi))
+    value = jnp.clip(jnp.where(near > TAIL, near + excess, middle), near, far)
+    return jnp.where(flip, -value, value), jnp.where(near > TAIL, log_ratio, log_mass)

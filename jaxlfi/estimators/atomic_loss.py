@@ -91,8 +91,8 @@ def atomic(
             weight is positive.
         weights: of the rows, not negative, shape [B]. A row of weight 0 is not an atom of others either.
         atoms: M.
-        combined: weight of a row's -log q, which is added to its atomic loss: 1 (as in sbi) for rows drawn from the prior and 0 for
-            others, or 0 for the atomic loss alone.
+        combined: weight of a row's -log q, which is added to its atomic loss: 1 (as in sbi) for rows drawn from the
+            prior and 0 for others, or 0 for the atomic loss alone.
 
     Returns:
         The weighted mean over rows; 0 if no row has weight.

@@ -177,8 +177,8 @@ def test_the_density_is_one_in_all_inside_and_nothing_outside(case, space):
     mass = float(case.posterior.mass_inside)
     # The truncation constant has the error of 10000 draws; a flow's density has kinks that cells blur.
     assert np.exp(log_prob).sum() * area == pytest.approx(1, abs=0.02 + 5 * np.sqrt((1 - mass) / mass / 10_000))
-    low, high = theta[0, 0], theta[-1, -1]
-    outside = jnp.asarray([low - [0.0, 1.0], high + [0.0, 1.0], [high[0] + 5, 0.0], [-100.0, 0.0]], jnp.float32)
+    (low, bottom), (high, top) = theta[0, 0], theta[-1, -1]
+    outside = jnp.array([[low, bottom - 1], [high, top + 1], [high + 5, 0.0], [-100.0, 0.0]])
     assert np.isneginf(case.posterior.log_prob(outside, space)).all()
 
 

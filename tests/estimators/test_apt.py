@@ -106,7 +106,9 @@ SUPPORT = Support([-1.0, -2.0], [2.0, 1.5])
 
 def free_draws(network, n: int) -> np.ndarray:
     """Of the flow, not truncated."""
-    return np.asarray(jax.jit(lambda network: network.condition(X, SUPPORT).density.sample(jax.random.key(4), n))(network))
+    return np.asarray(
+        jax.jit(lambda network: network.condition(X, SUPPORT).density.sample(jax.random.key(4), n))(network)
+    )
 
 
 def test_a_flow_runs_in_the_same_loop_and_repeats(flow_run):
@@ -123,7 +125,9 @@ def test_a_flows_mixture_has_the_moments_of_its_draws_inside(network):
     draws = free_draws(network, 20000)
     kept = draws[np.asarray(SUPPORT.contains(draws))]
     # Both are Monte Carlo estimates, of 10000 and of 20000 draws.
-    assert float(posterior.mass_inside) == pytest.approx(len(kept) / 20000, abs=5 * 0.5 * np.sqrt(1 / 10000 + 1 / 20000))
+    assert float(posterior.mass_inside) == pytest.approx(
+        len(kept) / 20000, abs=5 * 0.5 * np.sqrt(1 / 10000 + 1 / 20000)
+    )
     assert 0.05 < float(posterior.mass_inside) < 0.95  # a test without draws outside would say nothing
     scale = kept.std(0)
     np.testing.assert_allclose((np.asarray(posterior.mixture.mean) - kept.mean(0)) / scale, 0, atol=0.2)
@@ -139,7 +143,7 @@ def test_draws_of_the_posterior_are_the_flows_own_truncated_to_the_box(network):
     kept = free[np.asarray(SUPPORT.contains(free))]
     for d in range(2):
         assert ks_2samp(draws[:, d], kept[:, d]).pvalue > 1e-4
-    # In a box that the flow never reaches, draws are those of its mixture, truncated; and it says that nothing is inside.
+    # In a box that the flow never reaches, draws are those of its mixture, truncated, and nothing counts as inside.
     far = jax.jit(Network.condition)(network, X, Support([8.0, 8.0], [9.0, 9.0]))
     there = np.asarray(far.sample(jax.random.key(3), 500))
     assert float(far.mass_inside) == 0 and np.asarray(far.support.contains(there)).all()

@@ -373,7 +373,9 @@ def test_a_warm_start_continues_and_a_cold_one_does_not():
     _, anew = fitted(cold, network=first, seed=9)
     assert anew.loss[0, 0] > continued.loss[0, 0] + 0.5
     # What a cold start is given does not matter at all, and its normaliser is the data's.
-    other = first.replace(**jax.tree.map(lambda leaf: leaf + 1, {"params": first.params, "normaliser": first.normaliser}))
+    other = first.replace(
+        **jax.tree.map(lambda leaf: leaf + 1, {"params": first.params, "normaliser": first.normaliser})
+    )
     chex.assert_trees_all_equal(fitted(cold, network=first), fitted(cold, network=other))
 
 

@@ -72,7 +72,7 @@ def test_a_normaliser_is_a_pytree_that_knows_its_transform():
     assert doubled.name == "asinh"
     x = jnp.array([[3.0]])
     np.testing.assert_allclose(jax.jit(lambda n, x: n(x))(doubled, x), doubled(x), rtol=1e-6)
-    np.testing.assert_allclose(doubled(x), (np.arcsinh(3.0) - doubled.mean) / doubled.scale, rtol=1e-6)
+    np.testing.assert_allclose(doubled(x), (np.arcsinh(3.0) - doubled.mean[None]) / doubled.scale, rtol=1e-6)
 
 
 def test_no_rows_at_all_leave_summaries_as_they_are():

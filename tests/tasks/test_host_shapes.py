@@ -80,7 +80,7 @@ def test_axes_of_one_are_added_and_dropped(given, shape, expected):
 @pytest.mark.parametrize(
     ("result", "shape", "told"),
     [
-        (np.zeros((2, 5)), None, r"expected numbers of shape \[3, ...\] for 3 parameter vectors, got float64 of shape \[2, 5\]"),
+        (np.zeros((2, 5)), None, r"expected numbers of shape \[3, ...\] for 3 .* got float64 of shape \[2, 5\]"),
         (np.zeros(3), None, r"got float64 of shape \[3\]"),
         (np.zeros((3, 4)), (5,), r"expected numbers of shape \[3, 5\] .* of shape \[3, 4\]"),
         (np.zeros((3, 2, 5)), (5, 2), r"of shape \[3, 2, 5\]"),
@@ -88,7 +88,7 @@ def test_axes_of_one_are_added_and_dropped(given, shape, expected):
         (np.zeros((3, 5)) * 1j, None, r"got complex128"),
         ([[1.0, 2.0], [1.0], [3.0]], None, r"^simulate: ValueError: "),  # trajectories of unlike lengths
         (None, None, r"got object of shape \[\]"),
-        ((np.zeros((3, 5)), np.zeros(2, int)), None, r"expected an outcome for each of 3 simulations, got int64 of shape \[2\]"),
+        ((np.zeros((3, 5)), np.zeros(2, int)), None, r"expected an outcome for each of 3 .* int64 of shape \[2\]"),
         ((np.zeros((3, 5)), np.zeros(3)), None, r"expected an outcome .* got float64 of shape \[3\]"),
     ],
 )  # fmt: skip

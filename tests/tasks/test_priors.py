@@ -189,7 +189,9 @@ def test_a_prior_with_next_to_no_mass_inside_is_refused():
     elsewhere = distrax.MultivariateNormalDiag(jnp.array([40.0, 800.0]), jnp.array([0.05, 0.05]))
     for prior_space in ("natural", "inference"):
         prior = decade(elsewhere, prior_space).inference.prior
-        with pytest.raises(ValueError, match=r"^prior: expected some of its mass inside the support 'box', got 0 of it"):
+        with pytest.raises(
+            ValueError, match=r"^prior: expected some of its mass inside the support 'box', got 0 of it"
+        ):
             require_mass(prior, box, "'box'")
     mass = require_mass(INNER, box, "'box'")
     assert mass == pytest.approx(0.99, abs=0.02) and mass > MIN_INSIDE
@@ -252,7 +254,9 @@ def test_logarithmic_parameters_have_their_tails_in_inference_space():
     decade = np.log(10.0)
     theta = jnp.array([1.0, decade + 0.2 * decade])  # two tails' scales beyond the rate's upper bound
     inside = jnp.array([1.0, 1.0])
-    np.testing.assert_allclose(task.inference.prior.log_prob(theta) - task.inference.prior.log_prob(inside), -2.0, rtol=1e-4)
+    np.testing.assert_allclose(
+        task.inference.prior.log_prob(theta) - task.inference.prior.log_prob(inside), -2.0, rtol=1e-4
+    )
     own = with_tails(plain, plain.supports["guess"], tail=0.1)  # a box of natural units
     np.testing.assert_array_equal(own.prior.log_prob(theta), task.prior.log_prob(theta))
 
