@@ -11,7 +11,7 @@ WORKERS ?= 2
 help:  ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+$(VENV)/.installed: pyproject.toml setup.py constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,dev,whip]'
 	@touch $@
@@ -19,9 +19,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: $(VENV)/.installed  ## the main job: supports and heuristics compared on Lotka-Volterra
 	$(BIN)/jaxlfi compare lotka_volterra --preset quick --seeds 6 --out $(OUT)
 
-# What the tests of a file share is made once, as one process runs them all.
+# What the tests of a file share is made once, as one process runs them all; files in the order of tests/conftest.py.
 test: $(VENV)/.installed  ## all tests
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/.installed  ## style
 	$(BIN)/ruff check .

@@ -33,7 +33,7 @@ def posterior(x: jax.Array | np.ndarray) -> GaussianMixture:
 
 
 def task() -> Task:
-    """Two locations seen through a linear map with Gaussian noise; simulations never fail."""
+    """Two locations observed through a linear map with Gaussian noise; simulations never fail."""
     return Task(
         simulate,
         name="gaussian_linear",

@@ -8,27 +8,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs.lotka_volterra_ode import lognormal_noise, populations
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs.lotka_volterra.ode import lognormal_noise, populations
 from jaxlfi.tasks.task import Task
 
 SUBSTEPS = 25
-"""Integration steps a year."""
+"""Integration steps per year."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Nuisance:
-    """What is drawn anew in every simulation, because it is unknown and not of interest.
+    """Distributions of what is drawn anew in every simulation, because it is unknown and not inferred.
 
     Attributes:
-        initial_spread: the populations of 1900 are the first record times a log-normal of this scale.
-        noise: median scale of the log-normal measurement error, drawn for each species.
-        noise_spread: log-normal scale of that scale itself.
+        initial_sd: standard deviation of the logarithm of the initial populations, about that of the first record.
+        noise: median scale of the log-normal measurement error, which is drawn for each species.
+        noise_sd: standard deviation of the logarithm of that scale.
     """
 
-    initial_spread: float = 0.25
+    initial_sd: float = 0.25
     noise: float = 0.25
-    noise_spread: float = 0.3
+    noise_sd: float = 0.3
 
 
 REFERENCE_MEAN = np.array([0.024, 0.800, 0.545, 0.028])
@@ -45,19 +45,19 @@ def reference_log_rates() -> tuple[np.ndarray, np.ndarray]:
 
 def load() -> tuple[np.ndarray, np.ndarray]:
     """Years [21], and thousands of pelts of lynx and hare, shape [21, 2]."""
-    with resources.files("envs").joinpath("data/lynx_hare.csv").open() as file:
+    with resources.files("jaxlfi.envs").joinpath("data/lynx_hare.csv").open() as file:
         table = np.loadtxt(file, delimiter=",", skiprows=1, dtype=np.float32)
     return table[:, 0], table[:, 1:]
 
 
 def growth(trajectory: Float[Array, "years 2"]) -> Float[Array, "12"]:
-    """Twelve summaries: how each species' growth depends on the other, and its level, spread and memory.
+    """Twelve summaries: how the growth of each species depends on the other, its level, variation and autocorrelation.
 
     Integrated over a year, the equations are linear in the rates: the logarithm of X grows by theta_1 times the mean
     of Y, less theta_2, and that of Y by theta_3, less theta_4 times the mean of X. Slope and intercept of these two
-    regressions (the mean over a year by the trapezoidal rule, in units of its geometric mean over all years) hold most
-    of what 21 noisy years know of the rates, in four numbers. The others are the means and the logarithms of the
-    standard deviations of the log-series, and their autocorrelations at one and three years.
+    regressions (the mean over a year by the trapezoidal rule, in units of its geometric mean over all years) contain
+    most of the information that 21 noisy years have on the rates, in four numbers. The others are the means and the
+    logarithms of the standard deviations of the log-series, and their autocorrelations at one and three years.
     """
     level = jnp.log(jnp.clip(trajectory, 1e-6, 1e9))
     gain = jnp.diff(level, axis=0)
@@ -89,8 +89,8 @@ def task(nuisance: Nuisance = Nuisance()) -> Task:
 
     def simulate(key: jax.Array, log_rates: Float[Array, "4"]) -> Float[Array, "years 2"]:
         key_initial, key_scale, key_noise = jax.random.split(key, 3)
-        initial = pelts[0] * jnp.exp(nuisance.initial_spread * jax.random.normal(key_initial, (2,)))
-        scale = nuisance.noise * jnp.exp(nuisance.noise_spread * jax.random.normal(key_scale, (2,)))
+        initial = pelts[0] * jnp.exp(nuisance.initial_sd * jax.random.normal(key_initial, (2,)))
+        scale = nuisance.noise * jnp.exp(nuisance.noise_sd * jax.random.normal(key_scale, (2,)))
         clean = populations(jnp.exp(log_rates), initial, interval=1.0, records=len(years), substeps=SUBSTEPS)
         return lognormal_noise(key_noise, clean, scale)
 

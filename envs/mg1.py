@@ -1,9 +1,10 @@
-"""The M/G/1 queue: one server, Poisson arrivals, uniform service times, seen by its departures only."""
+"""The M/G/1 queue: one server, Poisson arrivals, uniform service times, observed by its departures only."""
 
 import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -33,10 +34,10 @@ FEASIBLE = SUPPORTS["broad"]
 PERCENTILES = (0.0, 25.0, 50.0, 75.0, 100.0)
 
 RATE_FLOOR = 1e-3
-"""The least arrival rate that is simulated, 1 / time.
+"""Minimum arrival rate of simulations, 1 / time.
 
-All boxes of the paper reach down to a rate of 0, where clipping puts draws, and nobody would ever arrive. At this rate
-jobs come 200 times more slowly than at the truth and never meet; lower ones would only stretch the same data further,
+All boxes of the paper include a rate of 0, where clipping puts draws, and no job would ever arrive. At this rate jobs
+arrive 200 times more slowly than at the truth and never queue; lower rates would only stretch the same data further,
 and rates this low are 0.3 % of the "ok" support.
 """
 
@@ -91,8 +92,8 @@ def draw_jobs(
     Args:
         key: consumed.
         theta: two bounds of the service time, in either order, and the arrival rate, shape [3].
-        jobs: J.
-        floor: least arrival rate; lower ones are raised to it.
+        jobs: number of jobs J.
+        floor: minimum arrival rate; lower ones are raised to it.
 
     Returns:
         service times, uniform between the bounds, and gaps, exponential with the rate, shape [J] each.
@@ -104,7 +105,7 @@ def draw_jobs(
     return service, gaps
 
 
-# ---------------------------------------------------------------------------------------------- what is seen of it
+# ---------------------------------------------------------------------------------------------- observations
 
 
 def percentiles_of(values: Float[Array, " jobs"], percentiles: Sequence[float]) -> Float[Array, " obs"]:
@@ -137,8 +138,8 @@ class Whitening:
     """An affine map of summaries to ones of mean 0 and standard deviation 1 over pilot simulations.
 
     Attributes:
-        mean: of the pilots, shape [S].
-        matrix: what centred summaries are multiplied by from the right, shape [S, S].
+        mean: of the pilot simulations' summaries, shape [S].
+        matrix: multiplies centred summaries from the right, shape [S, S].
     """
 
     mean: Float[Array, " obs"]
@@ -150,7 +151,7 @@ class Whitening:
 
 
 def zscore(pilots: np.ndarray) -> Whitening:
-    """Each summary by itself; one that does not vary is centred only.
+    """Standardise each summary by itself; one that does not vary is centred only.
 
     Args:
         pilots: summaries of pilot simulations, shape [N, S].
@@ -191,9 +192,9 @@ def pilot(
     """Percentiles of simulations from the uniform prior over the "ok" support, always the same ones, shape [N, S].
 
     Args:
-        jobs: J.
+        jobs: number of jobs J.
         percentiles: of the inter-departure times.
-        floor: least arrival rate.
+        floor: minimum arrival rate.
         count: number of simulations N.
     """
     key_theta, key_jobs = jax.random.split(jax.random.key(0))
@@ -213,8 +214,8 @@ def pilot(
 def task(
     jobs: int = 50,
     percentiles: Sequence[float] = PERCENTILES,
-    whiten: str | None = None,
-    order: str = "sorted",
+    whiten: Literal["zscore", "pca"] | None = None,
+    order: Literal["sorted", "departure"] = "sorted",
     floor: float = RATE_FLOOR,
 ) -> Task:
     """The M/G/1 queue of the paper: infer service bounds and arrival rate from inter-departure times.
@@ -227,12 +228,13 @@ def task(
     A trajectory is the inter-departure times of all jobs in ascending order. In order of departure they are nearly
     independent noise: record by record, a second simulation at the truth is further from an observed one than a series
     that never leaves the mean. In ascending order the distance of trajectories is the Wasserstein-2 distance of two
-    empirical distributions (in units of the observed spread), least where the distributions agree, and nothing that the
-    percentiles use is lost. An observation of one's own should be sorted too; the summary does not depend on it.
+    empirical distributions (in units of the observed standard deviation), which is smallest where the distributions
+    agree, and nothing that the percentiles use is lost. Your own observation should be sorted too; the summary does not
+    depend on it.
 
     The summary is percentiles of these times, equally spaced ones by default. They have heavy tails (like the inverse
-    of a rate that may be near 0), which `whiten` leaves as they are: it maps them by an affine map that is fixed
-    before inference, as its inventors do. By default that is left to the network's normaliser.
+    of a rate that may be near 0), which `whiten` does not change: it applies an affine map that is fixed before
+    inference, as Papamakarios and Murray do. By default that is left to the network's normaliser.
 
     Simulations never fail.
 
@@ -241,7 +243,7 @@ def task(
         percentiles: increasing, in [0, 100], no more than there are jobs.
         whiten: None, "zscore" or "pca": how the percentiles are whitened by pilot simulations, which are run here.
         order: "sorted" or "departure": how a trajectory lists its times, shape [J].
-        floor: least arrival rate that is simulated, 1 / time.
+        floor: minimum arrival rate of simulations, 1 / time.
 
     Raises:
         ValueError: for numbers, percentiles or names that are not as described.

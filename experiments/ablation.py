@@ -23,7 +23,6 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.keys import key_of, run_keys
@@ -31,6 +30,7 @@ from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.record import theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Mode, paired
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs.describe import heuristic_to_json, settings_to_json

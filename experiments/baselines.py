@@ -24,7 +24,6 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.keys import key_of, run_keys
@@ -32,6 +31,7 @@ from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.record import theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.figures import seeds as strips
 from jaxlfi.figures import style
 from jaxlfi.heuristics import Edge, Fixed, Heuristic, Truncate

@@ -21,14 +21,14 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
-from envs import gaussian_linear as gaussian
-from envs import lotka_volterra as predators
-from envs import lynx_hare as pelts
-from envs import mg1 as queue
 from jaxlfi.diagnostics.bounds import MASS_BEYOND, bound_evidence, edge_mass
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear as gaussian
+from jaxlfi.envs import lotka_volterra as predators
+from jaxlfi.envs import lynx_hare as pelts
+from jaxlfi.envs import mg1 as queue
 from jaxlfi.io import files as atomic
 from jaxlfi.tasks.task import Task
 
@@ -86,7 +86,7 @@ class Runs:
     """Runs of one `jaxlfi compare`.
 
     Attributes:
-        task: of this module, by name.
+        task: as `compare` is given it.
         supports: named supports, each kept fixed.
         seeds: how many, from 0.
         options: further words of the command.
@@ -101,18 +101,35 @@ class Runs:
 
     def command(self, folder: Path) -> list[str]:
         """The words of the command that makes them."""
-        task = f"experiments.bound_warnings:{self.task}"
         seeds = ["--seeds", str(self.seeds)]
-        words = [task, "--configurations", *self.supports, *seeds, *self.options, "--no-figures", "--out", str(folder)]
+        words = [
+            self.task,
+            "--configurations",
+            *self.supports,
+            *seeds,
+            *self.options,
+            "--no-figures",
+            "--out",
+            str(folder),
+        ]
         return ["jaxlfi", "compare", *words]
 
 
 SETS = {
     "named": Runs("lotka_volterra", ("ok", "misspecified", "broad"), 25, held_out=False),
-    "gaussian": Runs("gaussian_linear", ("ok", "misspecified", "broad", *GAUSSIAN), 4, options=("--rounds", "3")),
-    "lynx": Runs("lynx_hare", ("ok", "misspecified", *LYNX_HARE), 4, options=("--rounds", "4")),
-    "mg1": Runs("mg1", ("ok", "misspecified", "unmirrored", *MG1), 3, options=("--rounds", "4")),
-    "boxes": Runs("lotka_volterra", tuple(LOTKA_VOLTERRA), 3, options=("--rounds", "6")),
+    "gaussian": Runs(
+        "experiments.bound_warnings:gaussian_linear",
+        ("ok", "misspecified", "broad", *GAUSSIAN),
+        4,
+        options=("--rounds", "3"),
+    ),
+    "lynx": Runs(
+        "experiments.bound_warnings:lynx_hare", ("ok", "misspecified", *LYNX_HARE), 4, options=("--rounds", "4")
+    ),
+    "mg1": Runs(
+        "experiments.bound_warnings:mg1", ("ok", "misspecified", "unmirrored", *MG1), 3, options=("--rounds", "4")
+    ),
+    "boxes": Runs("experiments.bound_warnings:lotka_volterra", tuple(LOTKA_VOLTERRA), 3, options=("--rounds", "6")),
 }
 """The runs by the names of their files."""
 
@@ -121,12 +138,13 @@ FIELDS = ("logits", "means", "scale_tril", "support_low", "support_high")
 
 def truths(task: str) -> np.ndarray:
     """The true parameters, a row for each that gives the same data; the reference posterior's mean for real data."""
-    if task == "mg1":
+    name = task.rpartition(":")[2]
+    if name == "mg1":
         one = np.asarray(queue.task().truth)
         return np.stack([one, one[[1, 0, 2]]])
-    if task == "lynx_hare":
+    if name == "lynx_hare":
         return pelts.reference_log_rates()[0][None]
-    return np.asarray(globals()[task]().truth)[None]
+    return np.asarray(globals()[name]().truth)[None]
 
 
 def wrong_bounds(truth: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -309,6 +327,8 @@ def tables(every: list[Judged], thresholds: Mapping[str, Iterable[float]]) -> st
     parts = []
     for held_out, title in ((False, "Runs the rule was chosen on"), (True, "Held-out runs")):
         part = [one for one in every if SETS[one.runs].held_out == held_out]
+        if not part:
+            continue
         lines = [["rule", "threshold", *RATES.values()]]
         for rule, values in thresholds.items():
             for value in values:

@@ -3,8 +3,8 @@
     jaxlfi compare mg1 --out runs/mg1
     python -m experiments.mg1 runs/mg1 --out experiments/results/mg1
 
-(1, 5, 0.2) and (5, 1, 0.2) are the same queue (`envs.mg1.task`), and a posterior may put its mass on either or on both.
-The errors of a run's table count the second as wrong. Here the two bounds of the service time are sorted first.
+(1, 5, 0.2) and (5, 1, 0.2) are the same queue (`jaxlfi.envs.mg1.task`), and a posterior may put its mass on either or
+both. The errors of a run's table count the second as wrong. Here the two bounds of the service time are sorted first.
 """
 
 import argparse
@@ -15,15 +15,15 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from envs import mg1
 from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.envs import mg1
 from jaxlfi.figures import History, density, open_collection, style
 from jaxlfi.io import files as atomic
 
 SEEDS = 3
-"""Simulations shown of the truth."""
+"""Number of simulations at the truth that are shown."""
 ENTROPY_DRAWS = 10_000
-"""Draws by which an entropy is estimated."""
+"""Monte Carlo draws for the estimate of an entropy."""
 MEASURES = {
     "plain": "θ error",
     "sorted": "sorted θ error",
@@ -33,7 +33,7 @@ MEASURES = {
     "trajectory": "trajectory error",
     "entropy": "entropy [nats]",
 }
-"""What is told of every run, by its name in errors.npz."""
+"""What is reported of every run, by its name in errors.npz."""
 
 
 def ordered(theta: np.ndarray) -> np.ndarray:

@@ -1,10 +1,10 @@
-"""Real2Sim of the four stand-ins: what is inferred with the support fixed and adapted by EDGE, and how far it is off.
+"""Real2Sim of the four FEM reference objects: posteriors on a fixed support and adapted by EDGE, and their errors.
 
     python -m experiments.real2sim --runs runs/real2sim --out experiments/results/real2sim
 
-Runs `jaxlfi compare whip --object dlo-K --configurations initial initial+edge` for each object (what is there already
-is not run again), tells what every seed came to in table.csv, and draws counterparts of the paper's figures from the
-first seed's folders:
+Runs `jaxlfi compare whip --object dlo-K --configurations initial initial+edge` for each object (finished runs are not
+repeated), reports the result of every seed in table.csv, and draws counterparts of the paper's figures from the folders
+of the first seed:
 
     progression.png   fig:mog-n-param-space-progr: samples by iteration with their boxes, and the last mixtures
     domains.png       fig:mog-posterior-for-dr: the last mixtures and the 12 domains that policies would be trained on
@@ -23,8 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from envs.whip.episode import OBSERVATION
+import jaxlfi
 from jaxlfi.cli import parser as cli
+from jaxlfi.envs.whip.episode import OBSERVATION
 from jaxlfi.figures import History, open_collection, samples, style
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import folder as run_store
@@ -34,10 +35,10 @@ CONFIGURATIONS = ("initial", "initial+edge")
 DOMAINS = 12
 """Environments a policy is trained in at once, each with parameters of its own (section VI-H)."""
 BEST = 0.25
-"""Share of an iteration's samples whose distance is told."""
+"""Fraction of an iteration's samples, the nearest, whose distance is reported."""
 PIXELS = 256
 KEYPOINTS = slice(2, 22)
-"""Where an observation's keypoints are."""
+"""Slice of an observation that holds the keypoints."""
 
 
 def mean_keypoints(x: np.ndarray) -> np.ndarray:
@@ -70,7 +71,7 @@ def gaps(folder: Path) -> dict[str, np.ndarray]:
     dlo, cubes = slice(0, 4), slice(4, 10)
     distances = {
         "summary": np.linalg.norm(data["x"] - observed, axis=-1),
-        # Each of its kind: a point of the DLO is no cube, however near.
+        # DLO and cubes separately: a point of the DLO never matches a cube.
         "pixels": (4 * chamfer(seen[:, dlo], target[dlo]) + 6 * chamfer(seen[:, cubes], target[cubes])) / 10,
     }
     rounds = np.unique(data["round"])
@@ -83,14 +84,14 @@ def _best(distances: np.ndarray) -> tuple[float, float]:
 
 
 def domains(history: History) -> np.ndarray:
-    """Low-variance draws of the last posterior, clipped to its support, in coordinates, shape [12, 2]."""
-    belief = run_store.read_belief(history.folder)
+    """Low-variance draws of the last posterior, clipped to its support, in inference space, shape [12, 2]."""
+    belief = jaxlfi.load(history.folder).belief
     draws = belief.mixture.low_variance_sample(jax.random.key(0), DOMAINS)
     return np.asarray(jnp.clip(draws, belief.support.low, belief.support.high))
 
 
 def draw_progression(figure: Figure, histories: Mapping[str, Mapping[str, History]]) -> None:
-    """A row an object: samples and last mixture, with the support fixed and adapted."""
+    """One row per object: samples and last mixture, with the support fixed and adapted."""
     axes = figure.subplots(len(histories), 4, squeeze=False)
     for row, (name, own) in enumerate(histories.items()):
         for column, configuration in enumerate(CONFIGURATIONS):
@@ -104,7 +105,7 @@ def draw_progression(figure: Figure, histories: Mapping[str, Mapping[str, Histor
 
 
 def draw_domains(figure: Figure, histories: Mapping[str, Mapping[str, History]]) -> None:
-    """A column an object: the last mixture and twelve domains drawn from it, fixed above and adapted below."""
+    """One column per object: the last mixture and twelve domains drawn from it, fixed above and adapted below."""
     axes = figure.subplots(2, len(histories), squeeze=False)
     for column, (name, own) in enumerate(histories.items()):
         for row, configuration in enumerate(CONFIGURATIONS):
@@ -116,7 +117,7 @@ def draw_domains(figure: Figure, histories: Mapping[str, Mapping[str, History]])
 
 
 def draw_gaps(figure: Figure, found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]) -> None:
-    """A column an object: distance by iteration, of summaries (bold) and of keypoints in pixels (faded)."""
+    """One column per object: distance by iteration, of summaries (bold) and of keypoints in pixels (faded)."""
     axes = figure.subplots(1, len(found), squeeze=False)[0]
     colours = {"initial": "tab:orange", "initial+edge": "tab:blue"}
     for column, (name, own) in enumerate(found.items()):
@@ -136,7 +137,7 @@ def draw_gaps(figure: Figure, found: Mapping[str, Mapping[str, Mapping[str, np.n
 
 
 def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str, object]]:
-    """A line an object, configuration and seed: where the posterior and its support ended, and the last gaps."""
+    """One line per object, configuration and seed: the final posterior, its support, and the last gaps."""
     every = [
         (name, configuration, seed, history)
         for name, own in runs.items()
@@ -145,10 +146,9 @@ def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str,
     ]
     lines = []
     for name, configuration, seed, history in every:
-        belief = run_store.read_belief(history.folder)
-        draws = np.asarray(belief.mixture.sample(jax.random.key(1), 4000))
-        draws = np.clip(draws, belief.support.low, belief.support.high)
-        low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
+        run = jaxlfi.load(history.folder)
+        low, middle, high = np.quantile(run.posterior.sample(jax.random.key(1), 4000), [0.05, 0.5, 0.95], axis=0)
+        support = run.space.box_to_natural(run.belief.support)
         gap = gaps(history.folder)
         lines.append(
             {
@@ -156,13 +156,9 @@ def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str,
                 "configuration": configuration,
                 "seed": seed,
                 "length [mm]": f"{middle[0]:.0f} [{low[0]:.0f}, {high[0]:.0f}]",
-                "E [kPa]": " ".join(
-                    [f"{np.exp(middle[1]) / 1e3:.2f}", f"[{np.exp(low[1]) / 1e3:.2f}, {np.exp(high[1]) / 1e3:.2f}]"]
-                ),
-                "support length [mm]": f"[{belief.support.low[0]:.0f}, {belief.support.high[0]:.0f}]",
-                "support E [kPa]": "[{:.2g}, {:.2g}]".format(
-                    *(np.exp(float(b[1])) / 1e3 for b in (belief.support.low, belief.support.high))
-                ),
+                "E [kPa]": " ".join([f"{middle[1] / 1e3:.2f}", f"[{low[1] / 1e3:.2f}, {high[1] / 1e3:.2f}]"]),
+                "support length [mm]": f"[{support.low[0]:.0f}, {support.high[0]:.0f}]",
+                "support E [kPa]": f"[{support.low[1] / 1e3:.2g}, {support.high[1] / 1e3:.2g}]",
                 "summary gap": round(float(gap["summary"][-1, 0]), 3),
                 "pixel gap": round(float(gap["pixels"][-1, 0]), 2),
                 "seconds": round(float(np.sum(history.seconds)), 1),
@@ -174,10 +170,12 @@ def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str,
 def main() -> None:
     """Run what is missing, then draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=Path, required=True, help="where the runs are, or are to be")
+    parser.add_argument(
+        "--runs", type=Path, required=True, help="folder of the runs, which are made if they are missing"
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--objects", nargs="+", default=OBJECTS, help="names, or recorded rollouts' .npz")
-    parser.add_argument("--seeds", type=int, default=3, help="runs of each, side by side")
+    parser.add_argument("--seeds", type=int, default=3, help="runs of each configuration, in one batch")
     arguments = parser.parse_args()
     runs = {}
     for name in arguments.objects:

@@ -3,9 +3,9 @@
     python -m experiments.sim2sim --out experiments/results/sim2sim
 
 Twenty simulated DLOs inside Theta_0 and eight outside of it are observed once each, under the exploratory actions,
-and inferred with the support kept fixed and with EDGE. This is done for each setting of the keypoint detector, as that
-decides what can be known. Chunks of runs are saved as they end; a command that was stopped goes on when it is given
-again.
+and inferred with the support kept fixed and with EDGE, for each setting of the keypoint detector, which determines how
+much can be inferred. Chunks of runs are saved as they end; a command that was interrupted continues when it is
+repeated.
 """
 
 import argparse
@@ -24,11 +24,11 @@ from rich.progress import track
 from rich.table import Table
 
 import jaxlfi
-from envs.whip.chain import elasto_gravity
-from envs.whip.parameters import MEDIAN
-from envs.whip.real2sim import task
 from jaxlfi.bayessim.presets import QUICK
-from jaxlfi.distributions.belief import RESTRICTIONS
+from jaxlfi.distributions.belief import rejected
+from jaxlfi.envs.whip.parameters import MEDIAN
+from jaxlfi.envs.whip.physics.chain import elasto_gravity
+from jaxlfi.envs.whip.real2sim import task
 from jaxlfi.figures import style
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import folder as run_store
@@ -48,8 +48,7 @@ SETTINGS = QUICK.replace(
 )
 """`quick` with 480 simulations a run, where the paper has 1,500."""
 DRAWS = 500
-LANES = 14
-"""Runs in a chunk."""
+RUNS_PER_CHUNK = 14
 
 
 def truths(seed: int = 0) -> np.ndarray:
@@ -60,9 +59,9 @@ def truths(seed: int = 0) -> np.ndarray:
 
 
 def study(out: Path, detector: str, console: Console) -> dict[str, np.ndarray]:
-    """Draws of every posterior in coordinates, shape [28, 500, 2], and the final bounds, by heuristic."""
+    """Draws of every posterior in inference space, shape [28, 500, 2], and the final bounds, by heuristic."""
     problem = task(detector=detector)
-    theta = np.asarray(problem.to_coordinates(jnp.asarray(truths(), jnp.float32)))
+    theta = np.asarray(problem.space.to_inference(jnp.asarray(truths(), jnp.float32)))
     observe = jax.jit(jax.vmap(lambda key, theta: trajectory_and_outcome(problem, key, theta)))
     observed, failure = observe(jax.random.split(jax.random.key(1), len(theta)), theta)
     if np.any(failure):
@@ -77,8 +76,8 @@ def study(out: Path, detector: str, console: Console) -> dict[str, np.ndarray]:
                 run = jaxlfi.infer(
                     key_run, problem, observed, support="initial", heuristic=heuristic, settings=SETTINGS
                 )
-                draws = RESTRICTIONS["clip"](key_draw, run.belief, DRAWS)
-                failed = jnp.sum(run.info.failed)
+                draws = rejected(key_draw, run.belief, DRAWS)
+                failed = jnp.sum(run.history["failed"])
                 return {
                     "draws": draws, "failed": failed,
                     "low": run.belief.support.low, "high": run.belief.support.high,
@@ -89,11 +88,11 @@ def study(out: Path, detector: str, console: Console) -> dict[str, np.ndarray]:
         keys = jax.random.split(jax.random.key(2), len(theta))
         parts = []
         for start in track(
-            range(0, len(theta), LANES), description=f"{detector} {name}", console=console, transient=True
+            range(0, len(theta), RUNS_PER_CHUNK), description=f"{detector} {name}", console=console, transient=True
         ):
             path = out / "chunks" / f"{detector}_{name}_{start:02d}.npz"
             if not path.exists():
-                rows = slice(start, start + LANES)
+                rows = slice(start, start + RUNS_PER_CHUNK)
                 atomic.write_arrays(path, jax.device_get(infer(keys[rows], observed[rows])))
             parts.append(atomic.read_arrays(path))
         for field in parts[0]:
@@ -102,7 +101,7 @@ def study(out: Path, detector: str, console: Console) -> dict[str, np.ndarray]:
 
 
 def measures(found: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
-    """Errors, spreads and coverage of every posterior, each [28, 2]: of length in mm, and of ln E."""
+    """Errors, standard deviations and coverage of every posterior, each [28, 2]: of length in mm, and of ln E."""
     draws, theta = found[f"{name}/draws"], found["theta"]
     low, high = np.quantile(draws, [0.05, 0.95], axis=1)
     return {
@@ -114,7 +113,7 @@ def measures(found: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
 
 
 def lines(found: dict[str, np.ndarray], detector: str) -> list[dict[str, object]]:
-    """The table: one line a heuristic and group of truths."""
+    """The table: one line per heuristic and group of truths."""
     length, modulus = truths().T
     number = elasto_gravity(length / 1e3, modulus, MEDIAN.density)
     outside = np.arange(len(length)) >= INSIDE
@@ -148,7 +147,7 @@ def lines(found: dict[str, np.ndarray], detector: str) -> list[dict[str, object]
 
 
 def draw(figure: Figure, found: dict[str, dict[str, np.ndarray]]) -> None:
-    """Inferred against true, with 90 % intervals: a column a detector and heuristic, length above and ln E below."""
+    """Inferred against true, with 90 % intervals: one column per detector and heuristic, length above, ln E below."""
     columns = list(itertools.product(found, HEURISTICS))
     axes = figure.subplots(2, len(columns), squeeze=False, sharex="row", sharey="row")
     box = ((195, 305), (np.log(1e3), np.log(5e4)))

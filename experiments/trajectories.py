@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -23,7 +24,7 @@ COLOURS = ("#025358", "#F5A025", "#995FDD", "#E41A1C")
 
 def simulations(task: Task) -> np.ndarray:
     """Simulations at the truth, shape [seeds, T, C]."""
-    simulate = lambda key: task.simulate(key, task.to_natural(task.truth))
+    simulate = lambda key: task.simulate(key, jnp.asarray(task.truth))
     made = jax.vmap(simulate)(jax.random.split(jax.random.key(0), SEEDS))
     trajectories = np.asarray(made[0] if isinstance(made, tuple) else made)
     return trajectories.reshape(*trajectories.shape[:2], -1)
@@ -55,7 +56,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("experiments/results/trajectories"))
     given = parser.parse_args(arguments)
     task = tasks.load(given.task)
-    if task.truth is None or task.black_box:
+    if task.truth is None or task.on_host:
         parser.error(f"--task: expected one in JAX whose truth is known, got {given.task}")
     trajectories = simulations(task)
     atomic.write_arrays(given.out / f"{task.name}.npz", {"trajectories": trajectories})

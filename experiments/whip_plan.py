@@ -1,10 +1,10 @@
-"""Which DLOs can hit the top cube, and how hard it is to find out how: plans over a grid of length and modulus.
+"""Which DLOs can hit the top cube, and how long a plan takes to find, over a grid of length and modulus.
 
     python -m experiments.whip_plan --out experiments/results/whip-plan
 
-For every DLO the cross-entropy method (`envs.whip.planner`) looks for actions of the greatest return on average over
-places of the stack, and ends early where they hit hardly anything but the top cube. What it has found is then tried on
-places in between, of which it knew nothing.
+For every DLO the cross-entropy method (`jaxlfi.envs.whip.planner`) searches for actions that maximise the mean return
+over positions of the stack, and ends early once they hit hardly anything but the top cube. The plan is then tested at
+positions in between, which the search did not use.
 """
 
 import argparse
@@ -19,31 +19,31 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from envs.whip import planner
-from envs.whip.engines import pick
-from envs.whip.frames import COLOURS
-from envs.whip.parameters import median
+from jaxlfi.envs.whip import planner
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.parameters import median
+from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.figures import style
 from jaxlfi.io import files as atomic
 
 LENGTHS = (0.05, 0.12, 0.20, 0.25, 0.29, 0.35)
-"""In m."""
+"""Lengths of the DLOs, in m."""
 MODULI = (5e2, 1e3, 5e3, 2.5e4, 1e5, 5e5)
-"""In Pa."""
+"""Young's moduli of the DLOs, in Pa."""
 QUICK = ((0.12, 0.25, 0.35), (1e3, 2.5e4, 5e5))
 GOOD = 1.95
-"""A return from which on a plan counts as found: the top cube, and the one below it at most."""
+"""Return above which a plan counts as found: it hits the top cube, and at most the one below it."""
 PLACES = 9
-"""Of the stack, for trying what has been found."""
+"""Number of positions of the stack at which a plan is tested."""
 
 
 def search(length: float, young: float, method: planner.CrossEntropy, engine, seed: int = 0) -> dict:
     """The plan for one DLO, and how it was found.
 
     Returns:
-        `actions` [16, 2]; `value`, the mean return over the places it was searched for; `elsewhere`, over others;
-        `hit` [6] with the stack in the middle; `rollouts` in all, and `first`, until the first plan that was good, NaN
-        where none was; `seconds`.
+        `actions` [16, 2]; `value`, the mean return over the positions of the search; `elsewhere`, over others;
+        `hit` [6] with the stack in the middle; `rollouts` in total, and `first`, until the first plan that was good
+        (NaN if none was); `seconds`.
     """
     began = time.monotonic()
     parameters = median(length, young)
@@ -69,7 +69,7 @@ def _plan(method, engine, key, parameters):
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _judge(method, engine, parameters, actions):
-    """The mean return over many places, and the outcome in the middle."""
+    """The mean return over many positions, and the outcome at the middle one."""
     value = planner.mean_return(engine, parameters, actions, PLACES, method.jitter)
     return value, planner.play(engine, parameters, actions)
 
@@ -91,10 +91,10 @@ def draw(figure: Figure, lengths: Sequence[float], moduli: Sequence[float], foun
     for e, l in np.ndindex(found["value"].shape):
         letters = " ".join(name[0].upper() for name, hit in zip(COLOURS, found["hit"][e, l], strict=True) if hit)
         value, elsewhere, first = (found[name][e, l] for name in ("value", "elsewhere", "first"))
-        told = f"{value:.2f} {letters or '-'}\n({elsewhere:.2f})"
-        left.text(l, e, told, ha="center", va="center", color=_ink(value > 1.9))
-        told = "none" if np.isnan(first) else f"{first:.0f}"
-        right.text(l, e, told, ha="center", va="center", color=_ink(not first > 60))
+        text = f"{value:.2f} {letters or '-'}\n({elsewhere:.2f})"
+        left.text(l, e, text, ha="center", va="center", color=_ink(value > 1.9))
+        text = "none" if np.isnan(first) else f"{first:.0f}"
+        right.text(l, e, text, ha="center", va="center", color=_ink(not first > 60))
     left.set(ylabel="Young's modulus [Pa]", yticks=range(len(moduli)), yticklabels=[f"{e:g}" for e in moduli])
     titles = (
         "best mean return and cubes hit, bottom-up (return elsewhere)",
@@ -113,7 +113,7 @@ def _ink(bright: bool) -> str:
 
 
 def table(lengths: Sequence[float], moduli: Sequence[float], found: dict[str, np.ndarray]) -> str:
-    """One line a DLO, as csv."""
+    """One line per DLO, as csv."""
     out = io.StringIO()
     names = ("value", "elsewhere", "first", "rollouts", "seconds")
     writer = csv.writer(out, lineterminator="\n")
@@ -135,13 +135,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     method, engine, rows = planner.CrossEntropy(), pick(given.engine), []
     for young in moduli:
         rows.append([search(length, young, method, engine) for length in lengths])
-        told = ", ".join(f"{1e3 * l:g} mm {one['value']:.2f}" for l, one in zip(lengths, rows[-1], strict=True))
-        print(f"{young:g} Pa: {told}", flush=True)
+        row = ", ".join(f"{1e3 * l:g} mm {one['value']:.2f}" for l, one in zip(lengths, rows[-1], strict=True))
+        print(f"{young:g} Pa: {row}", flush=True)
     found = {name: np.array([[one[name] for one in row] for row in rows]) for name in rows[0][0]}
     given.out.mkdir(parents=True, exist_ok=True)
     atomic.write_arrays(given.out / "plans.npz", {"lengths": lengths, "moduli": moduli, **found})
     (given.out / "map.csv").write_text(table(lengths, moduli, found))
-    told = {name: found[name].tolist() for name in ("value", "elsewhere", "first", "rollouts")}
+    measured = {name: found[name].tolist() for name in ("value", "elsewhere", "first", "rollouts")}
     atomic.write_json(
         given.out / "map.json",
         {
@@ -151,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "lengths": lengths,
             "moduli": moduli,
             "minutes": found["seconds"].sum() / 60,
-            **told,
+            **measured,
         },
     )
     with style.context():

@@ -1,11 +1,15 @@
-"""What all tests share: strict JAX, quick compiling, one deterministic hypothesis profile, one key a test."""
+"""What all tests share: strict JAX, quick compiling, bounded memory, deterministic hypothesis, one key a test."""
 
+import ctypes
+import gc
 import os
 import zlib
+from pathlib import Path
 
 import hypothesis
 import jax
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 # Tests, and the processes they start, run for milliseconds what would be compiled for seconds. Half of that goes into
 # the newer fusions of XLA, which later versions cannot do without.
@@ -13,6 +17,9 @@ os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 os.environ.setdefault("XLA_FLAGS", "")
 if jax.__version_info__ < (0, 10):
     os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
+
+# Tracing allocates objects by the million: by default Python would look for cycles among them a thousand times a file.
+gc.set_threshold(50_000, 20, 50)
 
 # A key consumed twice is an error, in the library and in what it calls.
 jax.config.update("jax_debug_key_reuse", True)
@@ -28,14 +35,57 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("jaxlfi")
 
+MEMORY = 1000 * 2**20
+"""Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory."""
+
+
+LONG = (
+    "test_lotka_volterra_mjp", "test_sweep", "test_whip_engines", "test_whip_real2sim", "test_cli", "test_apt",
+    "test_figures", "test_heuristics", "test_flows", "test_diagnose", "test_bayessim", "test_run_store",
+    "test_lynx_hare", "test_fitting",
+)  # fmt: skip
+"""Files of half a minute and more."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with long files, so that no worker is left alone with one at the end."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
+
 
 @pytest.fixture
 def key(request: pytest.FixtureRequest) -> jax.Array:
-    """A typed key of the test's own: the same in every run, another in every test."""
-    return jax.random.key(zlib.crc32(request.node.nodeid.encode()))
+    """A typed key of the test's own: the same in every run and folder, another in every test."""
+    test = request.node.nodeid.partition("::")[2]
+    return jax.random.key(zlib.crc32(f"tests/{request.path.name}::{test}".encode()))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def compiled_once(tmp_path_factory: pytest.TempPathFactory):
+    """A cache of compiled programs, shared by the workers and the processes that tests start: they mostly compile."""
+    base = tmp_path_factory.getbasetemp()
+    folder = str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "xla")
+    for name, value in (("jax_compilation_cache_dir", folder), ("jax_persistent_cache_min_compile_time_secs", 0.2)):
+        os.environ[name.upper()] = str(value)
+        jax.config.update(name, value)
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # processes say nothing of programs that they find compiled
+    compilation_cache.reset_cache()  # so that the folder is looked at
 
 
 @pytest.fixture(autouse=True, scope="module")
 def compiling(request: pytest.FixtureRequest):
-    """Compile without most optimisations, but for modules that set `OPTIMISED`."""
+    """Compile without most optimisations, but for modules that set `OPTIMISED`; forget programs once they are many."""
     jax.config.update("jax_disable_most_optimizations", not getattr(request.module, "OPTIMISED", False))
+    yield
+    if resident() > MEMORY:
+        from jaxlfi.bayessim import programs  # late, so that shapes are checked from its first import on
+
+        programs.forget()
+        jax.clear_caches()
+        gc.collect()
+        getattr(ctypes.CDLL(None), "malloc_trim", int)(0)  # glibc keeps what is freed between blocks still in use
+
+
+def resident() -> int:
+    """Bytes of memory that this process occupies; 0 where the system does not say."""
+    pages = Path("/proc/self/statm")
+    return int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if pages.exists() else 0

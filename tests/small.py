@@ -6,11 +6,11 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from envs import gaussian_linear
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 
-TASK = "envs.gaussian_linear:task"
+TASK = "jaxlfi.envs.gaussian_linear:task"
 # Few and small steps: training amplifies rounding, and runs that ought to be equal are compared to a
 # tolerance.
 SETTINGS = Settings(

@@ -124,9 +124,10 @@ def test_ranks_of_other_draws_are_refused(rank, draws):
 # --------------------------------------------------------------------------------------------------------- laws
 
 
-def verdicts(scale: float, shift: float = 0.0, count: int = 150, draws: int = 100) -> tuple[list[str], str, str]:
+def verdicts(scale: float, shift: float = 0.0, seed: int = 7) -> tuple[list[str], str, str]:
     """Truths from correlated Gaussian posteriors, draws from the same but wider by `scale` and off by `shift`."""
-    rng = np.random.default_rng(7)
+    count, draws = 150, 100
+    rng = np.random.default_rng(seed)
     mean = rng.normal(size=(count, 2)) * 2
     tril = np.array([[1.0, 0.0], [0.6, 0.8]]) * SCALE[:, None]
     truths = mean + rng.normal(size=(count, 2)) @ tril.T
@@ -134,7 +135,7 @@ def verdicts(scale: float, shift: float = 0.0, count: int = 150, draws: int = 10
     noise = scale * rng.normal(size=(count, draws, 2))
     samples = centre[:, None] + noise @ tril.T
     white = np.linalg.solve(tril, (truths - centre).T).T / scale
-    keys = jax.random.split(jax.random.key(3), 3)
+    keys = jax.random.split(jax.random.key(seed), 3)
     rank = np.asarray(ranks(keys[0], truths, samples))
     by_parameter = [ranks_verdict(uniformity(rank[:, d], draws, tests=2)) for d in range(2)]
     density = density_ranks(keys[1], -0.5 * np.sum(white**2, 1), -0.5 * np.sum((noise / scale) ** 2, 2))
@@ -143,7 +144,9 @@ def verdicts(scale: float, shift: float = 0.0, count: int = 150, draws: int = 10
 
 
 def test_the_exact_posterior_passes():
-    assert verdicts(1.0) == ([OK, OK], OK, OK)
+    """But for one set of draws in a hundred, of each of three kinds: more than five of 25 have a chance of 3e-4."""
+    found = [verdicts(1.0, seed=seed) for seed in range(25)]
+    assert sum(one != ([OK, OK], OK, OK) for one in found) <= 5
 
 
 def test_a_posterior_too_narrow_is_over_confident():

@@ -323,7 +323,7 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, monkeypatch, capsys):
 def registered(monkeypatch):
     """One task that works and one whose package is broken."""
     points = [
-        EntryPoint("linear", "envs.gaussian_linear:task", tasks.GROUP),
+        EntryPoint("linear", "jaxlfi.envs.gaussian_linear:task", tasks.GROUP),
         EntryPoint("broken", "no.such.module:task", tasks.GROUP),
     ]
     monkeypatch.setattr(tasks, "entry_points", lambda group: points)
@@ -366,7 +366,7 @@ def test_tasks_take_options():
     with pytest.raises(ValueError, match="failed: ValueError: could not convert"):
         tasks.load("tests.test_cli:oven,heat=much")
     with pytest.raises(ValueError, match="expected options among none"):
-        tasks.load("envs.gaussian_linear:task,object=dlo-0")
+        tasks.load("jaxlfi.envs.gaussian_linear:task,object=dlo-0")
     for wrong in ("tests.test_cli:oven,heat", "tests.test_cli:oven,heat=", "tests.test_cli:oven,heat=1,heat=2"):
         with pytest.raises(ValueError, match="expected options as NAME,key=value"):
             tasks.load(wrong)

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import gaussian_linear
 from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.cli import parser as cli
 from jaxlfi.distributions.belief import Belief, uninformed
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.estimator import Estimator, Network, initialise
 from jaxlfi.estimators.normaliser import Normaliser
 from jaxlfi.estimators.posterior import truncated_draws, truncated_log_prob
@@ -31,8 +31,8 @@ from jaxlfi.studies import calibration as diagnose
 from jaxlfi.studies import grid as sweep
 from jaxlfi.studies.calibration import Plan, Subject, repeat
 from jaxlfi.studies.calibration import subject as subjects
-from jaxlfi.tasks.observation import SimulatorError
 from jaxlfi.tasks import registry as tasks
+from jaxlfi.tasks.observation import SimulatorError
 from tests.small import SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 X = np.array([-0.6, -0.3], np.float32)
@@ -174,7 +174,9 @@ def test_pictures_show_the_saved_arrays(repeated):
         calibration.draw_ranks(figure, arrays)
         above, below = figure.axes[1], figure.axes[3]  # the second parameter
         stairs = next(patch for patch in above.patches if patch.get_gid() == "count")
-        np.testing.assert_array_equal(stairs.get_data().values, np.bincount(arrays["ranks"][:, 1] > 10)[:2])
+        upper = np.sum(arrays["ranks"][:, 1] >= 10)  # 21 ranks in two bins: 0 to 9, and 10 to 20
+        np.testing.assert_array_equal(arrays["bin_edges"], [0, 10, 21])
+        np.testing.assert_array_equal(stairs.get_data().values, [20 - upper, upper])
         share = line(below, "difference").get_ydata()[1:-1] + arrays["level"]
         np.testing.assert_allclose(share, [np.mean(arrays["ranks"][:, 1] < k) for k in range(1, 21)])
         for draw, rank in ((calibration.draw_coverage, "density_ranks"), (calibration.draw_tarp, "distance_ranks")):

@@ -38,12 +38,12 @@ def test_more_summaries_than_simulations_are_no_trouble():
 
 
 def test_each_summary_may_fit_where_all_together_do_not():
-    """Two summaries that always move together, observed apart."""
+    """Two summaries that always move together, observed apart (of 100 seeds: tails of 0.068, p-values of 0.014)."""
     rng = np.random.default_rng(2)
-    rows = simulations(rng, 200)
+    rows = simulations(rng, 1000)
     odd = np.array([1.6e4, -6.6, 1.0])
     result = predictive_check(rows, odd)
-    assert result.tails.min() > 0.05 and result.p_value < 0.015
+    assert result.tails.min() > 0.05 and result.p_value < 0.02
     # Units do not matter.
     units = np.array([1e-6, 30.0, 1.0])
     other = predictive_check(rows * units, odd * units)

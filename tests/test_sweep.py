@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from envs import gaussian_linear
 from jaxlfi.bayessim import algorithm as bayessim
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.diagnostics import discrepancy
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Centre, Edge, Matched, Mode
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.folder import StoreError
@@ -237,7 +237,7 @@ SPOILED = {
     "axis": (lambda _, config: config["axes"][0]["values"].reverse(), "got changed ones"),
     "seeds": (lambda _, config: config["seeds"].append(9), "got changed ones"),
     "chunk length": (lambda _, config: config.update(lanes_per_chunk=4), "got changed ones"),
-    "task": (lambda _, config: config.update(task="envs.gaussian_linear:broken"), "complete description"),
+    "task": (lambda _, config: config.update(task="jaxlfi.envs.gaussian_linear:broken"), "complete description"),
     "parameters": (lambda _, config: config.update(names=["a", "b"]), "got changed ones"),
     "missing part": (lambda _, config: config.pop("axes"), "complete description"),
     "version": (lambda _, config: config.update(version=9), "expected version 1"),

@@ -3,17 +3,33 @@
 Needs the extra `whip` (MuJoCo and MJX).
 """
 
+from typing import Literal
 
-def task(object: str | None = None, detector: str = "mask", nuisances: str = "fixed", engine: str = "auto"):
-    """The Real2Sim task; its options are those of `envs.whip.real2sim.task`.
+
+def task(
+    object: str | None = None,
+    detector: Literal["clean", "mask", "noisy", "transporter"] = "mask",
+    nuisances: Literal["fixed", "random"] = "fixed",
+    engine: Literal["auto", "native", "mjx", "warp"] = "auto",
+):
+    """The Real2Sim task; its options are those of `jaxlfi.envs.whip.real2sim.task`.
 
     Raises:
         ImportError: where MuJoCo is not installed, with what to install.
+    """
+    require_mujoco()
+    from jaxlfi.envs.whip.real2sim import task as make
+
+    return make(object=object, detector=detector, nuisances=nuisances, engine=engine)
+
+
+def require_mujoco() -> None:
+    """Check that the extra `whip` is installed.
+
+    Raises:
+        ImportError: where it is not, with what to install.
     """
     try:
         import mujoco  # noqa: F401
     except ImportError as error:
         raise ImportError("the whipping task needs MuJoCo and MJX: pip install 'jaxlfi[whip]'") from error
-    from envs.whip.real2sim import task as make
-
-    return make(object=object, detector=detector, nuisances=nuisances, engine=engine)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.envs.whip import require_mujoco
 
 EXAMPLES = """\
 examples:
@@ -25,7 +26,7 @@ def parser() -> argparse.ArgumentParser:
     formatter = argparse.RawDescriptionHelpFormatter
     top = OneLineParser(
         prog="jaxlfi whip",
-        description="Look at the DLO whipping task, and plan whips.",
+        description="Render rollouts of the DLO whipping task, and plan whips.",
         epilog=EXAMPLES,
         formatter_class=formatter,
     )
@@ -34,15 +35,16 @@ def parser() -> argparse.ArgumentParser:
     render = commands.add_parser(
         "render",
         help="draw a rollout",
-        description="Roll out one episode and draw it: sheet.png, film.gif (half as fast as life) and rollout.npz.",
+        description="Roll out one episode and draw it: sheet.png, film.gif (at half speed), and rollout.npz with "
+        "rollout.json, a recording that `jaxlfi infer whip --object` accepts.",
     )
     _add_scene(render)
     render.add_argument(
         "--policy",
         default="explore",
         metavar="NAME|FILE",
-        help="explore: to get to know the DLO; random: a draw that stays in the workspace; plan: one that hits the top "
-        'cube, searched for first; or an .npz with an array "actions" [16, 2] in m (default: explore)',
+        help="explore: actions that excite the DLO; random: random actions in the workspace; plan: actions that hit "
+        'the top cube, found by a search; or an .npz with an array "actions" [16, 2] in m (default: explore)',
     )
     render.add_argument(
         "--detector", default="clean", metavar="NAME", help="clean, mask, noisy or transporter (default: clean)"
@@ -60,12 +62,17 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _add_scene(command: argparse.ArgumentParser) -> None:
-    """Which DLO, and what both commands need to simulate it."""
-    command.add_argument("--length", type=float, default=250.0, metavar="MM", help="of the DLO in mm, 50 to 350")
-    command.add_argument("--young", type=float, default=2.5e4, metavar="PA", help="its modulus in Pa, 500 to 5e5")
-    command.add_argument("--seed", type=int, default=0, metavar="N", help="of all random numbers (default: 0)")
+    """Options of both commands: the DLO and its simulation."""
+    command.add_argument("--length", type=float, default=250.0, metavar="MM", help="length of the DLO in mm, 50 to 350")
     command.add_argument(
-        "--engine", default="auto", metavar="NAME", help="native, mjx, warp, or auto: what suits the platform (default)"
+        "--young", type=float, default=2.5e4, metavar="PA", help="Young's modulus of the DLO in Pa, 500 to 5e5"
+    )
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all random numbers (default: 0)")
+    command.add_argument(
+        "--engine",
+        default="auto",
+        metavar="NAME",
+        help="native, mjx, warp, or auto: the one that suits the platform (default)",
     )
 
 
@@ -80,10 +87,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = parser().parse_args(argv)
     try:
+        require_mujoco()
         from jaxlfi.io import compile_cache
 
         compile_cache.enable()
-        from envs.whip import commands
+        from jaxlfi.envs.whip import commands
 
         getattr(commands, arguments.command)(arguments)
     except (ValueError, OSError, ImportError) as error:

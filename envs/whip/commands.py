@@ -1,4 +1,4 @@
-"""What the commands of the whipping task do; `envs.whip.cli` parses, this module works."""
+"""The commands of the whipping task, whose arguments `jaxlfi.envs.whip.cli` parses."""
 
 import argparse
 import functools
@@ -9,19 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from rich.console import Console
+from rich.progress import Progress
 
-from envs.whip import planner, rules
-from envs.whip import render as drawing
-from envs.whip.engine import Engine
-from envs.whip.engines import pick
-from envs.whip.episode import Whip
-from envs.whip.exploration import exploratory_actions
-from envs.whip.frames import COLOURS
-from envs.whip.keypoints import DETECTORS
-from envs.whip.parameters import WhipParameters, check, median
-from envs.whip.scene import Scene
+from jaxlfi.envs.whip import planner, rules
+from jaxlfi.envs.whip import recording as recordings
+from jaxlfi.envs.whip import render as drawing
+from jaxlfi.envs.whip.episode import Whip
+from jaxlfi.envs.whip.exploration import exploratory_actions
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.parameters import WhipParameters, check, median
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.physics.scene import Scene
+from jaxlfi.envs.whip.vision.camera import side_camera
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
-from jaxlfi.io.progress import RoundProgress
 
 POLICIES = ("explore", "random", "plan")
 
@@ -45,11 +47,22 @@ def render(arguments: argparse.Namespace) -> None:
     perform = jax.jit(drawing.perform, static_argnums=1)
     rollout = jax.device_get(perform(key_detector, Whip(engine, DETECTORS[name]), parameters, actions))
     out.mkdir(parents=True, exist_ok=True)
-    atomic.write_arrays(out / "rollout.npz", drawing.arrays(engine, rollout))
+    _write_rollout(out / "rollout.npz", drawing.arrays(engine, rollout), arguments)
     title = (f"l = {arguments.length:g} mm, E = {arguments.young:g} Pa", _outcome(rollout))
     pictures = drawing.save_pictures(out, finer, rollout, title)
     print(_outcome(rollout))
     print(f"wrote {', '.join(str(path) for path in (*pictures, out / 'rollout.npz'))}")
+
+
+def _write_rollout(path: Path, arrays: dict[str, np.ndarray], arguments: argparse.Namespace) -> None:
+    """Write a rollout as a recording that can be inferred from, where it can be one, and else its arrays only."""
+    scene = WhipParameters(**{name: arrays[f"parameters/{name}"] for name in vars(median())})
+    words = f"{arguments.length:g} mm, {arguments.young:g} Pa, policy {arguments.policy}, detector {arguments.detector}"
+    try:
+        recordings.write(path, recordings.simulated(arrays, side_camera(scene), f"Simulated DLO: {words}"), arrays)
+    except ValueError as error:
+        atomic.write_arrays(path, arrays)
+        print(f"rollout.npz cannot be inferred from, as it is no recording of an object: {error}")
 
 
 def plan(arguments: argparse.Namespace) -> None:
@@ -70,7 +83,7 @@ def plan(arguments: argparse.Namespace) -> None:
 
 
 def _parameters(arguments: argparse.Namespace) -> WhipParameters:
-    """The scene that was asked for, all else as in mu."""
+    """The scene that the arguments describe; all else is as in mu."""
     try:
         return check(median(arguments.length / 1e3, arguments.young))
     except ValueError as error:
@@ -78,7 +91,7 @@ def _parameters(arguments: argparse.Namespace) -> WhipParameters:
 
 
 def _actions(policy: str, key: jax.Array, engine: Engine, parameters: WhipParameters) -> Float[Array, "16 2"]:
-    """What a policy does."""
+    """The actions of a policy."""
     if policy == "explore":
         return exploratory_actions()
     if policy == "plan":
@@ -91,7 +104,7 @@ def _actions(policy: str, key: jax.Array, engine: Engine, parameters: WhipParame
 
 
 def _read_actions(path: str) -> np.ndarray:
-    """The array "actions" of an .npz: of a plan, of a rollout or of a recording."""
+    """The array "actions" of an .npz, which may be a plan, a rollout or a recording."""
     if not Path(path).exists():
         raise ValueError(f"policy: expected {', '.join(POLICIES)} or an .npz file, got {path!r}")
     actions = atomic.read_arrays(Path(path)).get("actions")
@@ -104,20 +117,17 @@ def _read_actions(path: str) -> np.ndarray:
 
 
 def _search(key: jax.Array, engine: Engine, parameters: WhipParameters) -> planner.Plan:
-    """Plan as `planner.plan` does, and show how far it is."""
+    """Plan as `planner.plan` does, with a progress bar; the history has only iterations that were needed."""
     method = planner.CrossEntropy()
-    step = jax.jit(functools.partial(planner.step, engine=engine, parameters=parameters, method=method))
-    search, history = planner.init(method), []
-    with RoundProgress(Console(stderr=True), method.iterations, 0, "planning") as progress:
-        while len(history) < method.iterations and search.value < method.enough:
-            search, values = step(jax.random.fold_in(key, len(history)), search=search)
-            history.append(values)
-            progress.advance()
-    return jax.device_get(planner.Plan(search.actions, search.value, jnp.stack(history)))
+    with Progress(console=Console(stderr=True)) as progress:
+        bar = progress.add_task("planning", total=method.iterations)
+        search = functools.partial(planner.plan, method=method, on_iteration=lambda: progress.advance(bar))
+        found = jax.device_get(jax.jit(search, static_argnums=1)(key, engine, parameters))
+    return found.replace(history=found.history[~np.isnan(found.history).all(axis=1)])
 
 
 def _outcome(rollout: drawing.Rollout) -> str:
-    """What became of an episode, in a few words."""
+    """The outcome of an episode in a few words."""
     last = int(rollout.length) - 1
     hit = ", ".join(name for name, is_hit in zip(COLOURS, rollout.steps.hit[last], strict=True) if is_hit)
     end = ", left the workspace" if rollout.steps.outside[last] else ""

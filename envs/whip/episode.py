@@ -7,22 +7,22 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from envs.whip import engine as physics
-from envs.whip import rules
-from envs.whip.camera import side_camera
-from envs.whip.engine import Engine, State
-from envs.whip.frames import Frames
-from envs.whip.keypoints import DETECTORS, Detector, Tracking, begin, measured, track
-from envs.whip.kinematics import frames
-from envs.whip.parameters import WhipParameters
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.frames import Frames
+from jaxlfi.envs.whip.parameters import WhipParameters
+from jaxlfi.envs.whip.physics import engine as physics
+from jaxlfi.envs.whip.physics.engine import Engine, State
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.vision.camera import side_camera
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS, ON_DLO, Detector, Tracking, begin, measured, track
 
 OBSERVATION = 28
-"""Numbers in an observation."""
+"""Length of an observation."""
 
 
 @struct.dataclass
 class Episode:
-    """What the next step needs.
+    """State of an episode between two steps.
 
     Attributes:
         state: of the physics.
@@ -41,18 +41,18 @@ class Episode:
 
 @struct.dataclass
 class Step:
-    """What a step gives to learn from.
+    """What a step returns to a learner.
 
     Attributes:
         observation: the gripper's x and z in m, four DLO and six cube keypoints in normalised pixels, six flags of
             cubes that have been hit, shape [28].
         reward: see `rules.reward`.
         terminated: whether the top cube has been hit or the gripper has left its workspace.
-        truncated: whether the episode's time is up, or the simulation has broken down.
+        truncated: whether the episode's time is up, or the simulation has become unstable.
         hit: cubes hit so far, bottom-up, shape [6].
         outside: whether the gripper has left its workspace.
-        failed: whether the simulation has broken down.
-        seen: keypoints that were seen, shape [10]; of the others the last position is told.
+        failed: whether the simulation has become unstable.
+        seen: keypoints that were seen, shape [10]; the others are reported at their last position.
     """
 
     observation: Float[Array, "*batch 28"]
@@ -70,13 +70,13 @@ class Whip:
     """The whipping task.
 
     Attributes:
-        engine: of its physics.
-        detector: of its keypoints.
+        engine: the physics.
+        detector: the error model of the keypoints.
 
     Example:
         >>> import jax
-        >>> from envs.whip.native import NativeEngine
-        >>> from envs.whip.parameters import median
+        >>> from jaxlfi.envs.whip.physics.native import NativeEngine
+        >>> from jaxlfi.envs.whip.parameters import median
         >>> whip = Whip(NativeEngine())
         >>> episode, observation = whip.reset(jax.random.key(0), median(length=0.25, young=2.5e4))
         >>> observation.shape
@@ -92,34 +92,33 @@ class Whip:
         state = physics.reset(self.engine.scene, parameters)
         keypoints, _, tracking = self._look(key_track, parameters, begin(key_begin, self.detector), state)
         hit = jnp.zeros(6, bool)
-        episode = Episode(state, tracking, keypoints[4:], hit, jnp.asarray(0))
+        episode = Episode(state, tracking, keypoints[ON_DLO:], hit, jnp.asarray(0))
         return episode, observation(measured(key_gripper, self.detector, state.qpos[:2]), keypoints, hit)
 
     def step(
         self, key: jax.Array, parameters: WhipParameters, episode: Episode, action: Float[Array, "2"]
     ) -> tuple[Episode, Step]:
         """Apply an action (dx, dz), in m."""
-        state = self.engine.advance(parameters, episode.state, rules.moved_target(episode.state.target, action))
+        state = physics.act(self.engine, parameters, episode.state, action)
         key_track, key_gripper = jax.random.split(key)
         keypoints, seen, tracking = self._look(key_track, parameters, episode.tracking, state)
         gripper = state.qpos[:2]
-        hit = rules.hits(episode.hit, episode.start, keypoints[4:])
-        out = rules.outside(gripper)
+        verdict = rules.judge(episode.hit, episode.start, keypoints[ON_DLO:], gripper, state.failed)
         steps = episode.steps + 1
         step = Step(
-            observation=observation(measured(key_gripper, self.detector, gripper), keypoints, hit),
-            reward=jnp.where(state.failed, 0.0, rules.reward(hit, out)),
-            terminated=(hit[rules.TOP] | out) & ~state.failed,
+            observation=observation(measured(key_gripper, self.detector, gripper), keypoints, verdict.hit),
+            reward=verdict.reward,
+            terminated=verdict.over & ~state.failed,
             truncated=(steps >= rules.STEPS) | state.failed,
-            hit=hit,
-            outside=out,
+            hit=verdict.hit,
+            outside=verdict.outside,
             failed=state.failed,
             seen=seen,
         )
-        return Episode(state, tracking, episode.start, hit, steps), step
+        return Episode(state, tracking, episode.start, verdict.hit, steps), step
 
     def frames(self, parameters: WhipParameters, episode: Episode) -> Frames:
-        """What there is to see."""
+        """The current frame."""
         return frames(self.engine.scene, parameters, episode.state.qpos)
 
     def _look(self, key, parameters, tracking, state):

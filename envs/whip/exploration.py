@@ -1,4 +1,4 @@
-"""The actions by which a DLO is got to know, the same for every object and simulation."""
+"""The exploratory actions that inference observes a DLO under, the same for every object and simulation."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,10 +8,10 @@ _ALONG_Z = (0.02, 0.02, 0.02, 0.02, *(0.0,) * 12)
 
 
 def exploratory_actions() -> Float[Array, "16 2"]:
-    """Draw back and up, then whip to and fro three times, faster and faster.
+    """Draw back and up, then whip to and fro three times, at increasing frequency.
 
     The gripper keeps at least 1 cm within its workspace, and no DLO of the initial support reaches the cubes or leaves
-    the image, so that what is seen depends smoothly on the DLO. Going through three frequencies excites the pendulum of
+    the image, so that observations depend smoothly on the DLO. The three frequencies excite the pendulum of
     a limp DLO as well as the first bending mode of a stiff one.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What there is to see of the whipping scene at an instant, whichever simulator it comes from."""
+"""Frames: the visible geometry of the whipping scene, for all simulators."""
 
 from flax import struct
 from jaxtyping import Array, Float
@@ -6,19 +6,19 @@ from jaxtyping import Array, Float
 
 @struct.dataclass
 class Frames:
-    """Instants of a scene, in m, in the world frame: x away from the robot, z up, the camera at negative y.
+    """One or more frames of a scene, in m, in the world frame: x away from the robot, z up, the camera at negative y.
 
     Attributes:
         gripper: x and z of the end effector, shape [..., 2].
         dlo: points of the DLO's centreline from the grip to the tip, not necessarily equally spaced, shape [..., P, 3].
         cubes: the cubes' centres, bottom-up, shape [..., 6, 3].
-        turns: the cubes' orientations as unit quaternions (w, x, y, z), shape [..., 6, 4].
+        orientations: of the cubes, as unit quaternions (w, x, y, z), shape [..., 6, 4].
     """
 
     gripper: Float[Array, "*time 2"]
     dlo: Float[Array, "*time points 3"]
     cubes: Float[Array, "*time 6 3"]
-    turns: Float[Array, "*time 6 4"]
+    orientations: Float[Array, "*time 6 4"]
 
 
 COLOURS = ("red", "green", "blue", "orange", "purple", "yellow")

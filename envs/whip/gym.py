@@ -1,7 +1,7 @@
-"""The whipping task for other people's learners: a gymnasium environment, and a vector of them stepped by one engine.
+"""The whipping task for reinforcement learning libraries: a gymnasium environment, and a vector environment.
 
-    gymnasium.make("envs.whip.gym:jaxlfi/Whip-v0")
-    gymnasium.make_vec("envs.whip.gym:jaxlfi/Whip-v0", num_envs=12, vectorization_mode="vector_entry_point")
+    gymnasium.make("jaxlfi.envs.whip.gym:jaxlfi/Whip-v0")
+    gymnasium.make_vec("jaxlfi.envs.whip.gym:jaxlfi/Whip-v0", num_envs=12, vectorization_mode="vector_entry_point")
 
 Actions are in metres; `gymnasium.wrappers.RescaleAction` brings them to [-1, 1].
 """
@@ -13,15 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.whip import rules
-from envs.whip.camera import side_camera
-from envs.whip.engine import Engine
-from envs.whip.engines import pick
-from envs.whip.episode import OBSERVATION, Episode, Step, Whip
-from envs.whip.keypoints import DETECTORS, Detector
-from envs.whip.parameters import INITIAL, WhipParameters, check, median, randomised
-from envs.whip.raster import segmentation
-from envs.whip.render import PALETTE
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.episode import OBSERVATION, Episode, Step, Whip
+from jaxlfi.envs.whip.parameters import INITIAL, WhipParameters, check, median, randomised
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.render import PALETTE
+from jaxlfi.envs.whip.vision.camera import side_camera
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS, Detector
+from jaxlfi.envs.whip.vision.raster import segmentation
 
 try:
     import gymnasium
@@ -29,16 +29,16 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise ImportError("envs.whip.gym needs gymnasium: pip install 'jaxlfi[whip]'") from error
+    raise ImportError("jaxlfi.envs.whip.gym needs gymnasium: pip install 'jaxlfi[whip]'") from error
 
 Domain = Callable[[jax.Array], WhipParameters]
-"""Draws a scene with a key."""
+"""Draws the parameters of a scene with a key."""
 
 ACTIONS = spaces.Box(-rules.ACTION_LIMIT, rules.ACTION_LIMIT, (2,), np.float32)
 OBSERVATIONS = spaces.Box(
     np.float32([-np.inf] * (OBSERVATION - 6) + [0.0] * 6), np.float32([np.inf] * (OBSERVATION - 6) + [1.0] * 6)
 )
-"""The gripper and the keypoints may be anywhere; see `episode.Step.observation`."""
+"""The gripper and the keypoints are unbounded; see `episode.Step.observation`."""
 
 
 def initial_domain(key: jax.Array) -> WhipParameters:
@@ -51,8 +51,9 @@ def initial_domain(key: jax.Array) -> WhipParameters:
 class WhipGym(gymnasium.Env):
     """The whipping task as a gymnasium environment.
 
-    `info` tells of `hit` [6], `outside`, `failed`, `seen` [10] (see `episode.Step`), and the scene's `length` in m and
-    `young` in Pa. Actions beyond their limit are clipped; one that is no action is refused, and the episode goes on.
+    `info` contains `hit` [6], `outside`, `failed`, `seen` [10] (see `episode.Step`), and the scene's `length` in m and
+    `young` in Pa. Actions beyond their limit are clipped; one that is not two finite numbers is refused, and the
+    episode continues.
 
     Example:
         >>> environment = WhipGym()
@@ -74,14 +75,14 @@ class WhipGym(gymnasium.Env):
         """Nothing is simulated yet.
 
         Args:
-            parameters: of the scene; or a function of a key that draws one for every episode, such as
-                `initial_domain`; by default mu.
+            parameters: of the scene, by default mu; or a function of a key that draws those of every episode, such as
+                `initial_domain`.
             detector: of keypoints, or its name: "clean", "mask", "noisy" or "transporter".
-            engine: of the physics, or its name (`engines.pick`).
+            engine: the physics, or its name (`physics.engines.pick`).
             render_mode: "rgb_array" for `render`.
 
         Raises:
-            ValueError: for parameters that no scene has, and names that are not known.
+            ValueError: for parameters outside of their ranges, and unknown names.
         """
         self.action_space, self.observation_space = ACTIONS, OBSERVATIONS
         self.render_mode = _mode(render_mode)
@@ -90,7 +91,7 @@ class WhipGym(gymnasium.Env):
         self._key = self._scene = self._episode = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        """Begin an episode, in a scene of its own where they are drawn; there are no options."""
+        """Begin an episode, in a new scene if scenes are drawn; there are no options."""
         super().reset(seed=seed)
         if seed is not None or self._key is None:
             self._key = jax.random.key(_entropy(self.np_random) if seed is None else seed)
@@ -125,9 +126,9 @@ class WhipGym(gymnasium.Env):
 
 
 class WhipVector(VectorEnv):
-    """Many whipping scenes stepped together; each is as a `WhipGym` of its own, with the seed `seed + i`.
+    """Many whipping scenes stepped together; scene i is equivalent to a `WhipGym` with the seed `seed + i`.
 
-    A scene whose episode has ended begins anew in the next step, whose action it does not need (gymnasium's
+    A scene whose episode has ended is reset in the next step, whose action it ignores (gymnasium's
     `AutoresetMode.NEXT_STEP`).
 
     Example:
@@ -149,8 +150,8 @@ class WhipVector(VectorEnv):
         """Nothing is simulated yet.
 
         Args:
-            num_envs: N.
-            parameters: as of `WhipGym`; also those of N scenes, with a leading axis.
+            num_envs: number of scenes N.
+            parameters: see `WhipGym`; or those of N scenes, with a leading axis.
             detector: see `WhipGym`.
             engine: see `WhipGym`.
 
@@ -173,11 +174,11 @@ class WhipVector(VectorEnv):
         """Begin all episodes.
 
         Args:
-            seed: of the first scene; or of each.
+            seed: of the first scene, or one per scene.
             options: unused.
 
         Raises:
-            ValueError: for another number of seeds.
+            ValueError: for a wrong number of seeds.
         """
         seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if np.ndim(seed) == 0 else [*seed]
         if len(seeds) != self.num_envs:
@@ -197,7 +198,7 @@ class WhipVector(VectorEnv):
         """Apply actions (dx, dz), in m, shape [N, 2].
 
         Raises:
-            ValueError: for another shape, and numbers that are not finite.
+            ValueError: for a wrong shape, and numbers that are not finite.
             ResetNeeded: before the first `reset`.
         """
         if self._episodes is None:
@@ -221,11 +222,11 @@ class WhipVector(VectorEnv):
 # ---------------------------------------------------------------------------------------------------- one scene
 
 Parts = tuple[Engine, Domain | None]
-"""What programs are compiled for: the physics, and how scenes are drawn where they are."""
+"""Static arguments of the compiled programs: the physics, and the distribution of scenes if they are drawn."""
 
 
 def _start(parts: Parts, detector: Detector, parameters: WhipParameters, key: jax.Array):
-    """A scene, the beginning of an episode in it, and what it looks like."""
+    """A scene, the start of an episode in it, and its first observation."""
     engine, draw = parts
     key_scene, key_reset = jax.random.split(key)
     scene = parameters if draw is None else draw(key_scene)
@@ -236,14 +237,14 @@ def _start(parts: Parts, detector: Detector, parameters: WhipParameters, key: ja
 
 @functools.partial(jax.jit, static_argnums=0)
 def _begin(parts: Parts, detector: Detector, parameters: WhipParameters, key: jax.Array):
-    """The key that is left, and `_start`."""
+    """The next key, and `_start`."""
     key, key_start, _ = jax.random.split(key, 3)
     return key, *_start(parts, detector, parameters, key_start)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _go_on(engine: Engine, detector: Detector, scene: WhipParameters, key: jax.Array, episode: Episode, action):
-    """The key that is left, the episode after an action, and what came of it."""
+    """The next key, the episode after an action, and its step."""
     key, _, key_step = jax.random.split(key, 3)
     return key, *Whip(engine, detector).step(key_step, scene, episode, action)
 
@@ -255,12 +256,11 @@ def _begin_many(parts: Parts, detector: Detector, parameters: WhipParameters, ke
 
 @functools.partial(jax.jit, static_argnums=0)
 def _go_on_many(parts: Parts, detector: Detector, parameters: WhipParameters, scenes, keys, episodes, actions, over):
-    """As `_go_on`, but as `_begin` where the episode was over; the scenes too."""
+    """As `_go_on`, but as `_begin` where the episode was over; also returns the scenes."""
 
     def one(parameters, scene, key, episode, action, over):
         key, key_start, key_step = jax.random.split(key, 3)
-        # To the engine an episode that is over has failed: such scenes it need not simulate.
-        idle = episode.replace(state=episode.state.replace(failed=episode.state.failed | over))
+        idle = episode.replace(state=episode.state.stopped(over))
         went_on = (scene, *Whip(parts[0], detector).step(key_step, scene, idle, action))
         started = _start(parts, detector, parameters, key_start)
         return key, *jax.tree.map(lambda yes, no: jnp.where(over, yes, no), started, went_on)
@@ -274,7 +274,7 @@ def _picture(engine: Engine, scene: WhipParameters, episode: Episode):
     return jnp.round(255 * jnp.asarray(PALETTE)[labels]).astype(jnp.uint8)
 
 
-# -------------------------------------------------------------------------------------------------- what is given
+# -------------------------------------------------------------------------------------------------- arguments
 
 
 def _parts(engine: str | Engine, parameters: WhipParameters | Domain | None) -> Parts:
@@ -282,17 +282,17 @@ def _parts(engine: str | Engine, parameters: WhipParameters | Domain | None) -> 
 
 
 def _fixed(parameters: WhipParameters | Domain | None, batch: tuple[int, ...]) -> WhipParameters:
-    """Scenes of a batch shape; where they are drawn, a placeholder."""
+    """Scenes of a batch shape; a placeholder if they are drawn."""
     one = median()
     given = one if parameters is None or callable(parameters) else check(parameters)
-    spread = {}
+    batched = {}
     for name, like in vars(one).items():
         value = jnp.asarray(getattr(given, name), jnp.float32)
         own = value.shape[: value.ndim - like.ndim]
         if own not in ((), batch):
             raise ValueError(f"parameters: expected one scene's or {list(batch)}, got {list(own)} for {name}")
-        spread[name] = jnp.broadcast_to(value, (*batch, *like.shape))
-    return WhipParameters(**spread)
+        batched[name] = jnp.broadcast_to(value, (*batch, *like.shape))
+    return WhipParameters(**batched)
 
 
 def _detector(detector: str | Detector) -> Detector:
@@ -320,7 +320,7 @@ def _action(action, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _own(now: Step) -> Step:
-    """Arrays of NumPy's that may be written to."""
+    """NumPy arrays that may be written to."""
     return jax.tree.map(np.array, now)
 
 
@@ -329,18 +329,22 @@ def _entropy(random: np.random.Generator) -> int:
 
 
 def _info(scene: WhipParameters, now: Step) -> dict[str, np.ndarray]:
-    told = {"hit": now.hit, "outside": now.outside, "failed": now.failed, "seen": now.seen}
-    return {name: np.asarray(value) for name, value in {**told, "length": scene.length, "young": scene.young}.items()}
+    of_step = {name: getattr(now, name) for name in ("hit", "outside", "failed", "seen")}
+    return {
+        name: np.asarray(value) for name, value in {**of_step, "length": scene.length, "young": scene.young}.items()
+    }
 
 
 def _one(info: dict[str, np.ndarray]) -> dict:
-    """Of one scene: scalars as Python's."""
+    """The info of one scene, with Python's scalars."""
     return {name: value if value.ndim else value.item() for name, value in info.items()}
 
 
 def _many(info: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Of many, with the masks of those that told, as gymnasium has them."""
+    """The info of many scenes, with masks of those that report it, as in gymnasium."""
     return {**info, **{f"_{name}": np.ones(len(value), bool) for name, value in info.items()}}
 
 
-gymnasium.register("jaxlfi/Whip-v0", entry_point="envs.whip.gym:WhipGym", vector_entry_point="envs.whip.gym:WhipVector")
+gymnasium.register(
+    "jaxlfi/Whip-v0", entry_point="jaxlfi.envs.whip.gym:WhipGym", vector_entry_point="jaxlfi.envs.whip.gym:WhipVector"
+)

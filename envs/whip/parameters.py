@@ -11,17 +11,17 @@ from jaxlfi.distributions.support import Support
 
 @struct.dataclass
 class WhipParameters:
-    """One whipping scene, in SI units; leaves may carry leading axes, one scene an entry (section VI-B).
+    """One whipping scene, in SI units; leaves may carry leading axes, one scene per entry (section VI-B).
 
     Attributes:
         length: of the DLO, l, in m.
         young: its Young's modulus E, in Pa.
         density: its density, in kg/m^3.
-        poisson: its Poisson's ratio. It has no effect on a planar inextensible beam, and is here to be complete.
+        poisson: its Poisson's ratio, which has no effect on a planar inextensible beam.
         cube_side: side of the cubes, in m.
         cube_density: their density, in kg/m^3.
-        stack: displacement of the stack of cubes from its place, x and y, in m.
-        camera: displacement of the camera from its place, x, y and z, in m.
+        stack: displacement of the stack of cubes from its nominal position, x and y, in m.
+        camera: displacement of the camera from its nominal position, x, y and z, in m.
     """
 
     length: Float[Array, "*batch"]
@@ -50,20 +50,20 @@ MEDIAN = WhipParameters(
     stack=(0.0, 0.0),
     camera=(0.0, 0.0, 0.0),
 )
-"""mu, what the paper calls the median of Theta_0, with nothing displaced."""
+"""mu, which the paper calls the median of Theta_0, with no displacements."""
 
 LOWEST = WhipParameters(0.050, 0.5e3, 50.0, 0.3, 0.020, 80.0, (-0.02, -0.005), (-0.025, -0.025, -0.025))
-"""The least values: of length and young by Phi, of the nuisances by section VI-B and VI-H."""
+"""Lower bounds: of length and young by Phi, of the nuisances by sections VI-B and VI-H."""
 
 HIGHEST = WhipParameters(0.350, 5e5, 100.0, 0.5, 0.030, 120.0, (0.02, 0.005), (0.025, 0.025, 0.025))
-"""The greatest values."""
+"""Upper bounds, likewise."""
 
 
 def median(length: Float[Array, "*batch"] | float = MEDIAN.length, young=MEDIAN.young) -> WhipParameters:
     """Scenes of the given length (m) and Young's modulus (Pa), all else as in mu."""
     length, young = jnp.broadcast_arrays(jnp.asarray(length, jnp.float32), jnp.asarray(young, jnp.float32))
-    spread = lambda value: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (*length.shape, *np.shape(value)))
-    rest = {name: spread(getattr(MEDIAN, name)) for name in NUISANCES}
+    broadcast = lambda value: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (*length.shape, *np.shape(value)))
+    rest = {name: broadcast(getattr(MEDIAN, name)) for name in NUISANCES}
     return WhipParameters(length=length, young=young, **rest)
 
 
@@ -87,10 +87,10 @@ NUISANCES = ("density", "poisson", "cube_side", "cube_density", "stack", "camera
 
 
 def check(parameters: WhipParameters) -> WhipParameters:
-    """Refuse parameters that no scene has.
+    """Refuse parameters outside of their ranges.
 
     Raises:
-        ValueError: naming the parameter, its range and what came.
+        ValueError: which names the parameter, its range and its value.
     """
     for name in ("length", "young", *NUISANCES):
         value = jnp.asarray(getattr(parameters, name))

@@ -1,6 +1,7 @@
-"""Open-loop plans by the cross-entropy method: actions that hit the top cube of a scene that is known."""
+"""Open-loop plans by the cross-entropy method: actions that hit the top cube of a known scene."""
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -8,16 +9,16 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from envs.whip import engine as physics
-from envs.whip import rules
-from envs.whip.camera import project, side_camera
-from envs.whip.engine import Engine
-from envs.whip.kinematics import frames
-from envs.whip.parameters import HIGHEST, WhipParameters
-from envs.whip.scene import START
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.parameters import HIGHEST, WhipParameters
+from jaxlfi.envs.whip.physics import engine as physics
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.rig import START
+from jaxlfi.envs.whip.vision.camera import project, side_camera
 
 MARGIN = 0.005
-"""How far plans keep the set-point from the limits of the workspace, in m: the DLO pulls the gripper off it."""
+"""Margin of planned set-points to the limits of the workspace, in m, as the DLO pulls the gripper off its set-point."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,17 +26,18 @@ class CrossEntropy:
     """How actions are searched for (Rubinstein, 1999).
 
     Attributes:
-        population: sequences of actions tried in an iteration.
-        elites: the best of them, which the next iteration's are like.
-        iterations: at most.
-        stacks: places of the stack over which the return of an episode is averaged.
-        jitter: how far these are from the scene's own place, at most, along x, in m.
-        deviation: of an action at first, in m.
-        correlation: of an action with the next one's, along the same axis: whipping takes a long move, and uncorrelated
+        population: number of action sequences per iteration.
+        elites: number of best sequences that the next iteration's distribution is fitted to.
+        iterations: maximum number of iterations.
+        stacks: number of positions of the stack over which the return of an episode is averaged.
+        jitter: maximum distance of these positions from the scene's own, along x, in m.
+        deviation: initial standard deviation of an action, in m.
+        correlation: between successive actions along the same axis: whipping takes a long move, and uncorrelated
             displacements of a few centimetres go nowhere.
-        smoothing: share of the last mean and deviation in the next.
-        least: to which deviations shrink at most, in m.
-        enough: mean return at which the search ends; 2 is the greatest there is, for the top cube alone everywhere.
+        smoothing: weight of the previous mean and standard deviation in the next ones.
+        min_deviation: lower bound of the standard deviations, in m.
+        target_return: mean return at which the search ends; the maximum is 2, for hitting only the top cube at every
+            position.
     """
 
     population: int = 48
@@ -46,19 +48,19 @@ class CrossEntropy:
     deviation: float = 0.04
     correlation: float = 0.7
     smoothing: float = 0.2
-    least: float = 0.004
-    enough: float = 1.98
+    min_deviation: float = 0.004
+    target_return: float = 1.98
 
 
 @struct.dataclass
 class Search:
-    """What the next iteration needs.
+    """State of the search between two iterations.
 
     Attributes:
-        mean: of actions, in m, shape [16, 2].
-        deviation: of each.
-        actions: the best so far, shape [16, 2].
-        value: their mean return.
+        mean: of the actions, in m, shape [16, 2].
+        deviation: standard deviation of each action, in m, shape [16, 2].
+        actions: the best actions so far, in m, shape [16, 2].
+        value: mean return of the best actions.
     """
 
     mean: Float[Array, "16 2"]
@@ -69,12 +71,13 @@ class Search:
 
 @struct.dataclass
 class Plan:
-    """What has been found.
+    """The result of a search.
 
     Attributes:
         actions: displacements dx, dz of the gripper's set-point, in m, shape [16, 2].
-        value: their return, the mean over the places of the stack.
-        history: of all that was tried, shape [iterations, population]; NaN in iterations that were not needed.
+        value: their mean return over the positions of the stack.
+        history: mean returns of all sequences that were tried, shape [iterations, population]; NaN in iterations that
+            were not needed.
     """
 
     actions: Float[Array, "16 2"]
@@ -84,14 +87,14 @@ class Plan:
 
 @struct.dataclass
 class Outcome:
-    """What an episode comes to.
+    """The outcome of an episode.
 
     Attributes:
         value: its return, the sum of rewards until it ends.
-        hit: cubes hit until then, bottom-up, shape [6].
-        outside: whether it ends outside of the workspace.
-        failed: or as the simulation has broken down.
-        steps: that it takes.
+        hit: cubes hit by its end, bottom-up, shape [6].
+        outside: whether it ends because the gripper has left the workspace.
+        failed: whether it ends because the simulation has become unstable.
+        steps: its number of control steps.
     """
 
     value: Float[Array, ""]
@@ -101,19 +104,26 @@ class Outcome:
     steps: Int[Array, ""]
 
 
-def plan(key: jax.Array, engine: Engine, parameters: WhipParameters, method: CrossEntropy = CrossEntropy()) -> Plan:
+def plan(
+    key: jax.Array,
+    engine: Engine,
+    parameters: WhipParameters,
+    method: CrossEntropy = CrossEntropy(),
+    on_iteration: Callable[[], None] | None = None,
+) -> Plan:
     """Search for actions of a high return in one scene; vmap for many.
 
     Args:
-        key: of all draws.
-        engine: of the physics.
+        key: consumed.
+        engine: the physics.
         parameters: of the scene.
         method: how to search.
+        on_iteration: called on the host after each iteration, to show progress.
 
     Example:
         >>> import jax
-        >>> from envs.whip.native import NativeEngine
-        >>> from envs.whip.parameters import median
+        >>> from jaxlfi.envs.whip.physics.native import NativeEngine
+        >>> from jaxlfi.envs.whip.parameters import median
         >>> method = CrossEntropy(population=4, elites=2, iterations=1, stacks=1)
         >>> plan(jax.random.key(0), NativeEngine(), median(length=0.3), method).actions.shape
         (16, 2)
@@ -121,11 +131,13 @@ def plan(key: jax.Array, engine: Engine, parameters: WhipParameters, method: Cro
 
     def unfinished(carry):
         i, search, _ = carry
-        return (i < method.iterations) & (search.value < method.enough)
+        return (i < method.iterations) & (search.value < method.target_return)
 
     def iterate(carry):
         i, search, history = carry
         search, values = step(jax.random.fold_in(key, i), engine, parameters, search, method)
+        if on_iteration is not None:
+            jax.debug.callback(on_iteration)
         return i + 1, search, history.at[i].set(values)
 
     history = jnp.full((method.iterations, method.population), jnp.nan)
@@ -134,7 +146,7 @@ def plan(key: jax.Array, engine: Engine, parameters: WhipParameters, method: Cro
 
 
 def init(method: CrossEntropy) -> Search:
-    """Before the first iteration."""
+    """The search before its first iteration."""
     still = jnp.zeros((rules.STEPS, 2))
     return Search(still, jnp.full_like(still, method.deviation), still, jnp.asarray(-jnp.inf))
 
@@ -142,10 +154,10 @@ def init(method: CrossEntropy) -> Search:
 def step(
     key: jax.Array, engine: Engine, parameters: WhipParameters, search: Search, method: CrossEntropy
 ) -> tuple[Search, Float[Array, " population"]]:
-    """One iteration: try some, and make the next like the best of them and the best so far.
+    """One iteration: try a population, and fit the next distribution to the best of it and the best so far.
 
     Returns:
-        The search after it, and the mean returns of what it tried, shape [population].
+        The search after the iteration, and the mean returns of its population, shape [population].
     """
     noise = jax.random.normal(key, (method.population, rules.STEPS, 2))
     tried = jax.vmap(lambda noise: draw(noise, search.mean, search.deviation, method.correlation))(noise)
@@ -157,7 +169,7 @@ def step(
     blend = lambda old, new: method.smoothing * old + (1 - method.smoothing) * new
     after = Search(
         mean=blend(search.mean, elites.mean(axis=0)),
-        deviation=jnp.maximum(blend(search.deviation, elites.std(axis=0)), method.least),
+        deviation=jnp.maximum(blend(search.deviation, elites.std(axis=0)), method.min_deviation),
         actions=elites[0],
         value=all_values[best[0]],
     )
@@ -167,22 +179,22 @@ def step(
 def draw(
     noise: Float[Array, "16 2"], mean: Float[Array, "16 2"], deviation: Float[Array, "16 2"], correlation: float
 ) -> Float[Array, "16 2"]:
-    """Actions around a mean, correlated in time, that keep the set-point inside of the workspace.
+    """Actions around a mean, correlated in time, that keep the set-point inside the workspace.
 
     Args:
-        noise: independent, standard normal.
-        mean: of actions, in m.
-        deviation: of each, in m.
-        correlation: of neighbours; it decays geometrically.
+        noise: independent standard normal numbers.
+        mean: of the actions, in m.
+        deviation: standard deviation of each action, in m.
+        correlation: between successive actions; it decays geometrically with their lag.
     """
     lag = np.subtract.outer(np.arange(rules.STEPS), np.arange(rules.STEPS))
-    fresh = np.where(np.arange(rules.STEPS) == 0, 1.0, (1 - correlation**2) ** 0.5)
-    mixing = jnp.asarray(np.where(lag >= 0, correlation ** np.maximum(lag, 0) * fresh, 0.0), jnp.float32)
+    innovation = np.where(np.arange(rules.STEPS) == 0, 1.0, (1 - correlation**2) ** 0.5)
+    mixing = jnp.asarray(np.where(lag >= 0, correlation ** np.maximum(lag, 0) * innovation, 0.0), jnp.float32)
     return inside(mean + deviation * jnp.matmul(mixing, noise, precision="highest"))
 
 
 def inside(actions: Float[Array, "16 2"]) -> Float[Array, "16 2"]:
-    """Actions within their limit, and shortened where they would move the set-point out of the workspace."""
+    """Actions clipped to their limit, and shortened where they would move the set-point out of the workspace."""
 
     def move(place, action):
         after = jnp.clip(rules.moved_target(place, action), rules.WORKSPACE[0] + MARGIN, rules.WORKSPACE[1] - MARGIN)
@@ -198,13 +210,13 @@ def mean_return(
     stacks: int,
     jitter: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
-    """The return of actions, averaged over places of the stack: the middles of equal parts of a range along x.
+    """The return of actions, averaged over positions of the stack: the midpoints of equal parts of a range along x.
 
     Args:
-        engine: of the physics.
-        parameters: of the scene; its own place of the stack is the middle of the range.
+        engine: the physics.
+        parameters: of the scene; its own position of the stack is the middle of the range.
         actions: in m.
-        stacks: number of places.
+        stacks: number of positions.
         jitter: half the range, in m.
     """
     middles = (2 * np.arange(stacks) + 1) / stacks - 1
@@ -214,7 +226,7 @@ def mean_return(
 
 
 def play(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> Outcome:
-    """One episode of given actions, as `episode.Whip` has it, but of the cubes only, which are seen without error."""
+    """One episode of given actions, by the rules of `episode.Whip`, with cubes that are seen without error."""
     camera = side_camera(parameters)
     see = lambda state: project(camera, frames(engine.scene, parameters, state.qpos).cubes)
     first = physics.reset(engine.scene, parameters)
@@ -222,14 +234,12 @@ def play(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2
 
     def act(carry, action):
         state, over, before = carry
-        state = engine.advance(parameters, state, rules.moved_target(state.target, action))
-        hit, out = rules.hits(before.hit, start, see(state)), rules.outside(state.qpos[:2])
-        earned = jnp.where(state.failed, 0.0, rules.reward(hit, out))
-        outcome = Outcome(before.value + earned, hit, out, state.failed, before.steps + 1)
+        state = physics.act(engine, parameters, state, action)
+        now = rules.judge(before.hit, start, see(state), state.qpos[:2], state.failed)
+        outcome = Outcome(before.value + now.reward, now.hit, now.outside, state.failed, before.steps + 1)
         outcome = jax.tree.map(lambda old, new: jnp.where(over, old, new), before, outcome)
-        over |= hit[rules.TOP] | out | state.failed
-        # To the engine an episode that is over has failed: such scenes it need not simulate.
-        return (state.replace(failed=over), over, outcome), None
+        over |= now.over
+        return (state.stopped(over), over, outcome), None
 
     no = jnp.asarray(False)
     nothing = Outcome(jnp.asarray(0.0), jnp.zeros(6, bool), no, no, jnp.asarray(0))

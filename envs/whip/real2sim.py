@@ -3,37 +3,38 @@
 import functools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs.whip import parameters as ranges
-from envs.whip import recording as recordings
-from envs.whip.camera import side_camera
-from envs.whip.engine import Engine
-from envs.whip.engines import pick
-from envs.whip.exploration import exploratory_actions
-from envs.whip.frames import COLOURS
-from envs.whip.keypoints import DETECTORS, Detector
-from envs.whip.parameters import WhipParameters, median, randomised
-from envs.whip.rollout import trajectory
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs.whip import parameters as ranges
+from jaxlfi.envs.whip import recording as recordings
+from jaxlfi.envs.whip.exploration import exploratory_actions
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.parameters import WhipParameters, median, randomised
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.trajectory import trajectory
+from jaxlfi.envs.whip.vision.camera import side_camera
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS, Detector
 from jaxlfi.tasks.summaries import cross_correlation
 from jaxlfi.tasks.task import Task
 
 TRUTH = (0.23, 8e3)
 """Length (m) and Young's modulus (Pa) of the simulated DLO that is observed where no object is named."""
 DATA = Path(__file__).parent / "data"
-"""Recorded rollouts of stand-ins for real objects."""
+"""Folder of the recorded rollouts of the FEM reference objects."""
 MILLIMETRES = np.array([1e3, 1.0])
-"""From (m, Pa) to the units that parameters are told in."""
+"""Factors from (m, Pa) to the units of the task's parameters, (mm, Pa)."""
 NUISANCES: dict[str, Callable[..., WhipParameters]] = {
     "fixed": lambda key, length, young: median(length, young),
     "random": randomised,
 }
-"""What is assumed of all that is not inferred: that it is as in mu, or only its range."""
+"""Assumptions on the parameters that are not inferred: the values of mu, or uniform in their ranges."""
 CHANNELS = (
     "gripper x (m)",
     "gripper z (m)",
@@ -53,26 +54,27 @@ SUMMARY_NAMES = (
 
 def task(
     object: str | None = None,
-    detector: str = "mask",
-    nuisances: str = "fixed",
-    engine: str = "auto",
+    detector: Literal["clean", "mask", "noisy", "transporter"] = "mask",
+    nuisances: Literal["fixed", "random"] = "fixed",
+    engine: Literal["auto", "native", "mjx", "warp"] = "auto",
 ) -> Task:
     """Infer length and Young's modulus of a DLO from keypoints of one whip.
 
-    A trajectory is 16 rows: the state before each action (28 numbers) and the action. It is summarised by how states
-    go with actions, their means and their standard deviations (112 numbers).
+    A trajectory is 16 rows: the state before each action (28 numbers) and the action. It is summarised by the
+    cross-correlations of states and actions, and the means and standard deviations of the states (112 numbers).
 
     Args:
-        object: what is observed: a stand-in for a real object by name ("dlo-0" to "dlo-3"), or the path of a recorded
-            rollout's .npz (`envs.whip.recording`). The simulator applies its actions and looks from where its camera
-            stood. Without one, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory actions.
-        detector: how simulated keypoints err (`envs.whip.keypoints.DETECTORS`): "clean", "mask", "noisy" or
-            "transporter". It ought to be like the detector that made the observation; the stand-ins' is "mask".
+        object: the observed object: an FEM reference object by name ("dlo-0" to "dlo-3"), or the path of a recorded
+            rollout's .npz (`recording`), which `jaxlfi whip render` writes, too. Simulations apply its actions and are
+            seen through its camera. By default, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory
+            actions.
+        detector: the errors of simulated keypoints (`vision.keypoints.DETECTORS`). They should resemble those of the
+            detector that the observation was made with; for the reference objects, that is "mask".
         nuisances: "fixed": density, cubes and placement are as in mu; "random": only their ranges are known.
-        engine: "native", "mjx" or "auto", the one that suits the platform.
+        engine: the physics: "auto" is the one that suits the platform.
 
     Raises:
-        ValueError: for names that are not known and recordings that do not fit.
+        ValueError: for unknown names and recordings that do not fit.
     """
     for name, choice, known in (("detector", detector, DETECTORS), ("nuisances", nuisances, NUISANCES)):
         if choice not in known:
@@ -87,15 +89,15 @@ def task(
 
 
 def recorded(object: str) -> recordings.Recording:
-    """A stand-in's rollout by its name, or a rollout from a file.
+    """The rollout of a reference object by its name, or a rollout from a file.
 
     Raises:
-        ValueError: where there is neither.
+        ValueError: if there is no such object or file.
     """
-    stand_ins = {path.stem: path for path in sorted(DATA.glob("dlo-*.npz"))}
-    path = stand_ins.get(object, Path(object))
+    known = {path.stem: path for path in sorted(DATA.glob("dlo-*.npz"))}
+    path = known.get(object, Path(object))
     if not path.exists():
-        raise ValueError(f"object: expected one of {', '.join(stand_ins)} or a recorded rollout's .npz, got {object!r}")
+        raise ValueError(f"object: expected one of {', '.join(known)} or a recorded rollout's .npz, got {object!r}")
     return recordings.read(path)
 
 
@@ -108,15 +110,15 @@ def whip_task(
     truth=None,
     observation=None,
 ) -> Task:
-    """The task of its parts, for studies that choose them themselves.
+    """The task made of its parts, for studies that choose them.
 
     Args:
-        engine: of the physics.
+        engine: the physics.
         detector: of simulated keypoints.
-        nuisances: the scene of a key, a length (m) and a modulus (Pa).
-        actions: that every rollout applies, shape [T, 2], in m.
-        camera: through which every rollout is seen; by default each scene's own side camera.
-        truth: length (m) and Young's modulus (Pa) of the observed DLO, where they are known.
+        nuisances: makes a scene of a key, a length (m) and a modulus (Pa).
+        actions: of every rollout, shape [T, 2], in m.
+        camera: through which every rollout is seen; by default the side camera of each scene.
+        truth: length (m) and Young's modulus (Pa) of the observed DLO, if they are known.
         observation: the observed trajectory, shape [T, 30].
     """
     actions = jnp.asarray(actions, jnp.float32)
@@ -134,8 +136,8 @@ def whip_task(
         names=("length", "young"),
         units=("mm", "Pa"),
         log=("young",),
-        supports={"initial": _told(ranges.INITIAL), "feasible": _told(ranges.FEASIBLE)},
-        feasible=_told(ranges.FEASIBLE),
+        supports={"initial": _in_task_units(ranges.INITIAL), "feasible": _in_task_units(ranges.FEASIBLE)},
+        feasible=_in_task_units(ranges.FEASIBLE),
         summary=functools.partial(cross_correlation, actions=2),
         truth=None if truth is None else np.asarray(truth) * MILLIMETRES,
         observation=observation,
@@ -148,5 +150,5 @@ def whip_task(
     )
 
 
-def _told(box: Support) -> Support:
+def _in_task_units(box: Support) -> Support:
     return Support(np.asarray(box.low) * MILLIMETRES, np.asarray(box.high) * MILLIMETRES)

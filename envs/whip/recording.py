@@ -1,13 +1,14 @@
-"""Recorded rollouts of one object, real or standing in for it: a file format, and the trajectory that inference sees.
+"""Recorded rollouts of one object, real or simulated: a file format, and the trajectory that inference sees.
 
-A recording NAME is two files. NAME.npz has the arrays, NAME.json says what they are:
+A recording NAME consists of two files: NAME.npz with the arrays below (others are ignored), and NAME.json, which
+describes them. `jaxlfi whip render` writes such a recording of a simulated DLO, rollout.npz and rollout.json.
 
 | NAME.npz    | shape      | unit              | what                                                            |
 |-------------|------------|-------------------|-----------------------------------------------------------------|
 | `times`     | [F]        | s                 | of the frames; 0 is when the first action begins                |
 | `gripper`   | [F, 2]     | m                 | x and z of the gripper, as measured                             |
 | `keypoints` | [F, 10, 2] | normalised pixels | u to the right, v down, 0 to 1 across the image                 |
-| `seen`      | [F, 10]    | boolean           | keypoints that were found; the others may be anything, also NaN |
+| `seen`      | [F, 10]    | boolean           | keypoints that were found; the others are not used, may be NaN  |
 | `actions`   | [16, 2]    | m                 | displacements dx, dz of the set-point, one a control interval   |
 | `hits`      | [F, 6]     | boolean           | cubes hit so far, bottom-up; may be left out                    |
 
@@ -15,17 +16,17 @@ A recording NAME is two files. NAME.npz has the arrays, NAME.json says what they
 |--------------------|-----------------------------------------------------------------------------------------------|
 | `schema`           | "jaxlfi.whip.recording"                                                                       |
 | `version`          | 1                                                                                             |
-| `source`           | "real" or "stand-in"                                                                          |
+| `source`           | "real" or "simulated"                                                                         |
 | `description`      | free text                                                                                     |
 | `frame_rate`       | of the frames, in Hz                                                                          |
 | `control_interval` | between two actions, in s                                                                     |
 | `units`            | of each array, as above                                                                       |
 | `keypoints`        | their names in order: "dlo 1" to "dlo 4", then the cubes' colours, bottom-up                  |
-| `camera`           | `position` in m, `turn` as in `envs.whip.camera`, `field_of_view` in degrees, `image_size` in |
-|                    | pixels                                                                                        |
+| `camera`           | `position` in m, `orientation` as in `vision.camera.Camera`, `field_of_view` in degrees,      |
+|                    | `image_size` in pixels                                                                        |
 | `colours`          | of what is seen, as "#RRGGBB", by name                                                        |
 | `facts`            | what is known of the object, for people to read: inference does not use it                    |
-| `provenance`       | where the recording comes from, likewise                                                      |
+| `provenance`       | where the recording comes from, for people to read                                            |
 """
 
 import dataclasses
@@ -39,14 +40,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from envs.whip.camera import Camera
-from envs.whip.frames import COLOURS
-from envs.whip.keypoints import KEYPOINTS, ON_DLO
-from envs.whip.rules import ACTION_LIMIT, HIT_DISTANCE, STEPS
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
+from jaxlfi.envs.whip.rules import ACTION_LIMIT, HIT_DISTANCE, STEPS
+from jaxlfi.envs.whip.vision.camera import Camera
+from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS, ON_DLO
 from jaxlfi.io import files as atomic
 
 SCHEMA, VERSION = "jaxlfi.whip.recording", 1
-SOURCES = ("stand-in", "real")
+SOURCES = ("simulated", "real")
 UNITS = {
     "times": "s",
     "gripper": "m",
@@ -67,13 +69,13 @@ _DESCRIBED = {
     "facts": dict,
     "provenance": dict,
 }
-"""What the description says that is not the same in all recordings, and its type."""
-_CAMERA = ("position", "turn", "field_of_view")
+"""Entries of the description that differ between recordings, and their types."""
+_CAMERA = ("position", "orientation", "field_of_view")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Recording:
-    """One rollout of an object, as it was seen.
+    """One rollout of an object, as a camera saw it.
 
     Attributes:
         times: of the F frames, in s; 0 is when the first action begins.
@@ -81,8 +83,8 @@ class Recording:
         keypoints: four on the DLO and six cubes, in normalised pixels, shape [F, 10, 2].
         seen: keypoints that were found, shape [F, 10].
         actions: displacements of the set-point, one a control interval, in m, shape [16, 2].
-        camera: through which all was seen.
-        source: "stand-in" or "real".
+        camera: through which the keypoints were seen.
+        source: "simulated" or "real".
         description: free text.
         frame_rate: of the frames, in Hz.
         control_interval: between two actions, in s.
@@ -105,7 +107,7 @@ class Recording:
     source: str
     description: str
     frame_rate: float
-    control_interval: float = 0.16
+    control_interval: float = CONTROL_INTERVAL
     image_size: int = 256
     hits: Bool[np.ndarray, "frames 6"] | None = None
     colours: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -122,12 +124,38 @@ class Recording:
         _check_arrays(self)
 
 
-def write(path: str | Path, recording: Recording) -> None:
+def simulated(arrays: Mapping[str, np.ndarray], camera: Camera, description: str) -> Recording:
+    """A rollout of the simulator as a recording, with one frame per control interval.
+
+    Keypoints outside of the image count as not seen.
+
+    Args:
+        arrays: `times`, `gripper`, `keypoints`, `seen`, `actions` and `hits`, as in a file.
+        camera: through which the rollout was seen.
+        description: free text.
+
+    Raises:
+        ValueError: for a rollout that is no recording, such as one whose DLO never enters the image.
+    """
+    inside = (np.abs(arrays["keypoints"] - 0.5) <= 0.5).all(axis=-1)
+    return Recording(
+        **{name: arrays[name] for name in ("times", "gripper", "keypoints", "hits")},
+        seen=arrays["seen"] & inside,
+        actions=np.clip(arrays["actions"], -ACTION_LIMIT, ACTION_LIMIT),
+        camera=camera,
+        source="simulated",
+        description=description,
+        frame_rate=1 / CONTROL_INTERVAL,
+    )
+
+
+def write(path: str | Path, recording: Recording, others: Mapping[str, np.ndarray] | None = None) -> None:
     """Write NAME.npz and NAME.json.
 
     Args:
         path: NAME.npz; neither file may exist.
         recording: to be written; times in double precision, the rest in single.
+        others: arrays of other names that NAME.npz is to have, too.
 
     Raises:
         ValueError: for another name, or files that exist.
@@ -138,14 +166,14 @@ def write(path: str | Path, recording: Recording) -> None:
             raise ValueError(f"path: expected a new recording, got {file}, which exists")
     named = {name: getattr(recording, name) for name in UNITS if getattr(recording, name) is not None}
     single = lambda name, value: np.asarray(value, np.float32) if value.dtype == float and name != "times" else value
-    told = {name: getattr(recording, name) for name in _DESCRIBED if name != "camera"}
+    described = {name: getattr(recording, name) for name in _DESCRIBED if name != "camera"}
     camera = {name: np.asarray(getattr(recording.camera, name), float).tolist() for name in _CAMERA}
     fixed = {"schema": SCHEMA, "version": VERSION, "units": {name: UNITS[name] for name in named}}
-    # A recording is whole once the second file is there.
-    atomic.write_arrays(arrays, {name: single(name, value) for name, value in named.items()})
+    # A recording is complete once the second file exists.
+    atomic.write_arrays(arrays, {**(others or {}), **{name: single(name, value) for name, value in named.items()}})
     atomic.write_json(
         description,
-        {**fixed, "keypoints": ORDER, **told, "camera": {**camera, "image_size": recording.image_size}},
+        {**fixed, "keypoints": ORDER, **described, "camera": {**camera, "image_size": recording.image_size}},
     )
 
 
@@ -153,7 +181,7 @@ def read(path: str | Path) -> Recording:
     """Read a recording.
 
     Args:
-        path: NAME.npz, beside which lies NAME.json.
+        path: NAME.npz; NAME.json is read from the same folder.
 
     Raises:
         ValueError: for files that are missing, damaged, of another kind or version, or that do not fit.
@@ -161,12 +189,13 @@ def read(path: str | Path) -> Recording:
     arrays, description = _files(path)
     values = atomic.read_arrays(arrays)
     try:
-        told = _told(description)
-        if set(values) != set(told["units"]):
-            raise ValueError(f"arrays: expected {sorted(told['units'])}, got {sorted(values)}")
-        camera = told.pop("camera")
+        described = _description(description)
+        if missing := set(described["units"]) - set(values):
+            raise ValueError(f"arrays: expected {sorted(described['units'])}, got no {', '.join(sorted(missing))}")
+        values = {name: values[name] for name in described["units"]}
+        camera = described.pop("camera")
         view = Camera(**{name: jnp.asarray(_array("camera", camera[name], float), jnp.float32) for name in _CAMERA})
-        rest = {name: told[name] for name in _DESCRIBED if name in told}
+        rest = {name: described[name] for name in _DESCRIBED if name in described}
         return Recording(**values, **rest, camera=view, image_size=camera["image_size"])
     except ValueError as error:
         raise ValueError(f"{arrays.with_suffix('')}: {error}") from error
@@ -179,29 +208,31 @@ def _files(path: str | Path) -> tuple[Path, Path]:
     return path, path.with_suffix(".json")
 
 
-def _told(path: Path) -> dict[str, Any]:
+def _description(path: Path) -> dict[str, Any]:
     """The description, where it is one of a recording that can be read."""
+    if not path.exists():
+        raise ValueError(f"a recording is two files: expected a description in {path.name} beside the .npz, got none")
     try:
-        told = json.loads(path.read_text())
+        described = json.loads(path.read_text())
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"expected a description in {path.name}, got {type(error).__name__}") from error
-    if not isinstance(told, dict) or told.get("schema") != SCHEMA:
+    if not isinstance(described, dict) or described.get("schema") != SCHEMA:
         raise ValueError(f"schema: expected {SCHEMA!r} in {path.name}, got another kind of file")
-    if told.get("version") != VERSION:
-        raise ValueError(f"version: expected {VERSION}, got {told.get('version')!r}")
+    if described.get("version") != VERSION:
+        raise ValueError(f"version: expected {VERSION}, got {described.get('version')!r}")
     for name, kind in {**_DESCRIBED, "units": dict, "keypoints": list}.items():
-        if name not in told:
+        if name not in described:
             raise ValueError(f"{name}: expected in {path.name}, got none")
-        if not isinstance(told[name], int | float if kind is float else kind):
-            raise ValueError(f"{name}: expected a {kind.__name__}, got {told[name]!r}")
-    required = {name: unit for name, unit in UNITS.items() if name != "hits" or name in told["units"]}
-    if told["units"] != required:
-        raise ValueError(f"units: expected {required}, got {told['units']}")
-    if told["keypoints"] != list(ORDER):
-        raise ValueError(f"keypoints: expected the order {list(ORDER)}, got {told['keypoints']}")
-    if set(told["camera"]) != {*_CAMERA, "image_size"}:
-        raise ValueError(f"camera: expected {[*_CAMERA, 'image_size']}, got {sorted(told['camera'])}")
-    return told
+        if not isinstance(described[name], int | float if kind is float else kind):
+            raise ValueError(f"{name}: expected a {kind.__name__}, got {described[name]!r}")
+    required = {name: unit for name, unit in UNITS.items() if name != "hits" or name in described["units"]}
+    if described["units"] != required:
+        raise ValueError(f"units: expected {required}, got {described['units']}")
+    if described["keypoints"] != list(ORDER):
+        raise ValueError(f"keypoints: expected the order {list(ORDER)}, got {described['keypoints']}")
+    if set(described["camera"]) != {*_CAMERA, "image_size"}:
+        raise ValueError(f"camera: expected {[*_CAMERA, 'image_size']}, got {sorted(described['camera'])}")
+    return described
 
 
 def _array(name: str, value: Any, kind: type) -> np.ndarray:
@@ -222,9 +253,11 @@ def _check_scalars(recording: Recording) -> None:
             raise ValueError(f"{name}: expected a positive number, got {value!r}")
     camera = [np.asarray(getattr(recording.camera, name), float) for name in _CAMERA]
     if [value.shape for value in camera] != [(3,), (4,), ()] or not all(np.isfinite(value).all() for value in camera):
-        raise ValueError(f"camera: expected a position [3], a turn [4] and a field of view, got {recording.camera}")
+        raise ValueError(
+            f"camera: expected a position [3], an orientation [4] and a field of view, got {recording.camera}"
+        )
     if abs(np.linalg.norm(camera[1]) - 1) > 1e-3:
-        raise ValueError(f"camera: expected a unit quaternion for its turn, got {camera[1].tolist()}")
+        raise ValueError(f"camera: expected a unit quaternion for its orientation, got {camera[1].tolist()}")
     if not 0 < camera[2] < 180:
         raise ValueError(f"camera: expected a field of view between 0 and 180 degrees, got {camera[2]}")
 
@@ -260,7 +293,7 @@ def _check_arrays(recording: Recording) -> None:
             f"actions: expected displacements of at most {ACTION_LIMIT} m, got one of {np.abs(actions).max():g}"
         )
     if hits is not None and (hits[:-1] & ~hits[1:]).any():
-        raise ValueError("hits: expected cubes that have been hit to stay so, got one that has not")
+        raise ValueError("hits: expected that a cube that has been hit stays hit, got one that does not")
 
 
 def _check_times(recording: Recording) -> None:
@@ -276,9 +309,9 @@ def _check_times(recording: Recording) -> None:
 
 
 def filled(recording: Recording) -> Float[np.ndarray, "frames 10 2"]:
-    """Keypoints of all frames: those not seen lie on the line between where they were seen before and after.
+    """Keypoints of all frames: those not seen are interpolated linearly between the frames in which they were.
 
-    At the end they stay where they were seen last, at the start they are where they are seen first.
+    Before the first of these, and after the last, they stay where they were in it.
     """
     out = np.empty_like(recording.keypoints)
     for k in range(KEYPOINTS):
@@ -297,22 +330,22 @@ def hit_flags(recording: Recording) -> Bool[np.ndarray, "frames 6"]:
 
 
 def resample(recording: Recording) -> Float[np.ndarray, "17 28"]:
-    """States before each action and after the last one (section VI-E), whatever the frame rate.
+    """States before each action and after the last one (section VI-E), for any frame rate.
 
-    Positions are interpolated between the frames around those instants; a flag is that of the last frame.
+    Positions are interpolated between the nearest frames; a flag is that of the last frame.
 
     Returns:
         The gripper's x and z in m, ten keypoints in normalised pixels, six flags; shape [17, 28].
     """
-    times, instants = recording.times, np.arange(STEPS + 1) * recording.control_interval
+    times, boundaries = recording.times, np.arange(STEPS + 1) * recording.control_interval
     positions = np.concatenate([recording.gripper, filled(recording).reshape(times.size, -1)], axis=1)
-    moving = np.stack([np.interp(instants, times, column) for column in positions.T], axis=1)
-    last = np.searchsorted(times, instants + 1e-6, side="right") - 1
+    moving = np.stack([np.interp(boundaries, times, column) for column in positions.T], axis=1)
+    last = np.searchsorted(times, boundaries + 1e-6, side="right") - 1
     flags = hit_flags(recording)[np.maximum(last, 0)]
     return np.concatenate([moving, flags], axis=1).astype(np.float32)
 
 
 def trajectory(recording: Recording) -> Float[np.ndarray, "16 30"]:
-    """What inference compares: the state before each action beside the action (section VI-F), shape [16, 30]."""
+    """What inference compares: the state before each action, and the action (section VI-F), shape [16, 30]."""
     actions = recording.actions.astype(np.float32)
     return np.concatenate([resample(recording)[:STEPS], actions], axis=1)

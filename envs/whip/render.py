@@ -1,4 +1,4 @@
-"""Pictures of rollouts, drawn from our own segmentation images: no graphics driver is needed."""
+"""Pictures of rollouts, drawn from segmentation images by ray casting: no graphics driver is needed."""
 
 import functools
 from collections.abc import Sequence
@@ -10,16 +10,17 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from envs.whip import rules
-from envs.whip.camera import Camera, project, side_camera
-from envs.whip.engine import Engine, State
-from envs.whip.episode import Step, Whip
-from envs.whip.frames import COLOURS, Frames
-from envs.whip.keypoints import KEYPOINTS, ON_DLO
-from envs.whip.kinematics import frames
-from envs.whip.parameters import WhipParameters
-from envs.whip.raster import segmentation
-from envs.whip.scene import RGBA
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.episode import Step, Whip
+from jaxlfi.envs.whip.frames import COLOURS, Frames
+from jaxlfi.envs.whip.parameters import WhipParameters
+from jaxlfi.envs.whip.physics import engine as physics
+from jaxlfi.envs.whip.physics.engine import Engine, State
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.rig import RGBA
+from jaxlfi.envs.whip.vision.camera import Camera, project, side_camera
+from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS, ON_DLO
+from jaxlfi.envs.whip.vision.raster import segmentation
 
 BACKGROUND = (1.0, 1.0, 1.0)
 PALETTE = np.array([BACKGROUND, *(RGBA[name][:3] for name in (*COLOURS, "dlo"))], np.float32)
@@ -27,23 +28,23 @@ PALETTE = np.array([BACKGROUND, *(RGBA[name][:3] for name in (*COLOURS, "dlo"))]
 SIZE = 320
 """Of the images, in pixels."""
 PIECES = 8
-"""Frames of an animation in a control interval, 20 ms each."""
+"""Frames of an animation per control interval, 20 ms each."""
 SLOWNESS = 2.0
-"""How many times slower than life an animation is."""
+"""How many times slower than real time an animation is."""
 
 
 @struct.dataclass
 class Rollout:
-    """One rollout of given actions, which goes on after the episode's end.
+    """One rollout of given actions, which continues after the end of the episode.
 
     Attributes:
         parameters: of the scene.
         actions: displacements of the set-point, in m, shape [16, 2].
         observations: before each action and after the last, shape [17, 28].
-        steps: what each action led to, stacked.
+        steps: the step of each action, stacked.
         states: of the physics, before each action and after the last, stacked.
-        length: steps of the episode.
-        value: its return, the sum of its rewards.
+        length: number of steps of the episode.
+        value: return of the episode, the sum of its rewards.
     """
 
     parameters: WhipParameters
@@ -56,13 +57,13 @@ class Rollout:
 
 
 def perform(key: jax.Array, whip: Whip, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> Rollout:
-    """Roll out actions to their end.
+    """Roll out all actions, also after the end of the episode.
 
     Args:
         key: of the detector.
         whip: the task.
         parameters: of the scene.
-        actions: to apply, in m.
+        actions: to be applied, in m.
     """
     first, start = whip.reset(jax.random.fold_in(key, 0), parameters)
 
@@ -87,30 +88,24 @@ def perform(key: jax.Array, whip: Whip, parameters: WhipParameters, actions: Flo
 
 
 def film(engine: Engine, rollout: Rollout, pieces: int) -> Frames:
-    """What there is to see between control steps too.
+    """Frames of a rollout, between its control steps too.
 
-    Every control interval is simulated again in pieces, from the state it began with: they are the rollout's own to
-    within rounding, which a simulation of all pieces in one go, after contacts, would not be.
+    Every control interval is simulated again in pieces, from its first state. The frames therefore agree with the
+    rollout to rounding; a simulation of all pieces from the start would not, after contacts.
 
     Args:
-        engine: whose control interval is that of the rollout over `pieces`.
+        engine: the physics, whose control interval is that of the rollout divided by `pieces`.
         rollout: to be filmed.
-        pieces: K.
+        pieces: number of pieces K of a control interval.
 
     Returns:
-        Frames at 16 K + 1 instants.
+        16 K + 1 frames.
     """
 
     def interval(state: State, after: State):
-        share = (jnp.arange(1, pieces) / pieces)[:, None]
-        targets = state.target + share * (after.target - state.target)
-
-        def step(state, target):
-            state = engine.advance(rollout.parameters, state, target)
-            return state, state.qpos
-
-        _, between = jax.lax.scan(step, state, targets)
-        return jnp.concatenate([state.qpos[None], between])
+        fraction = (jnp.arange(1, pieces) / pieces)[:, None]
+        targets = state.target + fraction * (after.target - state.target)
+        return physics.scan_states(functools.partial(engine.advance, rollout.parameters), state, targets).qpos
 
     before = jax.tree.map(lambda leaf: leaf[:-1], rollout.states)
     after = jax.tree.map(lambda leaf: leaf[1:], rollout.states)
@@ -142,27 +137,26 @@ def _shoot(engine: Engine, rollout: Rollout):
 
 
 def save_pictures(folder: Path, engine: Engine, rollout: Rollout, title: Sequence[str]) -> list[Path]:
-    """Draw a sheet of the 17 instants and an animation, with what the detector saw.
+    """Draw a sheet of the 17 frames at control steps and an animation, with the detected keypoints.
 
-    Keypoints fade between control steps, as nothing is detected there.
+    Keypoints fade between control steps, where nothing is detected.
 
     Args:
         folder: for sheet.png and film.gif.
-        engine: for the film: its control interval is that of the rollout over `PIECES`.
+        engine: the physics, whose control interval is that of the rollout divided by `PIECES`.
         rollout: to be drawn.
-        title: lines of it.
+        title: its lines.
 
     Returns:
-        What was written.
+        The files that were written.
     """
-    from jaxlfi.figures import whip as figures
+    from jaxlfi.envs.whip import figures
 
     labels, places, still = jax.device_get(_shoot(engine, rollout))
     at = np.arange(len(labels))
     step = at // PIECES
-    keypoints = np.asarray(rollout.observations[:, 2:22]).reshape(-1, KEYPOINTS, 2)[step]
-    seen = np.concatenate([np.ones((1, KEYPOINTS), bool), rollout.steps.seen])[step]
-    instants = figures.Instants(
+    keypoints, seen = keypoints_of(rollout.observations)[step], _seen(rollout)[step]
+    film = figures.Film(
         labels=labels,
         dlo=keypoints[:, :ON_DLO],
         cubes=keypoints[:, ON_DLO:],
@@ -175,32 +169,46 @@ def save_pictures(folder: Path, engine: Engine, rollout: Rollout, title: Sequenc
     )
     interval = SLOWNESS * engine.scene.control_interval
     return [
-        figures.save_sheet(folder / "sheet.png", instants.every(PIECES), ": ".join(title)),
-        figures.save_animation(folder / "film.gif", instants, "\n".join(title), interval, 0.6 ** (at % PIECES)),
+        figures.save_sheet(folder / "sheet.png", film.every(PIECES), ": ".join(title)),
+        figures.save_animation(folder / "film.gif", film, "\n".join(title), interval, 0.6 ** (at % PIECES)),
     ]
 
 
 def _captions(interval: float, rollout: Rollout, at: np.ndarray) -> list[str]:
-    """Time, and what the last step was rewarded with, if with anything before the end of the episode."""
+    """The time of each frame, and the last reward if it is not zero and the episode is not over."""
     rewards = np.concatenate([[0.0], rollout.steps.reward])
-    told = [f"r = {reward:.2f}" if reward else "" for reward in rewards]
-    told = [text if t <= rollout.length else "over" for t, text in enumerate(told)]
-    return [f"{i * interval:.2f} s   {told[i // PIECES]}".strip() for i in at]
+    texts = [f"r = {reward:.2f}" if reward else "" for reward in rewards]
+    texts = [text if t <= rollout.length else "over" for t, text in enumerate(texts)]
+    return [f"{i * interval:.2f} s   {texts[i // PIECES]}".strip() for i in at]
+
+
+def keypoints_of(observations: Float[Array, "time 28"]) -> np.ndarray:
+    """The keypoints in observations, in normalised pixels, shape [T, 10, 2]."""
+    return np.asarray(observations[:, 2 : 2 + 2 * KEYPOINTS]).reshape(-1, KEYPOINTS, 2)
+
+
+def _seen(rollout: Rollout) -> np.ndarray:
+    """Keypoints that were seen, shape [17, 10]: in the first frame, all are."""
+    return np.concatenate([np.ones((1, KEYPOINTS), bool), rollout.steps.seen])
 
 
 def arrays(engine: Engine, rollout: Rollout) -> dict[str, np.ndarray]:
     """A rollout as named arrays, for rollout.npz.
 
-    `states` [16, 28] before each `actions` [16, 2]; `rewards`, `outside`, `failed` [16] after it; `hits` [17, 6] and
-    `frames/...` [17, ...] before each action and after the last, in m; `parameters/...` in SI units; `length` in steps
-    and `return` of the episode.
+    Before each action and after the last: `times` [17], `gripper` [17, 2], `keypoints` [17, 10, 2], `seen` [17, 10] and
+    `hits` [17, 6] as in a recording (`recording`), and `frames/...` [17, ...] in m. For each of the `actions` [16, 2]:
+    `rewards`, `outside` and `failed` [16] after it. `parameters/...` in SI units; `length` in steps and `return` of the
+    episode.
     """
     see = jax.jit(jax.vmap(lambda qpos: frames(engine.scene, rollout.parameters, qpos)))
     named = {
-        "states": rollout.observations[:-1],
+        "times": engine.scene.control_interval * np.arange(rules.STEPS + 1),
+        "gripper": rollout.observations[:, :2],
+        "keypoints": keypoints_of(rollout.observations),
+        "seen": _seen(rollout),
+        "hits": np.concatenate([np.zeros((1, 6), bool), rollout.steps.hit]),
         "actions": rollout.actions,
         "rewards": rollout.steps.reward,
-        "hits": np.concatenate([np.zeros((1, 6), bool), rollout.steps.hit]),
         "outside": rollout.steps.outside,
         "failed": rollout.steps.failed,
         "length": rollout.length,

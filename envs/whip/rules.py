@@ -2,24 +2,25 @@
 
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jaxtyping import Array, Bool, Float
 
 STEPS = 16
-"""Control steps in an episode."""
+"""Number of control steps in an episode."""
 ACTION_LIMIT = 0.06
-"""The furthest that an action moves the set-point along x or z, in m."""
+"""Maximum displacement of the set-point by an action, along x and along z, in m."""
 WORKSPACE = np.array([[0.275, 0.1], [0.6, 0.5]], np.float32)
 """Lower and upper limits of the gripper's x and z, in m."""
 HIT_DISTANCE = 0.06
-"""How far a cube's keypoint must have moved from its start to count as hit, in normalised pixels."""
+"""Displacement of a cube's keypoint from its start above which the cube counts as hit, in normalised pixels."""
 TOP = 5
 """Index of the target, the yellow cube."""
 PENALTIES = np.array([0.05 * 2 ** (4 - i) for i in range(TOP)], np.float32)
-"""For hitting a cube below the target, from the red one at the bottom up."""
+"""Penalties for hitting the cubes below the target, from the red one at the bottom up."""
 
 
 def moved_target(target: Float[Array, "*batch 2"], action: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
-    """The set-point after an action (dx, dz) in m; what is beyond the limit of an action is clipped."""
+    """The set-point after an action (dx, dz) in m, which is clipped to its limit."""
     return target + jnp.clip(action, -ACTION_LIMIT, ACTION_LIMIT)
 
 
@@ -36,7 +37,7 @@ def hits(
     Args:
         before: cubes hit before.
         start: the cubes' keypoints at the start of the episode, in normalised pixels.
-        cubes: and now.
+        cubes: the cubes' keypoints now.
     """
     return before | (jnp.linalg.norm(cubes - start, axis=-1) > HIT_DISTANCE)
 
@@ -44,11 +45,48 @@ def hits(
 def reward(hit: Bool[Array, "*batch 6"], out: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
     """The reward of one step (section VI-G).
 
-    2 where the top cube has been hit, less a penalty for each of the others that has been, whichever came first and
-    again at every step; -1 for leaving the workspace.
+    2 if the top cube has been hit, minus a penalty for each other cube that has been hit, in whichever order, at every
+    step; -1 for leaving the workspace.
 
     Args:
         hit: cubes hit so far in the episode, bottom-up.
         out: whether the gripper is outside of its workspace.
     """
     return jnp.where(out, -1.0, 2.0 * hit[..., TOP] - hit[..., :TOP] @ jnp.asarray(PENALTIES))
+
+
+@struct.dataclass
+class Verdict:
+    """The rules applied to one step.
+
+    Attributes:
+        hit: cubes hit so far, bottom-up, shape [6].
+        outside: whether the gripper has left its workspace.
+        reward: see `reward`; 0 where the simulation has become unstable.
+        over: whether the episode ends: the top cube is hit, the gripper is outside, or the simulation is unstable.
+    """
+
+    hit: Bool[Array, "*batch 6"]
+    outside: Bool[Array, "*batch"]
+    reward: Float[Array, "*batch"]
+    over: Bool[Array, "*batch"]
+
+
+def judge(
+    before: Bool[Array, "6"],
+    start: Float[Array, "6 2"],
+    cubes: Float[Array, "6 2"],
+    gripper: Float[Array, "2"],
+    failed: Bool[Array, ""],
+) -> Verdict:
+    """Apply all rules to the state after a step.
+
+    Args:
+        before: cubes hit before the step.
+        start: the cubes' keypoints at the start of the episode, in normalised pixels.
+        cubes: the cubes' keypoints after the step.
+        gripper: its x and z after the step, in m.
+        failed: whether the simulation has become unstable.
+    """
+    hit, out = hits(before, start, cubes), outside(gripper)
+    return Verdict(hit, out, reward=jnp.where(failed, 0.0, reward(hit, out)), over=hit[TOP] | out | failed)

@@ -18,9 +18,9 @@ if "XLA_FLAGS" not in os.environ:  # read once, when jax starts
 
 import jax
 
-from envs.lotka_volterra import task as lotka_volterra
 from jaxlfi import QUICK, infer
 from jaxlfi.bayessim.keys import key_of
+from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.heuristics import Edge
 from jaxlfi.studies.grid import Axis, Grid, grid_runs, prepare, run_chunk
 

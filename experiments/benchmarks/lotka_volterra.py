@@ -26,7 +26,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
-from envs import lotka_volterra_mjp as lv  # noqa: E402
+from jaxlfi.envs.lotka_volterra import jump_process as lv  # noqa: E402
 
 TRUTH = np.log([0.01, 0.5, 1.0, 0.01]).astype(np.float32)
 PRIOR_BOUNDS = (-5.0, 2.0)
@@ -44,15 +44,15 @@ class Config:
         textbook_simulations: batch of the plain vmapped while loop.
         numpy_simulations: simulations by NumPy, in all.
         repeats: timed calls of each; the slow ones (NumPy) are called once.
-        lanes: lanes a shard, see `Schedule`.
-        phase: events a phase, see `Schedule`.
+        slots: slots per shard, see `Schedule`.
+        phase: events per phase, see `Schedule`.
     """
 
     simulations: int = 8192
     textbook_simulations: int = 256
     numpy_simulations: int = 30
     repeats: int = 5
-    lanes: int = lv.Schedule.lanes
+    slots: int = lv.Schedule.slots
     phase: int = lv.Schedule.phase
 
 
@@ -90,8 +90,8 @@ def log_rates_of(setting: str, count: int) -> jax.Array:
 
 
 def ours(config: Config, setting: str, shards: int) -> tuple[Run, float]:
-    """Our simulator on `shards` devices, and the share of lane-steps idle lanes lose there."""
-    schedule = lv.Schedule(lanes=config.lanes, phase=config.phase)
+    """Our simulator on `shards` devices, and the fraction of slot-steps that are idle."""
+    schedule = lv.Schedule(slots=config.slots, phase=config.phase)
     keys = jax.random.split(jax.random.key(0), config.simulations)
     log_rates = log_rates_of(setting, config.simulations)
 
@@ -110,7 +110,7 @@ def ours(config: Config, setting: str, shards: int) -> tuple[Run, float]:
         return result.steps, result.phases[None]
 
     steps, phases = sharded(work, lambda split: (split, split))()
-    executed = float(phases.sum()) * schedule.lanes * schedule.phase
+    executed = float(phases.sum()) * schedule.slots * schedule.phase
     idle = 1 - float(steps.sum(dtype=jnp.float32)) / executed
     simulate = jax.vmap(lv.make_simulator(PROCESS, schedule))
     return sharded(simulate, lambda split: split), idle
@@ -227,7 +227,7 @@ def main(config: Config) -> None:
     """Measures all and prints the table."""
     devices = f"{jax.device_count()} {jax.default_backend()} devices"
     print(f"jax {jax.__version__}, {devices}, {os.cpu_count()} cores")
-    print(f"{config.lanes} lanes, phases of {config.phase} events")
+    print(f"{config.slots} slots, phases of {config.phase} events")
     heads = ("simulator", "rates", "batch", "best 1/s", "median 1/s", "cores", "per core s")
     print("{:<22}{:<8}{:>7}{:>11}{:>11}{:>7}{:>11}{:>9}{:>8}".format(*heads, "first s", "idle"))
     for setting in ("truth", "prior"):

@@ -26,10 +26,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.keys import init_key, round_keys
 from jaxlfi.bayessim.presets import PRESETS
+from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.estimators import dataset
 from jaxlfi.estimators.base import untrained
 from jaxlfi.estimators.mixture_network import MixtureNetwork
@@ -202,7 +202,7 @@ import time
 from jaxlfi.io import compile_cache
 compile_cache.enable()
 import jax, jax.numpy as jnp
-from envs.lotka_volterra import task as factory
+from jaxlfi.envs.lotka_volterra import task as factory
 from jaxlfi.bayessim import algorithm
 from jaxlfi.heuristics import Edge
 from jaxlfi.bayessim.presets import QUICK

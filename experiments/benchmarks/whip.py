@@ -2,10 +2,10 @@
 
 Prints
 
-* steps of the physics and episodes a second, of random episodes in random scenes, by each engine for several sizes of
-  batches, and how many failed; against MuJoCo called by a plain Python loop on one core, and its own loop in C on one
-  core, which is the floor: the same models and actions. On a processor, MJX's batches are shared out among as many
-  devices as there are cores, and larger ones are cut to the first control steps;
+* physics steps and episodes per second, of random episodes in random scenes, for each engine and several batch sizes,
+  and how many failed; against MuJoCo called by a plain Python loop on one core, and its own loop in C on one core,
+  which is the floor: the same models and actions. On a processor, MJX's batches are divided among as many devices as
+  there are cores, and larger ones are limited to the first control steps;
 * seconds of tracing and compiling an episode of MJX, cold and from the cache on disk;
 * how far MJX agrees with MuJoCo: of sixty DLOs, eight at the corners of Phi and Theta_0 and the others random, each
   moved in five ways, how many knock the same cubes off. After contact motions are chaotic, so the yardstick is MuJoCo
@@ -36,25 +36,26 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from envs.whip import rules
-from envs.whip.chain import Chain
-from envs.whip.edits import edited_model
-from envs.whip.engine import Engine, State, ramp, rollout
-from envs.whip.engines import NAMES, pick
-from envs.whip.exploration import exploratory_actions
-from envs.whip.kinematics import frames
-from envs.whip.native import NativeEngine
-from envs.whip.parameters import FEASIBLE, INITIAL, WhipParameters, median
-from envs.whip.scene import CUBES, START, Scene
 from experiments.whip_physics.rollouts import random_scene, random_targets
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.exploration import exploratory_actions
+from jaxlfi.envs.whip.parameters import FEASIBLE, INITIAL, WhipParameters, median
+from jaxlfi.envs.whip.physics.chain import Chain
+from jaxlfi.envs.whip.physics.edits import edited_model
+from jaxlfi.envs.whip.physics.engine import Engine, State, ramp, rollout
+from jaxlfi.envs.whip.physics.engines import NAMES, pick
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.physics.native import NativeEngine
+from jaxlfi.envs.whip.physics.scene import CUBES, Scene
+from jaxlfi.envs.whip.rig import START
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.folder import command_line, environment
 
 SCENE = Scene()
 EPISODE = rules.STEPS * SCENE.substeps
-"""Steps of the physics."""
+"""Number of physics steps of an episode."""
 PATIENCE = 20_000
-"""Steps of the physics that MJX takes at most in a timed call on a processor."""
+"""Maximum number of physics steps of MJX in a timed call on a processor."""
 
 
 def random_batch(count: int) -> tuple[WhipParameters, jax.Array]:
@@ -153,8 +154,8 @@ import time
 from jaxlfi.io import compile_cache
 compile_cache.enable()
 import jax
-from envs.whip.engine import rollout
-from envs.whip.engines import NAMES, pick
+from jaxlfi.envs.whip.physics.engine import rollout
+from jaxlfi.envs.whip.physics.engines import NAMES, pick
 from experiments.benchmarks.whip import random_batch
 engine = pick("mjx")
 scenes, targets = random_batch(12)

@@ -2,8 +2,8 @@
 
     python -m experiments.whip_physics --out experiments/results/whip-physics
 
-Writes table.csv (a line a chain), results.json (all numbers, with versions and the command), arrays.npz and pictures.
-Needs the extra `whip` and SciPy.
+Writes table.csv (one line per chain), results.json (all numbers, with versions and the command), arrays.npz and
+figures. Needs the extra `whip` and SciPy.
 """
 
 import argparse
@@ -17,30 +17,30 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from envs.whip.chain import Chain
-from envs.whip.engines import pick
-from envs.whip.scene import Scene
 from experiments.whip_physics import figures, measure, rollouts
 from experiments.whip_physics.models import KINDS
+from jaxlfi.envs.whip.physics.chain import Chain
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.figures import style
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.folder import command_line, environment
 
 CHAINS = {"ball joints": Chain(planar=False), "planar hinges": Chain()}
-"""Those that can be in a scene, by their kind."""
+"""The chains that a scene can have, by their kind."""
 WILD = 4.0
 """A cube's speed far beyond that of a fall from the stack's top (1.7) and of the gripper (0.5), in m/s."""
 
 
 def statistics(scenes: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """What random episodes and stacks of one chain come down to."""
+    """Statistics of random episodes and stacks with one kind of chain."""
     failed, wild = scenes["failed"], scenes["cube"] > WILD
     stacks = {name.removeprefix("stack "): values for name, values in scenes.items() if name.startswith("stack ")}
     measures = ("lateral", "vertical", "drift")
     return {
         "rollouts": len(failed),
         "failed": int(failed.sum()),
-        "failed_share": float(failed.mean()),
+        "failed_fraction": float(failed.mean()),
         "failed_saturated": int((failed & scenes["saturated"]).sum()),
         "wild": int((wild & ~failed).sum()),
         "fastest_cube": float(scenes["cube"][~failed].max(initial=0.0)),
@@ -82,7 +82,7 @@ ENERGIES = ("highest", "greatest_rise", "end", "drift")
 
 
 def results(arrays: Mapping[str, np.ndarray], scenes: Mapping[str, dict]) -> dict[str, object]:
-    """All numbers, and what they are over."""
+    """All numbers, and the grids they are measured on."""
     return {
         "errors": {"kinds": KINDS, "elements": measure.ELEMENTS, **{name: arrays[name].tolist() for name in THEORY}},
         "sag": {"numbers": measure.NUMBERS, **sag_errors(arrays)},

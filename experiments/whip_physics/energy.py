@@ -1,24 +1,24 @@
-"""What becomes of a swinging chain's energy."""
+"""Energy of a swinging chain over time."""
 
 import mujoco
 import numpy as np
 
-from envs.whip.chain import GRAVITY
 from experiments.whip_physics import statics
+from jaxlfi.envs.whip.rig import GRAVITY
 
 
 def swing(model: mujoco.MjModel, timestep: float, seconds: float = 2.0, runge_kutta: bool = False) -> np.ndarray:
     """Energy of a clamped chain that is let go from where it rests held horizontally.
 
     Args:
-        model: a clamped chain with the damping and air that it shall have; it is changed.
+        model: a clamped chain with its damping and air; it is changed.
         timestep: in s.
         seconds: simulated.
         runge_kutta: in place of the scene's integrator, Euler with implicit damping.
 
     Returns:
-        Elastic, potential and kinetic energy above that of the chain at rest, as a share of what it begins with, at the
-        beginning of each step, shape [steps].
+        Elastic, potential and kinetic energy above that of the chain at rest, as a fraction of its initial value, at
+        the beginning of each step, shape [steps].
     """
     data = statics.equilibrium(model, np.zeros(3), np.array([GRAVITY, 0.0, 0.0]), loads=12)
     model.opt.gravity = (0, 0, -GRAVITY)

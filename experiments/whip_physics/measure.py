@@ -1,31 +1,33 @@
-"""Everything that is measured of the chains, as named arrays."""
+"""All measurements of the chains, as named arrays."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from envs.whip.chain import GRAVITY, SECOND_MOMENT, SECTION, Chain
-from envs.whip.engine import Engine
-from envs.whip.parameters import MEDIAN, WhipParameters, median
-from envs.whip.scene import Scene
 from experiments.whip_physics import beam, energy, models, rollouts, statics
+from jaxlfi.envs.whip.parameters import MEDIAN, WhipParameters, median
+from jaxlfi.envs.whip.physics.chain import SECOND_MOMENT, Chain
+from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.scene import Scene
+from jaxlfi.envs.whip.reference_objects.elastica import heavy_elastica
+from jaxlfi.envs.whip.rig import GRAVITY, SECTION
 
 ELEMENTS = (8, 10, 12, 16, 24)
-"""N."""
+"""Numbers of elements N."""
 DEFAULT = Chain().elements
 NUMBERS = (0.5, 5.8, 24.5, 100.0, 400.0, 1113.0, 4486.0)
 """Elasto-gravity numbers: a rod, ..., the median DLO, ..., the limpest of the initial support, the limpest of Phi."""
 SMALL = 1e-3
 """A small load at the tip, in units of E I / L^2."""
 ARC = np.linspace(0, 1, 201)
-"""Where shapes of beams are kept, in lengths of the beam."""
+"""Arc lengths at which shapes of beams are saved, in lengths of the beam."""
 TIMESTEPS = (4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4)
-"""Of the physics, in s."""
+"""Time steps of the physics, in s."""
 SWINGS = ((0.05, 5e5), (0.25, 2.5e4), (0.305, 1e3), (0.35, 5e5), (0.35, 5e2))
 """Length (m) and modulus (Pa) of DLOs let swing: corners of Phi, the limpest of the initial support, the median."""
 AIR = (0.0, Scene().air)
 """Densities of the air, in kg/m^3."""
 CUBES = {"median": {}, "small": {"cube_side": 0.020, "cube_density": 80.0}, "large": {"cube_side": 0.030}}
-"""Stacks at rest, by what differs from the median scene."""
+"""Stacks at rest, by their differences from the median scene."""
 
 
 def against_theory(parameters: WhipParameters = MEDIAN) -> dict[str, np.ndarray]:
@@ -71,7 +73,7 @@ def sags(parameters: WhipParameters = MEDIAN) -> dict[str, np.ndarray]:
         return np.stack([statics.sagged(model, GRAVITY) for model in made]) / parameters.length
 
     return {
-        "elastica": np.stack([beam.heavy_elastica(number, ARC) for number in NUMBERS]),
+        "elastica": np.stack([heavy_elastica(number, ARC) for number in NUMBERS]),
         **{f"sag {elements}": shapes("planar hinges", elements) for elements in ELEMENTS},
         "plain": shapes("plain cable", DEFAULT),
         "balls": shapes("ball joints", DEFAULT),
@@ -79,7 +81,7 @@ def sags(parameters: WhipParameters = MEDIAN) -> dict[str, np.ndarray]:
 
 
 def energies(kind: str = "planar hinges") -> dict[str, np.ndarray]:
-    """Energy of chains of 12 elements that swing for 2 s, as shares of what they begin with.
+    """Energy of chains of 12 elements that swing for 2 s, as fractions of their initial value.
 
     Returns:
         Of damped chains without air and with it, over `SWINGS` and `TIMESTEPS`, shape [2, swings, timesteps]: the

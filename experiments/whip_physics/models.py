@@ -3,9 +3,10 @@
 import mujoco
 import numpy as np
 
-from envs.whip.chain import SECTION, Chain, elasto_gravity
-from envs.whip.parameters import WhipParameters
-from envs.whip.scene import Scene, build, cube_names
+from jaxlfi.envs.whip.parameters import WhipParameters
+from jaxlfi.envs.whip.physics.chain import Chain, elasto_gravity
+from jaxlfi.envs.whip.physics.scene import Scene, build, cube_names
+from jaxlfi.envs.whip.rig import SECTION
 
 KINDS = ("plain cable", "ball joints", "planar hinges")
 

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from envs.whip import rules
-from envs.whip.chain import SECTION
-from envs.whip.engine import Engine, State, reset, rollout
-from envs.whip.kinematics import frames
-from envs.whip.parameters import FEASIBLE, WhipParameters, randomised
-from envs.whip.scene import CUBES, START
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.parameters import FEASIBLE, WhipParameters, randomised
+from jaxlfi.envs.whip.physics.engine import Engine, State, reset, rollout
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.physics.scene import CUBES
+from jaxlfi.envs.whip.rig import SECTION, START
 
 BATCH = 100
-"""Scenes that are simulated together."""
+"""Number of scenes that are simulated together."""
 
 
 def random_scene(key: jax.Array) -> WhipParameters:
@@ -34,7 +34,7 @@ def random_targets(key: jax.Array, saturated: Array | bool) -> Float[Array, "16 
 
     Args:
         key: of the episode.
-        saturated: whether actions are as large as they can be, as those of many learnt policies are; else uniform.
+        saturated: whether actions are at their limits, like those of many learnt policies; otherwise they are uniform.
     """
     actions = jax.random.uniform(key, (rules.STEPS, 2), minval=-1.0, maxval=1.0)
     actions = rules.ACTION_LIMIT * jnp.where(saturated, jnp.sign(actions), actions)
@@ -84,7 +84,7 @@ def random_episodes(engine: Engine, seed: int, count: int) -> dict[str, np.ndarr
 
 
 NUDGE = 1e-6
-"""Speed at which cubes at rest are set going, in m/s, so that no engine may leave them out as being at rest."""
+"""Initial speed of cubes at rest, in m/s, so that no engine leaves them out of the simulation."""
 
 
 def stack_at_rest(engine: Engine, parameters: WhipParameters, seconds: float = 5.0) -> dict[str, float]:
@@ -121,7 +121,7 @@ def _waiting(engine: Engine, steps: int, parameters: WhipParameters, state: Stat
 def steps_per_second(engines: Sequence[Engine], batch: int = BATCH, seed: int = 0, repeats: int = 3) -> list[float]:
     """Steps of the physics in a second, of all threads together, in random episodes of random scenes.
 
-    Each engine's best of some repetitions, in turns, so that what else the machine does is not counted against one.
+    The best of several repetitions, which alternate between engines, so that other load on the machine affects all.
     """
 
     def run(engine, keys):

@@ -28,7 +28,7 @@ def tip(model: mujoco.MjModel, data: mujoco.MjData, link: int) -> np.ndarray:
 
 
 def bent(model: mujoco.MjModel, angles: np.ndarray) -> mujoco.MjData:
-    """The chain turned by a rotation vector (or an angle) at each of its joints, at rest, shape [nv]."""
+    """The chain bent by a rotation vector (or an angle) at each of its joints, at rest, shape [nv]."""
     data = mujoco.MjData(model)
     _bend(model, data, angles)
     return data
@@ -57,16 +57,16 @@ def equilibrium(model: mujoco.MjModel, force: np.ndarray, weight: np.ndarray, lo
     scale = lever * (np.linalg.norm(force) + np.linalg.norm(weight) * mass(model))
     data, jacobian, last = mujoco.MjData(model), np.zeros((3, model.nv)), links(model)[-1]
 
-    def imbalance(angles, share):
-        model.opt.gravity = share * weight
+    def imbalance(angles, fraction):
+        model.opt.gravity = fraction * weight
         _bend(model, data, angles)
         mujoco.mj_jac(model, data, jacobian, None, tip(model, data, last), last)
-        return (data.qfrc_passive - data.qfrc_bias + share * jacobian.T @ force) / scale
+        return (data.qfrc_passive - data.qfrc_bias + fraction * jacobian.T @ force) / scale
 
     angles = np.zeros(model.nv)
     # Twice at the full load: a fresh Jacobian takes limp chains closer.
-    for share in [*np.geomspace(1e-3, 1.0, loads)[:-1], 1.0, 1.0]:
-        angles = optimize.root(imbalance, angles, args=(share,), tol=1e-13).x
+    for fraction in [*np.geomspace(1e-3, 1.0, loads)[:-1], 1.0, 1.0]:
+        angles = optimize.root(imbalance, angles, args=(fraction,), tol=1e-13).x
     left = np.abs(imbalance(angles, 1.0)).max()
     if not left < 1e-9:
         raise RuntimeError(f"equilibrium: expected torques that balance to 1e-9 of load times length, got {left:.1e}")
@@ -82,14 +82,14 @@ def tip_deflection(model: mujoco.MjModel, load: float) -> float:
 
 def sagged(model: mujoco.MjModel, gravity: float) -> np.ndarray:
     """The chain held horizontally: how far each node lies from the clamp and below it, in m, shape [links + 1, 2]."""
-    # Turned by 90 degrees instead of the chain: weight acts along x, the clamp points along -z.
+    # Gravity is rotated by 90 degrees instead of the chain: weight acts along x, the clamp points along -z.
     data = equilibrium(model, np.zeros(3), np.array([gravity, 0.0, 0.0]), loads=12)
     line = nodes(model, data) - nodes(model, data)[0]
     return np.stack([-line[:, 2], line[:, 0]], axis=-1)
 
 
 def in_plane(model: mujoco.MjModel) -> np.ndarray:
-    """Degrees of freedom that bend a straight chain in the plane y = 0."""
+    """DoFs that bend a straight chain in the plane y = 0."""
     every = np.arange(model.nv)
     return every[1::3] if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_BALL else every
 

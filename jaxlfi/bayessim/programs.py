@@ -46,3 +46,9 @@ def compiled(many: Any, arguments: tuple) -> Any:
             del _EXECUTABLES[next(iter(_EXECUTABLES))]
         _EXECUTABLES[signature] = many.lower(*arguments).compile()
     return _EXECUTABLES[signature]
+
+
+def forget() -> None:
+    """Drop all compiled programs, and the memory they hold; they are compiled anew when they are needed."""
+    _EXECUTABLES.clear()
+    _program.cache_clear()

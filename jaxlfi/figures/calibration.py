@@ -18,7 +18,7 @@ BAND = "#8C8C8C"
 """Colours of curves and of bands."""
 NARROW, WIDE = 0.45, 0.2
 """Opacities of the pointwise and of the simultaneous band."""
-RANKS, COVERAGE, DISTANCE = "ranks_share", "coverage_share", "distance_share"
+RANKS, COVERAGE, DISTANCE = "ranks_fraction", "coverage_fraction", "distance_fraction"
 """Arrays of cumulative fractions: of ranks, and of truths in densest regions and in regions around random points."""
 
 Arrays = Mapping[str, np.ndarray]

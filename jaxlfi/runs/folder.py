@@ -20,7 +20,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -32,8 +32,10 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.io import files as atomic
 from jaxlfi.io.serialise import json_safe
 from jaxlfi.runs import describe
-from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks.task import Task
+
+if TYPE_CHECKING:  # runs know how to save themselves
+    from jaxlfi.runs.run import Origin, Run
 
 RUN, RUNS, COMPARE = "jaxlfi-run", "jaxlfi-runs", "jaxlfi-compare"
 VERSION = 2
@@ -176,7 +178,7 @@ def check_version(path: Path, config: Mapping[str, Any]) -> None:
     if config.get("version") != VERSION:
         raise StoreError(
             f"{path}: expected version {VERSION} of the format, got {config.get('version')}: the folder was written by "
-            f"jaxlfi {config.get('versions', {}).get('jaxlfi', 'of another version')} in another format; run it again"
+            "another version of jaxlfi; run its command again"
         )
 
 
@@ -186,7 +188,7 @@ def append_ledger(folder: Path, index: int, row: Mapping[str, np.ndarray], reaso
     atomic.append_line(folder / "ledger.jsonl", line)
 
 
-def write_run(folder: Path, run: Run, keep_network: bool = False) -> None:
+def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
     """Write the arrays of one finished run into its folder, which exists and has its ledger.
 
     Args:
@@ -233,7 +235,7 @@ def write_run(folder: Path, run: Run, keep_network: bool = False) -> None:
         atomic.write_arrays(folder / "network.npz", named_leaves(run.network))
 
 
-def save(run: Run, folder: Path) -> Path:
+def save(run: "Run", folder: Path) -> Path:
     """Write one run into a new folder, complete or not at all."""
 
     def fill(staging: Path) -> None:
@@ -264,7 +266,7 @@ def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     atomic.write_bytes(path, text.getvalue().encode())
 
 
-def run_config(task: Task, origin: Origin, spec: RunSpec, settings: Settings) -> dict[str, Any]:
+def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) -> dict[str, Any]:
     """The config.json of one run."""
     feasible = task.inference.feasible
     return {

@@ -23,6 +23,7 @@ from jaxlfi.estimators.base import Network
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Heuristic
+from jaxlfi.runs import folder as folders
 from jaxlfi.tasks.task import Task
 
 DRAWS = 1000
@@ -163,10 +164,8 @@ class Run:
         Raises:
             ValueError: if something is there already, or for a run under `vmap`.
         """
-        from jaxlfi.runs import folder  # which writes runs
-
         _require_one(self, "save")
-        return folder.save(self, Path(path))
+        return folders.save(self, Path(path))
 
     def _summary(self, observation: Any) -> jax.Array:
         observation = jnp.asarray(observation, jnp.float32)

@@ -39,7 +39,7 @@ def load(reference: str) -> Task:
             another type, and objects that are no tasks.
 
     Example:
-        >>> load("envs.gaussian_linear:task").name
+        >>> load("jaxlfi.envs.gaussian_linear:task").name
         'gaussian_linear'
     """
     name, options = parse(reference)

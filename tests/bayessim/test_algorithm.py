@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from envs import gaussian_linear
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.keys import init_key, round_keys
 from jaxlfi.bayessim.settings import Settings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from envs.gaussian_linear import posterior
+from jaxlfi.envs.gaussian_linear import posterior
 from jaxlfi.runs.folder import read_ledger
 from jaxlfi.tasks.host import HostSimulator, SimulatorError
 from tests.small import FLAGS, SETTINGS, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture

@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import ks_2samp
 
 import jaxlfi
-from envs import gaussian_linear
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.presets import METHODS, QUICK
 from jaxlfi.bayessim.settings import Settings

@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from envs import gaussian_linear
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Fixed
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import folder as run_store

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from envs import gaussian_linear
+from jaxlfi.envs import gaussian_linear
 from jaxlfi import Support
 from jaxlfi.bayessim import programs
 from jaxlfi.heuristics import Edge, Fixed, Truncate

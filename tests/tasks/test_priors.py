@@ -11,7 +11,7 @@ import pytest
 from scipy import integrate, stats
 
 import jaxlfi
-from envs import gaussian_linear
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.observation import simulate_observation
 from jaxlfi.tasks.priors import MIN_INSIDE, TailedUniform, prior_draws, prior_mass, require_mass, with_tails

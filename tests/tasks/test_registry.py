@@ -7,7 +7,7 @@ from typing import Literal
 
 import pytest
 
-from envs import gaussian_linear
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.tasks import registry
 from jaxlfi.tasks.registry import convert, load, parse
 

@@ -45,7 +45,7 @@ class Grid:
         ValueError: for axes that are empty, repeated or not of the heuristic, and values it does not accept.
 
     Example:
-        >>> from envs.gaussian_linear import task  # doctest: +SKIP
+        >>> from jaxlfi.envs.gaussian_linear import task  # doctest: +SKIP
         >>> axes = (Axis("mass_threshold", (0.001, 0.005)),)  # doctest: +SKIP
         >>> measure(Grid(task(), task().support("ok"), Edge(), axes, seeds=(0, 1)))  # doctest: +SKIP
     """

@@ -1,0 +1,182 @@
+"""Pictures of rollouts: a sheet of frames and an animation, from segmentation labels and keypoints."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from PIL import Image
+
+from jaxlfi.figures import style
+
+COLUMNS = 6
+"""Number of columns of a sheet."""
+OVER = 0.35
+"""Opacity of frames after the end of the episode."""
+FOUND, REMEMBERED = "#FFFFFF", "#FF9C9C"
+"""Colours of keypoints on the DLO: found in this frame, or kept from an earlier one."""
+LINES = {
+    "table": {"color": "#B5A48C", "linewidth": 1.0},
+    "workspace of the gripper": {"color": "#999999", "linewidth": 0.6, "linestyle": (0, (3, 2))},
+}
+"""How lines are drawn, by name."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Film:
+    """What is seen in T frames, all positions in normalised pixels.
+
+    Attributes:
+        labels: segmentation images, indices into `palette`, 0 the background, shape [T, size, size].
+        dlo: keypoints of the DLO, in the detector's order, shape [T, 4, 2].
+        cubes: keypoints of the cubes, shape [T, 6, 2].
+        seen: keypoints of the DLO that are found rather than remembered, shape [T, 4].
+        gripper: where it is, shape [T, 2].
+        captions: a line for each frame, shape [T].
+        over: whether the episode is over by then, shape [T].
+        palette: colours of the labels, RGB from 0 to 1, shape [L, 3].
+        lines: polylines that are the same in all frames, by a name in `LINES`, shape [N, 2] each.
+    """
+
+    labels: np.ndarray
+    dlo: np.ndarray
+    cubes: np.ndarray
+    seen: np.ndarray
+    gripper: np.ndarray
+    captions: Sequence[str]
+    over: np.ndarray
+    palette: np.ndarray
+    lines: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+    def every(self, n: int) -> "Film":
+        """Every n-th frame, beginning with the first."""
+        own = ("labels", "dlo", "cubes", "seen", "gripper", "captions", "over")
+        return dataclasses.replace(self, **{name: getattr(self, name)[::n] for name in own})
+
+
+def draw_sheet(figure: Figure, film: Film, title: str) -> None:
+    """All frames in rows, and a legend of the markers.
+
+    Args:
+        figure: empty, of a page's width and the height `sheet_height`.
+        film: the frames.
+        title: above all frames.
+    """
+    panels = figure.subplots(_rows(len(film.labels)), COLUMNS).ravel()
+    for t, axes in enumerate(panels):
+        if t < len(film.labels):
+            _Picture(axes, film).show(t)
+        else:
+            axes.axis("off")
+    legend = panels[-1].legend(handles=_legend(film), loc="center", fontsize=5.5, handlelength=1.2)
+    legend.set_in_layout(False)  # it may be a little wider than its panel
+    figure.suptitle(title, fontsize=7.5)
+
+
+def sheet_height(count: int) -> float:
+    """The height of a sheet of `count` frames that is as wide as a page, in inches."""
+    return 0.3 + _rows(count) * (style.TEXT_WIDTH / COLUMNS + 0.13)
+
+
+def _rows(count: int) -> int:
+    return -(-(count + 1) // COLUMNS)
+
+
+def save_sheet(path: Path, film: Film, title: str) -> Path:
+    """Write a sheet of all frames as png; see `draw_sheet`."""
+    with style.context():
+        figure = style.new_figure(style.TEXT_WIDTH, sheet_height(len(film.labels)))
+        draw_sheet(figure, film, title)
+        return style.save(figure, path, 200)
+
+
+def save_animation(path: Path, film: Film, title: str, interval: float, freshness: np.ndarray) -> Path:
+    """Write an animated gif, in which a pixel of the labels is a pixel.
+
+    Args:
+        path: of the .gif file.
+        film: the frames.
+        title: above the frames; two lines fit.
+        interval: between frames, in s; the format resolves hundredths.
+        freshness: opacity of the keypoints in each frame, shape [T]: 1 for those detected in it, less for older ones.
+    """
+    size, margin, head = film.labels.shape[-1], 6, 52
+    width, height = size + 2 * margin, size + margin + head
+    frames = []
+    with style.context():
+        figure = style.new_figure(width / 100, height / 100)
+        figure.set_layout_engine("none")
+        axes = figure.add_axes((margin / width, margin / height, size / width, size / height))
+        figure.suptitle(title, fontsize=7.5, y=1 - 3 / height, va="top")
+        picture = _Picture(axes, film, scale=2.5)
+        for t, fresh in enumerate(freshness):
+            picture.show(t, fresh)
+            figure.canvas.draw()
+            # Frames have few colours, and dithering would flicker.
+            frame = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
+            frames.append(frame.quantize(64, dither=Image.Dither.NONE))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 * interval), loop=0)
+    return path
+
+
+class _Picture:
+    """One frame on axes, which can be replaced by another."""
+
+    def __init__(self, axes: Axes, film: Film, scale: float = 1.0):
+        self._film = film
+        for name, line in film.lines.items():
+            axes.plot(*line.T, **LINES[name], zorder=1)
+        size = film.labels.shape[-1]
+        self._image = axes.imshow(np.ones((size, size, 4)), extent=(0, 1, 1, 0), zorder=2)
+        axes.set(xlim=(0, 1), ylim=(1, 0), xticks=[], yticks=[], aspect="equal")
+        (self._gripper,) = axes.plot([], [], **_gripper(scale), zorder=3)
+        (self._cubes,) = axes.plot([], [], **_on_cubes(scale), zorder=4)
+        self._dlo = axes.scatter([], [], s=13 * scale**2, linewidths=0.4 * scale, edgecolors="black", zorder=5)
+        self._numbers = [
+            axes.text(0, 0, i + 1, fontsize=3.5 * scale, ha="center", va="center_baseline", zorder=6)
+            for i in range(film.dlo.shape[1])
+        ]
+        self._caption = axes.set_title("", fontsize=5.5 + scale**0.5)
+
+    def show(self, t: int, fresh: float = 1.0) -> None:
+        """Show frame t, its keypoints with an opacity."""
+        film, strength = self._film, OVER if self._film.over[t] else 1.0
+        labels = film.labels[t]
+        self._image.set_data(np.concatenate([film.palette[labels], strength * (labels > 0)[..., None]], axis=-1))
+        self._gripper.set_data(*film.gripper[t][:, None])
+        self._cubes.set_data(*film.cubes[t].T)
+        self._dlo.set_offsets(film.dlo[t])
+        self._dlo.set_facecolor([FOUND if seen else REMEMBERED for seen in film.seen[t]])
+        for number, place in zip(self._numbers, film.dlo[t], strict=True):
+            number.set_position(place)
+        self._caption.set_text(film.captions[t])
+        for artist in (self._gripper, self._caption):
+            artist.set_alpha(strength)
+        for artist in (self._cubes, self._dlo, *self._numbers):
+            artist.set_alpha(strength * fresh)
+
+
+def _gripper(scale: float) -> dict:
+    return {"marker": "s", "color": "#555555", "markersize": 4.5 * scale, "markeredgewidth": 0, "linestyle": "none"}
+
+
+def _on_cubes(scale: float) -> dict:
+    cross = {"marker": "+", "color": "black", "linestyle": "none"}
+    return {**cross, "markersize": 2.5 * scale, "markeredgewidth": 0.4 * scale}
+
+
+def _legend(film: Film) -> list[Line2D]:
+    dot = {"marker": "o", "markersize": 4, "markeredgecolor": "black", "markeredgewidth": 0.4, "linestyle": "none"}
+    handles = [
+        Line2D([], [], color=FOUND, label="keypoint on the DLO", **dot),
+        Line2D([], [], label="keypoint of a cube", **_on_cubes(1.5)),
+        Line2D([], [], label="gripper", **_gripper(1.0)),
+        *(Line2D([], [], label=name, **LINES[name]) for name in film.lines),
+    ]
+    if not film.seen.all():
+        handles.insert(1, Line2D([], [], color=REMEMBERED, label="not found: the last", **dot))
+    return handles

@@ -1,0 +1,24 @@
+"""The whipping rig: the sizes, places and times that all scenes and all simulators have in common."""
+
+SECTION = 0.015
+"""Width and height of the DLO's square section, a, in m (section VI-C)."""
+GRAVITY = 9.81
+"""In m/s^2."""
+START = (0.40, 0.36)
+"""Where the gripper begins, x and z in m: the longest DLO just clears the table."""
+STACK = 0.60
+"""Where the stack of cubes stands, x in m."""
+CONTROL_INTERVAL = 0.16
+"""Between two actions, in s."""
+RGBA = {
+    "red": (0.85, 0.15, 0.15, 1),
+    "green": (0.15, 0.65, 0.2, 1),
+    "blue": (0.1, 0.2, 0.6, 1),
+    "orange": (0.95, 0.55, 0.1, 1),
+    "purple": (0.5, 0.2, 0.6, 1),
+    "yellow": (0.95, 0.85, 0.1, 1),
+    "dlo": (0.2, 0.5, 0.95, 1),
+    "gripper": (0.4, 0.4, 0.4, 1),
+    "table": (0.85, 0.8, 0.75, 1),
+}
+"""Colours of what is in a scene, each channel from 0 to 1."""

@@ -1,0 +1,1 @@
+"""What a camera sees of a whipping scene: projection, segmentation images, and keypoints."""
