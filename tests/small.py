@@ -4,11 +4,16 @@ import functools
 
 import jax
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 
+<<<<<<< HEAD
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.estimators.mixture_network import MixtureNetwork
+=======
+from jaxlfi.bayessim import batch as lanes
+from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.estimators.estimator import Estimator
+>>>>>>> main
 
 TASK = "jaxlfi.envs.gaussian_linear:task"
 # Few and small steps: training amplifies rounding, and runs that ought to be equal are compared to a
@@ -27,8 +32,6 @@ FLAGS = (
     "--rounds 2 --simulations-per-round 20 --simulation-budget 25 --no-figures"
 ).split()
 """The same on the command line."""
-
-CACHE_SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 gaussian = functools.cache(gaussian_linear.task)
 """The task that `TASK` names."""
@@ -50,24 +53,11 @@ def command(*arguments: str) -> int:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def whole_runs(tmp_path_factory):
+def whole_runs():
     """What tests of whole runs need of jax; import this into their module.
 
-    A cache of compiled programs, shared with processes that a test starts: compiling is nearly all that these
-    tests wait for, and is done without most optimisations there too. And no key-reuse checker: it takes a vmapped scan
-    over keys for a reuse (jax 0.9.2). Unbatched runs are checked elsewhere.
+    No key-reuse checker: it takes a vmapped scan over keys for a reuse (jax 0.9.2). Unbatched runs are checked
+    elsewhere.
     """
-    folder = str(tmp_path_factory.getbasetemp() / "xla")
-    with pytest.MonkeyPatch.context() as patch, jax.debug_key_reuse(False):
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", folder)
-        patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
-        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-        patch.setenv("TF_CPP_MIN_LOG_LEVEL", "3")
-        before = {name: getattr(jax.config, name) for name in CACHE_SETTINGS}
-        for name, value in zip(CACHE_SETTINGS, (folder, 0.2), strict=True):
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()  # so that the new folder is looked at
+    with jax.debug_key_reuse(False):
         yield
-        for name, value in before.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()

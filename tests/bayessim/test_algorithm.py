@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+<<<<<<< HEAD:tests/bayessim/test_algorithm.py
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.keys import init_key, round_keys
@@ -18,6 +19,16 @@ from jaxlfi.distributions.belief import Belief, rejected
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.mixture_network import MixtureNetwork
+=======
+from jaxlfi.bayessim.algorithm import Settings
+from jaxlfi.bayessim import algorithm as bayessim
+from jaxlfi.diagnostics import bound_warnings, edge_mass
+from jaxlfi.distributions.belief import Belief, rejected
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
+from jaxlfi.estimators.estimator import Estimator
+>>>>>>> main:tests/test_bayessim.py
 from jaxlfi.heuristics import Choice, Edge, Fixed
 from jaxlfi.tasks.task import Task
 
@@ -63,16 +74,24 @@ def whitened(mixture: GaussianMixture):
     return mean, factor @ np.asarray(mixture.covariance) @ factor.T
 
 
-def assert_exact(belief: Belief, atol_mean: float, atol_covariance: float) -> None:
-    """Mean, covariance and both marginals of draws are those of the closed form."""
-    mean, covariance = whitened(belief.mixture)
+def middle(mixtures: GaussianMixture):
+    """Of several runs, the medians of the whitened means' and covariances' numbers: one in ten runs may be far off."""
+    means, covariances = zip(*(whitened(lane(mixtures, i)) for i in range(len(mixtures.logits))), strict=True)
+    return np.median(means, axis=0), np.median(covariances, axis=0)
+
+
+def assert_exact(beliefs: Belief, atol_mean: float, atol_covariance: float) -> None:
+    """Mean, covariance and both marginals of draws are those of the closed form, in the middle of several runs."""
+    mean, covariance = middle(beliefs.mixture)
     np.testing.assert_allclose(mean, 0, atol=atol_mean)
     np.testing.assert_allclose(covariance, np.eye(2), atol=atol_covariance)
-    draws = np.asarray(rejected(jax.random.key(0), jax.tree.map(jnp.asarray, belief), 2000))
+    drawn = jax.jit(jax.vmap(lambda belief: rejected(jax.random.key(0), belief, 2000)))
+    draws = np.asarray(drawn(jax.tree.map(jnp.asarray, beliefs)))
     for d in range(2):
         exact = stats.norm(float(EXACT.mean[d]), float(np.sqrt(EXACT.covariance[d, d])))
         # Distribution functions of two normals that differ by m standard deviations are 0.4 m apart.
-        assert stats.kstest(draws[:, d], exact.cdf).statistic < 0.4 * atol_mean + 2 / np.sqrt(2000)
+        distances = [stats.kstest(of_run[:, d], exact.cdf).statistic for of_run in draws]
+        assert np.median(distances) < 0.4 * atol_mean + 2 / np.sqrt(2000)
 
 
 def test_the_closed_form_is_bayes_rule():
@@ -96,17 +115,22 @@ def test_one_round_learns_the_exact_posterior():
     """4000 simulations from the flat prior need no correction, as p~ is the prior.
 
     A linear-Gaussian regression on so many is exact to a thirtieth of a standard deviation; what is left is
-    the network's, which must also learn what the box's edges do to posteriors near them. Measured for three
-    seeds: means within 0.11, covariances within 0.37 of the closed form.
+    the network's, which must also learn what the box's edges do to posteriors near them. Measured for eight
+    keys: means within 0.16, covariances within 0.45 of the closed form.
     """
     settings = Settings(estimator=MODEST, rounds=1, simulations_per_round=4000, simulation_budget=4000)
+<<<<<<< HEAD:tests/bayessim/test_algorithm.py
     state, _ = infer(settings, ("ok",), (0,), 1)
     assert_exact(run_of(state.belief, 0), 0.25, 0.45)
+=======
+    state, _ = infer(settings, ("ok",) * 3, (0,) * 3, 1)
+    assert_exact(state.belief, 0.25, 0.5)
+>>>>>>> main:tests/test_bayessim.py
 
 
 def test_importance_weights_keep_later_rounds_exact():
     """As above with an effective number of 670 simulations. Uncorrected, the covariance would be halved or
-    less.
+    less. Measured for eight keys: traces of 1.5 to 2.1, and one of 3.7.
     """
     settings = Settings(
         estimator=MODEST,
@@ -116,16 +140,26 @@ def test_importance_weights_keep_later_rounds_exact():
         correction="importance",
         restriction="reject",
     )
+<<<<<<< HEAD:tests/bayessim/test_algorithm.py
     state, info = infer(settings, ("ok",), (0,), 1)
     assert_exact(run_of(state.belief, 0), 0.5, 0.7)
     assert float(np.trace(whitened(run_of(state.belief.mixture, 0))[1])) > 1.4
     effective = info.correction.effective_size[0]
     assert effective[0] == pytest.approx(600, rel=1e-3)
     assert 600 < effective[1] < 1000 and 600 < effective[2] < 1200
+=======
+    state, info = infer(settings, ("ok",) * 5, (0,) * 5, 1)
+    assert_exact(state.belief, 0.4, 0.6)
+    assert np.trace(middle(state.belief.mixture)[1]) > 1.4
+    effective = info.correction.effective_size
+    np.testing.assert_allclose(effective[:, 0], 600, rtol=1e-3)
+    assert np.all((effective[:, 1:] > 600) & (effective[:, 1:] < [1000, 1200]))
+>>>>>>> main:tests/test_bayessim.py
 
 
 @pytest.fixture(scope="module")
 def sequential():
+<<<<<<< HEAD:tests/bayessim/test_algorithm.py
     """The paper's p-hat = q over five rounds of 100: the wrong support kept, and adapted; and the right one."""
     estimator = MODEST.replace(steps=450, batch_size=100)
     return infer(Settings(estimator=estimator, rounds=5), ("misspecified", "misspecified", "ok"), (0, 1, 0), 1)
@@ -135,8 +169,23 @@ def test_without_correction_the_mean_is_right_and_the_covariance_too_small(seque
     """Pooled proposals count the data again: a p~ like the posterior halves the covariance."""
     mean, covariance = whitened(run_of(sequential[0].belief.mixture, 2))
     np.testing.assert_allclose(mean, 0, atol=0.5)
+=======
+    """The paper's p-hat = q over five rounds: the wrong support kept, and adapted; and five runs on the right one."""
+    estimator = dataclasses.replace(MODEST, steps=600, batch_size=100)
+    settings = Settings(estimator=estimator, rounds=5, simulations_per_round=300, simulation_budget=300)
+    return infer(settings, ("misspecified",) * 2 + ("ok",) * 5, (0, 1) + (0,) * 5, 1)
+
+
+def test_without_correction_the_mean_is_right_and_the_spread_too_small(sequential):
+    """Pooled proposals count the data again: a p~ like the posterior halves the covariance.
+
+    Measured for six keys: traces of 0.7 to 0.84, and one of 4.4, where the exact one is 2.
+    """
+    mean, covariance = middle(jax.tree.map(lambda leaf: leaf[2:], sequential[0].belief.mixture))
+    np.testing.assert_allclose(mean, 0, atol=0.4)
+>>>>>>> main:tests/test_bayessim.py
     eigenvalues = np.linalg.eigvalsh(covariance)
-    assert 0.05 < eigenvalues.min() and eigenvalues.max() < 1.0
+    assert 0.05 < eigenvalues.min() and eigenvalues.max() < 0.8
 
 
 def test_a_fixed_support_piles_mass_on_the_bound_that_excludes_the_truth(sequential):
@@ -152,7 +201,8 @@ def test_edge_recovers_from_the_wrong_support(sequential):
     belief = run_of(sequential[0].belief, 1)
     assert bool(belief.support.contains(TASK.truth)) and float(belief.support.high[0]) > 1.0
     mean, _ = whitened(belief.mixture)
-    # In five rounds, two of which the truth was outside; a support that stays put is 2.3 to 2.9 off.
+    # In five rounds, two of which the truth was outside (measured for six keys: at most 1.04); a support that stays put
+    # is 2.3 to 2.9 off.
     np.testing.assert_allclose(mean, 0, atol=1.6)
     assert bound_warnings(TASK.space.labels, belief, TASK.feasible) == []
 
@@ -365,12 +415,21 @@ def test_a_support_wider_than_phi_widens_it_for_the_run():
             {"correction": "exact"},
             r"^correction: expected .*importance.*, got 'exact'$",
         ),
+<<<<<<< HEAD:tests/bayessim/test_algorithm.py
         ({"restriction": "wrap"}, r"^restriction: expected .*clip.*reject.*, got 'wrap'$"),
         ({"rounds": 0}, r"^rounds: expected .*, got 0$"),
         ({"simulations_per_round": 0}, r"^simulations_per_round: expected .*, got 0$"),
         ({"simulation_budget": 99}, r"^simulation_budget: expected at least the 100 simulations of a round, got 99$"),
         ({"defensive": 1.5}, r"^defensive: expected a number in \[0, 1\], got 1.5$"),
         ({"estimator": "mdn"}, r"^estimator: expected one such as jaxlfi.MixtureNetwork\(\), got 'mdn'$"),
+=======
+        ({"restriction": "wrap"}, r"^restriction: expected one of \['clip', 'reject'\], got 'wrap'"),
+        ({"rounds": 0}, r"^expected at least 1 round and 1 addition, got 0 and 100"),
+        ({"simulations_per_round": 0}, r"^expected at least 1 round and 1 addition, got 10 and 0"),
+        ({"simulation_budget": 99}, r"^simulation_budget: expected at least the 100 simulations of a round, got 99"),
+        ({"defensive": 1.5}, r"^defensive: expected a share in \[0, 1\], got 1.5"),
+        ({"estimator": Estimator(components=0)}, r"^components: expected at least 1, got 0"),
+>>>>>>> main:tests/test_bayessim.py
     ],
 )
 def test_settings_that_cannot_work_are_named(changes, message):

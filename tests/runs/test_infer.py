@@ -80,13 +80,13 @@ def test_vmap_over_anything_equals_a_loop():
         np.testing.assert_array_equal(own.posterior.support.low, own.belief.support.low)
     for what in ("save", "warnings"):
         with pytest.raises(ValueError, match=rf"^{what}: expected one run, got a batch .*jax\.tree\.map"):
-            together.save("nowhere") if what == "save" else together.warnings  # noqa: B018
+            together.save("nowhere") if what == "save" else together.warnings
     assert own.warnings is not None and own.posterior.sample(jax.random.key(0), 3).shape == (3, 2)
 
 
 @pytest.mark.parametrize("argument", [{"progress": True}, {"callback": print}, {"out": "nowhere"}])
 def test_what_a_traced_run_cannot_do_is_refused(argument):
-    with pytest.raises(ValueError, match="^infer: expected concrete arguments"):
+    with pytest.raises(ValueError, match=r"^infer: expected concrete arguments"):
         jax.eval_shape(lambda observation: infer(observation=observation, **argument).x, OBSERVED)
 
 
@@ -161,7 +161,7 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
             infer(out=tmp_path / "run", **({"settings": settings(rounds=1)} | changes))
     (tmp_path / "occupied").mkdir()
     (tmp_path / "occupied" / "notes.txt").write_text("mine")
-    with pytest.raises(StoreError, match="^out: expected a new or empty folder"):
+    with pytest.raises(StoreError, match=r"^out: expected a new or empty folder"):
         infer(settings=settings(rounds=1), out=tmp_path / "occupied")
     assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
 
@@ -170,7 +170,7 @@ def test_another_observation_or_support_is_another_run(tmp_path):
     """They do not stand in the settings, but the result of the folder would not be the one that was asked for."""
     infer(0, settings=settings(rounds=1), out=tmp_path / "run")
     for changes in ({"observation": OBSERVED + 1}, {"support": "ok"}):
-        with pytest.raises(StoreError, match="^out: expected a new folder or one of the same run"):
+        with pytest.raises(StoreError, match=r"^out: expected a new folder or one of the same run"):
             infer(out=tmp_path / "run", settings=settings(rounds=1), **changes)
 
 
