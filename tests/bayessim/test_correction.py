@@ -129,7 +129,9 @@ def test_before_any_data_there_is_no_reference():
 
 
 def test_to_the_letter_refuses_other_priors():
-    with pytest.raises(ValueError, match=r"^correction='paper' .* multivariate normal, got Independent; use correction="):
+    with pytest.raises(
+        ValueError, match=r"^correction='paper' .* multivariate normal, got Independent; use correction="
+    ):
         multiplied(task(distrax.Independent(distrax.Laplace(jnp.zeros(2), jnp.ones(2)), 1)), Q, INFORMED)
 
 

@@ -47,11 +47,20 @@ def test_wrong_settings_are_refused_where_they_are_made_or_replaced(changes, mes
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (Settings(simulation_budget=50), r"^simulation_budget: expected at least the 100 simulations of a round, got 50"),
+        (
+            Settings(simulation_budget=50),
+            r"^simulation_budget: expected at least the 100 simulations of a round, got 50",
+        ),
         (Settings(estimator="mdn"), r"^estimator: expected one such as jaxlfi.MixtureNetwork\(\), got 'mdn'"),
         (Settings(estimator=MixtureNetwork), r"^estimator: expected one such as jaxlfi.MixtureNetwork\(\), got"),
-        (Settings(estimator=MaskedFlow(), correction="paper"), r"^correction: expected 'none' or 'importance' for Mask"),
-        (Settings(estimator=SplineFlow(), correction="paper"), r"^correction: expected 'none' or 'importance' for Spli"),
+        (
+            Settings(estimator=MaskedFlow(), correction="paper"),
+            r"^correction: expected 'none' or 'importance' for Mask",
+        ),
+        (
+            Settings(estimator=SplineFlow(), correction="paper"),
+            r"^correction: expected 'none' or 'importance' for Spli",
+        ),
         (Settings(estimator=MixtureNetwork(patience=3)), r"^patience: expected validation above 0 to stop by"),
     ],
 )

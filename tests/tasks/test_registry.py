@@ -90,7 +90,7 @@ def test_a_task_of_ours_takes_its_options():
         ("made_up_tasks:number", "to give a jaxlfi.Task, got int"),
         ("made_up_tasks:absent", "cannot load 'made_up_tasks:absent': AttributeError"),
         ("no_such_module:task", "cannot load 'no_such_module:task': ModuleNotFoundError"),
-        ("envs/gaussian_linear.py:task", "leave out '.py'"),
+        ("jaxlfi/envs/gaussian_linear.py:task", "leave out '.py'"),
         ("gaussian", "or module:factory, got 'gaussian'"),
         ("", "or module:factory, got ''"),
     ],
