@@ -5,15 +5,9 @@ import functools
 import jax
 import pytest
 
-<<<<<<< HEAD
-from jaxlfi.envs import gaussian_linear
 from jaxlfi.bayessim.settings import Settings
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.mixture_network import MixtureNetwork
-=======
-from jaxlfi.bayessim import batch as lanes
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.estimators.estimator import Estimator
->>>>>>> main
 
 TASK = "jaxlfi.envs.gaussian_linear:task"
 # Few and small steps: training amplifies rounding, and runs that ought to be equal are compared to a

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 import jaxlfi
-from jaxlfi import jaxlfi.envs
+from jaxlfi import envs
 
 pytest.importorskip("setuptools")
 

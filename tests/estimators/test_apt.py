@@ -13,12 +13,12 @@ import pytest
 from scipy.stats import ks_2samp
 
 import jaxlfi
-from jaxlfi.envs import gaussian_linear
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.presets import METHODS, QUICK
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli import parser as cli
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.flow_estimators import FlowEstimator, MaskedFlow
 from jaxlfi.heuristics import Fixed

@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 import jaxlfi
-from jaxlfi.envs import gaussian_linear
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.load import load
 from jaxlfi.tasks.task import Task

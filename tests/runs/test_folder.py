@@ -8,9 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-<<<<<<< HEAD:tests/runs/test_folder.py
-from jaxlfi.envs import lotka_volterra, lynx_hare, mg1
 from jaxlfi.bayessim.presets import PRESETS
+from jaxlfi.envs import lotka_volterra, lynx_hare, mg1
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import folder as folders
@@ -18,22 +17,6 @@ from jaxlfi.runs.describe import heuristic_from_json, heuristic_to_json, setting
 from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.simulation import trajectory_and_outcome
 from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
-=======
-from jaxlfi.bayessim import algorithm as bayessim
-from jaxlfi.bayessim.presets import METHODS, PRESETS
-from jaxlfi.bayessim.record import posterior_draws
-from jaxlfi.distributions.support import Support
-from jaxlfi.envs import lotka_volterra, lynx_hare, mg1
-from jaxlfi.estimators.posterior import draws_within
-from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
-from jaxlfi.io import files as atomic
-from jaxlfi.io.serialise import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json
-from jaxlfi.runs import folder as run_store
-from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
-from jaxlfi.runs.inference import observe
-from jaxlfi.tasks.simulation import trajectory_and_outcome
-from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, share_engine, whole_runs  # noqa: F401 - a fixture
->>>>>>> main:tests/test_run_store.py
 
 ROUNDS, SIMULATIONS, BUDGET, DIM, COMPONENTS, OBS, SAMPLES = 2, 20, 25, 2, 4, 2, 20
 

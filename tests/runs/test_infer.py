@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi.envs import gaussian_linear
 from jaxlfi import Support
 from jaxlfi.bayessim import programs
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Edge, Fixed, Truncate
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.folder import StoreError, read_ledger

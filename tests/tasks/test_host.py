@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi.envs.gaussian_linear import MIXING, NOISE
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs.gaussian_linear import MIXING, NOISE
 from jaxlfi.tasks.host import HostSimulator, SimulatorError
 from jaxlfi.tasks.simulation import simulate_in_waves
 from tests.small import gaussian

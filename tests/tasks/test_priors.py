@@ -11,8 +11,8 @@ import pytest
 from scipy import integrate, stats
 
 import jaxlfi
-from jaxlfi.envs import gaussian_linear
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.tasks.observation import simulate_observation
 from jaxlfi.tasks.priors import MIN_INSIDE, TailedUniform, prior_draws, prior_mass, require_mass, with_tails
 from jaxlfi.tasks.task import Task
@@ -275,5 +275,5 @@ def test_a_tail_that_is_none_is_refused(tail):
 
 
 def test_an_unknown_support_is_named():
-    with pytest.raises(ValueError, match=r"^support: expected one of \['guess', 'wide'\], got 'x'"):
+    with pytest.raises(ValueError, match=r"^support: expected one of \['guess', 'wide'\] or a box .* got 'x'"):
         with_tails(logarithmic(), "x")

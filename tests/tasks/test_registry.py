@@ -27,11 +27,11 @@ def here(monkeypatch):
         label: str = "x",
         anything=None,
     ):
-        seen.update(locals())
+        seen.update({name: value for name, value in locals().items() if name != "seen"})
         return gaussian_linear.task()
 
     def late(size: "int" = 1, ratio: "float | int" = 0.5):
-        seen.update(locals())
+        seen.update({name: value for name, value in locals().items() if name != "seen"})
         return gaussian_linear.task()
 
     module.factory, module.late, module.seen = factory, late, seen
