@@ -69,7 +69,9 @@ class HostEngine(BatchEngine):
             return _stacked([not_simulated(self.task, own, observed[0], self.inputs.x.shape[-1]) for own in theta])
         return _stacked(
             [
-                compared(self.task, own, *simulate_batch(key, self.task, own, observed.shape[1:]), seen)
+                compared(
+                    self.task, own, *map(jnp.asarray, simulate_batch(key, self.task, own, observed.shape[1:])), seen
+                )
                 for key, own, seen in zip(keys, theta, observed, strict=True)
             ]
         )

@@ -1,4 +1,8 @@
-"""The keys of a run: one seed, split by what the numbers are for. No other module splits a run's key."""
+"""The keys of a run: one seed, split by what the numbers are for. No other module splits a run's key.
+
+A run's key is split alike for its start and for every round, each of which takes another part of it: a clone says so to
+JAX's checker of keys that are used twice.
+"""
 
 from typing import NamedTuple
 
@@ -47,12 +51,12 @@ def run_keys(key: jax.Array) -> RunKeys:
 
 def init_key(run: jax.Array) -> jax.Array:
     """By which a run's first network is made."""
-    return jax.random.split(run)[0]
+    return jax.random.split(jax.random.clone(run))[0]
 
 
 def round_keys(run: jax.Array, index: Int[Array, ""] | int) -> RoundKeys:
     """Of one round of a run."""
-    return RoundKeys(*jax.random.split(jax.random.fold_in(jax.random.split(run)[1], index), 3))
+    return RoundKeys(*jax.random.split(jax.random.fold_in(jax.random.split(jax.random.clone(run))[1], index), 3))
 
 
 def seed_of(key: jax.Array) -> int:

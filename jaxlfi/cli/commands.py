@@ -175,6 +175,7 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
         return _resume_grid(folder, console)
     config = run_store.read_config(folder)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
+        executing.clean(folder)
         _say(console, _COMPLETE.format(folder=folder))
         return None
     plan = executing.reopen(folder)

@@ -15,7 +15,7 @@ def require_key(key: Any, name: str = "key") -> jax.Array:
     """
     dtype = getattr(key, "dtype", None)
     if dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key) or key.shape != ():
-        raise ValueError(f"{name}: expected one key such as jax.random.key(0), got {key!r}")
+        raise ValueError(f"{name}: expected one key such as jax.random.key(0), got {' '.join(repr(key).split())}")
     return key
 
 

@@ -45,18 +45,13 @@ def append_line(path: Path, line: str) -> None:
         file.write(line)
 
 
-def keep_lines(path: Path, count: int) -> None:
-    """Cut a file of lines down to its first `count`, where it exists.
-
-    Raises:
-        ValueError: where it has fewer whole lines.
-    """
+def keep_lines(path: Path, count: int) -> int:
+    """Cut a file of lines down to its first `count` whole ones, where it exists; returns how many it has now."""
     content = path.read_bytes() if path.exists() else b""
-    lines = content.splitlines(keepends=True)[:count]
-    if len(lines) < count or (lines and not lines[-1].endswith(b"\n")):
-        raise ValueError(f"{path}: expected at least {count} whole lines, got {len(lines)}")
+    lines = [line for line in content.splitlines(keepends=True)[:count] if line.endswith(b"\n")]
     if content:
         os.truncate(path, sum(map(len, lines)))
+    return len(lines)
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compress: bool = True, durable: bool = False) -> None:

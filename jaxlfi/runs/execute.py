@@ -21,7 +21,7 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
-from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
+from jaxlfi.runs.checkpoint import Checkpoint
 from jaxlfi.runs.folder import COMPARE, RUN, RUNS, StoreError
 from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks import priors, registry
@@ -163,7 +163,7 @@ def execute(
     done = 0 if checkpoint is None else checkpoint.rounds_done()
     rows, seconds, final = ([], [], {}) if checkpoint is None else checkpoint.read_rounds(done)
     if folder is not None:
-        _cut_ledgers(folder, plan, done)
+        _complete_ledgers(folder, plan, rows, seconds, places)
 
     def keep(index: int, state: State, row: dict[str, np.ndarray], elapsed: float) -> None:
         nonlocal final
@@ -309,13 +309,16 @@ def _spec(description: dict[str, Any]) -> RunSpec:
     )
 
 
-def _cut_ledgers(folder: Path, plan: BatchPlan, done: int) -> None:
-    """Take back the lines of rounds that the checkpoint does not count: they are done again, to the same end."""
-    for name in plan.folders():
-        try:
-            atomic.keep_lines(folder / name / "ledger.jsonl", done)
-        except ValueError as error:
-            raise CheckpointError(str(error)) from error
+def _complete_ledgers(folder: Path, plan: BatchPlan, rows, seconds: Sequence[float], places) -> None:
+    """One line for each round that the checkpoint counts, wherever the process was stopped.
+
+    Lines of rounds that it does not count are taken back, as these are done again; those it stopped before are added.
+    """
+    for run, name in enumerate(plan.folders()):
+        whole = atomic.keep_lines(folder / name / "ledger.jsonl", len(rows))
+        for index in range(whole, len(rows)):
+            own = run_row(rows[index], run, places[run])
+            folders.append_ledger(folder / name, index, own, plan.task.reasons, seconds[index])
 
 
 def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
@@ -328,6 +331,11 @@ def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
         lines.sort(key=lambda line: (order.index(line["configuration"]), line["seed"]))
         folders.write_table(folder / "table.csv", lines)
     atomic.write_json(folder / "config.json", folders.read_config(folder) | {"status": "finished"})
+    clean(folder)
+
+
+def clean(folder: Path) -> None:
+    """Remove from a finished folder what only an unfinished one needs."""
     Checkpoint(folder).remove()
 
 

@@ -123,8 +123,12 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
         config = folders.read_config(out)
         _require_same(out, config, plan)
         if config.get("status", "finished") == "finished":
-            return load(out, plan.task)
-        _, observed = executing.reopen(out, plan.task)
+            run = load(out, plan.task)
+            _require_observation(out, run.observed, observed.trajectory[0])
+            return run
+        _, recorded = executing.reopen(out, plan.task)
+        _require_observation(out, recorded.trajectory[0], observed.trajectory[0])
+        observed = recorded
     console = Console(quiet=not progress)
     with RoundProgress(console, plan.settings.rounds, 0, f"{plan.task.name}: 1 run") as bar:
 
@@ -143,12 +147,23 @@ def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
     """Refuse to go on in the folder of another run."""
     (spec,) = plan.specs
     wanted = folders.run_config(plan.task, plan.origin(spec), spec, plan.settings)
-    compared = ("task_name", "names", "units", "feasible_low", "feasible_high", "heuristic", "settings", "seed")
+    compared = (
+        "task_name", "names", "units", "feasible_low", "feasible_high", "support", "heuristic", "settings", "seed",
+    )  # fmt: skip
     if other := [name for name in compared if config.get(name) != folders.as_json(wanted[name])]:
-        raise folders.StoreError(
-            f"out: expected a new folder or one of the same run, got {str(out)!r}, of a run with another "
-            + ", ".join(other)
-        )
+        raise _of_another_run(out, other)
+
+
+def _require_observation(out: Path, recorded: Any, observed: Any) -> None:
+    """Refuse to go on in the folder of a run with another observation; one that was simulated may be rounded anew."""
+    if np.shape(recorded) != np.shape(observed) or not np.allclose(recorded, observed, rtol=1e-4, atol=1e-6):
+        raise _of_another_run(out, ["observation"])
+
+
+def _of_another_run(out: Path, other: list[str]) -> folders.StoreError:
+    return folders.StoreError(
+        f"out: expected a new folder or one of the same run, got {str(out)!r}, of a run with another {', '.join(other)}"
+    )
 
 
 def _traced_support(task: Task, support: Any, space: SpaceName) -> Support:

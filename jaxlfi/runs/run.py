@@ -124,11 +124,11 @@ class Run:
         """The posterior of a summary that a run of one round would have ended with."""
         settings = self.settings
         prior = uninformed(self.support, settings.estimator.ensemble_size * settings.estimator.components)
-        heuristic = jax.tree.map(jnp.asarray, self.heuristic)
-        mixture = self.network.condition(x, self.support, key).mixture
+        heuristic, network = jax.tree.map(jnp.asarray, (self.heuristic, self.network))
+        mixture = network.condition(x, self.support, key).mixture
         mixture, _ = CORRECTIONS[settings.correction].change(self.task, mixture, prior)
         belief, _ = heuristic(prior, mixture, self.feasible)
-        return posterior_after(belief, self.network, x)
+        return posterior_after(belief, network, x)
 
     @property
     def mixture(self) -> GaussianMixture:

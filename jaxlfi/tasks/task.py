@@ -200,8 +200,9 @@ class Task:
         Raises:
             ValueError: for an unknown name, or a box that is reversed, not finite or outside of Phi.
         """
+        natural = is_natural(space)
         if isinstance(choice, Support):
-            if is_natural(space):
+            if natural:
                 self.check_box(choice, "support")
                 choice = self.space.box_to_inference(choice)
             return check_within(choice, self.inference.feasible)

@@ -1,4 +1,4 @@
-"""Lanes: many runs as one program give what each gives alone, on one device and on two."""
+"""Batches: many runs as one program give what each gives alone, on one device and on two."""
 
 import os
 import subprocess
@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi.bayessim import algorithm as bayessim
-from jaxlfi.bayessim import batch as lanes
-from jaxlfi.bayessim.batch import Lane, LaneEngine, stack_heuristics, stack_inputs
+from jaxlfi.bayessim import algorithm
+from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack, stack_heuristics, stack_inputs
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.bayessim.record import own_evidence
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
@@ -20,25 +19,25 @@ from tests.small import SETTINGS, gaussian, whole_runs  # noqa: F401 - a fixture
 OBSERVED = np.array([0.8, -0.6], np.float32)
 
 
-def lane(support: str, heuristic, seed: int) -> Lane:
-    """A lane of the Gaussian task."""
-    return Lane(support, support, gaussian().support(support), heuristic, seed)
+def spec(support: str, heuristic, seed: int) -> RunSpec:
+    """A run of the Gaussian task."""
+    return RunSpec(support, support, gaussian().support(support), heuristic, seed)
 
 
-LANES = [
-    lane("ok", Fixed(), 0),
-    lane("misspecified", Edge(), 0),
-    lane("misspecified", Matched(Mode()), 1),
-    lane("broad", Edge(expansion=0.5), 1),
-    lane("misspecified", Centre(), 2),
+SPECS = [
+    spec("ok", Fixed(), 0),
+    spec("misspecified", Edge(), 0),
+    spec("misspecified", Matched(Mode()), 1),
+    spec("broad", Edge(expansion=0.5), 1),
+    spec("misspecified", Centre(), 2),
 ]
 
 
-def step_lanes(devices=None):
-    """The five lanes after two rounds, with every round's record."""
-    observed = np.tile(OBSERVED, (len(LANES), 1))
-    inputs, places = stack_inputs(LANES, observed, observed)
-    engine = LaneEngine(gaussian(), SETTINGS, inputs, devices)
+def step_batch(devices=None):
+    """The five runs after two rounds, with every round's record."""
+    observed = np.tile(OBSERVED, (len(SPECS), 1))
+    inputs, places = stack_inputs(SPECS, observed, observed)
+    engine = BatchEngine(gaussian(), SETTINGS, inputs, devices)
     state, rows = engine.start(), []
     for index in range(SETTINGS.rounds):
         state, row = engine.round(state, index)
@@ -48,37 +47,37 @@ def step_lanes(devices=None):
 
 @pytest.fixture(scope="module")
 def stepped(whole_runs):  # noqa: F811 - the fixture
-    """As `step_lanes`, on one device."""
-    return step_lanes(jax.local_devices()[:1])
+    """As `step_batch`, on one device."""
+    return step_batch(jax.local_devices()[:1])
 
 
 @jax.jit
 def run_alone(key, heuristic, support):
-    """One lane by itself, as one program."""
-    state, _ = bayessim.run(key, gaussian(), SETTINGS, heuristic, jnp.asarray(OBSERVED), support)
+    """One run by itself, as one program."""
+    state, _ = algorithm.run(key, gaussian(), SETTINGS, heuristic, jnp.asarray(OBSERVED), support)
     return state
 
 
-@pytest.mark.parametrize("index", range(len(LANES)))
-def test_each_lane_is_the_pure_run_of_its_seed(stepped, index):
+@pytest.mark.parametrize("index", range(len(SPECS)))
+def test_each_run_of_a_batch_is_the_pure_run_of_its_seed(stepped, index):
     state, _, _, inputs = stepped
-    own = LANES[index]
-    # Lane 1 by its own rule, the others by the choice of all rules, which is the same program for each.
+    own = SPECS[index]
+    # Run 1 by its own rule, the others by the choice of all rules, which is the same program for each.
     heuristic = own.heuristic if index == 1 else jax.tree.map(lambda leaf: leaf[index], inputs.heuristic)
     alone = run_alone(run_keys(jax.random.key(own.seed)).run, heuristic, own.support)
     for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(ours[index], theirs, rtol=2e-3, atol=2e-3)
 
 
-def test_lanes_of_one_seed_share_their_first_draws(stepped):
+def test_runs_of_one_seed_share_their_first_draws(stepped):
     _, rows, _, _ = stepped
     theta = rows[0]["theta"]
-    unit = [(t - np.asarray(x.support.low)) / np.asarray(x.support.width) for t, x in zip(theta, LANES, strict=True)]
+    unit = [(t - np.asarray(x.support.low)) / np.asarray(x.support.width) for t, x in zip(theta, SPECS, strict=True)]
     np.testing.assert_allclose(unit[0], unit[1], atol=1e-5)
     assert not np.allclose(unit[1], unit[2], atol=1e-2)
 
 
-def test_evidence_is_the_lanes_own(stepped):
+def test_evidence_is_the_runs_own(stepped):
     _, rows, places, _ = stepped
     seen = [{name for name in own_evidence(rows[0], place) if name.startswith("evidence/")} for place in places]
     assert seen[0] == set()
@@ -101,23 +100,23 @@ def test_rules_of_one_structure_share_a_place_in_the_choice():
 
 def test_inputs_are_padded_to_the_devices():
     observed = np.tile(OBSERVED, (3, 1))
-    inputs, _ = stack_inputs(LANES[:3], observed, observed)
-    engine = LaneEngine(gaussian(), SETTINGS, inputs)
+    inputs, _ = stack_inputs(SPECS[:3], observed, observed)
+    engine = BatchEngine(gaussian(), SETTINGS, inputs)
     assert engine.place(jnp.arange(3)).tolist() == [0, 1, 2]  # one device: nothing to pad
     assert engine.fetch(jnp.arange(4)).tolist() == [0, 1, 2]
 
 
 TWO_DEVICES = """
 import jax, numpy as np, sys
-from tests.test_lanes import step_lanes
+from tests.bayessim.test_batch import step_batch
 assert jax.local_device_count() == 2
-state, _, _, _ = step_lanes()
+state, _, _, _ = step_batch()
 np.savez(sys.argv[1], *map(np.asarray, jax.tree.leaves(state)))
 """
 
 
 def test_two_devices_give_what_one_gives(stepped, tmp_path):
-    """Five lanes on two devices: one of them is padding."""
+    """Five runs on two devices: one of them is padding."""
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
     environment = os.environ | {"XLA_FLAGS": flags}
     command = [sys.executable, "-c", TWO_DEVICES, str(tmp_path / "two.npz")]
@@ -130,5 +129,5 @@ def test_two_devices_give_what_one_gives(stepped, tmp_path):
 
 
 def test_stacking_makes_a_leading_axis():
-    stacked = lanes.stack([Edge(mass_threshold=0.1), Edge(mass_threshold=np.float32(0.2))])
+    stacked = stack([Edge(mass_threshold=0.1), Edge(mass_threshold=np.float32(0.2))])
     assert all(leaf.shape == (2,) and leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(stacked))

@@ -1,0 +1,295 @@
+"""infer: the library call, its purity, the folder it can keep its run in, and what it refuses."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlfi
+from jaxlfi import Support
+from jaxlfi.bayessim import programs
+from jaxlfi.envs import gaussian_linear
+from jaxlfi.heuristics import Edge, Fixed, Truncate
+from jaxlfi.io import files as atomic
+from jaxlfi.runs.folder import StoreError, read_ledger
+from jaxlfi.runs.load import load
+from jaxlfi.tasks.host import SimulatorError
+from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
+
+pytestmark = pytest.mark.filterwarnings("ignore::jaxlfi.SupportWarning")
+
+OBSERVED = np.array([0.8, -0.6], np.float32)
+ARRAYS = ("posterior.npz", "dataset.npz", "history.npz", "observation.npz")
+
+
+def infer(seed=0, task=None, observation=OBSERVED, **arguments):
+    """`jaxlfi.infer` with the small settings."""
+    arguments = {"support": "misspecified", "settings": SETTINGS} | arguments
+    return jaxlfi.infer(jax.random.key(seed), task or gaussian(), observation, **arguments)
+
+
+def same_arrays(a, b, but=("seconds",)):
+    """Equal to the last bit, but for what was measured."""
+    first, second = atomic.read_arrays(a), atomic.read_arrays(b)
+    assert first.keys() == second.keys()
+    for name in first.keys() - set(but):
+        np.testing.assert_array_equal(first[name], second[name], err_msg=f"{a} {name}")
+
+
+# ----------------------------------------------------------------------------------------- one program, many calls
+
+
+@pytest.fixture
+def compilations():
+    """Names of the programs that are compiled from here on, in whatever way."""
+    seen = []
+    jax.monitoring.register_event_duration_secs_listener(listener := lambda event, seconds, **_: seen.append(event))
+    yield lambda: [event for event in seen if event.endswith("backend_compile_duration")]
+    jax.monitoring.unregister_event_duration_listener(listener)
+
+
+def test_an_equal_task_made_anew_compiles_nothing(compilations):
+    infer(0, gaussian_linear.task())
+    before, kept = len(compilations()), dict(programs._EXECUTABLES)
+    assert before > 0  # so that compilations are seen at all
+    again = gaussian_linear.task()
+    assert again is not gaussian()
+    infer(1, again, OBSERVED + 1, heuristic=Edge(mass_threshold=0.3))
+    infer(2, dataclasses.replace(again), support=Support([-2.0, -2.0], [1.0, 1.0]))
+    assert len(compilations()) == before and programs._EXECUTABLES == kept
+    other = dataclasses.replace(again, simulate=lambda key, theta: gaussian_linear.simulate(key, theta))
+    infer(1, other)
+    assert len(compilations()) > before
+
+
+def test_vmap_over_anything_equals_a_loop():
+    edges = [Edge(mass_threshold=tau) for tau in (0.005, 0.2, 0.9)]
+    observations = OBSERVED + np.array([[0.0], [0.5], [1.0]], np.float32)
+    low = np.array([[-3.0, -3.0], [-2.0, -2.0], [-1.0, -3.0]], np.float32)
+    high = jnp.array([0.0, 3.0])
+    together = jax.vmap(lambda h, o, low: infer(heuristic=h, observation=o, support=Support(low, high)))(
+        jaxlfi.stack(edges), jnp.asarray(observations), jnp.asarray(low)
+    )
+    for i, edge in enumerate(edges):
+        alone = infer(heuristic=edge, observation=observations[i], support=Support(low[i], np.asarray(high)))
+        own = jax.tree.map(lambda leaf, i=i: leaf[i], together)
+        for a, b in zip(jax.tree.leaves(own.belief), jax.tree.leaves(alone.belief), strict=True):
+            np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-3)
+        assert own.history.keys() == alone.history.keys()
+        np.testing.assert_allclose(own.history["theta"], alone.history["theta"], rtol=2e-2, atol=2e-2)
+        np.testing.assert_array_equal(own.posterior.support.low, own.belief.support.low)
+    for what in ("save", "warnings"):
+        with pytest.raises(ValueError, match=rf"^{what}: expected one run, got a batch .*jax\.tree\.map"):
+            together.save("nowhere") if what == "save" else together.warnings
+    assert own.warnings is not None and own.posterior.sample(jax.random.key(0), 3).shape == (3, 2)
+
+
+@pytest.mark.parametrize("argument", [{"progress": True}, {"callback": print}, {"out": "nowhere"}])
+def test_what_a_traced_run_cannot_do_is_refused(argument):
+    with pytest.raises(ValueError, match=r"^infer: expected concrete arguments"):
+        jax.eval_shape(lambda observation: infer(observation=observation, **argument).x, OBSERVED)
+
+
+def test_the_command_line_and_the_library_agree(tmp_path):
+    assert command("infer", TASK, "--support", "misspecified", *FLAGS, "--out", tmp_path / "cli") == 0
+    run = infer(0, observation=None)
+    run.save(tmp_path / "library")
+    files = [sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("cli", "library")]
+    assert files[0] == files[1]
+    for name in ARRAYS:  # the same program in the same process: to the last bit
+        same_arrays(tmp_path / "library" / name, tmp_path / "cli" / name)
+    ledgers = [read_ledger(tmp_path / name) for name in ("library", "cli")]
+    assert [line["round"] for line in ledgers[0]] == [line["round"] for line in ledgers[1]] == [0, 1]
+    assert ledgers[0][1]["theta_error"] == ledgers[1][1]["theta_error"]
+    with pytest.raises(ValueError, match="holds something"):
+        run.save(tmp_path / "library")
+
+
+# ------------------------------------------------------------------------------------ progress, callbacks, folders
+
+
+class Stopped(Exception):
+    """Raised by a callback."""
+
+
+def test_a_run_in_a_folder_goes_on_where_a_callback_stopped_it(tmp_path):
+    three = settings(rounds=3)
+    seen, rows = [], []
+
+    def watch(index, row):
+        seen.append(index)
+        rows.append(row)
+
+    whole = infer(3, settings=three, callback=watch, out=tmp_path / "whole")
+    assert seen == [0, 1, 2]
+    for index, row in enumerate(rows):  # of the one run, by the names of its history
+        np.testing.assert_array_equal(row["theta"], whole.history["theta"][index])
+        assert row["sample_theta"].shape == (20, 2)
+
+    def stop(index, row):
+        if index == 1:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        infer(3, settings=three, callback=stop, out=tmp_path / "stopped")
+    with pytest.raises(StoreError, match=r"expected a finished run; go on with it by 'jaxlfi resume'"):
+        load(tmp_path / "stopped")
+    left = []
+    resumed = infer(3, settings=three, callback=lambda index, row: left.append(index), out=tmp_path / "stopped")
+    assert left == [2]
+    for name in ARRAYS:
+        same_arrays(tmp_path / "whole" / name, tmp_path / "stopped" / name)
+    assert [line["round"] for line in read_ledger(tmp_path / "stopped")] == [0, 1, 2]
+    np.testing.assert_array_equal(resumed.draws(9), whole.draws(9))
+    assert not (tmp_path / "stopped" / "checkpoint").exists()
+    # Finished: it is read, and nothing is done again.
+    done = infer(3, settings=three, callback=stop, out=tmp_path / "stopped")
+    np.testing.assert_array_equal(done.mixture.means, whole.mixture.means)
+
+
+def test_a_folder_of_another_run_is_refused(tmp_path):
+    infer(0, settings=settings(rounds=1), out=tmp_path / "run")
+    before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    others = {
+        "seed": {"seed": 1},
+        "settings": {"settings": settings(rounds=1, simulation_budget=30)},
+        "heuristic": {"heuristic": Edge(expansion=0.1)},
+        "task_name": {"task": dataclasses.replace(gaussian(), name="another")},
+    }
+    for name, changes in others.items():
+        with pytest.raises(StoreError, match=f"^out: expected a new folder or one of the same run, got .* {name}$"):
+            infer(out=tmp_path / "run", **({"settings": settings(rounds=1)} | changes))
+    (tmp_path / "occupied").mkdir()
+    (tmp_path / "occupied" / "notes.txt").write_text("mine")
+    with pytest.raises(StoreError, match=r"^out: expected a new or empty folder"):
+        infer(settings=settings(rounds=1), out=tmp_path / "occupied")
+    assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
+
+
+def test_another_observation_or_support_is_another_run(tmp_path):
+    """They do not stand in the settings, but the result of the folder would not be the one that was asked for."""
+    infer(0, settings=settings(rounds=1), out=tmp_path / "run")
+    for changes in ({"observation": OBSERVED + 1}, {"support": "ok"}):
+        with pytest.raises(StoreError, match=r"^out: expected a new folder or one of the same run"):
+            infer(out=tmp_path / "run", settings=settings(rounds=1), **changes)
+
+
+def test_progress_is_shown_when_asked_for(capsys):
+    infer(settings=settings(rounds=1))
+    assert capsys.readouterr().out == ""
+    infer(settings=settings(rounds=1), progress=True)
+    assert "gaussian_linear: 1 run" in capsys.readouterr().out
+
+
+# -------------------------------------------------------------------------------------------- posteriors of a run
+
+
+def test_draws_lie_in_the_support():
+    run = infer(heuristic=Fixed(), support="ok")
+    draws = run.posterior.sample(jax.random.key(1), 500)
+    assert draws.shape == (500, 2) and bool(run.belief.support.contains(draws).all())
+
+
+def test_a_network_of_one_round_knows_other_observations(tmp_path):
+    one = settings(rounds=1)
+    run = infer(settings=one, heuristic=Edge())
+    assert run.amortised
+    own, again = run.posterior, run.posterior_of(OBSERVED)
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(own), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+    other = run.posterior_of(OBSERVED + 1)
+    assert np.abs(np.asarray(other.mean()) - np.asarray(own.mean())).max() > 0.05
+    loaded = load(run.save(tmp_path / "run"), gaussian()).posterior_of(OBSERVED + 1)
+    np.testing.assert_allclose(loaded.mixture.means, other.mixture.means, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match=r"^observation: expected a trajectory of shape \[2\] .* got \[3\]$"):
+        run.posterior_of(np.zeros(3))
+    with pytest.raises(ValueError, match=r"^posterior_of: expected a run whose network was kept"):
+        run.replace(network=None).posterior_of(OBSERVED)
+
+
+def test_a_network_of_several_rounds_does_not():
+    run = infer(observation=None)
+    assert not run.amortised
+    with pytest.raises(ValueError, match=r"^posterior_of: expected a run of one round, got one of 2, whose network"):
+        run.posterior_of(OBSERVED)
+
+
+def test_a_fixed_support_that_is_wrong_warns():
+    # Hardly trained, the posterior is nearly as wide as Phi: far wider than this support.
+    narrow = Support([-0.2, -0.2], [0.2, 0.2])
+    with pytest.warns(jaxlfi.SupportWarning, match="first: .* upper bound 0.2"):
+        run = infer(support=narrow, heuristic=Fixed())
+    assert any("widen the support" in text for text in run.warnings)
+
+
+def test_without_an_observation_one_is_simulated_at_the_truth():
+    a, b, c = infer(0, observation=None), infer(0, observation=None), infer(1, observation=None)
+    np.testing.assert_array_equal(a.observed, b.observed)
+    assert not np.allclose(a.observed, c.observed)
+    fixed = dataclasses.replace(gaussian(), observation=OBSERVED)
+    np.testing.assert_array_equal(infer(0, fixed, observation=None).observed, OBSERVED)
+
+
+# ------------------------------------------------------------------------------------------------- what is refused
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"observation": np.zeros(3)}, r"observation: expected the shape the simulator produces, \[2\], got \[3\]"),
+        ({"observation": np.array([np.nan, 0])}, "observation: expected finite"),
+        ({"support": "unknown"}, "support: expected one of"),
+        ({"support": ([0, 0], [1, 1])}, r"support: expected one of .* or a box such as jaxlfi\.Support"),
+        ({"support": Support([0.0], [1.0])}, "support: expected bounds for 2 parameters, got 1"),
+        ({"support": Support([0.0, 0.0], [1.0, 11.0])}, "support: expected a box inside the feasible domain Phi"),
+        ({"space": "log"}, "space: expected 'natural' or 'inference', got 'log'"),
+        ({"heuristic": "edge"}, r"heuristic: expected an instance such as jaxlfi\.Edge\(\), got 'edge'"),
+        ({"heuristic": Edge}, r"heuristic: expected an instance such as jaxlfi\.Edge\(\), got the class Edge"),
+        ({"heuristic": lambda *_: None}, r"heuristic: expected an instance"),
+        ({"heuristic": Edge(expansion=np.ones(3))}, r"heuristic: .*scalars or 2 values, got shape \(3,\)"),
+        ({"settings": "quick"}, r"settings: expected jaxlfi\.Settings such as jaxlfi\.QUICK, got 'quick'"),
+        ({"settings": settings(simulation_budget=5)}, "simulation_budget: expected at least the 20"),
+        ({"task": "gaussian_linear"}, r"task: expected a jaxlfi\.Task, got str"),
+        ({"task": dataclasses.replace(gaussian(), truth=None), "observation": None}, "observation: expected one"),
+    ],
+)
+def test_bad_input_is_named(arguments, message):
+    with pytest.raises(ValueError, match=f"^{message}") as refused:
+        infer(**arguments)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("key", [0, "seed", np.zeros(2, np.uint32), jax.random.split(jax.random.key(0), 2)])
+def test_a_key_is_one_typed_key(key):
+    with pytest.raises(ValueError, match=r"^key: expected one key such as jax\.random\.key\(0\), got ") as refused:
+        jaxlfi.infer(key, gaussian(), OBSERVED, settings=SETTINGS)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("simulate", "message"),
+    [
+        (lambda key, theta: np.asarray(theta), "JAX can trace"),
+        (lambda key, theta: theta[0], r"expected one array"),
+        (lambda key, theta: (theta, theta, theta), r"expected one array"),
+        (lambda key, theta: (theta, theta > 0), "expected a scalar outcome"),
+        (lambda key, theta: (theta, False), r"got none \(failed: 25, non_finite: 0\)"),
+    ],
+)
+def test_a_simulator_that_breaks_its_contract_is_named(simulate, message):
+    with pytest.raises(SimulatorError, match=message):
+        infer(task=dataclasses.replace(gaussian(), simulate=simulate, summary=lambda trajectory: trajectory))
+
+
+def test_bounds_are_natural_unless_asked_for_otherwise():
+    box = Support([0.5, -3.0], [3.0, 3.0])
+    task = dataclasses.replace(gaussian(), supports={"own": box}, feasible=box, log=("first",))
+    natural = infer(
+        task=task, support=Support([1.0, -1.0], [2.0, 1.0]), heuristic=Truncate(), settings=settings(rounds=1)
+    )
+    inner = Support([0.0, -1.0], [float(np.log(2.0)), 1.0])
+    inference = infer(task=task, support=inner, space="inference", heuristic=Truncate(), settings=settings(rounds=1))
+    np.testing.assert_allclose(natural.support.low, [0.0, -1.0])
+    np.testing.assert_allclose(natural.belief.mixture.means, inference.belief.mixture.means, rtol=1e-3, atol=1e-3)

@@ -1,0 +1,219 @@
+"""load and save: a run folder is the run that made it, in this process and in another."""
+
+import dataclasses
+import json
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlfi
+from jaxlfi.heuristics import Choice, Edge, Fixed, Matched, Mode
+from jaxlfi.io import files as atomic
+from jaxlfi.runs.describe import settings_to_json
+from jaxlfi.runs.folder import StoreError
+from jaxlfi.runs.load import load
+from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
+
+OBSERVED = np.array([0.8, -0.6], np.float32)
+CHOICE = Choice(1, (Edge(), Matched(Mode(proximity=0.3)), Fixed()))
+
+
+def same_leaves(a, b) -> None:
+    """Equal pytrees, to the last bit."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for ours, theirs in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.fixture(scope="module")
+def run(whole_runs):  # noqa: F811 - the fixture
+    """A run by a choice of rules, one of them nested, with a seed of more than 32 bits."""
+    key = jax.random.wrap_key_data(jnp.array([5, 7], jnp.uint32))
+    return jaxlfi.infer(key, gaussian(), OBSERVED, support="misspecified", heuristic=CHOICE, settings=SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def saved(run, tmp_path_factory):
+    """It, in a folder."""
+    return run.save(tmp_path_factory.mktemp("load") / "run")
+
+
+def test_a_saved_run_is_loaded_as_it_was(run, saved):
+    again = load(saved, gaussian())
+    assert type(again) is type(run)
+    same_leaves(again.belief, run.belief)
+    assert again.history.keys() == run.history.keys()
+    for name, value in run.history.items():
+        np.testing.assert_array_equal(again.history[name], value, err_msg=name)
+    size = int(run.dataset.size)
+    assert int(again.dataset.size) == size == 40
+    for name in ("theta", "x", "round", "weight"):
+        np.testing.assert_array_equal(getattr(again.dataset, name)[:size], getattr(run.dataset, name)[:size])
+        assert getattr(again.dataset, name).shape == getattr(run.dataset, name).shape
+    same_leaves(again.heuristic, run.heuristic)
+    assert again.settings == run.settings and settings_to_json(again.settings) == settings_to_json(run.settings)
+    np.testing.assert_array_equal(jax.random.key_data(again.key), jax.random.key_data(run.key))
+    same_leaves((again.support, again.feasible), (run.support, run.feasible))
+    np.testing.assert_array_equal(again.observed, run.observed)
+    np.testing.assert_array_equal(again.x, run.x)
+    assert again.space == run.space and again.task == run.task and again.warnings == run.warnings
+    np.testing.assert_array_equal(again.draws(), run.draws())
+
+
+def test_saving_what_was_loaded_gives_the_same_files(saved, tmp_path):
+    again = load(saved, gaussian()).save(tmp_path / "again")
+    assert {path.name for path in again.iterdir()} == {path.name for path in saved.iterdir()}
+    for path in saved.glob("*.npz"):
+        first, second = atomic.read_arrays(path), atomic.read_arrays(again / path.name)
+        assert first.keys() == second.keys()
+        for name, value in first.items():
+            np.testing.assert_array_equal(value, second[name])
+    assert (again / "ledger.jsonl").read_text() == (saved / "ledger.jsonl").read_text()
+    configs = [json.loads((folder / "config.json").read_text()) for folder in (saved, again)]
+    for config in configs:
+        for measured in ("started", "command_line"):
+            config.pop(measured)
+    assert configs[0] == configs[1]
+
+
+def test_a_run_of_a_task_made_in_python_is_loaded_without_it(run, saved, tmp_path):
+    assert json.loads((saved / "config.json").read_text())["task"] is None
+    again = load(saved)
+    assert again.task is None and again.space == run.space
+    np.testing.assert_array_equal(again.draws(50), run.draws(50))
+    assert np.isfinite(again.posterior.log_prob(again.posterior.mean()))
+    with pytest.raises(
+        StoreError, match=r"^save: expected a run whose task is known: jaxlfi\.load\(folder, task=\.\.\.\)"
+    ):
+        again.save(tmp_path / "new")
+    other = dataclasses.replace(gaussian(), names=("a", "b"))
+    with pytest.raises(StoreError, match="expected the task as it was when the run was made, with parameters"):
+        load(saved, other)
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """A comparison of two configurations, of one seed each."""
+    out = tmp_path_factory.mktemp("compare") / "comparison"
+    own = ("--configurations", "misspecified", "misspecified+edge", "--seeds", "1", "--rounds", "1")
+    assert command("compare", TASK, *FLAGS, *own, "--out", out) == 0
+    return out
+
+
+FRESH = """
+import sys, jax, numpy as np, jaxlfi
+run = jaxlfi.load(sys.argv[1])
+draws = run.posterior.sample(jax.random.key(0), 200)
+np.savez(sys.argv[2], draws=draws, means=run.mixture.means, task=run.task.name, amortised=run.amortised)
+"""
+
+
+def test_a_fresh_process_loads_a_run_of_a_comparison(compared, tmp_path):
+    for configuration in ("misspecified", "misspecified+edge"):
+        folder = compared / configuration / "seed_000"
+        here = load(folder)
+        assert here.origin.configuration == configuration and here.origin.reference == TASK
+    arguments = [sys.executable, "-c", FRESH, str(folder), str(tmp_path / "fresh.npz")]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    fresh = np.load(tmp_path / "fresh.npz")
+    np.testing.assert_array_equal(fresh["means"], here.mixture.means)
+    np.testing.assert_allclose(fresh["draws"], here.posterior.sample(jax.random.key(0), 200), rtol=1e-4, atol=1e-5)
+    assert str(fresh["task"]) == "gaussian_linear" and bool(fresh["amortised"])
+
+
+def test_the_folder_of_several_runs_is_refused_with_advice(compared):
+    with pytest.raises(StoreError, match=r"expected the folder of one run, such as .*misspecified/seed_000$"):
+        load(compared)
+
+
+def test_a_batch_under_vmap_is_not_saved(tmp_path):
+    keys = jax.random.split(jax.random.key(0), 2)
+    together = jax.vmap(lambda key: jaxlfi.infer(key, gaussian(), OBSERVED, settings=settings(rounds=1)))(keys)
+    with pytest.raises(ValueError, match=r"^save: expected one run, got a batch of them .*jax\.tree\.map\(") as refused:
+        together.save(tmp_path / "batch")
+    assert "\n" not in str(refused.value) and not (tmp_path / "batch").exists()
+    one = jax.tree.map(lambda leaf: leaf[1], together)
+    again = load(one.save(tmp_path / "one"), gaussian())
+    same_leaves(again.belief, one.belief)
+    np.testing.assert_array_equal(jax.random.key_data(again.key), jax.random.key_data(keys[1]))
+
+
+# ------------------------------------------------------------------------------------------------- damaged folders
+
+
+def config_with(**changes):
+    """Change the folder's config.json."""
+
+    def damage(folder):
+        config = json.loads((folder / "config.json").read_text())
+        (folder / "config.json").write_text(json.dumps(config | changes))
+
+    return damage
+
+
+def without(name):
+    """Delete an entry of config.json."""
+
+    def damage(folder):
+        config = json.loads((folder / "config.json").read_text())
+        del config[name]
+        (folder / "config.json").write_text(json.dumps(config))
+
+    return damage
+
+
+def cut(name):
+    """Leave half of a file."""
+
+    def damage(folder):
+        content = (folder / name).read_bytes()
+        (folder / name).write_bytes(content[: len(content) // 2])
+
+    return damage
+
+
+def replaced(name, **arrays):
+    """Other arrays in a file."""
+    return lambda folder: atomic.write_arrays(folder / name, arrays)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: shutil.rmtree(folder), "expected a run folder, got .* which is no folder"),
+        (lambda folder: (folder / "config.json").unlink(), "without a readable config.json"),
+        (cut("config.json"), "without a readable config.json"),
+        (config_with(format="other"), "config.json is not of jaxlfi"),
+        (config_with(format="jaxlfi-grid"), "config.json is of format 'jaxlfi-grid'"),
+        (config_with(version=1), r"expected version 2 of the format, got 1: .*run it again"),
+        (config_with(status="running"), "expected a finished run; go on with it by 'jaxlfi resume'"),
+        (lambda folder: (folder / "posterior.npz").unlink(), "expected a finished run"),
+        (without("settings"), "config.json: expected a complete description of the run"),
+        (without("parameters"), "config.json: expected a complete description of the run"),
+        (without("task"), "config.json: expected a complete description of the run"),
+        (config_with(seed="none"), "config.json: expected a complete description of the run"),
+        (
+            config_with(heuristic={"name": "never", "hyperparameters": {}}),
+            "config.json: expected a complete desc.*never",
+        ),
+        (config_with(settings=[1]), "config.json: expected a complete description of the run"),
+        (cut("posterior.npz"), "posterior.npz: expected a whole .npz file"),
+        (cut("history.npz"), "history.npz: expected a whole .npz file"),
+        (lambda folder: (folder / "dataset.npz").unlink(), "dataset.npz: expected a whole .npz file"),
+        (replaced("observation.npz", x=np.zeros(2)), "observation.npz: expected an array trajectory, got none"),
+        (replaced("network.npz", a=np.zeros(2)), "network.npz: expected an array"),
+    ],
+)
+def test_folders_that_hold_no_whole_run_are_one_line(saved, tmp_path, damage, message):
+    folder = tmp_path / "run"
+    shutil.copytree(saved, folder)
+    damage(folder)
+    with pytest.raises(ValueError, match=message) as refused:
+        load(folder)
+    assert "\n" not in str(refused.value) and str(folder) in str(refused.value)

@@ -1,0 +1,142 @@
+"""Resuming: a folder is whole at any moment, and goes on to the same bits."""
+
+import itertools
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from jaxlfi.io import files as atomic
+from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
+from jaxlfi.runs.folder import read_ledger
+from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401 - a fixture
+
+
+class Killed(BaseException):
+    """The process dies here."""
+
+
+def kill_at(monkeypatch, nth: int, midway: bool):
+    """Let the nth write to a file be the process's last act; `midway` leaves half of it: a .part, or half a line."""
+    write_bytes, append_line, count = atomic.write_bytes, atomic.append_line, [0]
+
+    def write(path, content, durable=False):
+        count[0] += 1
+        if count[0] == nth and midway:
+            path.with_name(path.name + ".part").write_bytes(content[: len(content) // 2])
+            raise Killed
+        write_bytes(path, content, durable)
+        if count[0] == nth:
+            raise Killed
+
+    def append(path, line):
+        count[0] += 1
+        append_line(path, line[: len(line) // 2] if count[0] == nth and midway else line)
+        if count[0] == nth:
+            raise Killed
+
+    monkeypatch.setattr(atomic, "write_bytes", write)
+    monkeypatch.setattr(atomic, "append_line", append)
+
+
+def test_a_run_killed_at_any_write_resumes_to_the_same_bits(tmp_path, monkeypatch):
+    arguments = ("infer", TASK, "--support", "misspecified", *FLAGS, "--seeds", "2", "--out")
+    assert command(*arguments, tmp_path / "whole") == 0
+    created, killed = 0, 0
+    for nth, midway in itertools.product(range(1, 100), (False, True)):
+        out = tmp_path / f"killed_{nth}_{midway}"
+        with monkeypatch.context() as patch:
+            kill_at(patch, nth, midway)
+            try:
+                assert command(*arguments, out) == 0
+                break
+            except Killed:
+                killed += 1
+        if not out.exists():  # not yet created: nothing was begun, and nothing is in the way
+            continue
+        created += 1
+        assert command("resume", out, "--no-figures") == 0
+        for seed in ("seed_000", "seed_001"):
+            for name in ("posterior.npz", "dataset.npz"):
+                assert_same_arrays(tmp_path / "whole" / seed / name, out / seed / name)
+            assert [line["round"] for line in read_ledger(out / seed)] == [0, 1]  # each once, and in order
+            assert not list((out / seed).glob("*.part"))
+        assert not (out / "checkpoint").exists()
+    assert killed >= 40 and created >= 30
+
+
+def assert_same_arrays(a, b):
+    """Equal to the last bit."""
+    first, second = atomic.read_arrays(a), atomic.read_arrays(b)
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        assert value.tobytes() == second[name].tobytes(), (a, name)
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A run that was killed after its first round."""
+    out = tmp_path_factory.mktemp("stopped") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        kill_at(patch, 5, midway=False)
+        with pytest.raises(Killed):
+            command("infer", TASK, *FLAGS, "--out", out)
+    assert Checkpoint(out).rounds_done() == 1
+    return out
+
+
+@pytest.mark.parametrize(
+    ("damage", "file"),
+    [
+        (damage, file)
+        for damage in ("truncated", "flipped", "missing", "foreign")
+        for file in ("state.npz", "round_000.npz", "start.npz")
+        if (damage, file) != ("missing", "state.npz")  # without a state a run begins with its first round
+    ],
+)
+def test_a_damaged_checkpoint_is_refused_and_left_alone(stopped, tmp_path, capsys, file, damage):
+    out = tmp_path / "run"
+    shutil.copytree(stopped, out)
+    path = out / "checkpoint" / file
+    content = path.read_bytes()
+    if damage == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    elif damage == "flipped":
+        middle = len(content) // 2
+        path.write_bytes(content[:middle] + bytes([content[middle] ^ 255]) + content[middle + 1 :])
+    elif damage == "missing":
+        path.unlink()
+    else:
+        np.savez(path, something=np.zeros(3))
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    capsys.readouterr()
+    assert command("resume", out, "--no-figures") == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and file in message and "expected" in message
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_a_state_of_another_shape_is_refused(tmp_path):
+    checkpoint = Checkpoint(tmp_path)
+    checkpoint.write_start(np.zeros((1, 2)), np.zeros((1, 2)))
+    checkpoint.write_round(0, {"a": np.zeros(3)}, {"b": np.ones(2), "final_x": np.zeros((1, 20, 2))}, 0.1)
+    rows, seconds, final = checkpoint.read_rounds(1)
+    assert [list(row) for row in rows] == [["b"]] and seconds == [0.1] and list(final) == ["final_x"]
+    assert checkpoint.read_state({"a": np.ones(3)})["a"].tolist() == [0, 0, 0]
+    with pytest.raises(CheckpointError, match=r"expected .* of shape"):
+        checkpoint.read_state({"a": np.zeros(4)})
+
+
+@pytest.mark.parametrize(("package", "warned"), [("jax", True), ("jaxlfi", True), ("numpy", False), (None, False)])
+def test_resuming_by_other_versions_warns(stopped, tmp_path, capsys, package, warned):
+    out = tmp_path / "run"
+    shutil.copytree(stopped, out)
+    config = json.loads((out / "config.json").read_text())
+    if package is not None:
+        config["versions"][package] = "0.0.1"
+        (out / "config.json").write_text(json.dumps(config))
+    assert command("resume", out, "--no-figures") == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert (f"warning: begun with {package} 0.0.1, now" in printed) == warned
+    assert ("warning: begun with" in printed) == warned
