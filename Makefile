@@ -6,7 +6,7 @@ OUT ?= runs/demo
 # Worker processes of the tests; two suit a small machine.
 WORKERS ?= 2
 
-.PHONY: demo test lint bench clean help
+.PHONY: demo test lint docs bench clean help
 
 help:  ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -27,9 +27,13 @@ lint: $(VENV)/.installed  ## style
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check --quiet .
 
+docs: $(VENV)/.installed  ## the documentation site, in site/
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 bench: $(VENV)/.installed  ## benchmarks against NumPy, numba and PyTorch
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/python -m experiments.benchmarks
 
 clean:  ## remove the environment and caches
-	rm -rf $(VENV) .pytest_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) site .pytest_cache .ruff_cache *.egg-info

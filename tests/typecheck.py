@@ -1,5 +1,7 @@
 """The checker that pytest's --jaxtyping-packages applies to every annotated function of the numerical core."""
 
+import typing
+
 from beartype import beartype
 
 
@@ -7,6 +9,16 @@ def checked(function):
     """Check a function's annotations at run time with beartype, but not a constructor's.
 
     The constructors are those of pytrees. JAX rebuilds them around whatever the leaves become (NumPy arrays, shapes,
-    vmap axes, boolean masks, one more axis), none of which the annotations mean.
+    vmap axes, boolean masks, one more axis), none of which the annotations mean. `Self` is known only where a whole
+    class is checked. Counts and words of a choice are not checked here: the library refuses wrong ones by a ValueError,
+    which is tested.
     """
-    return function if function.__name__ == "__init__" else beartype(function)
+    if function.__name__ == "__init__" or typing.Self in function.__annotations__.values():
+        return function
+    kept = {
+        name: kind
+        for name, kind in function.__annotations__.items()
+        if kind is not int and typing.get_origin(kind) is not typing.Literal
+    }
+    function.__annotations__ = kept
+    return beartype(function)

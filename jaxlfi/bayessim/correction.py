@@ -109,7 +109,8 @@ def importance_weights(
     log_proposal = jax.nn.logsumexp(log_each, axis=0)
     target = 0.0 if task.inference.prior is None else task.inference.prior.log_prob(dataset.theta)
     log_weight = jnp.where(dataset.valid & jnp.isfinite(log_proposal), target - log_proposal, -jnp.inf)
-    weight = jnp.exp(log_weight - jnp.max(log_weight, initial=-1e30))
+    # A simulation that was given with its density stands for so many draws of the prior.
+    weight = dataset.weight * jnp.exp(log_weight - jnp.max(log_weight, initial=-1e30))
     size = jnp.maximum(dataset.size, 1)
     return jnp.minimum(weight, jnp.sqrt(size) * jnp.sum(weight) / size)
 

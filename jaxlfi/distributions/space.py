@@ -67,7 +67,7 @@ class Space:
         """The way back."""
         return Support(self.to_natural(box.low), self.to_natural(box.high))
 
-    def log_jacobian(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
+    def log_jacobian(self, theta: Float[Array | np.ndarray, "*n dim"]) -> Float[Array, "*n"]:
         """Logarithm of the volume that a unit of inference space has in natural units, at a point of inference space.
 
         A log-density over natural units is that over inference space minus this.

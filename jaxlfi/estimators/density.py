@@ -45,8 +45,9 @@ class EnsembleDensity:
         return jax.nn.logsumexp(log_each, axis=0) - jnp.log(self.ensemble_size) - jnp.sum(jnp.log(self.scale))
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
-        """`n` draws, from the networks in turn; some may leave any support."""
-        keys = jax.random.split(key, self.ensemble_size)
-        draws = jax.vmap(lambda key, q: q.sample(key, n))(keys, self.each)
-        turn = jnp.arange(n) % self.ensemble_size
-        return self.shift + self.scale * draws[turn, jnp.arange(n)]
+        """`n` independent draws, each of a network chosen at random; some may leave any support."""
+        *keys, key_choice = jax.random.split(key, self.ensemble_size + 1)
+        draws = jax.vmap(lambda key, q: q.sample(key, n))(jnp.stack(keys), self.each)
+        # In turn would not do: whoever takes the first of several draws that is inside would prefer the first network.
+        choice = jax.random.randint(key_choice, (n,), 0, self.ensemble_size)
+        return self.shift + self.scale * draws[choice, jnp.arange(n)]

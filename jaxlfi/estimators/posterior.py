@@ -1,12 +1,13 @@
 """Posterior: q_phi(theta | x^r) truncated to a support, for mixture density networks and flows alike."""
 
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxlfi.distributions.arguments import require_count, require_key
 from jaxlfi.distributions.mixture import GaussianMixture
@@ -57,8 +58,8 @@ class Posterior:
         draws = _sample(require_key(key), self, int(n))
         return self.space.to_natural(draws) if is_natural(space) else draws
 
-    def log_prob(self, theta: Float[Array, "*n dim"], space: SpaceName = "natural") -> Float[Array, "*n"]:
-        """Log-density at theta, shape [..., D]; -inf outside the support.
+    def log_prob(self, theta: ArrayLike | Sequence, space: SpaceName = "natural") -> Float[Array, "*n"]:
+        """Log-density at theta, numbers of shape [..., D]; -inf outside the support.
 
         Raises:
             ValueError: for another number of parameters.

@@ -17,7 +17,7 @@ import shlex
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -127,7 +127,7 @@ def refuse_occupied(folder: Path) -> None:
         )
 
 
-def create(folder: Path, config: Mapping[str, Any], fill) -> None:
+def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any]) -> None:
     """Bring a run folder into being, complete or not at all.
 
     Args:

@@ -3,9 +3,11 @@
 import dataclasses
 import functools
 import re
+import types
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import distrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -249,6 +251,10 @@ def _same(a: Any, b: Any) -> bool:
         return False
     if isinstance(a, Mapping):
         return list(a) == list(b) and all(_same(a[name], b[name]) for name in a)
+    if isinstance(a, distrax.Distribution | distrax.Bijector):  # as pytrees they hold bound methods, which differ
+        return _same(vars(a), vars(b))
+    if isinstance(a, types.MethodType):
+        return a.__func__ is b.__func__ and _same(a.__self__, b.__self__)
     if isinstance(a, functools.partial):
         return a.func == b.func and _same(a.args, b.args) and _same(a.keywords, b.keywords)
     if isinstance(a, tuple | list):

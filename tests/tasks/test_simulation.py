@@ -43,7 +43,7 @@ def test_budget_against_a_loop(failures, simulations_per_round):
     assert int(attempts.attempted) == int(attempts.succeeded) + int(attempts.failed(3).sum())
 
 
-def test_batched_attempts_are_counted_lane_by_lane():
+def test_batched_attempts_are_counted_run_by_run():
     failure = jnp.array([[0, 1, 0, 2], [3, 3, 1, 3]])
     one = lambda failure: within_budget(jnp.zeros((4, 1)), jnp.zeros((4, 1)), failure, 2)
     attempts = jax.vmap(one)(failure)

@@ -48,10 +48,18 @@ def test_rows_are_the_kept_ones_in_order(rounds):
     np.testing.assert_array_equal(dataset.x[size:], 0.0)
 
 
-def test_lanes_fill_at_their_own_pace():
+def test_runs_of_a_batch_fill_at_their_own_pace():
     failures = jnp.array([[0, 1, 0, 0, 0], [1, 1, 1, 0, 1]])
     place = jnp.arange(5.0)[:, None]
     one = lambda failure: augment(empty(CAPACITY, 1, 1), within_budget(place, place, failure, 3), 0)
     both = jax.vmap(one)(failures)
     np.testing.assert_array_equal(both.size, [3, 1])
     np.testing.assert_array_equal(both.theta[:, :4, 0], [[0, 2, 3, 0], [3, 0, 0, 0]])
+
+
+def test_the_weights_of_given_simulations_are_kept():
+    """1 for what a run simulates itself; what was given keeps its own weight, behind which the next rounds' follow."""
+    given = attempts([0, 1, 0, 0, 0], 1).replace(weight=jnp.array([0.5, 9.0, 2.0, 0.25, 7.0]))
+    dataset = augment(augment(empty(CAPACITY, 2, 1), given, 0), attempts([0, 0, 1, 1, 1], 101), 1)
+    np.testing.assert_array_equal(dataset.weight[:5], [0.5, 2.0, 0.25, 1.0, 1.0])
+    np.testing.assert_array_equal(dataset.round[:5], [0, 0, 0, 1, 1])

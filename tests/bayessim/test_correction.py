@@ -71,6 +71,13 @@ def test_some_corrections_weigh_all_filled_rows_the_same(name):
     np.testing.assert_array_equal(weights, [1, 1, 1, 0, 0])
 
 
+@pytest.mark.parametrize("name", ["none", "paper"])
+def test_simulations_given_with_a_density_keep_their_weights(name):
+    given = data(np.ones((3, 2)), 5).replace(weight=jnp.array([0.5, 2.0, 0.25, 7.0, 1.0]))
+    weights = CORRECTIONS[name].row_weights(task(), given, INFORMED, 0, 0.0)
+    np.testing.assert_array_equal(weights, [0.5, 2.0, 0.25, 0, 0])
+
+
 def test_to_the_letter_multiplies_by_the_reference():
     posterior, bad = multiplied(task(), Q, INFORMED)
     assert int(bad) == 0 and posterior.logits.shape == (1,)
@@ -122,8 +129,10 @@ def test_before_any_data_there_is_no_reference():
 
 
 def test_to_the_letter_refuses_other_priors():
-    with pytest.raises(ValueError, match=r"^correction='paper' .* multivariate normal, got Laplace; use correction="):
-        multiplied(task(distrax.Laplace(jnp.zeros(2), jnp.ones(2))), Q, INFORMED)
+    with pytest.raises(
+        ValueError, match=r"^correction='paper' .* multivariate normal, got Independent; use correction="
+    ):
+        multiplied(task(distrax.Independent(distrax.Laplace(jnp.zeros(2), jnp.ones(2)), 1)), Q, INFORMED)
 
 
 # --------------------------------------------------------------------------------------- importance weights
@@ -133,7 +142,8 @@ def data(theta, capacity: int = 40) -> Dataset:
     theta = np.asarray(theta, np.float32)
     padded = np.zeros((capacity, theta.shape[1]), np.float32)
     padded[: len(theta)] = theta
-    return Dataset(jnp.asarray(padded), jnp.zeros((capacity, 1)), jnp.zeros(capacity, int), jnp.asarray(len(theta)))
+    rows = jnp.zeros(capacity, int)
+    return Dataset(jnp.asarray(padded), jnp.zeros((capacity, 1)), rows, jnp.ones(capacity), jnp.asarray(len(theta)))
 
 
 def proposals(*beliefs: Belief) -> Belief:
@@ -170,13 +180,22 @@ def test_weights_against_numpy(rounds):
     np.testing.assert_allclose(relative(weights), relative(truncated(1 / np.sum(each, axis=0))), rtol=5e-3)
 
 
-def test_the_defensive_share_is_part_of_the_proposal():
-    share = 0.3
-    weights = importance(task(), data(THETA), ROUNDS, 1, share)
+def test_the_defensive_fraction_is_part_of_the_proposal():
+    fraction = 0.3
+    weights = importance(task(), data(THETA), ROUNDS, 1, fraction)
     uniform = np.full(30, 1 / (18.0 * 14.0))
-    proposal = uniform + share * uniform + (1 - share) * density(PREVIOUS)(THETA)
+    proposal = uniform + fraction * uniform + (1 - fraction) * density(PREVIOUS)(THETA)
     np.testing.assert_allclose(relative(weights), relative(truncated(1 / proposal)), rtol=5e-3)
     assert np.abs(relative(weights) - relative(importance(task(), data(THETA), ROUNDS, 1))).max() > 0.1
+
+
+def test_simulations_given_with_a_density_count_as_draws_of_the_prior():
+    """One that stands for two weighs twice as much, in the same mixture of proposals."""
+    given = data(THETA).replace(weight=jnp.ones(40).at[:10].set(2.0))
+    plain = 1 / (np.full(30, 1 / (18.0 * 14.0)) + density(PREVIOUS)(THETA))
+    expected = plain * np.where(np.arange(30) < 10, 2.0, 1.0)
+    weights = importance(task(), given, ROUNDS, 1)
+    np.testing.assert_allclose(relative(weights), relative(truncated(expected)), rtol=5e-3)
 
 
 def test_a_prior_of_the_tasks_own_is_target_and_first_proposal():

@@ -1,7 +1,6 @@
 """Automatic posterior transformation: Algorithm 1 with an atomic loss and flows."""
 
 import csv
-import dataclasses
 import json
 import shutil
 
@@ -12,25 +11,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import ks_2samp
-from test_bayessim import EXACT, MODEST, TASK, X, infer, lane, whitened
 
 import jaxlfi
-from jaxlfi.bayessim.algorithm import Settings
-from jaxlfi.bayessim import algorithm as bayessim
+from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.presets import METHODS, QUICK
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli import parser as cli
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
-from jaxlfi.estimators.estimator import Estimator, Network, draw, initialise, normalisers
-from jaxlfi.estimators.posterior import draws_within, posterior
+from jaxlfi.estimators.base import Network, untrained
+from jaxlfi.estimators.flow_estimators import FlowEstimator, MaskedFlow
 from jaxlfi.heuristics import Fixed
 from jaxlfi.runs import folder as run_store
-from jaxlfi.runs.load import posterior_samples
 from jaxlfi.tasks.task import Task
+from tests.bayessim.test_algorithm import EXACT, MODEST, TASK, X, infer, run_of, whitened
 
-ATOMIC = dataclasses.replace(MODEST, hidden=(32, 32), steps=2000, learning_rate=3e-3, loss="atomic")
-FLOW = Estimator(
-    family="maf",
+ATOMIC = MODEST.replace(hidden=(32, 32), steps=2000, learning_rate=3e-3, loss="atomic")
+FLOW = MaskedFlow(
     loss="atomic",
     hidden=(8, 8),
     transforms=1,
@@ -52,9 +49,9 @@ def test_the_atomic_loss_needs_no_correction_for_its_proposals():
         estimator=ATOMIC, rounds=3, simulations_per_round=500, simulation_budget=500, restriction="reject"
     )
     state, info = infer(settings, ("ok",) * 2, (0,) * 2, 1)
-    np.testing.assert_allclose(info.correction.inside[:, -1], 1.0, atol=0.02)
+    np.testing.assert_allclose(info.correction.mass_inside[:, -1], 1.0, atol=0.02)
     for i in range(2):
-        mean, covariance = whitened(lane(state.belief.mixture, i))
+        mean, covariance = whitened(run_of(state.belief.mixture, i))
         np.testing.assert_allclose(mean, 0, atol=0.35)
         assert 1.5 < np.trace(covariance) < 2.8
 
@@ -75,7 +72,7 @@ def test_a_prior_of_the_tasks_own_is_the_posteriors():
     )
 
     def one(key):
-        return bayessim.run(key, task, settings, Fixed(), X, box)[0].belief.mixture
+        return algorithm.run(key, task, settings, Fixed(), X, box)[0].belief.mixture
 
     learnt = jax.jit(one)(jax.random.key(2))
     precision = np.linalg.inv(np.asarray(EXACT.covariance, np.float64)) + np.diag(prior_scale.astype(np.float64) ** -2)
@@ -94,8 +91,24 @@ def test_a_prior_of_the_tasks_own_is_the_posteriors():
 @pytest.fixture(scope="module")
 def flow_run():
     settings = Settings(estimator=FLOW, rounds=2, simulations_per_round=30, simulation_budget=30, restriction="reject")
-    run = jax.jit(lambda key: bayessim.run(key, TASK, settings, Fixed(), X, TASK.supports["ok"]))
+    run = jax.jit(lambda key: algorithm.run(key, TASK, settings, Fixed(), X, TASK.support("ok")))
     return run, jax.device_get(run(jax.random.key(0)))
+
+
+@pytest.fixture(scope="module")
+def network(flow_run):
+    """The flow after two rounds."""
+    return jax.tree.map(jnp.asarray, flow_run[1][0].network)
+
+
+SUPPORT = Support([-1.0, -2.0], [2.0, 1.5])
+
+
+def free_draws(network, n: int) -> np.ndarray:
+    """Of the flow, not truncated."""
+    return np.asarray(
+        jax.jit(lambda network: network.condition(X, SUPPORT).density.sample(jax.random.key(4), n))(network)
+    )
 
 
 def test_a_flow_runs_in_the_same_loop_and_repeats(flow_run):
@@ -104,52 +117,58 @@ def test_a_flow_runs_in_the_same_loop_and_repeats(flow_run):
     chex.assert_tree_all_finite(state.belief)
     assert state.belief.mixture.means.shape == (FLOW.components, 2)
     assert info.fit.loss.shape == (2, 1, FLOW.epochs) and np.isfinite(info.fit.loss).all()
-    assert np.all((info.correction.inside > 0) & (info.correction.inside <= 1))
+    assert np.all((info.correction.mass_inside > 0) & (info.correction.mass_inside <= 1))
 
 
-def test_a_flows_mixture_has_the_moments_of_its_draws_inside(flow_run):
-    _, (state, _) = flow_run
-    support, key = Support([-1.0, -2.0], [2.0, 1.5]), jax.random.key(1)
-    mixture, inside = jax.jit(posterior, static_argnums=1)(key, FLOW, state.network, X, state.feasible, support)
-    draws = draw(jax.random.key(2), FLOW, state.network, X, state.feasible, 20000)
-    kept = np.asarray(draws)[np.asarray(support.contains(draws))]
-    assert float(inside) == pytest.approx(len(kept) / 20000, abs=0.08)  # 5 standard errors of 1000 draws
-    assert 0.05 < float(inside) < 0.95  # a test without draws outside would say nothing
+def test_a_flows_mixture_has_the_moments_of_its_draws_inside(network):
+    posterior = jax.jit(Network.condition)(network, X, SUPPORT, jax.random.key(1))
+    draws = free_draws(network, 20000)
+    kept = draws[np.asarray(SUPPORT.contains(draws))]
+    # Both are Monte Carlo estimates, of 10000 and of 20000 draws.
+    assert float(posterior.mass_inside) == pytest.approx(
+        len(kept) / 20000, abs=5 * 0.5 * np.sqrt(1 / 10000 + 1 / 20000)
+    )
+    assert 0.05 < float(posterior.mass_inside) < 0.95  # a test without draws outside would say nothing
     scale = kept.std(0)
-    np.testing.assert_allclose((np.asarray(mixture.mean) - kept.mean(0)) / scale, 0, atol=0.2)
-    np.testing.assert_allclose(np.sqrt(np.diag(np.asarray(mixture.covariance))) / scale, 1, atol=0.15)
+    np.testing.assert_allclose((np.asarray(posterior.mixture.mean) - kept.mean(0)) / scale, 0, atol=0.2)
+    np.testing.assert_allclose(np.sqrt(np.diag(np.asarray(posterior.mixture.covariance))) / scale, 1, atol=0.15)
 
 
-def test_draws_within_are_the_flows_own_cut_to_the_box(flow_run):
-    _, (state, _) = flow_run
-    support = Support([-1.0, -2.0], [2.0, 1.5])
-    draws, inside = draws_within(jax.random.key(3), FLOW, state.network, X, state.feasible, support, 4000)
-    draws = np.asarray(draws)
-    assert draws.shape == (4000, 2) and np.asarray(support.contains(draws)).all()
+def test_draws_of_the_posterior_are_the_flows_own_truncated_to_the_box(network):
+    posterior = jax.jit(Network.condition)(network, X, SUPPORT)
+    draws = np.asarray(posterior.sample(jax.random.key(3), 4000))
+    assert draws.shape == (4000, 2) and np.asarray(SUPPORT.contains(draws)).all()
     assert len(np.unique(draws, axis=0)) == 4000
-    free = np.asarray(draw(jax.random.key(4), FLOW, state.network, X, state.feasible, 40000))
-    kept = free[np.asarray(support.contains(free))]
+    free = free_draws(network, 40000)
+    kept = free[np.asarray(SUPPORT.contains(free))]
     for d in range(2):
         assert ks_2samp(draws[:, d], kept[:, d]).pvalue > 1e-4
-    assert float(inside) == pytest.approx(len(kept) / len(free), abs=0.02)
-    # A box that the flow never reaches is given in bounded time, and honestly: nothing was inside.
-    far = Support([8.0, 8.0], [9.0, 9.0])
-    clipped, none = draws_within(jax.random.key(3), FLOW, state.network, X, state.feasible, far, 50)
-    assert float(none) == 0 and np.asarray(far.contains(clipped)).all()
+    # In a box that the flow never reaches, draws are those of its mixture, truncated, and nothing counts as inside.
+    far = jax.jit(Network.condition)(network, X, Support([8.0, 8.0], [9.0, 9.0]))
+    there = np.asarray(far.sample(jax.random.key(3), 500))
+    assert float(far.mass_inside) == 0 and np.asarray(far.support.contains(there)).all()
+    assert len(np.unique(there, axis=0)) > 450 and (there > 8.0).all(1).mean() > 0.99
 
 
-def test_members_take_turns():
-    estimator = dataclasses.replace(FLOW, ensemble_size=2)
+def test_networks_of_an_ensemble_are_drawn_from_alike_and_in_random_order():
+    estimator = FLOW.replace(ensemble_size=2)
     scale = Support([-10.0, -10.0], [10.0, 10.0])
-    nothing = bayessim.datasets.empty(4, 2, 2)
-    network = Network(initialise(jax.random.key(0), estimator, 2, 2), *normalisers(estimator, nothing, scale))
+    network = untrained(jax.random.key(0), estimator, 2, scale, TASK.space)
     apart = network.replace(
         theta_normaliser=network.theta_normaliser.replace(mean=jnp.array([0.5, -0.5]), scale=jnp.array([0.01, 0.02]))
     )
-    draws = np.asarray(draw(jax.random.key(1), estimator, apart, jnp.zeros(2), scale, 2000))
+    draws = np.asarray(estimator.density(apart, jnp.zeros(2)).sample(jax.random.key(1), 2000))
     # Both start as standard normals, which the normaliser and the box place and stretch, each side by its own.
     np.testing.assert_allclose(draws.mean(0), [5.0, -5.0], atol=0.03)
     np.testing.assert_allclose(draws.std(0), [0.1, 0.2], rtol=0.1)
+    # One of them moved apart, each draw is told by its place.
+    moved = jax.tree.map(lambda leaf: leaf, apart.params)
+    bias = moved["params"]["transform_0_bias_1"]
+    moved["params"]["transform_0_bias_1"] = bias.at[1, :2].add(50.0)
+    two = np.asarray(estimator.density(apart.replace(params=moved), jnp.zeros(2)).sample(jax.random.key(1), 2000))
+    near = np.abs((two - [5.0, -5.0]) / [0.1, 0.2]).max(1) < 10
+    assert abs(near.mean() - 0.5) < 5 * 0.5 / np.sqrt(2000)
+    assert abs((near[1:] == near[:-1]).mean() - 0.5) < 5 * 0.5 / np.sqrt(1999)
 
 
 # ------------------------------------------------------------------------------------------ methods and folders
@@ -167,12 +186,12 @@ def test_methods_keep_the_budget():
         and npe.estimator.loss == "likelihood"
     )
     for settings in (apt, npe):
-        assert settings.check().estimator.is_flow
+        assert isinstance(settings.check().estimator, FlowEstimator)
     assert METHODS["bayessim"](QUICK) is QUICK
 
 
 SMALL_RUN = (
-    "infer gaussian_linear --method apt --family maf --transforms 1 --hidden 8 8 --epochs 2 --rounds 2 "
+    "infer gaussian_linear --method apt --estimator maf --transforms 1 --hidden 8 8 --epochs 2 --rounds 2 "
     "--simulations-per-round 20 "
     "--heuristic edge --no-figures --no-cache --out"
 )
@@ -193,26 +212,30 @@ def test_a_run_can_be_sampled(folder, tmp_path):
     assert cli.main(["sample", str(folder), "-n", "50", "--out", str(tmp_path / "draws.npz")]) == 0
     with np.load(tmp_path / "draws.npz") as arrays:
         np.testing.assert_allclose(np.array(rows[1:], float), arrays["theta"], rtol=1e-6)
-        belief = run_store.read_belief(folder)
-        assert np.asarray(belief.support.contains(arrays["theta"])).all()
-    first, _, _ = posterior_samples(folder, 50, seed=0)
-    other, _, _ = posterior_samples(folder, 50, seed=1)
+        belief = jaxlfi.load(folder).belief
+        assert np.asarray(belief.support.contains(jnp.asarray(arrays["theta"], jnp.float32))).all()
+        first = arrays["theta"]
+    posterior = jaxlfi.load(folder).posterior
+    np.testing.assert_allclose(posterior.sample(jax.random.key(0), 50), first, rtol=1e-5, atol=1e-6)
+    other = np.asarray(posterior.sample(jax.random.key(1), 50))
     assert np.abs(first - other).max() > 1e-3
 
 
 def test_a_library_run_draws_from_the_flow_and_saves_it(tmp_path):
     settings = Settings(estimator=FLOW, rounds=2, simulations_per_round=30, simulation_budget=30, restriction="reject")
     run = jaxlfi.infer(jax.random.key(0), TASK, X, support="ok", heuristic=jaxlfi.Edge(), settings=settings)
-    draws = np.asarray(run.sample(jax.random.key(0), 300))
+    draws = np.asarray(run.posterior.sample(jax.random.key(0), 300))
     run.save(tmp_path / "run")
-    saved, names, inside = posterior_samples(tmp_path / "run", 300, seed=0)
-    np.testing.assert_allclose(saved, draws, rtol=1e-5, atol=1e-5)
-    assert names == ["first", "second"] and 0 < inside <= 1
+    loaded = jaxlfi.load(tmp_path / "run", task=TASK).posterior
+    np.testing.assert_allclose(loaded.sample(jax.random.key(0), 300), draws, rtol=1e-5, atol=1e-5)
+    assert loaded.space.names == ("first", "second") and 0 < float(loaded.mass_inside) <= 1
+    theta = draws[:20]
+    np.testing.assert_allclose(loaded.log_prob(theta), run.posterior.log_prob(theta), rtol=1e-4, atol=1e-4)
 
 
-def test_the_ledger_tells_how_much_of_the_posterior_is_inside(folder):
+def test_the_ledger_says_how_much_of_the_posterior_is_inside(folder):
     ledger = run_store.read_ledger(folder)
-    assert all(0 <= line["inside"] <= 1 for line in ledger)
+    assert all(0 <= line["mass_inside"] <= 1 for line in ledger)
 
 
 @pytest.mark.parametrize("number", ["0", "-3"])
@@ -236,7 +259,7 @@ def test_bad_files_and_names_are_one_line(folder, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("damage", ["cut", "foreign", "missing"])
-def test_a_damaged_network_is_told(folder, tmp_path, capsys, damage):
+def test_a_damaged_network_is_reported(folder, tmp_path, capsys, damage):
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     network = copy / "network.npz"
@@ -256,7 +279,7 @@ def test_a_damaged_network_is_told(folder, tmp_path, capsys, damage):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--family", "glow"], "family"),
+        (["--estimator", "glow"], "estimator"),
         (["--loss", "hinge"], "loss"),
         (["--method", "apt", "--hidden", "8", "9"], "equal width"),
     ],

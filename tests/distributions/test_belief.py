@@ -10,10 +10,11 @@ from scipy import stats
 from jaxlfi.distributions.belief import RESTRICTIONS, Belief, uninformed
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.truncation import TRIES
 from tests.strategies import keys, problems
 
 CLIPPED = jax.jit(RESTRICTIONS["clip"], static_argnames="n")
-REJECTED = jax.jit(RESTRICTIONS["reject"], static_argnames=("n", "tries"))
+REJECTED = jax.jit(RESTRICTIONS["reject"], static_argnames="n")
 
 N = 20_000
 MEAN, SCALE = np.array([0.4, 5.0]), np.array([1.5, 0.7])
@@ -56,7 +57,7 @@ def test_clipping_puts_the_outside_mass_on_the_bounds(key):
 
 
 def test_rejection_draws_the_truncated_density(key):
-    draws = np.asarray(REJECTED(key, GAUSSIAN, n=N, tries=64))
+    draws = np.asarray(REJECTED(key, GAUSSIAN, n=N))
     for d in range(2):
         assert stats.kstest(draws[:, d], truncated(d).cdf).pvalue > 1e-3
     assert abs(np.corrcoef(draws.T)[0, 1]) < 5 / np.sqrt(N)
@@ -68,21 +69,22 @@ def test_rejection_far_outside_falls_back_to_uniform_draws(key):
         GAUSSIAN.support,
         jnp.asarray(True),
     )
-    draws = np.asarray(REJECTED(key, far, n=5000, tries=2))
+    draws = np.asarray(REJECTED(key, far, n=5000))
     for d in range(2):
         box = stats.uniform(float(far.support.low[d]), float(far.support.width[d]))
         assert stats.kstest(draws[:, d], box.cdf).pvalue > 1e-3
 
 
-def test_rejection_falls_back_only_where_no_try_is_inside(key):
-    """Half the mass far outside, tries = 1: half the draws are uniform, half are the narrow component's."""
+def test_rejection_falls_back_only_where_no_candidate_is_inside(key):
+    """A narrow component of a fiftieth of the mass, the rest far outside: 0.98^32 of the draws are uniform."""
     split = Belief(
-        GaussianMixture(jnp.zeros(2), jnp.array([[0.5], [100.0]]), jnp.full((2, 1, 1), 1e-3)),
+        GaussianMixture(jnp.log(jnp.array([0.02, 0.98])), jnp.array([[0.5], [100.0]]), jnp.full((2, 1, 1), 1e-3)),
         Support([0.0], [1.0]),
         jnp.asarray(True),
     )
-    narrow = np.abs(np.asarray(REJECTED(key, split, n=4000, tries=1)) - 0.5) < 5e-3
-    assert abs(narrow.mean() - 0.505) < 5 * 0.5 / np.sqrt(4000)
+    narrow = np.abs(np.asarray(REJECTED(key, split, n=4000)) - 0.5) < 5e-3
+    uniform = 0.98**TRIES
+    assert abs(narrow.mean() - (1 - 0.99 * uniform)) < 5 * 0.5 / np.sqrt(4000)
 
 
 def test_the_uninformed_belief_covers_its_box():

@@ -1,0 +1,275 @@
+"""What every density estimator keeps to: those that are registered, and one that somebody else wrote."""
+
+import dataclasses
+import functools
+
+import chex
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from scipy import stats
+
+from jaxlfi import plugins
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators import dataset as datasets
+from jaxlfi.estimators import registry
+from jaxlfi.estimators.base import Estimator, Network, untrained
+from jaxlfi.estimators.posterior import Posterior
+from jaxlfi.estimators.training import fit
+from jaxlfi.fields import declared, option
+from jaxlfi.io.serialise import from_json, to_json
+
+# --------------------------------------------------------------------------------- an estimator of another package
+
+
+@struct.dataclass
+class Logistic:
+    """Independent logistic variables, one vector of them for each x."""
+
+    mean: jax.Array
+    log_scale: jax.Array
+
+    def log_prob(self, theta):
+        """Log-density at theta."""
+        z = (theta - self.mean) * jnp.exp(-self.log_scale)
+        return jnp.sum(-z - 2 * jax.nn.softplus(-z) - self.log_scale, axis=-1)
+
+    def sample(self, key, n):
+        """`n` draws."""
+        return self.mean + jnp.exp(self.log_scale) * jax.random.logistic(key, (n, *self.mean.shape))
+
+
+class LogisticNetwork(nn.Module):
+    """From a summary to the density."""
+
+    dim: int
+    width: int
+
+    @nn.compact
+    def __call__(self, x):
+        """The density of each x."""
+        mean, log_scale = jnp.split(nn.Dense(2 * self.dim)(nn.tanh(nn.Dense(self.width)(x))), 2, axis=-1)
+        return Logistic(mean, jnp.tanh(log_scale) - 1.0)
+
+
+class OneFile(Estimator):
+    """All that a third party writes."""
+
+    width: int = option(8, low=1, help="units of the hidden layer")
+
+    def module(self, dim: int) -> nn.Module:
+        """The network."""
+        return LogisticNetwork(dim, self.width)
+
+
+# -------------------------------------------------------------------------------------------------- the suite
+
+COMMON = {
+    "hidden": (8, 8),
+    "transforms": 2,
+    "bins": 4,
+    "components": 2,
+    "ensemble_size": 2,
+    "epochs": 60,
+    "batch_size": 20,
+    "learning_rate": 1e-2,
+}
+"""Small settings; a family takes those that it has."""
+KINDS = {name: registry.load(name) for name in plugins.names(registry.GROUP)} | {"third party": OneFile}
+SPACE = Space(("rate", "shift"), (True, False))
+PHI = Support([np.log(0.1), -4.0], [np.log(20.0), 4.0])
+BOX = Support([np.log(0.4), -1.5], [np.log(6.0), 1.0])
+X = jnp.array([0.4, -1.3, 0.9])
+CELLS = 160
+
+
+def small(kind: type[Estimator]) -> Estimator:
+    """An instance of the family."""
+    return kind(**{name: value for name, value in COMMON.items() if name in declared(kind)}).check()
+
+
+def perturbed(estimator: Estimator) -> Network:
+    """A network away from its start, as one is that has seen simulations of a part of Phi."""
+    network = jax.jit(lambda key: untrained(key, estimator, 3, PHI, SPACE))(jax.random.key(0))
+    draw = np.random.default_rng(0)
+    params = jax.tree.map(lambda leaf: leaf + 0.15 * draw.normal(size=leaf.shape).astype(np.float32), network.params)
+    of_theta = network.theta_normaliser
+    if of_theta is not None:
+        of_theta = of_theta.replace(mean=jnp.array([0.2, -0.1]), scale=jnp.array([0.3, 0.25]))
+    return network.replace(params=params, theta_normaliser=of_theta)
+
+
+@dataclasses.dataclass
+class Case:
+    """A family, its network and the posterior of X, by a compiled program."""
+
+    estimator: Estimator
+    network: Network
+    posterior: Posterior
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def case(request) -> Case:
+    """One for each family."""
+    estimator = small(KINDS[request.param])
+    network = perturbed(estimator)
+    return Case(estimator, network, jax.jit(Network.condition)(network, X, BOX))
+
+
+def test_ours_are_registered():
+    assert {"mdn", "maf", "nsf"} <= set(KINDS)
+
+
+def test_families_are_found_by_their_names_and_written_to_json(case):
+    name = registry.name_of(case.estimator)
+    if isinstance(case.estimator, OneFile):
+        assert name.endswith("test_estimators:OneFile")
+        return
+    assert registry.load(name) is type(case.estimator)
+    assert from_json(to_json(case.estimator, registry.name_of), registry.load) == case.estimator
+
+
+def test_conditioning_is_the_same_compiled_and_not(case):
+    eager = case.network.condition(X, BOX)
+    theta = jnp.stack([BOX.centre, BOX.low, BOX.high])
+    np.testing.assert_allclose(
+        eager.log_prob(theta, space="inference"), case.posterior.log_prob(theta, space="inference"), atol=5e-3
+    )
+    assert float(eager.mass_inside) == pytest.approx(float(case.posterior.mass_inside), abs=2e-3)
+    # Fitting a mixture to draws may end in another order of its components, but not with other moments.
+    np.testing.assert_allclose(eager.mixture.mean, case.posterior.mixture.mean, atol=0.02)
+    np.testing.assert_allclose(eager.mixture.covariance, case.posterior.mixture.covariance, atol=0.05)
+
+
+def test_conditioning_can_be_mapped_over_observations(case):
+    x = jnp.stack([X, -X])
+    both = jax.jit(jax.vmap(lambda x: case.network.condition(x, BOX).log_prob(BOX.centre, space="inference")))(x)
+    assert float(both[0]) == pytest.approx(float(case.posterior.log_prob(BOX.centre, space="inference")), abs=5e-3)
+    assert abs(float(both[1] - both[0])) > 0.01  # it sees x
+
+
+def test_some_of_the_density_is_inside_and_some_is_not(case):
+    """Else the tests below would say nothing."""
+    assert 0.02 < float(case.posterior.mass_inside) < 0.98
+
+
+@functools.cache
+def cells(natural: bool) -> tuple[np.ndarray, float, tuple[np.ndarray, np.ndarray]]:
+    """Middles of the cells of BOX, [n, n, 2], their area, and the cells' upper edges."""
+    low, high = np.asarray(BOX.low, float), np.asarray(BOX.high, float)
+    if natural:
+        low, high = np.array([np.exp(low[0]), low[1]]), np.array([np.exp(high[0]), high[1]])
+    width = (high - low) / CELLS
+    axes = [low[d] + width[d] * (np.arange(CELLS) + 0.5) for d in range(2)]
+    edges = tuple(axis + 0.5 * w for axis, w in zip(axes, width, strict=True))
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32), float(width.prod()), edges
+
+
+@pytest.mark.parametrize("space", ["natural", "inference"])
+def test_the_density_is_one_in_all_inside_and_nothing_outside(case, space):
+    theta, area, _ = cells(space == "natural")
+    log_prob = np.asarray(jax.jit(lambda p: p.log_prob(theta, space))(case.posterior), float)
+    assert np.isfinite(log_prob).all()
+    mass = float(case.posterior.mass_inside)
+    # The truncation constant has the error of 10000 draws; a flow's density has kinks that cells blur.
+    assert np.exp(log_prob).sum() * area == pytest.approx(1, abs=0.02 + 5 * np.sqrt((1 - mass) / mass / 10_000))
+    (low, bottom), (high, top) = theta[0, 0], theta[-1, -1]
+    outside = jnp.array([[low, bottom - 1], [high, top + 1], [high + 5, 0.0], [-100.0, 0.0]])
+    assert np.isneginf(case.posterior.log_prob(outside, space)).all()
+
+
+def test_draws_are_inside_and_have_the_density(case, key):
+    draws = np.asarray(case.posterior.sample(key, 3000, space="inference"))
+    assert draws.shape == (3000, 2)
+    assert ((draws > np.asarray(BOX.low)) & (draws < np.asarray(BOX.high))).all()
+    assert len(np.unique(draws, axis=0)) == 3000
+    theta, _, edges = cells(False)
+    density = np.exp(np.asarray(jax.jit(lambda p: p.log_prob(theta, "inference"))(case.posterior), float))
+    for d in range(2):
+        cdf = np.cumsum(density.sum(1 - d)) / density.sum()
+        law = lambda t, d=d, cdf=cdf: np.interp(t, np.append(float(BOX.low[d]), edges[d]), np.append(0.0, cdf))
+        assert stats.kstest(draws[:, d], law).pvalue > 1e-3
+    mass = density / density.sum()
+    centred = theta.reshape(-1, 2) - mass.reshape(-1) @ theta.reshape(-1, 2)
+    covariance = (centred * mass.reshape(-1, 1)).T @ centred
+    correlation = covariance[0, 1] / np.sqrt(np.prod(np.diag(covariance)))
+    assert np.corrcoef(draws.T)[0, 1] == pytest.approx(correlation, abs=5 / np.sqrt(3000))
+
+
+def test_draws_in_natural_units_are_the_same_draws(case, key):
+    inner = case.posterior.sample(jax.random.clone(key), 20, space="inference")
+    np.testing.assert_allclose(case.posterior.sample(key, 20), SPACE.to_natural(inner), rtol=1e-5)
+
+
+def test_the_mixture_is_like_the_density(case, key):
+    """What heuristics and proposals see: truncated to the box, it has the moments of the posterior's draws."""
+    mixture = case.posterior.mixture
+    assert mixture.logits.shape == (case.estimator.ensemble_size * case.estimator.components,)
+    chex.assert_tree_all_finite((mixture.means, mixture.scale_tril))
+    first, second = jax.random.split(key)
+    draws = np.asarray(case.posterior.sample(first, 3000, space="inference"))
+    like = case.posterior.replace(density=mixture, mass_inside=jnp.ones(()))
+    others = np.asarray(like.sample(second, 3000, space="inference"))
+    scale = draws.std(0)
+    np.testing.assert_allclose((others.mean(0) - draws.mean(0)) / scale, 0, atol=0.2)
+    np.testing.assert_allclose(others.std(0) / scale, 1, atol=0.2)
+
+
+def test_the_maximum_is_above_all_draws(case, key):
+    draws = case.posterior.sample(key, 500)
+    peak = case.posterior.map()
+    assert float(case.posterior.log_prob(peak)) >= float(case.posterior.log_prob(draws).max()) - 1e-3
+
+
+def test_posteriors_are_pytrees(case):
+    leaves, structure = jax.tree.flatten(case.posterior)
+    theta = BOX.centre[None]
+    np.testing.assert_array_equal(
+        jax.tree.unflatten(structure, leaves).log_prob(theta, "inference"), case.posterior.log_prob(theta, "inference")
+    )
+
+
+def test_training_lowers_the_loss(case):
+    """theta from the box, x a linear map of it with noise."""
+    draw = np.random.default_rng(1)
+    theta = draw.uniform(BOX.low, BOX.high, (80, 2)).astype(np.float32)
+    x = theta @ np.float32([[1.0, 0.4, 0.0], [-0.2, 0.8, 1.0]]) + 0.1 * draw.normal(size=(80, 3)).astype(np.float32)
+    dataset = datasets.empty(80, 2, 3).replace(theta=jnp.asarray(theta), x=jnp.asarray(x), size=jnp.asarray(80))
+
+    def train(key):
+        network = untrained(key, case.estimator, 3, PHI, SPACE).with_normalisers(dataset)
+        return fit(jax.random.key(1), network, dataset, jnp.ones(80), 80)
+
+    network, info = jax.jit(train)(jax.random.key(0))
+    loss = np.asarray(info.loss)
+    assert loss.shape == (2, 60) and np.isfinite(loss).all() and int(info.nonfinite.sum()) == 0
+    assert (loss[:, -5:].mean(axis=1) < loss[:, 0] - 0.5).all()
+    chex.assert_tree_all_finite(network.params)
+
+
+def test_what_is_no_estimator_is_refused():
+    for wrong, told in (
+        ("glow", "expected one of"),
+        ("builtins:dict", "a class derived from Estimator"),
+        ("jaxlfi.estimators.base:Estimator", "with all its methods"),
+        ("jaxlfi.estimators.flow_estimators:FlowEstimator", "with all its methods"),
+        ("no_such_module:Thing", "cannot load"),
+    ):
+        with pytest.raises(ValueError, match=f"^estimator: .*{told}") as error:
+            registry.load(wrong)
+        assert "\n" not in str(error.value)
+
+
+def test_settings_that_families_share_are_kept_from_one_to_another():
+    mdn, nsf = KINDS["mdn"](hidden=(9, 9), ensemble_size=3, prune=0.1), KINDS["nsf"]
+    other = registry.converted(mdn, nsf, {"bins": 7})
+    assert type(other) is nsf and (other.hidden, other.ensemble_size, other.bins) == ((9, 9), 3, 7)
+    assert registry.converted(mdn, KINDS["mdn"], {"prune": 0.2}) == mdn.replace(prune=0.2)
+    with pytest.raises(ValueError, match=r"^bins: expected a setting of MixtureNetwork"):
+        registry.converted(mdn, KINDS["mdn"], {"bins": 7})
+    with pytest.raises(ValueError, match=r"^bins: expected a whole number in \[1, 999\], got 0"):
+        registry.converted(mdn, nsf, {"bins": 0})

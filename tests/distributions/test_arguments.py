@@ -1,0 +1,32 @@
+"""Checks of arguments at the doors of the library."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlfi.distributions.arguments import is_concrete, require_count, require_key
+
+
+def test_a_key_is_one_typed_key():
+    key = jax.random.key(3)
+    assert require_key(key) is key
+    for wrong in (0, jax.random.PRNGKey(0), jax.random.split(key), np.zeros(2), None, "key"):
+        with pytest.raises(ValueError, match=r"^key: expected one key such as jax.random.key\(0\), got"):
+            require_key(wrong)
+
+
+def test_counts_are_whole_and_large_enough():
+    assert require_count(3, "n") == 3
+    assert require_count(np.int64(2), "n") == 2
+    assert require_count(0, "n", least=0) == 0
+    for wrong in (0, -1, 2.5, 2.0, True, "3", None, [1]):
+        with pytest.raises(ValueError, match=r"^n: expected a whole number of at least 1, got"):
+            require_count(wrong, "n")
+
+
+def test_tracers_are_seen_anywhere_in_a_tree():
+    seen = []
+    jax.jit(lambda x: seen.append(is_concrete({"a": jnp.ones(2), "b": (x, 1)})))(1.0)
+    assert seen == [False]
+    assert is_concrete({"a": jnp.ones(2), "b": (np.ones(1), 1, None)})

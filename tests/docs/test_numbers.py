@@ -1,0 +1,322 @@
+"""Numbers in experiments/README.md are those of the arrays that are kept: each text is made anew and looked up there.
+
+What a passage says is written here once more, with every number computed from a file of experiments/results.
+"""
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxlfi.cli.commands import bootstrap_interval
+
+ROOT = Path(__file__).parents[2] / "experiments"
+RESULTS = ROOT / "results"
+README = " ".join((ROOT / "README.md").read_text().split())
+SUPPORTS = ("ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre")
+
+
+def arrays(name: str) -> dict[str, np.ndarray]:
+    with np.load(RESULTS / f"{name}.npz") as file:
+        return dict(file)
+
+
+def rows(name: str) -> list[dict[str, str]]:
+    with (RESULTS / name / "table.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def column(name: str, measure: str, **where: str) -> np.ndarray:
+    """One measure of a table's rows that have these values."""
+    chosen = [row for row in rows(name) if all(row[key] == value for key, value in where.items())]
+    return np.array([float(row[measure]) for row in chosen])
+
+
+def with_interval(values: np.ndarray, median: bool = True) -> str:
+    """A mean with its 95 % bootstrap interval, and the median."""
+    low, high = bootstrap_interval(values)
+    return f"{values.mean():.2f} [{low:.2f}, {high:.2f}]" + f" ({np.median(values):.2f})" * median
+
+
+def ablation(variant: str) -> dict[str, np.ndarray]:
+    """Summed errors of each configuration, shape [seeds]."""
+    kept = arrays(f"ablation/{variant}")
+    return dict(zip(kept["configurations"].tolist(), kept["theta_error"], strict=True))
+
+
+VARIANTS = sorted(path.stem for path in (RESULTS / "ablation").glob("*.npz"))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_ablation(variant):
+    change = json.loads((RESULTS / f"ablation/{variant}.json").read_text())["change"]
+    errors = ablation(variant)
+    cells = [with_interval(errors[name]) if name in errors else "" for name in SUPPORTS]
+    row = " | ".join([f"| `{variant}`", change, *cells])
+    assert " ".join(row.split()) in README
+
+
+def difference(errors: dict[str, np.ndarray], one: str, other: str) -> str:
+    """A paired difference of two configurations."""
+    return with_interval(errors[one] - errors[other], median=False)
+
+
+def test_claims_at_twenty_seeds():
+    errors, every = ablation("quick"), arrays("ablation/quick")
+    names = every["configurations"].tolist()
+    by_parameter = dict(zip(names, every["theta_error_by_parameter"].mean(axis=1), strict=True))
+    success = dict(zip(names, every["succeeded"].sum(axis=1) / every["attempted"].sum(axis=1), strict=True))
+    wrong, fine, broad, edge = (errors[name] for name in ("misspecified", "ok", "broad", "misspecified+edge"))
+    texts = [
+        f"{with_interval(wrong, False)} against {with_interval(fine, False)} on the OK support",
+        "their errors are {:.2f} and {:.2f} against {:.2f} and {:.2f}".format(
+            *by_parameter["misspecified"][2:], *by_parameter["ok"][2:]
+        ),
+        f"holds: {broad.mean():.2f} ({np.median(broad):.2f}), worse than OK by {difference(errors, 'broad', 'ok')}",
+        f"in the first round {success['broad'][0]:.0%} of the broad support's".replace("%", " %"),
+        f"and {success['ok'][0]:.0%} of the OK support's".replace("%", " %"),
+        f"in the last {success['broad'][-1]:.0%} and {success['ok'][-1]:.0%}".replace("%", " %"),
+        f"holds, strongly: {with_interval(edge)}",
+        f"lower in {np.sum(edge < wrong)} of {len(edge)} seeds",
+        f"(difference {difference(errors, 'misspecified+centre', 'misspecified+edge')})",
+        f"({difference(errors, 'misspecified+mode', 'misspecified+edge')})",
+        f"({difference(errors, 'misspecified+edge', 'ok')} above it",
+        f"EDGE does, by {difference(errors, 'broad', 'misspecified+edge')}",
+        f"(by {difference(errors, 'broad', 'misspecified+centre')}",
+        "{:.2f} ({:.2f}), between the other two".format(
+            errors["misspecified+mode"].mean(), np.median(errors["misspecified+mode"])
+        ),
+    ]
+    assert_printed(texts)
+
+
+def assert_printed(texts: list[str]) -> None:
+    missing = [text for text in texts if " ".join(text.split()) not in README]
+    assert missing == [], "computed from the arrays, and not in experiments/README.md"
+
+
+def test_wider_and_wider_supports():
+    names = ("ok", "broad", "broader", "broadest")
+    errors = {name: column("wide", "theta_error", configuration=name) for name in names}
+    shown = [f"{values.mean():.2f} ({np.median(values):.2f})" for values in errors.values()]
+    first = f"from {errors['ok'].mean():.2f} (median {np.median(errors['ok']):.2f})"
+    assert_printed([f"{first} on the OK support to {shown[1]}, {shown[2]} and {shown[3]}"])
+
+
+def test_flows():
+    apt = lambda folder, name: column(folder, "theta_error", configuration=name)
+    assert_printed(
+        [
+            f"{with_interval(apt('apt', 'ok'))} on the OK support",
+            f"{with_interval(apt('apt', 'misspecified+edge'))} on the misspecified one with EDGE",
+            f"bring it to {with_interval(apt('apt-fast', 'misspecified+edge'))}",
+        ]
+    )
+
+
+def test_edge_grid():
+    grid = arrays("edge-grid/grid")
+    error, success = grid["theta_error"].mean(axis=-1), grid["success_rate"].mean(axis=-1)
+    chosen = error[1, 1, 1]
+    by_step, by_threshold = error.mean(axis=(0, 1)), error.mean(axis=(0, 2))
+    assert_printed(
+        [
+            f"ends between {error.min():.2f} and {error.max():.2f}",
+            f"They give {chosen:.2f} ({np.sum(error < chosen)} of {error.size} combinations are lower",
+            f"({by_threshold[2]:.2f} against {by_threshold[0]:.2f})",
+            f"({by_step[2]:.2f} at 0.4, {by_step[1]:.2f} at 0.2, {by_step[0]:.2f} at 0.1)",
+            f"{success.min():.0%} to {success.max():.0%}, {success.mean():.0%} in the mean".replace("%", " %"),
+            f"they have the least ({success[1, 1, 1]:.0%})".replace("%", " %"),
+        ]
+    )
+    assert success[1, 1, 1] == success.min()
+
+
+def test_mode_grid():
+    grid = arrays("mode-grid/grid")
+    error, success = grid["theta_error"].mean(axis=-1), grid["success_rate"].mean(axis=-1)
+    chosen, pairs = error[1, 1, 1, 1], error.mean(axis=(0, 2))
+    assert pairs.min() == pairs[1, 1]
+    assert np.sum(error < chosen) == 9
+    assert_printed(
+        [
+            f"are the best pair ({pairs[1, 1]:.2f} ±",
+            f"the chosen four together, {chosen:.2f}, are tenth of {error.size}",
+            f"combinations range from {error.min():.2f} to {error.max():.2f}",
+            "{:.1f} % where the range is {:.1f} % to {:.1f} %".format(
+                *(100 * value for value in (success[1, 1, 1, 1], success.min(), success.max()))
+            ),
+            f"{success.mean():.0%} here in the mean".replace("%", " %"),
+        ]
+    )
+
+
+@pytest.mark.parametrize("name", SUPPORTS)
+def test_mg1(name):
+    kept = arrays("mg1/errors")
+    cells = [f"{kept[f'{name}/{measure}'].mean():.2f}" for measure in ("plain", "sorted", "trajectory", "entropy")]
+    assert_printed([f"| {name} | {' | '.join(cells)} |"])
+
+
+UNMIRRORED = ("ok", "unmirrored", "unmirrored+edge", "unmirrored+mode", "unmirrored+centre")
+
+
+@pytest.mark.parametrize("name", UNMIRRORED)
+def test_mg1_unmirrored(name):
+    kept = arrays("mg1-unmirrored/errors")
+    low, high = bootstrap_interval(kept[f"{name}/sorted"])
+    cells = [f"{kept[f'{name}/{measure}'].mean():.2f}" for measure in ("sorted", "trajectory", "entropy")]
+    row = f"| {name} | {cells[0]} [{low:.2f}, {high:.2f}] | {cells[1]} | {cells[2]} |"
+    assert row in README.replace("**", "")
+
+
+BASELINES = sorted(path.stem for path in (RESULTS / "baselines").glob("*.npz"))
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_baselines(name):
+    kept, edge = arrays(f"baselines/{name}"), arrays("baselines/misspecified+edge")
+    error = kept["theta_error"]
+    gap = "" if name == "misspecified+edge" else with_interval(error - edge["theta_error"], median=False)
+    success = np.mean(kept["succeeded"].sum(axis=-1) / kept["attempted"].sum(axis=-1))
+    row = f"| `{name}` | {with_interval(error)} | {gap} | {np.nanmean(kept['trajectory_error']):.2f} | {success:.0%} |"
+    assert_printed([row.replace("% |", " % |")])
+
+
+def test_diagnostics():
+    found = {}
+    for name in ("gaussian_linear", "misspecified", "edge"):
+        checks = json.loads((RESULTS / f"diagnostics/{name}/diagnostics.json").read_text())["checks"]
+        found[name] = {check["name"]: check["statistic"] for check in checks}
+    support, regions, tarp, classifier = (
+        [found[name][check] for name in found]
+        for check in (
+            "final support",
+            "coverage of densest regions",
+            "coverage from random points (TARP)",
+            "classifier, draws or truths",
+        )
+    )
+    held = [re.search(r"\d+ of \d+", text)[0] for text in support]
+    at = lambda texts: [re.search(r"90%: ([\d.]+)", text)[1] for text in texts]
+    densest, points = at(regions), at(tarp)
+    plain = README.replace("**", "")
+    for text in (
+        f"| {held[0]} truths | {held[1]} | {held[2]} |",
+        f"hold | {densest[0]}, ok | {densest[1]} | {densest[2]}, over-confident |",
+        f"hold | {points[0]}, ok | {points[1]}, over-confident | {points[2]}, over-confident |",
+        f"| {classifier[0]}, ok | {classifier[1]} | {classifier[2]}, ok |",
+    ):
+        assert text in plain
+
+
+def test_paper_preset():
+    ledger = [json.loads(line) for line in (RESULTS / "paper/ledger.jsonl").read_text().splitlines()]
+    errors = ", ".join(f"{line['theta_error']:.1f}" for line in ledger)
+    assert_printed([f"Summed error by round: {errors}."])
+
+
+def test_sbibm():
+    """Mean and standard deviation over observations, of every cell."""
+    values: dict[tuple, list[float]] = {}
+    with (RESULTS / "sbibm/table.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            values.setdefault((row["task"], row["method"], row["simulations"]), []).append(float(row["c2st"]))
+    printed = np.array(re.findall(r"(0\.\d{3}) ± (0\.\d{3})", README), float)
+    assert len(printed) == len(values)
+    for cell, found in values.items():  # the table keeps four digits
+        off = np.abs(printed - [np.mean(found), np.std(found, ddof=1)])
+        assert np.any(np.all(off < 6e-4, axis=1)), cell
+
+
+def same(text: str, value: float) -> bool:
+    """Whether a printed number is a value, to its own digits; tables keep one digit more or two."""
+    digits = len(text.partition(".")[2])
+    return abs(float(text) - value) <= 0.51 * 10.0**-digits
+
+
+SIM2SIM = [row for row in rows("sim2sim") if row["truths"] in ("inside", "outside")]
+
+
+@pytest.mark.parametrize("row", SIM2SIM, ids=lambda row: "-".join((row["detector"], row["truths"], row["support"])))
+def test_sim2sim(row):
+    """Errors as printed are the table's."""
+    label = {"fixed": "fixed", "edge": "EDGE"}[row["support"]]
+    section = README[README.index("## The whip: known truth") :]
+    section = section[section.index(f"| {row['detector']} | 20 inside") :]
+    section = section if row["truths"] == "inside" else section[section.index("| 8 outside") :]
+    cells = [cell.strip() for cell in section[section.index(f"| {label} |") :].split("|")[2:6]]
+    printed = [cells[0], cells[1], *cells[2].split(", ")]
+    columns = ("length error [mm]", "ln E error", "length sd / width", "ln E sd / width")
+    for text, name in zip(printed, columns, strict=True):
+        assert same(text, float(row[name])), name
+    held = [round(float(row[name]) * int(row["n"])) for name in ("length in 90 %", "ln E in 90 %")]
+    assert cells[3] == f"{held[0]}, {held[1]} of {row['n']}"
+
+
+@pytest.mark.parametrize("configuration", ["initial", "initial+edge"])
+@pytest.mark.parametrize("dlo", ["dlo-0", "dlo-1", "dlo-2", "dlo-3"])
+def test_real2sim(dlo, configuration):
+    """Median and interval of seed 0, medians of the other seeds, and the final support of the modulus."""
+    found = [row for row in rows("real2sim") if row["object"] == dlo and row["configuration"] == configuration]
+    section = README[README.index(f"| {dlo}: ") :]
+    label = "EDGE" if "edge" in configuration else "fixed"
+    cells = [cell.strip() for cell in section[section.index(f"| {label} |") :].split("|")[2:7]]
+    numbers = lambda text: re.findall(r"[\d.]+(?:e\+\d+)?", text)
+    assert cells[0] == found[0]["length [mm]"]
+    assert numbers(cells[1]) == [numbers(row["length [mm]"])[0] for row in found[1:]]
+    kept = [float(value) for value in numbers(found[0]["E [kPa]"])]
+    assert all(map(same, numbers(cells[2]), kept)) and len(numbers(cells[2])) == 3
+    assert all(map(same, numbers(cells[3]), (float(numbers(row["E [kPa]"])[0]) for row in found[1:])))
+    support = [float(value) for value in numbers(found[0]["support E [kPa]"])]
+    np.testing.assert_allclose([float(value) for value in numbers(cells[4])], support, rtol=0.05)
+
+
+def test_engines_of_the_whip():
+    measured = json.loads((RESULTS / "whip-engines/speed.json").read_text())["measured"]
+    for printed, name in (
+        ("native, one thread", "native, one thread"),
+        ("native, two threads", "native"),
+        ("MJX, two shards", "mjx"),
+    ):
+        cells = " | ".join(f"{measured[name][batch]['steps/s']:,.0f}" for batch in ("1", "12", "100", "1024"))
+        assert_printed([f"| {printed} | {cells} |"])
+
+
+def test_front_page():
+    """The figures below the first picture of the project's README."""
+    errors = ablation("quick")
+    wrong, edge, fine = (errors[name].mean() for name in ("misspecified", "misspecified+edge", "ok"))
+    text = f"the summed error is {wrong:.1f} on the wrong box, {edge:.1f} with EDGE, {fine:.1f} on a good box"
+    assert text in " ".join((ROOT.parent / "README.md").read_text().split())
+
+
+def test_bound_warnings():
+    """The chosen rule's hits and false alarms, from the posteriors that are kept."""
+    from jax import vmap
+
+    from jaxlfi.diagnostics.bounds import MASS_BEYOND, bound_evidence
+    from jaxlfi.distributions.belief import Belief
+    from jaxlfi.distributions.mixture import GaussianMixture
+    from jaxlfi.distributions.support import Support
+    from jaxlfi.envs.lotka_volterra import task
+
+    kept, truth = arrays("bound-warnings/named"), np.asarray(task().inference.truth)
+    hits, wrong, alarms, right, warned, runs = 0, 0, 0, 0, 0, 0
+    for name in ("ok", "misspecified", "broad"):
+        leaf = lambda part, name=name: kept[f"{name}/{part}"]
+        box = Support(leaf("support_low"), leaf("support_high"))
+        mixture = GaussianMixture(leaf("logits"), leaf("means"), leaf("scale_tril"))
+        evidence = vmap(bound_evidence)(Belief(mixture, box, np.ones(len(box.low), bool)))
+        named = np.stack(evidence) > MASS_BEYOND
+        beyond = np.stack([truth < box.low, truth > box.high])
+        hits, wrong = hits + np.sum(named & beyond), wrong + np.sum(beyond)
+        if not beyond.any():
+            alarms, right = alarms + np.sum(named), right + named.size
+            warned, runs = warned + np.sum(named.any(axis=(0, 2))), runs + named.shape[1]
+    (row,) = re.findall(r"\| \*\*now: more than [^|]+\|[^|]+\|[^|]+\|[^|]+\|", README)
+    for count, of in ((hits, wrong), (alarms, right), (warned, runs)):
+        assert f"({count} of {of})" in row

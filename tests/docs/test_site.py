@@ -1,0 +1,127 @@
+"""The documentation's pages: their directives, links, code and tables keep up with the code."""
+
+import ast
+import dataclasses
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+import jaxlfi
+from jaxlfi.bayessim.record import ledger_line, record
+from jaxlfi.fields import declared
+from jaxlfi.heuristics import Edge, Mode, Truncate
+from jaxlfi.runs import folder
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+
+
+def hooks():
+    spec = importlib.util.spec_from_file_location("docs_hooks", ROOT / "docs/hooks.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def text(name: str) -> str:
+    return (ROOT / "docs" / name).read_text()
+
+
+def test_directives_are_replaced_by_what_they_stand_for():
+    made = hooks()
+    words = made.rendered(text("words.md"))
+    assert "<!--" not in words
+    for kind in (Edge, Mode, Truncate, jaxlfi.Settings, jaxlfi.MixtureNetwork, jaxlfi.SplineFlow):
+        for name, field in declared(kind).items():
+            assert f"| `{name}` |" in words and field.info.help in words
+    commands = made.rendered(text("command-line.md"))
+    assert "<!--" not in commands and "--zone-fraction" in commands and "--simulations" in commands
+    assert "## own_heuristic.py" in made.rendered(text("examples.md"))
+
+
+def test_every_page_is_in_the_menu():
+    yaml = pytest.importorskip("yaml")
+    menu = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    named = set(re.findall(r"'([\w/-]+\.md)'", str(menu)))
+    assert named == {path.relative_to(ROOT / "docs").as_posix() for path in PAGES}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_links_and_modules_exist(page):
+    body = page.read_text()
+    for target in re.findall(r"\]\(([^)#\s]+)", re.sub(r"`[^`]*`", "", body)):
+        place = page.parent / target
+        if target.lstrip("./").startswith("results/"):
+            place = ROOT / "experiments" / target.lstrip("./")
+        assert place.exists(), target
+    for module in re.findall(r"^::: (\S+)$", body, re.MULTILINE):
+        assert importlib.util.find_spec(module), module
+    for reference in re.findall(r"\]\[(jaxlfi[\w.]+)\]", body):
+        module, _, name = reference.rpartition(".")
+        assert hasattr(importlib.import_module(module), name), reference
+    for snippet in re.findall(r'^--8<-- "([^"]+)"$', body, re.MULTILINE):
+        assert (ROOT / snippet).exists()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_python_in_pages_is_python_and_names_what_exists(page):
+    for body in re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL):
+        if "--8<--" in body:
+            continue
+        for node in ast.walk(ast.parse(body)):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "jaxlfi":
+                assert hasattr(jaxlfi, node.attr), node.attr
+
+
+def keys_of_return(function) -> set[str]:
+    """The literal keys of the dictionary that a function returns."""
+    import inspect
+
+    tree = ast.parse(inspect.getsource(function))
+    found = [node for node in ast.walk(tree) if isinstance(node, ast.Dict)]
+    return {key.value for key in found[0].keys if isinstance(key, ast.Constant)}
+
+
+def described(section: str) -> set[str]:
+    """Names in the first column of a section's table of the page on run folders."""
+    (body,) = re.findall(rf"^## {re.escape(section)}\n(.*?)(?=^## |\Z)", text("run-folders.md"), re.M | re.S)
+    rows = [line.split("|")[1] for line in body.splitlines() if line.startswith("| `")]
+    return {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
+
+
+def test_every_array_of_a_round_is_described():
+    assert keys_of_return(record) <= described("history.npz") | {"final_trajectory", "final_x"}
+    assert {"failed", "support_low", "support_high", "proposal_low", "proposal_high"} <= described("ledger.jsonl")
+    assert keys_of_return(ledger_line) <= described("ledger.jsonl")
+
+
+def test_every_key_of_a_configuration_is_described():
+    assert keys_of_return(folder.run_config) | keys_of_return(folder.environment) <= described("config.json")
+
+
+def test_every_array_of_a_written_run_is_described():
+    import inspect
+
+    source = ast.parse(inspect.getsource(folder.write_run))
+    dictionaries = [node for node in ast.walk(source) if isinstance(node, ast.Dict)]
+    names = {key.value for node in dictionaries for key in node.keys if isinstance(key, ast.Constant)}
+    parts = ("posterior.npz", "dataset.npz", "history.npz", "observation.npz")
+    assert names <= set().union(*(described(part) for part in parts))
+    assert {"theta", "x", "round", "weight"} <= described("dataset.npz")
+
+
+def test_every_public_name_is_in_the_index():
+    index = text("api/index.md")
+    exceptions = {"SimulatorError", "SupportWarning"}
+    missing = [name for name in jaxlfi.__all__ if name not in exceptions and not re.search(rf"\b{name}`", index)]
+    assert missing == []
+
+
+def test_settings_of_the_pages_are_fields():
+    fields = {field.name for field in dataclasses.fields(jaxlfi.Settings)} | set(declared(jaxlfi.MixtureNetwork))
+    for name in re.findall(r"`Settings\.(\w+)", "".join(page.read_text() for page in PAGES)):
+        assert name in fields

@@ -1,0 +1,233 @@
+"""Observation files and what is made of them; observations checked against the simulator, or simulated at the truth."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.host import HostSimulator, SimulatorError
+from jaxlfi.tasks.observation import checked, observe, read, read_for, simulate_observation, simulator_shapes
+from jaxlfi.tasks.task import Task
+
+VALUES = np.float32([8.0, 5.3626, 3.5946, -2.4096])
+COLUMN = VALUES[:, None]
+BOX = Support([0.5, 1.0], [3.0, 8.0])
+
+
+def decay(key, theta):
+    """A trajectory [4]."""
+    return theta[1] * jnp.exp(-theta[0] * jnp.arange(4.0)) + 0.1 * jax.random.normal(key, (4,))
+
+
+def task(simulate=decay, **changes) -> Task:
+    """Two parameters, the first in logarithms."""
+    return Task(simulate, ("rate", "start"), {"box": BOX}, BOX, log=("rate",), **changes)
+
+
+def lines(cells=VALUES, heading: str | None = None, row="{value}", end="\n") -> str:
+    """Rows of a file."""
+    rows = [row.format(index=i, value=f"{value:.4f}") for i, value in enumerate(cells)]
+    return end.join([heading, *rows] if heading is not None else rows) + end
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        lines(),
+        lines(heading="signal"),
+        lines(heading='"a signal, in mV"'),
+        lines(end="\r\n"),
+        lines(heading="signal", end="\r\n"),
+        lines(end="\n\n"),
+        "# a comment\n" + lines(),
+        lines(row=" {value} "),
+        lines(heading="time,signal", row="{index},{value}"),
+        lines(heading="Time (s),signal", row="{index},{value}"),
+        lines(heading="t [ms],signal", row="{index},{value}"),
+        lines(heading="seconds,signal", row="{index},{value}"),
+        lines(heading=",signal", row="{index},{value}"),  # the index that pandas writes
+        lines(heading="Year , signal", row="{index},{value}"),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+@pytest.mark.parametrize("suffix", [".csv", ".CSV"])
+def test_one_channel_is_read_with_every_record(tmp_path, text, encoding, suffix):
+    """A byte-order mark takes no record away, and a column of times or indices is no channel."""
+    path = tmp_path / f"x{suffix}"
+    path.write_text(text, encoding=encoding)
+    np.testing.assert_allclose(read(path), COLUMN, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0,8\n1,5\n", [[0, 8], [1, 5]]),  # without headings nothing says that the first column is a time
+        ("a,b\n0,8\n1,5\n", [[0, 8], [1, 5]]),
+        ("time\n0\n1\n", [[0], [1]]),  # the only column is the channel, whatever it is called
+        ("time,a,b\n0,8,-1\n1,5,2e3\n", [[8, -1], [5, 2000]]),
+        ("8,00000\n5,36256\n", [[8, 0], [5, 36256]]),  # decimal commas are two columns, refused by their shape
+    ],
+)
+def test_columns_are_channels(tmp_path, text, expected):
+    (tmp_path / "x.csv").write_text(text)
+    np.testing.assert_array_equal(read(tmp_path / "x.csv"), np.float32(expected))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "expected at least one row of numbers, got none"),
+        ("\n\n", "expected at least one row of numbers, got none"),
+        ("signal\n", "expected at least one row of numbers, got headings only"),
+        (lines() + "1,2\n", "expected 1 numbers in row 5, got '1,2'"),
+        (lines(row="{value},"), "expected a row of headings or a row of numbers first, got '8.0000,'"),
+        ("a,b\n1,2\n3,\n", "expected 2 numbers in row 3, got '3,'"),
+        ("signal\n1\nbroken\n2\n", "expected 1 numbers in row 3, got 'broken'"),
+        ("hello\nworld\n", "expected 1 numbers in row 2, got 'world'"),
+        ("8.0;1\n5.3;1\n", "expected 1 numbers in row 2, got '5.3;1'"),
+        ("8.0  5.3  3.5\n", "got headings only"),
+        ("1,a\n2,3\n", "expected a row of headings or a row of numbers first, got '1,a'"),
+    ],
+)
+def test_broken_files_are_told_in_one_line(tmp_path, text, told):
+    path = tmp_path / "x.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"^observation: cannot read .*x.csv': ") as error:
+        read(path)
+    assert told in str(error.value) and "\n" not in str(error.value)
+
+
+def test_other_files_are_refused(tmp_path):
+    (tmp_path / "latin.csv").write_bytes("größe\n8.0\n".encode("latin-1"))
+    (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04 not a zip")
+    for name in ("latin.csv", "broken.npz", "missing.csv", "missing.npz"):
+        with pytest.raises(ValueError, match=r"^observation: cannot read ") as error:
+            read(tmp_path / name)
+        assert "\n" not in str(error.value)
+    for name in ("x.npy", "x.txt", "x"):
+        with pytest.raises(ValueError, match=r"^observation: expected a .csv or .npz file, got"):
+            read(tmp_path / name)
+
+
+def test_arrays_are_read_as_they_are(tmp_path):
+    for name, arrays in {
+        "one": {"anything": np.arange(6).reshape(3, 2)},
+        "named": {"trajectory": np.arange(6.0).reshape(3, 2), "times": np.arange(3)},
+        "flags": {"trajectory": np.ones((3, 2), bool)},
+    }.items():
+        np.savez(tmp_path / f"{name}.npz", **arrays)
+        got = read(tmp_path / f"{name}.npz")
+        assert got.dtype == np.float32
+        np.testing.assert_array_equal(got, next(iter(arrays.values())))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "told"),
+    [
+        ({"a": np.ones(3), "b": np.ones(3)}, "expected an array called 'trajectory'"),
+        ({"trajectory": np.ones(3) + 1j}, "expected real numbers, got an array of type complex128"),
+        ({"trajectory": np.array(["8.0", "5.3"])}, "expected real numbers, got an array of type <U3"),
+        ({"trajectory": np.array([[1.0], None], object)}, "cannot read"),
+    ],
+)
+def test_arrays_that_are_no_numbers_are_refused(tmp_path, arrays, told):
+    """Object arrays are pickles, and never loaded."""
+    np.savez(tmp_path / "x.npz", **arrays)
+    with pytest.raises(ValueError, match=r"^observation: cannot read") as error:
+        read(tmp_path / "x.npz")
+    assert told in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_file_takes_the_simulators_shape_where_only_axes_of_one_differ(tmp_path):
+    (tmp_path / "x.csv").write_text(lines())
+    assert read_for(task(), tmp_path / "x.csv").shape == (4,)
+    assert read_for(task(lambda key, theta: jnp.zeros((4, 1, 1))), tmp_path / "x.csv").shape == (4, 1, 1)
+    # Another shape stays as it is, and is refused in the simulator's terms.
+    assert read_for(task(lambda key, theta: jnp.zeros(5)), tmp_path / "x.csv").shape == (4, 1)
+    host = task(HostSimulator(lambda rng, theta: theta))
+    assert read_for(host, tmp_path / "x.csv").shape == (4, 1)
+
+
+# -------------------------------------------------------------------------------------------------- checking
+
+
+def test_shapes_are_found_without_running_the_simulator():
+    shapes = simulator_shapes(task(summary=lambda trajectory: trajectory[:3]))
+    assert (shapes.trajectory, shapes.summary) == ((4,), 3)
+    with_outcome = task(lambda key, theta: (decay(key, theta), theta[0] > 0))
+    assert simulator_shapes(with_outcome).trajectory == (4,)
+
+
+@pytest.mark.parametrize(
+    ("simulate", "told"),
+    [
+        (lambda key, theta: np.asarray(theta), r"expected a function JAX can trace \(wrap .* jaxlfi.HostSimulator\)"),
+        (lambda key, theta: 1 / 0, "got ZeroDivisionError: division by zero"),
+        (lambda key, theta: theta["rate"], "expected a function JAX can trace"),
+        (lambda key, theta: theta[0], "expected one array"),
+        (lambda key, theta: {"x": theta}, "expected one array"),
+        (lambda key, theta: None, "expected one array"),
+        (lambda key, theta: (theta, theta), "expected a scalar outcome"),
+        (lambda: None, "got TypeError"),
+    ],
+)
+def test_simulators_that_break_their_contract_are_told_in_one_line(simulate, told):
+    with pytest.raises(SimulatorError, match=f"^simulate: .*{told}") as error:
+        simulator_shapes(task(simulate))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "summary", [lambda trajectory: trajectory[0], lambda trajectory: trajectory["x"], lambda x: x.reshape(2, 2)]
+)
+def test_summaries_that_are_no_vectors_are_told_in_one_line(summary):
+    with pytest.raises(SimulatorError, match=r"^summary: expected a ") as error:
+        simulator_shapes(task(summary=summary))
+    assert "\n" not in str(error.value)
+
+
+def test_observations_have_the_simulators_shape_and_are_finite():
+    shapes = simulator_shapes(task())
+    taken = checked(VALUES.astype(np.float64), shapes)
+    assert taken.dtype == jnp.float32
+    np.testing.assert_array_equal(taken, VALUES)
+    for wrong in (COLUMN, VALUES[:3], 1.0):
+        with pytest.raises(ValueError, match=r"^observation: expected the shape the simulator produces, \[4\], got"):
+            checked(wrong, shapes)
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(ValueError, match=r"^observation: expected finite numbers"):
+            checked([*VALUES[:3], wrong], shapes)
+
+
+def test_an_observation_is_given_or_the_tasks_or_simulated_at_the_truth(key):
+    given, own = jnp.ones(4), np.full(4, 2.0, np.float32)
+    np.testing.assert_array_equal(observe(jax.random.clone(key), task(observation=own), given)[0], given)
+    np.testing.assert_array_equal(observe(jax.random.clone(key), task(observation=own), None)[0], own)
+    quiet = task(lambda key, theta: jnp.stack([theta[0], theta[1]]), truth=[2.0, 5.0])
+    observed, x = observe(jax.random.clone(key), quiet, None)
+    np.testing.assert_allclose(observed, [2.0, 5.0], rtol=1e-6)  # in natural units
+    np.testing.assert_allclose(x, [2.0, 5.0], rtol=1e-6)
+    with pytest.raises(ValueError, match=r"^observation: expected one, as the task has neither an observation nor"):
+        observe(key, task(), None)
+
+
+def test_a_summary_that_is_not_finite_is_refused(key):
+    broken = task(summary=jnp.log)
+    with pytest.raises(ValueError, match=r"^observation: expected a finite summary, got"):
+        observe(key, broken, VALUES)
+
+
+def test_the_truth_is_simulated_until_it_succeeds(key):
+    """Half of the simulations fail; and one that always fails is told."""
+    half = task(lambda key, theta: (theta, jax.random.bernoulli(key)), truth=[2.0, 5.0])
+    for k in jax.random.split(key, 8):
+        np.testing.assert_allclose(simulate_observation(k, half), [2.0, 5.0], rtol=1e-6)
+    never = task(lambda key, theta: (theta, False), truth=[2.0, 5.0])
+    with pytest.raises(SimulatorError, match="got 16 failures in 16 tries"):
+        simulate_observation(jax.random.key(0), never)
+    host = dataclasses.replace(never, simulate=HostSimulator(lambda rng, theta: 1 / 0))
+    with pytest.raises(SimulatorError, match=r"^simulate: ZeroDivisionError: division by zero$"):
+        simulate_observation(jax.random.key(0), host)
