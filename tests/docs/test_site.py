@@ -125,3 +125,10 @@ def test_settings_of_the_pages_are_fields():
     fields = {field.name for field in dataclasses.fields(jaxlfi.Settings)} | set(declared(jaxlfi.MixtureNetwork))
     for name in re.findall(r"`Settings\.(\w+)", "".join(page.read_text() for page in PAGES)):
         assert name in fields
+
+
+def test_contributing_names_files_that_exist():
+    for name in re.findall(
+        r"(?<![\w/])((?:tests|experiments|examples|docs)/[\w./]*\w)", (ROOT / "CONTRIBUTING.md").read_text()
+    ):
+        assert (ROOT / name).exists() or "NAME" in name, name
