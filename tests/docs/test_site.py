@@ -132,3 +132,12 @@ def test_contributing_names_files_that_exist():
         r"(?<![\w/])((?:tests|experiments|examples|docs)/[\w./]*\w)", (ROOT / "CONTRIBUTING.md").read_text()
     ):
         assert (ROOT / name).exists() or "NAME" in name, name
+
+
+@pytest.mark.parametrize(("page", "start"), [("calibration.md", "import numpy"), ("quickstart.md", "import numpy")])
+def test_short_blocks_of_pages_run(page, start, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"^```python\n(.*?)^```$", text(page), re.MULTILINE | re.DOTALL)
+    (body,) = [block for block in blocks if block.startswith(start)]
+    exec(compile(body, page, "exec"), {})
+    assert capsys.readouterr().out or (tmp_path / "pairs.png").exists()
