@@ -1,4 +1,4 @@
-"""Iterative BayesSim with support adaptation: Algorithm 1, lines 9-20, as init / step / run."""
+"""Iterative BayesSim with support adaptation: Algorithm 1, lines 6-17, as init / step / run."""
 
 from collections.abc import Callable
 from typing import Any
@@ -102,7 +102,7 @@ def init(
 
 
 def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> Float[Array, "attempts dim"]:
-    """Draw theta ~ p_i (line 11): the prior over Theta_0 in the first round, then the restricted posterior.
+    """Draw theta ~ p_i (line 8): the prior over Theta_0 in the first round, then the restricted posterior.
 
     A belief that is not informed is the prior over its support: so it is in the first round, and always by `Truncate`.
     A defensive fraction of the draws stays with the prior over the *current* support: it covers the ground that the
@@ -127,7 +127,7 @@ def update(
     round: Int[Array, ""] | int,
     simulations: Simulations,
 ) -> tuple[State, Round]:
-    """All of a round that comes after its simulations (lines 12-20)."""
+    """All of a round that comes after its simulations (lines 9-17)."""
     dataset = datasets.augment(state.dataset, simulations, round)
     proposals = jax.tree.map(lambda all_, now: all_.at[round].set(now), state.proposals, state.belief)
     correction = CORRECTIONS[settings.correction]
@@ -168,7 +168,7 @@ def step(
     state: State,
     round: Int[Array, ""] | int,
 ) -> tuple[State, Round]:
-    """One round of Algorithm 1 for a simulator in JAX (lines 11-20).
+    """One round of Algorithm 1 for a simulator in JAX (lines 8-17).
 
     Args:
         keys: of the round, consumed.
@@ -197,7 +197,7 @@ def run(
     support: Support,
     look: Callable[[Array, State, Round], Any] = lambda index, state, info: info,
 ) -> tuple[State, Any]:
-    """The whole inference, as one scan: Algorithm 1, lines 9-20.
+    """The whole inference, as one scan: Algorithm 1, lines 6-17.
 
     Pure: jit it, and vmap it over keys, supports, observations and the leaves of heuristics and settings.
 

@@ -65,7 +65,7 @@ def unchanged(task: Task, q: GaussianMixture, previous: Belief) -> tuple[Gaussia
 
 
 def times_reference(task: Task, q: GaussianMixture, previous: Belief) -> tuple[GaussianMixture, Array]:
-    """p-hat proportional to (p_i / p~) q, to the letter of line 14, reduced to as many components as q has.
+    """p-hat proportional to (p_i / p~) q, to the letter of line 11, reduced to as many components as q has.
 
     p~ is the prior: uniform, and then a constant, or a Gaussian that the task brings, which is divided out.
     """

@@ -157,7 +157,7 @@ class Network:
     space: Space = struct.field(pytree_node=False)
 
     def condition(self, x: Float[Array, " obs"], support: Support, key: jax.Array | None = None) -> Posterior:
-        """The posterior of a raw summary (Algorithm 1, line 14), truncated to a support.
+        """The posterior of a raw summary (Algorithm 1, line 11), truncated to a support.
 
         Args:
             x: the summary, shape [S].

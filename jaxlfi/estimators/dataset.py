@@ -9,7 +9,7 @@ from jaxlfi.tasks.simulation import Simulations
 
 @struct.dataclass
 class Dataset:
-    """The accumulated pairs (theta, x) of Algorithm 1, line 12. The first `size` rows are filled, the rest are zero.
+    """The accumulated pairs (theta, x) of Algorithm 1, line 9. The first `size` rows are filled, the rest are zero.
 
     Attributes:
         theta: parameters in inference space, shape [C, D].
@@ -49,7 +49,7 @@ def empty(capacity: int, dim: int, obs: int) -> Dataset:
 
 
 def augment(dataset: Dataset, simulations: Simulations, round: Int[Array, ""] | int) -> Dataset:
-    """Add the kept simulations behind the rows already filled (Algorithm 1, line 12), as far as there is room."""
+    """Add the kept simulations behind the rows already filled (Algorithm 1, line 9), as far as there is room."""
     row = dataset.size + jnp.cumsum(simulations.kept) - 1
     row = jnp.where(simulations.kept, row, dataset.capacity)  # past the end: dropped
     return Dataset(

@@ -53,7 +53,7 @@ def fit(
     expected_size: Int[Array, ""] | int,
     log_prior: Float[Array, " cap"] | None = None,
 ) -> tuple[Network, FitInfo]:
-    """Train q_phi over the dataset (Algorithm 1, line 13).
+    """Train q_phi over the dataset (Algorithm 1, line 10).
 
     Args:
         key: consumed.

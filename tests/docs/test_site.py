@@ -125,3 +125,19 @@ def test_settings_of_the_pages_are_fields():
     fields = {field.name for field in dataclasses.fields(jaxlfi.Settings)} | set(declared(jaxlfi.MixtureNetwork))
     for name in re.findall(r"`Settings\.(\w+)", "".join(page.read_text() for page in PAGES)):
         assert name in fields
+
+
+def test_contributing_names_files_that_exist():
+    for name in re.findall(
+        r"(?<![\w/])((?:tests|experiments|examples|docs)/[\w./]*\w)", (ROOT / "CONTRIBUTING.md").read_text()
+    ):
+        assert (ROOT / name).exists() or "NAME" in name, name
+
+
+@pytest.mark.parametrize(("page", "start"), [("calibration.md", "import numpy"), ("quickstart.md", "import numpy")])
+def test_short_blocks_of_pages_run(page, start, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"^```python\n(.*?)^```$", text(page), re.MULTILINE | re.DOTALL)
+    (body,) = [block for block in blocks if block.startswith(start)]
+    exec(compile(body, page, "exec"), {})
+    assert capsys.readouterr().out or (tmp_path / "pairs.png").exists()
