@@ -4,7 +4,6 @@ import time
 from types import TracebackType
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -33,7 +32,7 @@ class RoundProgress:
             label: what is going on.
         """
         self._console, self._rounds, self._first, self._done = console, rounds, done, done
-        self._label = label = escape(label)  # names of tasks are no markup
+        self._label = label
         self._began = time.monotonic()
         columns = (
             TextColumn("{task.description}", markup=False),

@@ -116,8 +116,6 @@ def refuse_occupied(folder: Path) -> None:
         raise StoreError(
             f"out: expected a new or empty folder, got {str(folder)!r}, a symbolic link to something that is not there"
         )
-    if folder.is_symlink() and not folder.exists():
-        raise StoreError(f"out: expected a new folder, got {str(folder)!r}, a link that leads nowhere")
     if not folder.exists():
         return
     if not folder.is_dir() or any(folder.iterdir()):
