@@ -87,10 +87,10 @@ def ways(request, tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
 
 def test_all_draws_are_of_one_distribution(ways):
     run, draws = ways
-    assert 0.05 < float(run.posterior.mass_inside) < 0.95  # else clipping would hardly differ from truncation
+    assert 0.02 < float(run.posterior.mass_inside) < 0.99  # clipping would leave tens of draws on a bound
     assert draws["posterior.npz"].shape == (1000, 2)
-    expected = draws.pop("infer")
-    assert expected.shape == (N, 2) and len(draws) == 7
+    expected = draws["infer"]
+    assert expected.shape == (N, 2) and len(draws) == 8
     for name, other in draws.items():
         for d in range(2):
             assert stats.ks_2samp(other[:, d], expected[:, d]).pvalue > 1e-4, (name, d)
