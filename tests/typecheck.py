@@ -2,6 +2,7 @@
 
 import typing
 
+import jax
 from beartype import beartype
 
 
@@ -10,15 +11,15 @@ def checked(function):
 
     The constructors are those of pytrees. JAX rebuilds them around whatever the leaves become (NumPy arrays, shapes,
     vmap axes, boolean masks, one more axis), none of which the annotations mean. `Self` is known only where a whole
-    class is checked. Counts and words of a choice are not checked here: the library refuses wrong ones by a ValueError,
-    which is tested.
+    class is checked. Counts, keys and words of a choice are not checked here: the library refuses wrong ones by a
+    ValueError, which is tested.
     """
     if function.__name__ == "__init__" or typing.Self in function.__annotations__.values():
         return function
     kept = {
         name: kind
         for name, kind in function.__annotations__.items()
-        if kind is not int and typing.get_origin(kind) is not typing.Literal
+        if kind not in (int, jax.Array) and typing.get_origin(kind) is not typing.Literal
     }
     function.__annotations__ = kept
     return beartype(function)

@@ -53,11 +53,11 @@ class Support:
         """Number of parameters D."""
         return self.low.shape[-1]
 
-    def contains(self, theta: Float[Array, "*n dim"]) -> Bool[Array, "*n"]:
+    def contains(self, theta: Float[Array | np.ndarray, "*n dim"]) -> Bool[Array, "*n"]:
         """Whether each parameter vector lies in the box, bounds included."""
         return jnp.all((theta >= self.low) & (theta <= self.high), axis=-1)
 
-    def clip(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n dim"]:
+    def clip(self, theta: Float[Array | np.ndarray, "*n dim"]) -> Float[Array, "*n dim"]:
         """The nearest point of the box, dimension by dimension."""
         return jnp.clip(theta, self.low, self.high)
 
@@ -70,7 +70,7 @@ class Support:
         """The smallest box around both."""
         return Support(jnp.minimum(self.low, other.low), jnp.maximum(self.high, other.high))
 
-    def to_unit(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n dim"]:
+    def to_unit(self, theta: Float[Array | np.ndarray, "*n dim"]) -> Float[Array, "*n dim"]:
         """Scale the box to [-1, 1]^D."""
         return (theta - self.centre) / (0.5 * self.width)
 
