@@ -54,6 +54,8 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         settings = describe.settings_from_json(config["settings"])
         heuristic = describe.heuristic_from_json(config["heuristic"])
         support = describe.support_from_json(config["support"])
+        if support.dim != space.dim:
+            raise ValueError(f"support: expected bounds for {space.dim} parameters, got {support.dim}")
         feasible = Support(config["feasible_low"], config["feasible_high"]).hull(support)
         origin = Origin(config["task"], config["configuration"], config["support"]["name"], config["preset"])
         key = key_of(config["seed"])

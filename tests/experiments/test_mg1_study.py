@@ -9,7 +9,7 @@ from scipy import stats
 from experiments.mg1 import MEASURES, entropy, main, measures, ordered, sample_trajectories, table
 from jaxlfi.envs import mg1
 from jaxlfi.figures import load
-from tests.test_figures import change, write_run
+from tests.figures.test_figures import change, write_run
 
 TRUTH = np.array([1.0, 5.0, 0.2])
 

@@ -260,7 +260,7 @@ def test_help_lists_its_flags_without_importing_it(environment):
     output = " ".join(environment.run("-c", script).split())
     assert output.endswith("[]")
     assert "--gain X [X ...] widen: how far a bound moves (kappa; [0, 2]; default: 0.5)" in output
-    assert "--units N independent: units of the hidden layer" in output
+    assert "--units N units of the hidden layer" in output
     assert "line" in environment.jaxlfi("tasks", "line,points=7")
 
 
