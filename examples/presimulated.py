@@ -25,10 +25,11 @@ def main():
     """Write a file of simulations, infer from it alone, and compare with the exact posterior."""
     problem = task()
     rng = np.random.default_rng(0)
-    # A design of somebody's own: more simulations at small values of the first parameter.
-    first, second = 6 * rng.beta(1.0, 2.0, PAIRS) - 3, rng.uniform(-3, 3, PAIRS)
+    # A design of somebody's own: half of the simulations uniform, half at small values of the first parameter.
+    uniform, small = rng.uniform(-3, 3, (PAIRS, 2)), 6 * rng.beta(1.0, 2.0, PAIRS) - 3
+    first, second = np.where(rng.random(PAIRS) < 0.5, uniform[:, 0], small), uniform[:, 1]
     theta = np.stack([first, second], axis=1)
-    log_density = np.log(2 * (3 - first) / 36) - np.log(6)
+    log_density = np.log(0.5 / 6 + 0.5 * 2 * (3 - first) / 36) - np.log(6)
     trajectory = jax.vmap(problem.simulate)(jax.random.split(jax.random.key(2), PAIRS), jnp.asarray(theta, jnp.float32))
     observed = problem.simulate(jax.random.key(1), problem.truth)
     with tempfile.TemporaryDirectory() as place:

