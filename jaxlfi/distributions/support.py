@@ -29,8 +29,8 @@ class Support:
         [9.0, 0.8999999761581421]
     """
 
-    low: Float[Array, "*batch dim"]
-    high: Float[Array, "*batch dim"]
+    low: Float[Array | np.ndarray, "*batch dim"]
+    high: Float[Array | np.ndarray, "*batch dim"]
 
     def __post_init__(self):
         if isinstance(self.low, list | tuple) or isinstance(self.high, list | tuple):
@@ -39,12 +39,12 @@ class Support:
             object.__setattr__(self, "high", jnp.asarray(high))
 
     @property
-    def width(self) -> Float[Array, "*batch dim"]:
+    def width(self) -> Float[Array | np.ndarray, "*batch dim"]:
         """theta_max - theta_min, the range size r of Algorithms 2-4."""
         return self.high - self.low
 
     @property
-    def centre(self) -> Float[Array, "*batch dim"]:
+    def centre(self) -> Float[Array | np.ndarray, "*batch dim"]:
         """The middle of the box."""
         return 0.5 * (self.low + self.high)
 
