@@ -17,9 +17,11 @@ from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.presets import METHODS, QUICK
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli import parser as cli
+from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.base import Network, untrained
+from jaxlfi.estimators.density import EnsembleDensity
 from jaxlfi.estimators.flow_estimators import FlowEstimator, MaskedFlow
 from jaxlfi.heuristics import Fixed
 from jaxlfi.runs import folder as run_store
