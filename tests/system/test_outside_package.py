@@ -319,7 +319,13 @@ def test_diagnose_repeats_its_runs(environment, compared):
         "--out",
         "diagnostics",
     ]
-    output = environment.jaxlfi("diagnose", *words)
+    script = """
+        import importlib, sys
+        importlib.import_module("jaxlfi.diagnostics.c2st").MAX_EPOCHS = 20  # the classifier would take longest
+        from jaxlfi.cli.parser import main
+        sys.exit(main(sys.argv[1:]))
+    """
+    output = environment.run("-c", textwrap.dedent(script), "diagnose", *words)
     assert "rank of ln slope" in output
     arrays = np.load(environment.work / "diagnostics" / "diagnostics.npz")
     assert arrays["draws"].shape == (20, 20, 2) and np.isfinite(arrays["log_prob"]).all()
