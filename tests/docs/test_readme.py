@@ -19,6 +19,7 @@ SMALL = jaxlfi.QUICK.replace(
     rounds=2,
     simulations_per_round=40,
     simulation_budget=50,
+    predictive=False,
     estimator=jaxlfi.QUICK.estimator.replace(hidden=(16,), steps=100, batch_size=20),
 )
 """The blocks say nothing of settings; with these they take seconds."""
