@@ -179,7 +179,7 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
         _say(console, _COMPLETE.format(folder=folder))
         return None
     plan = executing.reopen(folder)
-    if changed := executing.changed_versions(folder):
+    if changed := executing.changed_versions(config):
         _warn(console, f"begun with {', '.join(changed)}: the result may differ in rounding from an uninterrupted one")
     return folder, plan
 
@@ -192,7 +192,7 @@ def _resume_grid(folder: Path, console: Console) -> Prepared | None:
     if config.get("status") == "finished":
         _say(console, _COMPLETE.format(folder=folder))
         return None
-    changed = executing.changed_versions(folder)
+    changed = executing.changed_versions(config)
     if config.get("devices") != (here := jax.local_device_count()):
         changed.append(f"{config.get('devices')} devices, now {here}")
     if changed:

@@ -291,9 +291,9 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
     return plan, Observed(*Checkpoint(folder).read_start())
 
 
-def changed_versions(folder: Path) -> list[str]:
+def changed_versions(config: Mapping[str, Any]) -> list[str]:
     """In words, which packages are of other versions than when a folder was begun: the same bits need the same ones."""
-    recorded = folders.read_config(folder).get("versions", {})
+    recorded = config.get("versions", {})
     now = folders.versions()
     changed = [name for name in VERSIONS if recorded.get(name) not in (None, now[name])]
     return [f"{name} {recorded[name]}, now {now[name]}" for name in changed]
