@@ -200,7 +200,7 @@ class Environment:
     def run(self, *words) -> str:
         """What a command that has to succeed prints."""
         process = self.start(*words)
-        output, errors = process.communicate(timeout=300)
+        output, errors = process.communicate(timeout=900)
         assert process.returncode == 0, errors
         return output
 
@@ -220,11 +220,11 @@ def inferred(environment) -> str:
     """A run that was interrupted and resumed."""
     words = ["infer", "line,noise=0.2,points=3", "--support", "tight", "--heuristic", "widen", "--gain", "0.25", "0.75"]
     process = environment.start("-m", "jaxlfi", *words, *TINY, "--rounds", "40", "--out", "run")
-    begun, deadline = environment.work / "run" / "checkpoint" / "state.npz", time.monotonic() + 300
+    begun, deadline = environment.work / "run" / "checkpoint" / "state.npz", time.monotonic() + 900
     while not begun.exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=100)
+    _, errors = process.communicate(timeout=300)
     assert process.returncode == 130 and "jaxlfi resume run" in errors, errors
     assert not (environment.work / "run" / "posterior.npz").exists()
     environment.jaxlfi("resume", "run", "--no-figures")
