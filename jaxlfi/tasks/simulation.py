@@ -49,7 +49,9 @@ class Simulations:
         return jnp.sum((self.failure[..., None] == codes) & self.counted[..., None], axis=-2)
 
 
-def trajectory_and_outcome(task: Task, key: jax.Array, theta: Float[Array, " dim"]) -> tuple[Array, Int[Array, ""]]:
+def trajectory_and_outcome(
+    task: Task, key: jax.Array, theta: Float[Array | np.ndarray, " dim"]
+) -> tuple[Array, Int[Array, ""]]:
     """One simulation at theta [D] in inference space: its trajectory and 0, or the code of the reason it failed for."""
     result = task.simulate(key, task.space.to_natural(theta))
     trajectory, outcome = result if isinstance(result, tuple) else (result, jnp.asarray(0))

@@ -36,11 +36,11 @@ def problem():
 
 
 def test_the_declaration_is_the_papers(problem):
-    assert problem.coordinates == ("length", "ln young") and problem.units == ("mm", "Pa")
-    np.testing.assert_allclose(problem.to_natural(problem.supports["initial"].low), [195, 1e3], rtol=1e-5)
-    np.testing.assert_allclose(problem.to_natural(problem.supports["initial"].high), [305, 5e4], rtol=1e-5)
-    np.testing.assert_allclose(problem.to_natural(problem.feasible.low), [50, 0.5e3], rtol=1e-5)
-    np.testing.assert_allclose(problem.to_natural(problem.feasible.high), [350, 5e5], rtol=1e-5)
+    assert problem.space.labels == ("length", "ln young") and problem.units == ("mm", "Pa")
+    np.testing.assert_allclose(problem.supports["initial"].low, [195, 1e3], rtol=1e-5)
+    np.testing.assert_allclose(problem.supports["initial"].high, [305, 5e4], rtol=1e-5)
+    np.testing.assert_allclose(problem.feasible.low, [50, 0.5e3], rtol=1e-5)
+    np.testing.assert_allclose(problem.feasible.high, [350, 5e5], rtol=1e-5)
     for box in problem.supports.values():
         check_within(box, problem.feasible)
     assert problem.settings == {"rounds": 15, "batch_size": 10}
@@ -49,7 +49,7 @@ def test_the_declaration_is_the_papers(problem):
 
 
 def test_a_simulation_is_the_trajectory_of_its_parameters(problem, key):
-    theta = problem.to_coordinates(jnp.array([270.0, 4e3]))
+    theta = problem.space.to_inference(jnp.array([270.0, 4e3]))
     found, failure = jax.jit(lambda k, t: trajectory_and_outcome(problem, k, t))(key, theta)
     scene = median(0.270, 4e3)
     clean = DETECTORS["clean"]
@@ -65,7 +65,7 @@ def test_a_simulation_is_the_trajectory_of_its_parameters(problem, key):
 
 def test_length_is_seen_at_once_and_stiffness_in_motion(problem, key):
     simulate = jax.jit(jax.vmap(lambda t: trajectory_and_outcome(problem, key, t)[0]))
-    middle, longer, stiffer = simulate(problem.to_coordinates(jnp.array([[250, 5e3], [260, 5e3], [250, 1e4]])))
+    middle, longer, stiffer = simulate(problem.space.to_inference(jnp.array([[250, 5e3], [260, 5e3], [250, 1e4]])))
     tip = lambda states: states[:, 8:10]
     # The camera's field of view is 0.6 m: a DLO that is 10 mm longer hangs 1/60 lower.
     np.testing.assert_allclose(tip(longer)[0] - tip(middle)[0], [0.0, 1 / 60], atol=1e-4)
@@ -83,14 +83,14 @@ def test_the_exploratory_actions_stay_in_the_workspace():
 def test_unstable_simulations_are_reported(key):
     shaky = NativeEngine(Scene(chain=Chain(elements=16, retardation=0.0, viscosity=0.0), timestep=0.005))
     made = whip_task(shaky, DETECTORS["clean"], NUISANCES["fixed"], exploratory_actions(), truth=(0.23, 8e3))
-    stiff = made.to_coordinates(jnp.array([[100.0, 5e5], [120.0, 4e5]]))
+    stiff = made.space.to_inference(jnp.array([[100.0, 5e5], [120.0, 4e5]]))
     _, failure = jax.jit(jax.vmap(lambda t: trajectory_and_outcome(made, key, t)))(stiff)
     assert failure.tolist() == [1, 1] and made.reasons[0] == "unstable"
 
 
 def test_random_nuisances_differ_from_key_to_key(key):
     made = task(detector="clean", nuisances="random", engine="native")
-    theta = made.to_coordinates(jnp.array([250.0, 5e3]))
+    theta = made.space.to_inference(jnp.array([250.0, 5e3]))
     simulate = jax.jit(jax.vmap(lambda k: trajectory_and_outcome(made, k, theta)))
     found, _ = simulate(jax.random.split(key, 3))
     assert len(np.unique(np.asarray(found[:, 0, 20]))) == 3  # the top cube, seen from elsewhere
@@ -131,9 +131,9 @@ def test_length_and_stiffness_are_inferred(problem):
     errors = []
     for seed in range(3):
         run = jaxlfi.infer(jax.random.key(seed), problem, settings=settings, heuristic=jaxlfi.Edge())
-        assert int(np.sum(run.info.failed)) == 0
-        draws = run.sample(jax.random.key(100 + seed), 1000)
-        errors.append(np.abs(np.median(draws, axis=0) - np.asarray(problem.truth)))
+        assert int(np.sum(run.history["failed"])) == 0
+        draws = run.posterior.sample(jax.random.key(100 + seed), 1000, space="inference")
+        errors.append(np.abs(np.median(draws, axis=0) - np.asarray(problem.inference.truth)))
     length, stiffness = np.median(errors, axis=0)
     assert length < 5 and stiffness < 0.3
 
@@ -152,7 +152,7 @@ def test_a_run_from_the_command_line(tmp_path, capsys):
 def test_without_mujoco_the_task_says_what_to_install():
     script = (
         "import sys; sys.modules['mujoco'] = None; import jaxlfi, jaxlfi.envs.lotka_volterra, jaxlfi.envs.whip; "
-        "from jaxlfi import tasks; tasks.load('lotka_volterra'); tasks.load('jaxlfi.envs.whip:task')"
+        "from jaxlfi.tasks import registry as tasks; tasks.load('lotka_volterra'); tasks.load('jaxlfi.envs.whip:task')"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode != 0 and "pip install 'jaxlfi[whip]'" in done.stderr.splitlines()[-1]
