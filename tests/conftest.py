@@ -38,6 +38,9 @@ hypothesis.settings.load_profile("jaxlfi")
 MEMORY = 1000 * 2**20
 """Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory."""
 
+MOST = 1600 * 2**20
+"""Bytes beyond which it does so between two tests of one file, which would mostly have used the same programs."""
+
 
 LONG = (
     "test_lotka_volterra_mjp", "test_grid", "test_whip_engines", "test_whip_real2sim", "test_cli", "test_apt",
@@ -77,12 +80,25 @@ def compiling(request: pytest.FixtureRequest):
     jax.config.update("jax_disable_most_optimizations", not getattr(request.module, "OPTIMISED", False))
     yield
     if resident() > MEMORY:
-        from jaxlfi.bayessim import programs  # late, so that shapes are checked from its first import on
+        forget()
 
-        programs.forget()
-        jax.clear_caches()
-        gc.collect()
-        getattr(ctypes.CDLL(None), "malloc_trim", int)(0)  # glibc keeps what is freed between blocks still in use
+
+@pytest.fixture(autouse=True)
+def forgetting():
+    """Forget programs within a file whose tests compile ever new ones."""
+    yield
+    if resident() > MOST:
+        forget()
+
+
+def forget() -> None:
+    """Let go of every compiled program, and give the memory back to the system."""
+    from jaxlfi.bayessim import programs  # late, so that shapes are checked from its first import on
+
+    programs.forget()
+    jax.clear_caches()
+    gc.collect()
+    getattr(ctypes.CDLL(None), "malloc_trim", int)(0)  # glibc keeps what is freed between blocks still in use
 
 
 def resident() -> int:

@@ -186,7 +186,7 @@ def test_one_weight_of_many_is_limited():
 def test_weights_change_what_is_learnt():
     """Half of the pairs are given the weight of next to nothing: the posterior is that of the other half."""
     given = pairs(200)
-    given["trajectory"][100:] += 5.0
+    given["trajectory"][100:] -= 2.0
     weighted = given | {"log_density": np.where(np.arange(200) < 100, 0.0, 14.0)}
     estimator = SETTINGS.estimator.replace(steps=400, batch_size=100, learning_rate=1e-2, components=1)
     infer = lambda simulations: jaxlfi.infer(
@@ -195,7 +195,7 @@ def test_weights_change_what_is_learnt():
     )  # fmt: skip
     exact = np.asarray(posterior(OBSERVED).mean)
     far, near = (np.abs(np.asarray(infer(given_).mixture.mean) - exact).max() for given_ in (given, weighted))
-    assert near < 0.7 < far or near < 0.5 * far
+    assert near < 0.45 and far > 0.75
 
 
 # ------------------------------------------------------------------------------------------------- what is refused
