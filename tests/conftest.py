@@ -38,7 +38,7 @@ hypothesis.settings.load_profile("jaxlfi")
 MEMORY = 1000 * 2**20
 """Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory."""
 
-MOST = 1600 * 2**20
+MAX_MEMORY = 1600 * 2**20
 """Bytes beyond which it does so between two tests of one file, which would mostly have used the same programs."""
 
 
@@ -87,7 +87,7 @@ def compiling(request: pytest.FixtureRequest):
 def forgetting():
     """Forget programs within a file whose tests compile ever new ones."""
     yield
-    if resident() > MOST:
+    if resident() > MAX_MEMORY:
         forget()
 
 

@@ -304,7 +304,7 @@ def test_flags_read_values_of_the_type_of_the_default():
     parser = argparse.ArgumentParser()
     families = {"everything": fields.declared(Everything)}
     flags.add(parser.add_argument_group("all"), families, into="settings")
-    words = "--rate 0.5 --norm inf --count 5 --layers 3 4 --switch no --kind b --word no --fraction 0".split()
+    words = "--rate 0.5 --norm inf --count 5 --layers 3 4 --no-switch --kind b --word no --fraction 0".split()
     given = parser.parse_args(words).settings
     expected = Everything(
         rate=0.5, norm=math.inf, count=5, layers=(3, 4), switch=False, kind="b", word="no", fraction=0.0

@@ -74,8 +74,8 @@ def _loader(registry: Any):
         if ":" not in name:
             return registry.load(name)
         kind = dataclass_of(name)
-        if not issubclass(kind, Heuristic | Estimator):
-            raise ValueError(f"description: expected a heuristic or an estimator, got {name!r}")
+        if not issubclass(kind, Heuristic | Estimator | Support):
+            raise ValueError(f"description: expected a heuristic, an estimator or a support, got {name!r}")
         return kind
 
     return load
