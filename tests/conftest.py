@@ -43,9 +43,9 @@ MAX_MEMORY = 1600 * 2**20
 
 
 LONG = (
-    "test_lotka_volterra_mjp", "test_grid", "test_whip_engines", "test_whip_real2sim", "test_cli", "test_apt",
-    "test_figures", "test_heuristics", "test_flows", "test_calibration_study", "test_bayessim", "test_run_store",
-    "test_lynx_hare", "test_fitting",
+    "test_examples", "test_cli", "test_outside_package", "test_draws", "test_infer", "test_grid", "test_apt",
+    "test_resume", "test_readme", "test_calibration_study", "test_lynx_hare", "test_load", "test_real2sim",
+    "test_algorithm", "test_engines",
 )  # fmt: skip
 """Files of half a minute and more."""
 
