@@ -250,20 +250,20 @@ def run_help(folder, *words: str) -> str:
         f"sys.path.insert(0, {str(folder)!r}); import jaxlfi.cli.parser as c; c.main(sys.argv[1:])"
     )
     done = subprocess.run([sys.executable, "-c", script, *words, "--help"], capture_output=True, text=True, check=True)
-    *told, last = done.stdout.splitlines()
+    *shown, last = done.stdout.splitlines()
     assert last == "imported: []"
-    return " ".join(" ".join(told).split())
+    return " ".join(" ".join(shown).split())
 
 
 def test_help_lists_the_flags_of_all_installed_heuristics(swelling):
-    told = run_help(swelling, "infer")
-    assert "--gain X [X ...] swell: how far bounds move (kappa; [0, 2]; default: 0.5)" in told
-    assert "gain kappa, how far bounds move" in told
-    assert "--side NAME swell: which bounds (both, low; default: both)" in told
-    assert "edge, mode: how far a bound moves, as a fraction of the support's width; swell: another step (eta; " in told
-    assert "default: 0.2 (edge), 0.2 (mode), 0.3 (swell)" in told
-    assert "--hyperparameter-seeds X [X ...] swell: as a flag of the command is called" in told
-    assert "none, swell, truncate, or your own as module:Class" in told
+    text = run_help(swelling, "infer")
+    assert "--gain X [X ...] swell: how far bounds move (kappa; [0, 2]; default: 0.5)" in text
+    assert "gain kappa, how far bounds move" in text
+    assert "--side NAME swell: which bounds (both, low; default: both)" in text
+    assert "edge, mode: how far a bound moves, as a fraction of the support's width; swell: another step (eta; " in text
+    assert "default: 0.2 (edge), 0.2 (mode), 0.3 (swell)" in text
+    assert "--hyperparameter-seeds X [X ...] swell: as a flag of the command is called" in text
+    assert "none, swell, truncate, or your own as module:Class" in text
 
 
 def test_flags_of_a_class_that_is_not_registered_are_found_by_its_name(path):

@@ -2,9 +2,10 @@
 
     python -m experiments.sbibm --tasks two_moons --methods npe apt --simulations 1000 --out experiments/results/sbibm
 
-Every published observation is a lane of one compiled program. Results are added to OUT/table.csv, one line an
-observation; a line that is there is not computed again, and draws are kept in OUT/draws. The classifier takes longer
-than inference, minutes an observation in ten dimensions. Needs the `bench` extra (scikit-learn).
+All published observations are inferred as one batch, in one compiled program. Results are added to
+OUT/table.csv, one line an observation; a line that is there is not computed again, and draws are kept in OUT/draws. The
+classifier takes longer than inference, minutes an observation in ten dimensions. Needs the `bench` extra
+(scikit-learn).
 """
 
 import argparse

@@ -37,14 +37,14 @@ def test_training_that_diverges_is_warned_of(tmp_path, capsys):
     out = tmp_path / "run"
     flags = [*FLAGS, "--learning-rate", "1e6", "--rounds", "1", "--heuristic", "none", "--no-predictive", "--out", out]
     assert command("infer", TASK, *flags) == 0
-    told = " ".join("".join(capsys.readouterr()).split())
-    assert "gradient steps of a round were not finite" in told and "lower learning_rate (1e+06)" in told
+    printed = " ".join("".join(capsys.readouterr()).split())
+    assert "gradient steps of a round were not finite" in printed and "lower learning_rate (1e+06)" in printed
     with np.load(out / "history.npz") as history:
         assert (history["nonfinite"] > 0).any()
 
 
 @pytest.mark.parametrize(
-    ("flags", "told"),
+    ("flags", "message"),
     [
         ("--patience -1", "patience"),
         ("--clip-norm 0", "clip"),
@@ -58,9 +58,9 @@ def test_training_that_diverges_is_warned_of(tmp_path, capsys):
         ("--heuristic edge --expansion -1", "expansion"),
     ],
 )
-def test_settings_that_train_nothing_are_refused_before_a_folder_is_made(flags, told, tmp_path, capsys):
+def test_settings_that_train_nothing_are_refused_before_a_folder_is_made(flags, message, tmp_path, capsys):
     out = tmp_path / "run"
     assert command("infer", TASK, *flags.split(), "--no-figures", "--out", out) == 2
     error = capsys.readouterr().err
-    assert told in error and "Traceback" not in error and not out.exists()
+    assert message in error and "Traceback" not in error and not out.exists()
     assert len(error.strip().splitlines()) == 1 or error.strip().splitlines()[-1].count("error") == 1

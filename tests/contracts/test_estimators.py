@@ -252,14 +252,14 @@ def test_training_lowers_the_loss(case):
 
 
 def test_what_is_no_estimator_is_refused():
-    for wrong, told in (
+    for wrong, message in (
         ("glow", "expected one of"),
         ("builtins:dict", "a class derived from Estimator"),
         ("jaxlfi.estimators.base:Estimator", "with all its methods"),
         ("jaxlfi.estimators.flow_estimators:FlowEstimator", "with all its methods"),
         ("no_such_module:Thing", "cannot load"),
     ):
-        with pytest.raises(ValueError, match=f"^estimator: .*{told}") as error:
+        with pytest.raises(ValueError, match=f"^estimator: .*{message}") as error:
             registry.load(wrong)
         assert "\n" not in str(error.value)
 

@@ -22,7 +22,7 @@ def samples(shift: float, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("shift", [0.0, 1.0, 3.0])
-def test_shifted_gaussians_are_told_apart_as_well_as_can_be(shift):
+def test_shifted_gaussians_are_distinguished_as_well_as_can_be(shift):
     """The best accuracy is Phi(d / 2); three standard errors of 800 rows, and what a trained classifier loses."""
     accuracy = float(compiled(jax.random.key(0), *samples(shift)))
     assert norm.cdf(shift / 2) - 0.07 < accuracy < norm.cdf(shift / 2) + 0.055

@@ -77,13 +77,13 @@ def test_a_summary_that_never_varies():
 
 
 @pytest.mark.parametrize(
-    ("simulated", "observed", "told"),
+    ("simulated", "observed", "message"),
     [
         (np.zeros((30, 2)), np.zeros(3), "expected shapes"),
         (np.zeros((30, 2)), np.array([0.0, np.nan]), "a finite observation"),
         (np.full((30, 2), np.nan), np.zeros(2), f"at least {MIN_SIMULATIONS} finite rows, got 0 of 30"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(simulated, observed, told):
-    with pytest.raises(Exception, match=f"{told}|obs"):
+def test_what_cannot_be_compared_is_refused(simulated, observed, message):
+    with pytest.raises(Exception, match=f"{message}|obs"):
         predictive_check(simulated, observed)

@@ -250,14 +250,14 @@ def test_no_draws_are_refused(folder, number, capsys):
 def test_bad_files_and_names_are_one_line(folder, tmp_path, capsys):
     out = tmp_path / "there.csv"
     out.write_text("mine")
-    for arguments, told in (
+    for arguments, message in (
         (["sample", str(folder), "--out", str(out)], "exists"),
         (["sample", str(folder), "--out", str(tmp_path / "draws.txt")], ".csv or .npz"),
         (["sample", str(tmp_path)], "config.json"),
     ):
         assert cli.main(arguments) == 2
         error = capsys.readouterr().err
-        assert told in error and error.count("\n") == 1
+        assert message in error and error.count("\n") == 1
     assert out.read_text() == "mine"
 
 
@@ -280,15 +280,15 @@ def test_a_damaged_network_is_reported(folder, tmp_path, capsys, damage):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["--estimator", "glow"], "estimator"),
         (["--loss", "hinge"], "loss"),
         (["--method", "apt", "--hidden", "8", "9"], "equal width"),
     ],
 )
-def test_unknown_parts_are_refused(arguments, told, tmp_path, capsys):
+def test_unknown_parts_are_refused(arguments, message, tmp_path, capsys):
     out = tmp_path / "none"
     assert cli.main(["infer", "gaussian_linear", *arguments, "--out", str(out)]) == 2
     error = capsys.readouterr().err
-    assert told in error and error.count("\n") == 1 and not out.exists()
+    assert message in error and error.count("\n") == 1 and not out.exists()

@@ -73,7 +73,7 @@ def test_atomic_is_what_a_plain_loop_says():
     assert loss == pytest.approx(total / weights.sum(), rel=1e-5)
 
 
-def test_equal_atoms_under_a_uniform_prior_are_told_apart_by_chance():
+def test_equal_atoms_under_a_uniform_prior_are_distinguished_by_chance():
     theta = jnp.full((5, 2), 0.7)
     loss = atomic(jax.random.key(0), squares, theta, jnp.zeros(5), jnp.ones(5), 4)
     assert loss == pytest.approx(np.log(4), rel=1e-6)

@@ -794,9 +794,9 @@ def test_vmap_is_a_loop(rule):
 @pytest.mark.parametrize("name", [name for name, rule in RULES.items() if jax.tree.leaves(rule)])
 def test_vmap_over_hyperparameters_is_a_loop(name):
     rule = RULES[name]
-    lanes = [rule, jax.tree.map(lambda value: value * 2, rule)]
-    together = jax.jit(jax.vmap(lambda lane: lane(*example())))(stack(*lanes))
-    chex.assert_trees_all_close(together, stack(*(apply(lane, *example()) for lane in lanes)), rtol=1e-6, atol=1e-6)
+    rules = [rule, jax.tree.map(lambda value: value * 2, rule)]
+    together = jax.jit(jax.vmap(lambda each: each(*example())))(stack(*rules))
+    chex.assert_trees_all_close(together, stack(*(apply(each, *example()) for each in rules)), rtol=1e-6, atol=1e-6)
 
 
 def test_pytree_round_trip(rule):
@@ -816,9 +816,9 @@ def test_other_hyperparameters_compile_nothing(rule):
         traces.append(None)
         return rule(previous, posterior, feasible)
 
-    for lane in (rule, jax.tree.map(lambda value: value * 2, rule)):
+    for each in (rule, jax.tree.map(lambda value: value * 2, rule)):
         for problem in variants():
-            counted(lane, *problem)
+            counted(each, *problem)
     assert len(traces) == 1
 
 

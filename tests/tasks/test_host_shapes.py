@@ -78,7 +78,7 @@ def test_axes_of_one_are_added_and_dropped(given, shape, expected):
 
 
 @pytest.mark.parametrize(
-    ("result", "shape", "told"),
+    ("result", "shape", "message"),
     [
         (np.zeros((2, 5)), None, r"expected numbers of shape \[3, ...\] for 3 .* got float64 of shape \[2, 5\]"),
         (np.zeros(3), None, r"got float64 of shape \[3\]"),
@@ -92,8 +92,8 @@ def test_axes_of_one_are_added_and_dropped(given, shape, expected):
         ((np.zeros((3, 5)), np.zeros(3)), None, r"expected an outcome .* got float64 of shape \[3\]"),
     ],
 )  # fmt: skip
-def test_broken_contracts_are_told(result, shape, told):
-    with pytest.raises(SimulatorError, match=told) as error:
+def test_broken_contracts_are_reported(result, shape, message):
+    with pytest.raises(SimulatorError, match=message) as error:
         HostSimulator(lambda rng, theta: result).batch(np.random.default_rng(0), THETA, shape)
     assert str(error.value).startswith("simulate: ")
 

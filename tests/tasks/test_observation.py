@@ -77,7 +77,7 @@ def test_columns_are_channels(tmp_path, text, expected):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "expected at least one row of numbers, got none"),
         ("\n\n", "expected at least one row of numbers, got none"),
@@ -92,12 +92,12 @@ def test_columns_are_channels(tmp_path, text, expected):
         ("1,a\n2,3\n", "expected a row of headings or a row of numbers first, got '1,a'"),
     ],
 )
-def test_broken_files_are_told_in_one_line(tmp_path, text, told):
+def test_broken_files_are_reported_in_one_line(tmp_path, text, message):
     path = tmp_path / "x.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=r"^observation: cannot read .*x.csv': ") as error:
         read(path)
-    assert told in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_other_files_are_refused(tmp_path):
@@ -125,7 +125,7 @@ def test_arrays_are_read_as_they_are(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arrays", "told"),
+    ("arrays", "message"),
     [
         ({"a": np.ones(3), "b": np.ones(3)}, "expected an array called 'trajectory'"),
         ({"trajectory": np.ones(3) + 1j}, "expected real numbers, got an array of type complex128"),
@@ -133,12 +133,12 @@ def test_arrays_are_read_as_they_are(tmp_path):
         ({"trajectory": np.array([[1.0], None], object)}, "cannot read"),
     ],
 )
-def test_arrays_that_are_no_numbers_are_refused(tmp_path, arrays, told):
+def test_arrays_that_are_no_numbers_are_refused(tmp_path, arrays, message):
     """Object arrays are pickles, and never loaded."""
     np.savez(tmp_path / "x.npz", **arrays)
     with pytest.raises(ValueError, match=r"^observation: cannot read") as error:
         read(tmp_path / "x.npz")
-    assert told in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_a_file_takes_the_simulators_shape_where_only_axes_of_one_differ(tmp_path):
@@ -162,7 +162,7 @@ def test_shapes_are_found_without_running_the_simulator():
 
 
 @pytest.mark.parametrize(
-    ("simulate", "told"),
+    ("simulate", "message"),
     [
         (lambda key, theta: np.asarray(theta), r"expected a function JAX can trace \(wrap .* jaxlfi.HostSimulator\)"),
         (lambda key, theta: 1 / 0, "got ZeroDivisionError: division by zero"),
@@ -174,8 +174,8 @@ def test_shapes_are_found_without_running_the_simulator():
         (lambda: None, "got TypeError"),
     ],
 )
-def test_simulators_that_break_their_contract_are_told_in_one_line(simulate, told):
-    with pytest.raises(SimulatorError, match=f"^simulate: .*{told}") as error:
+def test_simulators_that_break_their_contract_are_reported_in_one_line(simulate, message):
+    with pytest.raises(SimulatorError, match=f"^simulate: .*{message}") as error:
         simulator_shapes(task(simulate))
     assert "\n" not in str(error.value)
 
@@ -183,7 +183,7 @@ def test_simulators_that_break_their_contract_are_told_in_one_line(simulate, tol
 @pytest.mark.parametrize(
     "summary", [lambda trajectory: trajectory[0], lambda trajectory: trajectory["x"], lambda x: x.reshape(2, 2)]
 )
-def test_summaries_that_are_no_vectors_are_told_in_one_line(summary):
+def test_summaries_that_are_no_vectors_are_reported_in_one_line(summary):
     with pytest.raises(SimulatorError, match=r"^summary: expected a ") as error:
         simulator_shapes(task(summary=summary))
     assert "\n" not in str(error.value)
@@ -221,7 +221,7 @@ def test_a_summary_that_is_not_finite_is_refused(key):
 
 
 def test_the_truth_is_simulated_until_it_succeeds(key):
-    """Half of the simulations fail; and one that always fails is told."""
+    """Half of the simulations fail; and one that always fails is reported."""
     half = task(lambda key, theta: (theta, jax.random.bernoulli(key)), truth=[2.0, 5.0])
     for k in jax.random.split(key, 8):
         np.testing.assert_allclose(simulate_observation(k, half), [2.0, 5.0], rtol=1e-6)

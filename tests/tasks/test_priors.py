@@ -199,9 +199,9 @@ def test_a_prior_with_next_to_no_mass_inside_is_refused():
 
 def test_a_run_does_not_start_on_a_prior_outside_its_box():
     elsewhere = distrax.MultivariateNormalDiag(jnp.array([40.0, 800.0]), jnp.array([0.05, 0.05]))
-    with pytest.raises(ValueError, match=r"^prior: expected some of its mass inside the support") as told:
+    with pytest.raises(ValueError, match=r"^prior: expected some of its mass inside the support") as caught:
         jaxlfi.infer(jax.random.key(0), decade(elsewhere), jnp.array([1.0, 0.0]), settings=small.SETTINGS)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 # ------------------------------------------------------------------------------------------------ tailed priors

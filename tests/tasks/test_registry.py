@@ -72,7 +72,7 @@ def test_a_task_of_ours_takes_its_options():
 
 
 @pytest.mark.parametrize(
-    ("reference", "told"),
+    ("reference", "message"),
     [
         ("made_up_tasks:factory,steps=2.5", "steps: expected a value of type int, got '2.5'"),
         ("made_up_tasks:factory,steps=many", "steps: expected a value of type int, got 'many'"),
@@ -95,8 +95,8 @@ def test_a_task_of_ours_takes_its_options():
         ("", "or module:factory, got ''"),
     ],
 )
-def test_wrong_references_are_told_in_one_line(here, reference, told):
-    with pytest.raises(ValueError, match=f"^task: .*{told}") as error:
+def test_wrong_references_are_reported_in_one_line(here, reference, message):
+    with pytest.raises(ValueError, match=f"^task: .*{message}") as error:
         load(reference)
     assert "\n" not in str(error.value)
 

@@ -219,9 +219,9 @@ def test_bad_declarations_are_named(changes, message):
 
 @pytest.mark.parametrize("label", ["a/../../zz", "a+b", "", "../up", "a\\b", ".hidden", "/root", "a:b"])
 def test_supports_that_could_not_name_a_folder_are_refused(label):
-    with pytest.raises(ValueError, match=r"^supports: expected names of letters, digits, .* got") as told:
+    with pytest.raises(ValueError, match=r"^supports: expected names of letters, digits, .* got") as caught:
         make(supports={label: make().supports["guess"]})
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("label", ["ok", "Theta_0", "a.b-c d", "breit", "größer"])
@@ -252,7 +252,7 @@ class Breaking:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "message"),
     [
         ("uniform", "got str$"),
         (Scipylike(), "got Scipylike$"),
@@ -263,9 +263,9 @@ class Breaking:
         (Breaking(), "got Breaking: no$"),
     ],
 )
-def test_wrong_priors_are_refused_in_one_line(wrong, told):
+def test_wrong_priors_are_refused_in_one_line(wrong, message):
     expected = r"^prior: expected a distrax distribution over vectors of 3 parameters"
-    with pytest.raises(ValueError, match=f"{expected}, .*{told}") as error:
+    with pytest.raises(ValueError, match=f"{expected}, .*{message}") as error:
         make(prior=wrong)
     assert "\n" not in str(error.value)
 
