@@ -3,6 +3,7 @@
 import ctypes
 import gc
 import os
+import signal
 import zlib
 from pathlib import Path
 
@@ -20,6 +21,9 @@ if jax.__version_info__ < (0, 10):
 
 # Tracing allocates objects by the million: by default Python would look for cycles among them a thousand times a file.
 gc.set_threshold(50_000, 20, 50)
+
+# A job in a shell's background ignores SIGINT, as would what it starts: the processes that tests interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A key consumed twice is an error, in the library and in what it calls.
 jax.config.update("jax_debug_key_reuse", True)
