@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import log_ndtr, ndtr, ndtri
+from jax.scipy.special import log_ndtr, ndtri
 from jaxtyping import Array, Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
@@ -37,12 +37,16 @@ def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: S
 
     def candidate(component: Array, uniform: Array) -> tuple[Array, Array]:
         mean, factor = mixture.means[component], mixture.scale_tril[component]
-        z, log_weight = jnp.zeros(support.dim), -log_share[component]
-        for d in range(support.dim):
+
+        def next_dimension(d: Array, drawn: tuple[Array, Array]) -> tuple[Array, Array]:
+            z, log_weight = drawn
             given = mean[d] + factor[d] @ z  # entries of z from d on are still zero
             low, high = (support.low[d] - given) / factor[d, d], (support.high[d] - given) / factor[d, d]
             value, log_mass = _truncated_normal(uniform[d], low, high)
-            z, log_weight = z.at[d].set(value), log_weight + log_mass
+            return z.at[d].set(value), log_weight + log_mass
+
+        nothing = jnp.zeros(support.dim), -log_share[component]
+        z, log_weight = jax.lax.fori_loop(0, support.dim, next_dimension, nothing)
         return support.clip(mean + factor @ z), log_weight
 
     theta, log_weight = jax.vmap(jax.vmap(candidate))(component, uniform)
@@ -71,9 +75,9 @@ def _truncated_normal(
     """
     flip = low + high < 0  # to the side of the upper tail, where small masses keep their precision
     near, far = jnp.where(flip, -high, low), jnp.where(flip, -low, high)
-    log_beyond = log_ndtr(-near)
-    log_mass = log_beyond + jnp.log1p(-jnp.exp(jnp.minimum(log_ndtr(-far) - log_beyond, -1e-7)))
-    beyond_near, beyond_far = ndtr(-near), ndtr(-far)
+    log_beyond_near, log_beyond_far = log_ndtr(-jnp.stack([near, far]))
+    log_mass = log_beyond_near + jnp.log1p(-jnp.exp(jnp.minimum(log_beyond_far - log_beyond_near, -1e-7)))
+    beyond_near, beyond_far = jnp.exp(log_beyond_near), jnp.exp(log_beyond_far)
     middle = -ndtri(jnp.clip(beyond_near - uniform * (beyond_near - beyond_far), 1e-37, 1.0 - 1e-7))
     # Beyond a of a few standard deviations the density falls about as exp(-a (z - a)).
     rate = jnp.maximum(near, TAIL)

@@ -19,6 +19,8 @@ from jaxlfi.estimators.density import Density
 
 MEAN_DRAWS = 4096
 """Number of draws that the posterior mean is estimated from (1.6 % of a standard deviation)."""
+MAP_DRAWS = 1000
+"""Number of draws among which the ascents towards the mode find their starts."""
 MAP_STARTS = 16
 """Number of gradient ascents towards the mode, each from one of the draws of highest density."""
 MAP_STEPS = 300
@@ -69,12 +71,7 @@ class Posterior:
         theta = jnp.asarray(theta, jnp.float32)
         if theta.ndim == 0 or theta.shape[-1] != self.space.dim:
             raise ValueError(f"theta: expected shape [..., {self.space.dim}], got {list(theta.shape)}")
-        if not is_natural(space):
-            return self._log_prob(theta)
-        inner = self.space.to_inference(theta)
-        finite = jnp.all(jnp.isfinite(inner), axis=-1)
-        inner = jnp.where(finite[..., None], inner, self.support.centre)
-        return jnp.where(finite, self._log_prob(inner) - self.space.log_jacobian(inner), -jnp.inf)
+        return _log_prob(self, theta, is_natural(space))
 
     def mean(self, space: SpaceName = "natural") -> Float[Array, " dim"]:
         """The mean, over `MEAN_DRAWS` draws that are the same each time, shape [D]."""
@@ -87,20 +84,20 @@ class Posterior:
         inference space have different maxima where a parameter is inferred as its logarithm: `space` chooses the
         density, and the units of the result.
         """
-        point = _maximum(self, is_natural(space))
-        return self.space.to_natural(point) if is_natural(space) else point
+        draws = self.sample(jax.random.key(0), MAP_DRAWS, space="inference")
+        return _maximum(self, draws, is_natural(space))
 
     def on(self, support: Support) -> "Posterior":
         """The same density truncated to another support, in inference space."""
         return truncated(self.density, self.mixture, support, self.space)
 
-    def _log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
-        return truncated_log_prob(self.density.log_prob(theta), theta, self.support, self.mass_inside)
-
 
 def truncated(density: Density, mixture: GaussianMixture, support: Support, space: Space) -> Posterior:
     """A density truncated to a support, with the mass it has in there."""
     return Posterior(density, mixture, support, mass_inside(density.sample, support), space)
+
+
+# Compiled as wholes: operation by operation, a flow's density alone would be hundreds of small programs.
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -110,16 +107,27 @@ def _sample(key: jax.Array, posterior: Posterior, n: int) -> Array:
     return rejection_sample(key, posterior.density.sample, box, n, fallback)
 
 
-@functools.partial(jax.jit, static_argnums=1)
-def _maximum(posterior: Posterior, natural: bool) -> Array:
-    """The maximum in inference space, of the density over natural units or over inference space."""
+@functools.partial(jax.jit, static_argnums=2)
+def _log_prob(posterior: Posterior, theta: Array, natural: bool) -> Array:
+    """Log-density over natural units or over inference space, at a point in the same."""
+    inner = posterior.space.to_inference(theta) if natural else theta
+    finite = jnp.all(jnp.isfinite(inner), axis=-1)
+    inner = jnp.where(finite[..., None], inner, posterior.support.centre)
+    log_prob = truncated_log_prob(posterior.density.log_prob(inner), inner, posterior.support, posterior.mass_inside)
+    log_jacobian = posterior.space.log_jacobian(inner) if natural else 0.0
+    return jnp.where(finite, log_prob - log_jacobian, -jnp.inf)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _maximum(posterior: Posterior, draws: Array, natural: bool) -> Array:
+    """The maximum of the density over natural units or over inference space, by ascent from the best of some draws."""
     box = posterior.support
 
     def objective(unit: Array) -> Array:
         theta = box.centre + 0.5 * box.width * unit
         return posterior.density.log_prob(theta) - (posterior.space.log_jacobian(theta) if natural else 0.0)
 
-    draws = box.to_unit(_sample(jax.random.key(0), posterior, 1000))
+    draws = box.to_unit(draws)
     _, best = jax.lax.top_k(jax.vmap(objective)(draws), MAP_STARTS)
     adam = optax.adam(optax.cosine_decay_schedule(MAP_RATE, MAP_STEPS))
 
@@ -133,4 +141,5 @@ def _maximum(posterior: Posterior, natural: bool) -> Array:
         return unit, objective(unit)
 
     units, heights = jax.vmap(ascend)(draws[best])
-    return box.clip(box.centre + 0.5 * box.width * units[jnp.argmax(heights)])
+    point = box.clip(box.centre + 0.5 * box.width * units[jnp.argmax(heights)])
+    return posterior.space.to_natural(point) if natural else point
