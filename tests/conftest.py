@@ -39,7 +39,7 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("jaxlfi")
 
-MEMORY = 1000 * 2**20
+MEMORY = 1400 * 2**20
 """Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory."""
 
 MAX_MEMORY = 1600 * 2**20

@@ -217,7 +217,8 @@ class BatchEngine:
 
     def compile(self, state: State, index: int = 0) -> Any:
         """Compile a round ahead of its first use, so that it can be timed by itself; returns the program."""
-        return self._compiled(round_one, state, index)
+        one, more = self._one(index)
+        return self._compiled(one, state, index, *more)
 
     def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
         """Step every run; `state` is consumed.
@@ -226,9 +227,11 @@ class BatchEngine:
             The next state, and the round's record (`jaxlfi.bayessim.record.record`) with a leading axis of one entry a
             run.
         """
-        if index == 0 and self.first is not None:
-            return self._step(given_one, state, index, self.first_round())
-        return self._step(round_one, state, index)
+        one, more = self._one(index)
+        executable = self._compiled(one, state, index, *more)
+        state, rows = executable(self.settings, self.inputs, state, jnp.asarray(index), *more)
+        rows = jax.device_get(rows)
+        return state, {name: value[: self.runs] for name, value in rows.items()}
 
     def first_round(self) -> Simulations:
         """The given simulations, for every run."""
@@ -248,11 +251,11 @@ class BatchEngine:
         rows = np.minimum(np.arange(self._padded), self.runs - 1)
         return jax.tree.map(lambda leaf: jax.device_put(jnp.asarray(leaf)[rows], sharding), tree)
 
-    def _step(self, one: Callable, state: State, index: int, *more: Any) -> tuple[State, dict[str, np.ndarray]]:
-        executable = self._compiled(one, state, index, *more)
-        state, rows = executable(self.settings, self.inputs, state, jnp.asarray(index), *more)
-        rows = jax.device_get(rows)
-        return state, {name: value[: self.runs] for name, value in rows.items()}
+    def _one(self, index: int) -> tuple[Callable, tuple]:
+        """What one run does in a round, and the arguments that it takes besides."""
+        if index == 0 and self.first is not None:
+            return given_one, (self.first_round(),)
+        return round_one, ()
 
     def _compiled(self, one: Callable, state: State, index: int, *more: Any) -> Any:
         # The round's index is not batched: loops over minibatches then have one trip count for all runs.

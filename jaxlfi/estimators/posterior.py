@@ -59,8 +59,9 @@ class Posterior:
             ValueError: for what is no key, or a number that is not whole and at least 1.
         """
         require_count(n, "n")
+        natural = is_natural(space)
         draws = _sample(require_key(key), self, int(n))
-        return self.space.to_natural(draws) if is_natural(space) else draws
+        return self.space.to_natural(draws) if natural else draws
 
     def log_prob(self, theta: ArrayLike | Sequence, space: SpaceName = "natural") -> Float[Array, "*n"]:
         """Log-density at theta, numbers of shape [..., D]; -inf outside the support.

@@ -10,10 +10,19 @@ import numpy as np
 import pytest
 
 from jaxlfi.bayessim import algorithm
-from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack, stack_heuristics, stack_inputs
+from jaxlfi.bayessim.batch import (
+    BatchEngine,
+    RunSpec,
+    given_one,
+    round_one,
+    stack,
+    stack_heuristics,
+    stack_inputs,
+)
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.bayessim.record import own_evidence
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
+from jaxlfi.tasks.presimulated import presimulated
 from tests.small import gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
@@ -132,3 +141,17 @@ def test_two_devices_give_what_one_gives(stepped, tmp_path):
 def test_stacking_makes_a_leading_axis():
     stacked = stack([Edge(mass_threshold=0.1), Edge(mass_threshold=np.float32(0.2))])
     assert all(leaf.shape == (2,) and leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(stacked))
+
+
+def test_what_is_compiled_ahead_is_what_a_round_runs(monkeypatch):
+    """With given simulations another program for the first round, and no unused one."""
+    observed = OBSERVED[None]
+    first = presimulated(gaussian(), {"theta": np.eye(20, 2), "x": np.eye(20, 2)}, gaussian().support("ok"))[0]
+    inputs, _ = stack_inputs(SPECS[:1], observed, observed)
+    seen = []
+    monkeypatch.setattr(BatchEngine, "_compiled", lambda self, one, *_: seen.append(one))
+    for given in (None, first):
+        engine = BatchEngine(gaussian(), SETTINGS, inputs, first=given)
+        engine.compile(None, 0)
+        engine.compile(None, 1)
+    assert seen == [round_one, round_one, given_one, round_one]

@@ -11,7 +11,7 @@ import jaxlfi
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.gaussian_linear import MIXING, NOISE, posterior
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import read_ledger
+from jaxlfi.runs.folder import StoreError, read_ledger
 from jaxlfi.runs.load import load
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
@@ -88,6 +88,12 @@ def test_later_rounds_simulate_as_ever(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         jaxlfi.infer(jax.random.key(2), gaussian(), OBSERVED, out=tmp_path / "stopped", callback=stop, **arguments)
+    others = given | {"theta": given["theta"][::-1].copy()}  # which fill the same box
+    for folder in ("stopped", "run"):
+        with pytest.raises(StoreError, match=r"^out: expected a new folder or one of the same run, .*simulations\)$"):
+            jaxlfi.infer(
+                jax.random.key(2), gaussian(), OBSERVED, out=tmp_path / folder, **arguments | {"simulations": others}
+            )
     resumed = jaxlfi.infer(jax.random.key(2), gaussian(), OBSERVED, out=tmp_path / "stopped", **arguments)
     np.testing.assert_array_equal(resumed.mixture.means, run.mixture.means)
     loaded = load(tmp_path / "run", gaussian())
