@@ -177,7 +177,7 @@ def collect(folder: Path, runs: Runs) -> dict[str, np.ndarray]:
 
 def make(name: str, runs: Runs, folder: Path, out: Path) -> None:
     """Run what is not there yet, and save its posteriors and how they were made."""
-    if not (folder / "table.csv").exists():  # the last thing a complete comparison writes
+    if not (folder / "table.csv").exists():  # the last file that a comparison writes
         command = runs.command(folder)
         subprocess.run([sys.executable, "-m", *command], check=True)
     config = json.loads((folder / "config.json").read_text())

@@ -90,7 +90,7 @@ DIAGNOSE_EXAMPLES = """\
 Truths are drawn from the prior over a support and simulated, and the run's method is asked for the posterior of each:
 by its network, where the run had one round and kept it (--method npe, or --rounds 1 --keep-network), else by repeating
 the whole inference side by side, in chunks that are saved as they end. A command that was stopped goes on when it is
-given again. It takes about as long as that many runs; the exit status is 0 whatever the verdicts.
+given again. It takes about as long as that many runs; a failed check does not change the exit status, 0.
 
 checks:
   rank          of each truth among its draws, by parameter (simulation-based calibration)

@@ -37,11 +37,11 @@ def c2st(key: jax.Array, first: Float[Array, "n dim"], second: Float[Array, "n d
     the moments of the first. Adam's settings, the penalty and when training ends are those of scikit-learn, which
     that definition relies on.
 
-    Departs in two things. Training does not end in the first 50 epochs: where samples are hard to tell apart the loss
-    lies on a plateau at first, where the definition's classifier stops from some starts, as if the samples were alike.
-    Longer plateaus end it still, so a small accuracy is weaker evidence than a large one. And the folds have as many
-    rows of either sample, row i of both in the same: rows that belong together, such as two parameters of one
-    observation, are then held out together. Up to four rows are left out.
+    Two points depart from that definition. Training does not end in the first 50 epochs: where samples are hard to
+    tell apart the loss lies on a plateau at first, where the definition's classifier stops from some starts, as if the
+    samples were alike. Longer plateaus end it still, so a small accuracy is weaker evidence than a large one. And the
+    folds have as many rows of either sample, row i of both in the same: rows that belong together, such as two
+    parameters of one observation, are then held out together. Up to four rows are left out.
 
     Jit it: all folds are trained together. The same key gives the same folds, starts and so the same number.
 

@@ -19,6 +19,7 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.arguments import is_concrete, require_key
 from jaxlfi.distributions.space import SpaceName
 from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.heuristics import Edge, Heuristic, registry
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs import execute as executing
@@ -28,6 +29,7 @@ from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Origin, Run, SupportWarning
 from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
+from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
 
 Callback = Callable[[int, dict[str, np.ndarray]], Any]
@@ -125,9 +127,12 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
         if config.get("status", "finished") == "finished":
             run = load(out, plan.task)
             _require_observation(out, run.observed, observed.trajectory[0])
+            if observed.first is not None:
+                _require_simulations(out, _first_round(run.dataset), _kept(observed.first))
             return run
         _, recorded = executing.reopen(out, plan.task)
         _require_observation(out, recorded.trajectory[0], observed.trajectory[0])
+        _require_simulations(out, _kept(recorded.first), _kept(observed.first))
         observed = recorded
     console = Console(quiet=not progress)
     with RoundProgress(console, plan.settings.rounds, 0, f"{plan.task.name}: 1 run") as bar:
@@ -158,6 +163,23 @@ def _require_observation(out: Path, recorded: Any, observed: Any) -> None:
     """Refuse to go on in the folder of a run with another observation; one that was simulated may be rounded anew."""
     if np.shape(recorded) != np.shape(observed) or not np.allclose(recorded, observed, rtol=1e-4, atol=1e-6):
         raise _of_another_run(out, ["observation"])
+
+
+def _require_simulations(out: Path, recorded: np.ndarray, given: np.ndarray) -> None:
+    """Refuse to go on in the folder of a run that began with other simulations."""
+    if not np.array_equal(recorded, given):
+        raise _of_another_run(out, ["first round (simulations)"])
+
+
+def _kept(given: Simulations | None) -> np.ndarray:
+    """Given simulations as rows of parameters and summaries; none where the first round makes its own."""
+    return np.zeros(0) if given is None else np.concatenate([given.theta, given.x], axis=1)[np.asarray(given.kept)]
+
+
+def _first_round(dataset: Dataset) -> np.ndarray:
+    """The same of a finished run."""
+    rows = np.concatenate([dataset.theta, dataset.x], axis=1)[: int(dataset.size)]
+    return rows[np.asarray(dataset.round)[: int(dataset.size)] == 0]
 
 
 def _of_another_run(out: Path, other: list[str]) -> folders.StoreError:
