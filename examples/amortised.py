@@ -32,7 +32,8 @@ def main():
         draws = run.posterior_of(observation).sample(key, 200)
         return jnp.quantile(draws, jnp.array([0.05, 0.5, 0.95]), axis=0)
 
-    low, median, high = jnp.moveaxis(jax.vmap(interval)(jax.random.split(key_draw, TRUTHS), observations), 1, 0)
+    intervals = jax.jit(jax.vmap(interval, out_axes=1))
+    low, median, high = intervals(jax.random.split(key_draw, TRUTHS), observations)
     held = jnp.mean((low <= truths) & (truths <= high), axis=0)
     error = jnp.mean(jnp.abs(median - truths), axis=0)
     for d, name in enumerate(problem.names):

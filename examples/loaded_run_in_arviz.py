@@ -16,14 +16,16 @@ from jaxlfi.runs.export import to_inference_data
 
 # The posterior is one Gaussian: more components would have to be learnt for nothing.
 ESTIMATOR = jaxlfi.QUICK.estimator.replace(components=1, ensemble_size=2, prune=0.0, learning_rate=3e-3)
-SETTINGS = jaxlfi.QUICK.replace(estimator=ESTIMATOR, rounds=2)
+SETTINGS = jaxlfi.QUICK.replace(
+    estimator=ESTIMATOR, rounds=1, simulations_per_round=4000, simulation_budget=4000, predictive=False
+)
 
 
 def main():
     """Save, load, export."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "gaussian"
-        run = jaxlfi.infer(jax.random.key(0), task(), support="misspecified", settings=SETTINGS)
+        run = jaxlfi.infer(jax.random.key(0), task(), heuristic=jaxlfi.Fixed(), settings=SETTINGS)
         run.save(folder)  # `jaxlfi infer ... --out DIR` writes the same files
         print("kept:", ", ".join(sorted(path.name for path in folder.iterdir())))
 

@@ -30,6 +30,7 @@ def simulate(key, theta):
     return start * jnp.exp(-rate * TIMES) + NOISE * jax.random.normal(key, TIMES.shape)
 
 
+@jax.jit
 def exact(observed):
     """Mean and standard deviation of the true posterior of the logarithms, by a sum over a grid."""
     axes = [jnp.linspace(low, high, 400) for low, high in zip(jnp.log(BOX.low), jnp.log(BOX.high), strict=True)]

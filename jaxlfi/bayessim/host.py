@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_draws, propose_one, update_one
-from jaxlfi.bayessim.programs import program
+from jaxlfi.bayessim.programs import compiled, program
 from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
@@ -33,18 +33,20 @@ class HostEngine(BatchEngine):
         """Prepare, without compiling; see `BatchEngine`."""
         super().__init__(task, settings, inputs, devices=jax.local_devices()[:1], first=first)
         part = lambda one, *axes: program(functools.partial(one, task), self.mesh, (None, 0, 0, None, *axes))
-        self._propose, self._update = part(propose_one), part(update_one, 0)
+        self._propose_many, self._update_many = part(propose_one), part(update_one, 0)
 
     def compile(self, state: State, index: int = 0) -> None:
         """Compile the parts of a round ahead of their first use, while no simulator waits."""
-        theta, _ = self._propose(self.settings, self.inputs, state, jnp.asarray(index))
+        place = jnp.asarray(index)
+        theta, _ = self._propose(state, place)
         if index == 0 and self.first is not None:
             simulations = self.first_round()
         else:
             flags = jnp.zeros(theta.shape[:2], bool)
             x = jnp.zeros((*theta.shape[:2], self.inputs.x.shape[-1]))
             simulations = Simulations(theta, x, jnp.zeros(flags.shape, jnp.int32), flags, flags, jnp.ones(flags.shape))
-        self._update.lower(self.settings, self.inputs, state, jnp.asarray(index), simulations).compile()
+        compiled(self._update_many, (self.settings, self.inputs, state, place, simulations))
+        compiled(_check_draws, (self.inputs, state, place))
 
     def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
         """Step every run; see `BatchEngine.round`."""
@@ -52,9 +54,12 @@ class HostEngine(BatchEngine):
         if index == 0 and self.first is not None:
             simulations = self.first_round()
         else:
-            simulations = self._simulated(*self._propose(self.settings, self.inputs, state, place))
-        state, info = self._update(self.settings, self.inputs, state, place, simulations)
+            simulations = self._simulated(*self._propose(state, place))
+        state, info = _call(self._update_many, self.settings, self.inputs, state, place, simulations)
         return state, jax.device_get(record(info, self._checked(state, place)))
+
+    def _propose(self, state: State, place: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _call(self._propose_many, self.settings, self.inputs, state, place)
 
     def _simulated(self, theta: jax.Array, keys: jax.Array) -> Simulations:
         shape, wanted = self.inputs.observed.shape[1:], self.settings.simulations_per_round
@@ -63,7 +68,7 @@ class HostEngine(BatchEngine):
 
     def _checked(self, state: State, index: jax.Array) -> Discrepancy:
         """How far the runs' posteriors are from truth and observation."""
-        theta, keys = _check_draws(self.inputs, state, index)
+        theta, keys = _call(_check_draws, self.inputs, state, index)
         observed = self.inputs.observed
         if not self.settings.predictive:
             return _stacked([not_simulated(self.task, own, observed[0], self.inputs.x.shape[-1]) for own in theta])
@@ -78,6 +83,11 @@ class HostEngine(BatchEngine):
 
 
 _check_draws = jax.jit(jax.vmap(check_draws, in_axes=(0, 0, None)))
+
+
+def _call(many: Any, *arguments: Any) -> Any:
+    """Call a program compiled once: a state that was read back from a checkpoint does not compile it anew."""
+    return compiled(many, arguments)(*arguments)
 
 
 def _stacked(trees: list[Any]) -> Any:

@@ -1,6 +1,7 @@
 """Run: what an inference run found, as `infer` returns it and `load` reads it back."""
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -122,13 +123,7 @@ class Run:
 
     def conditioned(self, x: Float[Array, " obs"], key: jax.Array | None = None) -> Posterior:
         """The posterior of a summary that a run of one round would have ended with."""
-        settings = self.settings
-        prior = uninformed(self.support, settings.estimator.ensemble_size * settings.estimator.components)
-        heuristic, network = jax.tree.map(jnp.asarray, (self.heuristic, self.network))
-        mixture = network.condition(x, self.support, key).mixture
-        mixture, _ = CORRECTIONS[settings.correction].change(self.task, mixture, prior)
-        belief, _ = heuristic(prior, mixture, self.feasible)
-        return posterior_after(belief, network, x)
+        return _conditioned(self.task, self.settings, self.heuristic, self.network, self.support, self.feasible, x, key)
 
     @property
     def mixture(self) -> GaussianMixture:
@@ -177,6 +172,15 @@ class Run:
             f"observation: expected a trajectory of shape {list(self.observed.shape)} or a summary of shape "
             f"{list(self.x.shape)}, got {list(observation.shape)}"
         )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
+    prior = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
+    mixture = network.condition(x, support, key).mixture
+    mixture, _ = CORRECTIONS[settings.correction].change(task, mixture, prior)
+    belief, _ = heuristic(prior, mixture, feasible)
+    return posterior_after(belief, network, x)
 
 
 _posterior_after = jax.jit(posterior_after)

@@ -14,9 +14,10 @@ from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack, stack_heuristics,
 from jaxlfi.bayessim.keys import run_keys
 from jaxlfi.bayessim.record import own_evidence
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
-from tests.small import SETTINGS, gaussian, whole_runs  # noqa: F401 - a fixture
+from tests.small import gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
+SETTINGS = settings(predictive=False)
 
 
 def spec(support: str, heuristic, seed: int) -> RunSpec:

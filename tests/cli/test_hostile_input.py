@@ -17,7 +17,7 @@ from jaxlfi import figures
 from jaxlfi.cli import parser as cli
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import execute as executing
-from tests.small import FLAGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
+from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
 COMMANDS = ("tasks", "infer", "compare", "grid", "resume", "sample", "diagnose", "report")
 HERE = "tests.cli.test_hostile_input"
@@ -125,33 +125,31 @@ def test_any_failure_before_the_first_round_leaves_no_folder(tmp_path, monkeypat
 
 # ------------------------------------------------------------------------------------------------------- names
 
-NAMES = ("ln k", "c,d")
-MARKED = ("[/m]", "[bold]x")
+NAMES = ("ln k[/m]", "c,d[bold]x")
 
 
 def marked():
-    """Names and units that rich would take for markup."""
-    return dataclasses.replace(gaussian(), name="[/task]", names=MARKED, units=("[m]", "[/red]"))
+    """Names and units that rich would take for markup; neither parameter is a logarithm."""
+    return dataclasses.replace(gaussian(), name="[/task]", names=NAMES, units=("[m]", "[/red]"))
 
 
 @pytest.fixture(scope="module")
 def named(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
-    """A run of a task whose parameters have such names, neither of them a logarithm."""
-    task = dataclasses.replace(gaussian(), names=NAMES)
-    run = jaxlfi.infer(jax.random.key(3), task, settings=settings(rounds=1))
+    """A run of a task whose parameters have such names."""
+    run = jaxlfi.infer(jax.random.key(3), marked(), settings=SETTINGS)
     return run.save(tmp_path_factory.mktemp("named") / "run"), run
 
 
 def test_samples_have_the_names_and_values_of_the_parameters(named, tmp_path):
     """A name that begins with "ln " is no logarithm, and a comma in a name is no second column."""
     folder, run = named
-    draws = np.asarray(run.posterior.sample(jax.random.key(0), 7))
-    assert command("sample", folder, "-n", 7, "--out", tmp_path / "draws.csv") == 0
+    draws = np.asarray(run.posterior.sample(jax.random.key(0), 1000))
+    assert command("sample", folder, "-n", 1000, "--out", tmp_path / "draws.csv") == 0
     with (tmp_path / "draws.csv").open(newline="") as file:
         heading, *rows = csv.reader(file)
     assert tuple(heading) == NAMES
     np.testing.assert_allclose(np.array(rows, float), draws, rtol=1e-6)
-    assert command("sample", folder, "-n", 7, "--out", tmp_path / "draws.npz") == 0
+    assert command("sample", folder, "-n", 1000, "--out", tmp_path / "draws.npz") == 0
     arrays = atomic.read_arrays(tmp_path / "draws.npz")
     assert tuple(arrays["names"]) == NAMES
     np.testing.assert_allclose(arrays["theta"], draws, rtol=1e-6)
@@ -160,12 +158,12 @@ def test_samples_have_the_names_and_values_of_the_parameters(named, tmp_path):
 def test_markup_in_names_is_printed_as_it_is(tmp_path, monkeypatch, capsys):
     assert command("tasks", f"{HERE}:marked") == 0
     output = capsys.readouterr().out
-    assert all(text in output for text in ("[/task]", *MARKED, "[m]", "[/red]"))
+    assert all(text in output for text in ("[/task]", *NAMES, "[m]", "[/red]"))
     out = tmp_path / "[bold]run"
-    assert command("infer", f"{HERE}:marked", *FLAGS, "--rounds", 1, "--out", out) == 0
+    assert command("infer", f"{HERE}:marked", *FLAGS, "--out", out) == 0
     output = capsys.readouterr().out
-    assert "[/task]: 1 run: 1 of 1 rounds to do" in output and f"results: {out}" in output
-    assert command("sample", out, "-n", 3) == 0
+    assert "[/task]: 1 run: 2 of 2 rounds to do" in output and f"results: {out}" in output
+    assert command("sample", out, "-n", 1000) == 0
     assert f"samples: {out / 'samples.csv'}" in capsys.readouterr().out
     monkeypatch.setattr(figures, "report", lambda folder: [folder / "[/x].png"])
     assert command("report", out) == 0

@@ -18,7 +18,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import dataset as datasets
 from jaxlfi.estimators import registry
 from jaxlfi.estimators.base import Estimator, Network, untrained
-from jaxlfi.estimators.posterior import Posterior
+from jaxlfi.estimators.posterior import MAP_DRAWS, Posterior
 from jaxlfi.estimators.training import fit
 from jaxlfi.fields import declared, option
 from jaxlfi.io.serialise import from_json, to_json
@@ -69,7 +69,7 @@ class OneFile(Estimator):
 # -------------------------------------------------------------------------------------------------- the suite
 
 COMMON = {
-    "hidden": (8, 8),
+    "hidden": (8,),
     "transforms": 2,
     "bins": 4,
     "components": 2,
@@ -85,6 +85,8 @@ PHI = Support([np.log(0.1), -4.0], [np.log(20.0), 4.0])
 BOX = Support([np.log(0.4), -1.5], [np.log(6.0), 1.0])
 X = jnp.array([0.4, -1.3, 0.9])
 CELLS = 160
+DRAWS = 3000
+"""Draws that are judged, of `MAP_DRAWS` at a time: the number that `Posterior.map` compiles, too."""
 
 
 def small(kind: type[Estimator]) -> Estimator:
@@ -92,32 +94,69 @@ def small(kind: type[Estimator]) -> Estimator:
     return kind(**{name: value for name, value in COMMON.items() if name in declared(kind)}).check()
 
 
-def perturbed(estimator: Estimator) -> Network:
-    """A network away from its start, as one is that has seen simulations of a part of Phi."""
-    network = jax.jit(lambda key: untrained(key, estimator, 3, PHI, SPACE))(jax.random.key(0))
-    draw = np.random.default_rng(0)
-    params = jax.tree.map(lambda leaf: leaf + 0.15 * draw.normal(size=leaf.shape).astype(np.float32), network.params)
-    of_theta = network.theta_normaliser
-    if of_theta is not None:
-        of_theta = of_theta.replace(mean=jnp.array([0.2, -0.1]), scale=jnp.array([0.3, 0.25]))
-    return network.replace(params=params, theta_normaliser=of_theta)
-
-
 @dataclasses.dataclass
 class Case:
-    """A family, its network and the posterior of X, by a compiled program."""
+    """A family, its network at the start and away from it, and the posterior of X, by a compiled program."""
 
     estimator: Estimator
+    start: Network
     network: Network
     posterior: Posterior
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def perturbed(key: jax.Array, estimator: Estimator) -> tuple[Network, Network, Posterior]:
+    """A network, the same away from its start, as one is that has seen simulations of a part of Phi, and what it says
+    of X.
+    """
+    start = untrained(key, estimator, 3, PHI, SPACE)
+    draw = np.random.default_rng(0)
+    params = jax.tree.map(lambda leaf: leaf + 0.15 * draw.normal(size=leaf.shape).astype(np.float32), start.params)
+    of_theta = start.theta_normaliser
+    if of_theta is not None:
+        of_theta = of_theta.replace(mean=jnp.array([0.2, -0.1]), scale=jnp.array([0.3, 0.25]))
+    network = start.replace(params=params, theta_normaliser=of_theta)
+    return start, network, network.condition(X, BOX)
 
 
 @pytest.fixture(scope="module", params=KINDS)
 def case(request) -> Case:
     """One for each family."""
     estimator = small(KINDS[request.param])
-    network = perturbed(estimator)
-    return Case(estimator, network, jax.jit(Network.condition)(network, X, BOX))
+    return Case(estimator, *perturbed(jax.random.key(8), estimator))
+
+
+@functools.cache
+def cells(natural: bool) -> tuple[np.ndarray, float, tuple[np.ndarray, np.ndarray]]:
+    """Middles of the cells of BOX, [n, n, 2], their area, and the cells' upper edges."""
+    low, high = np.asarray(BOX.low, float), np.asarray(BOX.high, float)
+    if natural:
+        low, high = np.array([np.exp(low[0]), low[1]]), np.array([np.exp(high[0]), high[1]])
+    width = (high - low) / CELLS
+    axes = [low[d] + width[d] * (np.arange(CELLS) + 0.5) for d in range(2)]
+    edges = tuple(axis + 0.5 * w for axis, w in zip(axes, width, strict=True))
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32), float(width.prod()), edges
+
+
+def log_prob(posterior: Posterior, space: str, points=()) -> tuple[np.ndarray, np.ndarray]:
+    """Log-density at the middles of the cells, [n, n], and at some more points: of one shape, so compiled once."""
+    theta, _, _ = cells(space == "natural")
+    more = np.zeros((20, CELLS, 2), np.float32)
+    more.reshape(-1, 2)[: len(points)] = np.reshape(points, (-1, 2))
+    both = np.asarray(posterior.log_prob(np.concatenate([theta, more]), space), float)
+    return both[:CELLS], both[CELLS:].reshape(-1)[: len(points)]
+
+
+def sampled(posterior: Posterior, key: jax.Array) -> np.ndarray:
+    """`DRAWS` draws in inference space."""
+    keys = jax.random.split(key, DRAWS // MAP_DRAWS)
+    return np.concatenate([posterior.sample(key, MAP_DRAWS, space="inference") for key in keys])
+
+
+@pytest.fixture(scope="module")
+def draws(case) -> np.ndarray:
+    """Of the posterior."""
+    return sampled(case.posterior, jax.random.key(2))
 
 
 def test_ours_are_registered():
@@ -135,9 +174,9 @@ def test_families_are_found_by_their_names_and_written_to_json(case):
 
 def test_conditioning_is_the_same_compiled_and_not(case):
     eager = case.network.condition(X, BOX)
-    theta = jnp.stack([BOX.centre, BOX.low, BOX.high])
+    theta = np.stack([BOX.centre, BOX.low, BOX.high])
     np.testing.assert_allclose(
-        eager.log_prob(theta, space="inference"), case.posterior.log_prob(theta, space="inference"), atol=5e-3
+        log_prob(eager, "inference", theta)[1], log_prob(case.posterior, "inference", theta)[1], atol=5e-3
     )
     assert float(eager.mass_inside) == pytest.approx(float(case.posterior.mass_inside), abs=2e-3)
     # Fitting a mixture to draws may end in another order of its components, but not with other moments.
@@ -148,7 +187,7 @@ def test_conditioning_is_the_same_compiled_and_not(case):
 def test_conditioning_can_be_mapped_over_observations(case):
     x = jnp.stack([X, -X])
     both = jax.jit(jax.vmap(lambda x: case.network.condition(x, BOX).log_prob(BOX.centre, space="inference")))(x)
-    assert float(both[0]) == pytest.approx(float(case.posterior.log_prob(BOX.centre, space="inference")), abs=5e-3)
+    assert float(both[0]) == pytest.approx(log_prob(case.posterior, "inference", [BOX.centre])[1][0], abs=5e-3)
     assert abs(float(both[1] - both[0])) > 0.01  # it sees x
 
 
@@ -157,38 +196,26 @@ def test_some_of_the_density_is_inside_and_some_is_not(case):
     assert 0.02 < float(case.posterior.mass_inside) < 0.98
 
 
-@functools.cache
-def cells(natural: bool) -> tuple[np.ndarray, float, tuple[np.ndarray, np.ndarray]]:
-    """Middles of the cells of BOX, [n, n, 2], their area, and the cells' upper edges."""
-    low, high = np.asarray(BOX.low, float), np.asarray(BOX.high, float)
-    if natural:
-        low, high = np.array([np.exp(low[0]), low[1]]), np.array([np.exp(high[0]), high[1]])
-    width = (high - low) / CELLS
-    axes = [low[d] + width[d] * (np.arange(CELLS) + 0.5) for d in range(2)]
-    edges = tuple(axis + 0.5 * w for axis, w in zip(axes, width, strict=True))
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32), float(width.prod()), edges
-
-
 @pytest.mark.parametrize("space", ["natural", "inference"])
 def test_the_density_is_one_in_all_inside_and_nothing_outside(case, space):
     theta, area, _ = cells(space == "natural")
-    log_prob = np.asarray(jax.jit(lambda p: p.log_prob(theta, space))(case.posterior), float)
-    assert np.isfinite(log_prob).all()
+    (low, bottom), (high, top) = theta[0, 0], theta[-1, -1]
+    inside, outside = log_prob(
+        case.posterior, space, [[low, bottom - 1], [high, top + 1], [high + 5, 0.0], [-100.0, 0.0]]
+    )
+    assert np.isfinite(inside).all()
     mass = float(case.posterior.mass_inside)
     # The truncation constant has the error of 10000 draws; a flow's density has kinks that cells blur.
-    assert np.exp(log_prob).sum() * area == pytest.approx(1, abs=0.02 + 5 * np.sqrt((1 - mass) / mass / 10_000))
-    (low, bottom), (high, top) = theta[0, 0], theta[-1, -1]
-    outside = jnp.array([[low, bottom - 1], [high, top + 1], [high + 5, 0.0], [-100.0, 0.0]])
-    assert np.isneginf(case.posterior.log_prob(outside, space)).all()
+    assert np.exp(inside).sum() * area == pytest.approx(1, abs=0.02 + 5 * np.sqrt((1 - mass) / mass / 10_000))
+    assert np.isneginf(outside).all()
 
 
-def test_draws_are_inside_and_have_the_density(case, key):
-    draws = np.asarray(case.posterior.sample(key, 3000, space="inference"))
-    assert draws.shape == (3000, 2)
+def test_draws_are_inside_and_have_the_density(case, draws):
+    assert draws.shape == (DRAWS, 2)
     assert ((draws > np.asarray(BOX.low)) & (draws < np.asarray(BOX.high))).all()
-    assert len(np.unique(draws, axis=0)) == 3000
+    assert len(np.unique(draws, axis=0)) == DRAWS
     theta, _, edges = cells(False)
-    density = np.exp(np.asarray(jax.jit(lambda p: p.log_prob(theta, "inference"))(case.posterior), float))
+    density = np.exp(log_prob(case.posterior, "inference")[0])
     for d in range(2):
         cdf = np.cumsum(density.sum(1 - d)) / density.sum()
         law = lambda t, d=d, cdf=cdf: np.interp(t, np.append(float(BOX.low[d]), edges[d]), np.append(0.0, cdf))
@@ -197,40 +224,36 @@ def test_draws_are_inside_and_have_the_density(case, key):
     centred = theta.reshape(-1, 2) - mass.reshape(-1) @ theta.reshape(-1, 2)
     covariance = (centred * mass.reshape(-1, 1)).T @ centred
     correlation = covariance[0, 1] / np.sqrt(np.prod(np.diag(covariance)))
-    assert np.corrcoef(draws.T)[0, 1] == pytest.approx(correlation, abs=5 / np.sqrt(3000))
+    assert np.corrcoef(draws.T)[0, 1] == pytest.approx(correlation, abs=5 / np.sqrt(DRAWS))
 
 
 def test_draws_in_natural_units_are_the_same_draws(case, key):
-    inner = case.posterior.sample(jax.random.clone(key), 20, space="inference")
-    np.testing.assert_allclose(case.posterior.sample(key, 20), SPACE.to_natural(inner), rtol=1e-5)
+    inner = case.posterior.sample(jax.random.clone(key), MAP_DRAWS, space="inference")
+    np.testing.assert_allclose(case.posterior.sample(key, MAP_DRAWS), SPACE.to_natural(inner), rtol=1e-5)
 
 
-def test_the_mixture_is_like_the_density(case, key):
+def test_the_mixture_is_like_the_density(case, draws, key):
     """What heuristics and proposals see: truncated to the box, it has the moments of the posterior's draws."""
     mixture = case.posterior.mixture
     assert mixture.logits.shape == (case.estimator.ensemble_size * case.estimator.components,)
     chex.assert_tree_all_finite((mixture.means, mixture.scale_tril))
-    first, second = jax.random.split(key)
-    draws = np.asarray(case.posterior.sample(first, 3000, space="inference"))
     like = case.posterior.replace(density=mixture, mass_inside=jnp.ones(()))
-    others = np.asarray(like.sample(second, 3000, space="inference"))
+    others = sampled(like, key)
     scale = draws.std(0)
     np.testing.assert_allclose((others.mean(0) - draws.mean(0)) / scale, 0, atol=0.2)
     np.testing.assert_allclose(others.std(0) / scale, 1, atol=0.2)
 
 
-def test_the_maximum_is_above_all_draws(case, key):
-    draws = case.posterior.sample(key, 500)
+def test_the_maximum_is_above_all_draws(case, draws):
     peak = case.posterior.map()
-    assert float(case.posterior.log_prob(peak)) >= float(case.posterior.log_prob(draws).max()) - 1e-3
+    height = log_prob(case.posterior, "natural", np.concatenate([peak[None], SPACE.to_natural(draws)]))[1]
+    assert height[0] >= height[1:].max() - 1e-3
 
 
 def test_posteriors_are_pytrees(case):
     leaves, structure = jax.tree.flatten(case.posterior)
-    theta = BOX.centre[None]
-    np.testing.assert_array_equal(
-        jax.tree.unflatten(structure, leaves).log_prob(theta, "inference"), case.posterior.log_prob(theta, "inference")
-    )
+    again = jax.tree.unflatten(structure, leaves)
+    np.testing.assert_array_equal(log_prob(again, "inference")[0], log_prob(case.posterior, "inference")[0])
 
 
 def test_training_lowers_the_loss(case):
@@ -240,11 +263,10 @@ def test_training_lowers_the_loss(case):
     x = theta @ np.float32([[1.0, 0.4, 0.0], [-0.2, 0.8, 1.0]]) + 0.1 * draw.normal(size=(80, 3)).astype(np.float32)
     dataset = datasets.empty(80, 2, 3).replace(theta=jnp.asarray(theta), x=jnp.asarray(x), size=jnp.asarray(80))
 
-    def train(key):
-        network = untrained(key, case.estimator, 3, PHI, SPACE).with_normalisers(dataset)
-        return fit(jax.random.key(1), network, dataset, jnp.ones(80), 80)
+    def train(key, network):
+        return fit(key, network.with_normalisers(dataset), dataset, jnp.ones(80), 80)
 
-    network, info = jax.jit(train)(jax.random.key(0))
+    network, info = jax.jit(train)(jax.random.key(1), case.start)
     loss = np.asarray(info.loss)
     assert loss.shape == (2, 60) and np.isfinite(loss).all() and int(info.nonfinite.sum()) == 0
     assert (loss[:, -5:].mean(axis=1) < loss[:, 0] - 0.5).all()

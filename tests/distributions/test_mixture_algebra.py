@@ -194,7 +194,7 @@ def test_skip_keeps_as_component():
         np.testing.assert_allclose(ratio.means[k], A.means[k], atol=1e-6)
         np.testing.assert_allclose(ratio.scale_tril[k], A.scale_tril[k], atol=1e-6)
         # Divided by the divisor's peak, which has the unit of a density, too.
-        peak = float(NARROW_IN_ONE.log_prob(NARROW_IN_ONE.means[0]))
+        peak = float(log_prob(NARROW_IN_ONE, NARROW_IN_ONE.means[0]))
         assert float(ratio.logits[k]) == pytest.approx(float(A.logits[k]) - peak, rel=1e-4)
     assert not bool(pairing.fell_back)
 
@@ -422,8 +422,8 @@ def test_impossible_numbers_of_components_are_named(components):
 
 
 def test_vmap_is_a_loop():
-    batch = jax.vmap(lambda shift: GaussianMixture(A.logits * shift, A.means * shift, A.scale_tril))(
-        jnp.array([1.0, 2.0])
+    batch = jax.tree.map(
+        jnp.asarray, jax.tree.map(lambda a, b: np.stack([a, b]), A, A.replace(logits=2 * A.logits, means=2 * A.means))
     )
 
     def whole(a):

@@ -116,7 +116,7 @@ def test_the_order_of_the_samples_is_nothing(separated):
 
 def test_a_weight_is_so_many_samples_and_none_is_no_sample(separated):
     theta, _ = separated
-    times = np.random.default_rng(4).integers(0, 3, 1200)
+    times = np.random.default_rng(4).permutation(np.arange(1200) % 3)  # 1200 in all
     dirty = np.where(times[:, None] > 0, theta, np.nan)
     repeated = np.repeat(theta, times, axis=0)
     weighted, _ = FIT(jax.random.key(1), dirty, jnp.asarray(times, jnp.float32), **SETTINGS)

@@ -125,13 +125,12 @@ def test_the_mirrored_mixture_in_the_mirrored_box_is_mirrored(key):
 
 def test_it_agrees_with_rejection_where_much_is_inside(key):
     """Ten dimensions, half of the mass inside."""
-    from jaxlfi.distributions.truncation import rejection_sample
-
     mixture = GaussianMixture(jnp.zeros(1), jnp.full((1, 10), 0.5), jnp.eye(10)[None])
     support = Support([-1.0] * 10, [3.0] * 10)
-    first, second = jax.random.split(key)
-    draws = np.asarray(DRAWS(first, mixture, support, 2000))
-    kept = np.asarray(jax.jit(lambda key: rejection_sample(key, mixture.sample, support, 2000))(second))
+    draws = np.asarray(DRAWS(key, mixture, support, 2000))
+    free = np.random.default_rng(0).normal(0.5, 1.0, (4 * N, 10))
+    kept = free[((free >= -1.0) & (free <= 3.0)).all(1)]
+    assert len(kept) > N
     for d in (0, 4, 9):
         assert stats.ks_2samp(draws[:, d], kept[:, d]).pvalue > 1e-3
     assert stats.ks_2samp(draws.sum(1), kept.sum(1)).pvalue > 1e-3

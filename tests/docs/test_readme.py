@@ -11,23 +11,16 @@ import pytest
 
 import jaxlfi
 from jaxlfi.cli import parser as cli
+from tests.small import SETTINGS
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-SMALL = jaxlfi.QUICK.replace(
-    rounds=2,
-    simulations_per_round=40,
-    simulation_budget=50,
-    predictive=False,
-    estimator=jaxlfi.QUICK.estimator.replace(hidden=(16,), steps=100, batch_size=20),
-)
-"""The blocks say nothing of settings; with these they take seconds."""
 RUN = {
     "jaxlfi tasks": "",
-    "jaxlfi infer decay:task": "--rounds 2 --simulations-per-round 60 --simulation-budget 80 --epochs 5 --transforms 1 "
-    "--no-figures",
-    "jaxlfi sample runs/decay": "-n 50",
+    "jaxlfi infer decay:task": "--rounds 2 --simulations-per-round 60 --simulation-budget 80 --epochs 5 --hidden 16 "
+    "--transforms 1 --validation 0 --patience 0 --no-predictive --no-figures",
+    "jaxlfi sample runs/decay": "-n 1000",
 }
 """Commands that are run, and what is appended to make them quick; all others are parsed."""
 
@@ -54,7 +47,7 @@ def fresh(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch, jax.debug_key_reuse(False):
         patch.chdir(place)
         patch.syspath_prepend(str(place))
-        patch.setattr(jaxlfi, "infer", lambda *given, **named: infer(*given, **({"settings": SMALL} | named)))
+        patch.setattr(jaxlfi, "infer", lambda *given, **named: infer(*given, **({"settings": SETTINGS} | named)))
         yield place
 
 
@@ -84,7 +77,7 @@ def test_python_blocks_and_quick_commands_run_in_order(fresh, capsys):
                 ran += found
     assert sorted(ran) == sorted(RUN)
     assert (fresh / "runs/spring/posterior.npz").exists()
-    assert len((fresh / "runs/decay/posterior.csv").read_text().splitlines()) == 51
+    assert len((fresh / "runs/decay/posterior.csv").read_text().splitlines()) == 1001
     run, runs, first = namespace["run"], namespace["runs"], namespace["first"]
     loaded = jaxlfi.load("runs/spring", namespace["task"])
     np.testing.assert_allclose(loaded.mixture.means, run.mixture.means, rtol=1e-5)

@@ -11,14 +11,13 @@ from jaxlfi.tasks.simulation import within_budget
 
 CAPACITY, BUDGET = 8, 5
 augmented = jax.jit(augment)
+kept_within = jax.jit(within_budget, static_argnums=3)
 
 
 def attempts(failure, first: int, simulations_per_round: int = 3):
     """Simulations whose theta and x tell which one they are; those of failures must not be stored."""
-    place = jnp.arange(first, first + len(failure), dtype=jnp.float32)
-    return within_budget(
-        jnp.stack([place, -place], axis=1), 10 * place[:, None], jnp.asarray(failure), simulations_per_round
-    )
+    place = np.arange(first, first + len(failure), dtype=np.float32)
+    return kept_within(np.stack([place, -place], axis=1), 10 * place[:, None], np.array(failure), simulations_per_round)
 
 
 def test_an_empty_dataset_has_no_valid_rows():
@@ -52,7 +51,7 @@ def test_runs_of_a_batch_fill_at_their_own_pace():
     failures = jnp.array([[0, 1, 0, 0, 0], [1, 1, 1, 0, 1]])
     place = jnp.arange(5.0)[:, None]
     one = lambda failure: augment(empty(CAPACITY, 1, 1), within_budget(place, place, failure, 3), 0)
-    both = jax.vmap(one)(failures)
+    both = jax.jit(jax.vmap(one))(failures)
     np.testing.assert_array_equal(both.size, [3, 1])
     np.testing.assert_array_equal(both.theta[:, :4, 0], [[0, 2, 3, 0], [3, 0, 0, 0]])
 
@@ -60,6 +59,6 @@ def test_runs_of_a_batch_fill_at_their_own_pace():
 def test_the_weights_of_given_simulations_are_kept():
     """1 for what a run simulates itself; what was given keeps its own weight, behind which the next rounds' follow."""
     given = attempts([0, 1, 0, 0, 0], 1).replace(weight=jnp.array([0.5, 9.0, 2.0, 0.25, 7.0]))
-    dataset = augment(augment(empty(CAPACITY, 2, 1), given, 0), attempts([0, 0, 1, 1, 1], 101), 1)
+    dataset = augmented(augmented(empty(CAPACITY, 2, 1), given, 0), attempts([0, 0, 1, 1, 1], 101), 1)
     np.testing.assert_array_equal(dataset.weight[:5], [0.5, 2.0, 0.25, 1.0, 1.0])
     np.testing.assert_array_equal(dataset.round[:5], [0, 0, 0, 1, 1])

@@ -1,5 +1,7 @@
 """Posteriors are normalised densities: 1 over their box, nothing outside, and the draws are their own."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,24 +49,34 @@ ESTIMATORS = {
 }
 
 
-@pytest.mark.parametrize("space", ["inference", "natural"])
-@pytest.mark.parametrize("name", ESTIMATORS)
-def test_the_density_of_a_network_is_that_of_its_draws(name, space):
+@functools.cache
+def perturbed(name: str) -> Posterior:
     """An ensemble of two perturbed networks, seen through both affine maps, in a box that cuts it."""
     estimator = ESTIMATORS[name]
     scale, box = Support([-10.0, 0.0], [10.0, 4.0]), Support([0.0, 0.5], [4.0, 2.5])
-    network = untrained(jax.random.key(0), estimator, 3, scale, LOG)
-    leaves, structure = jax.tree.flatten(network.params)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    noisy = [leaf + 0.3 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
-    network = network.replace(
-        params=jax.tree.unflatten(structure, noisy),
-        normaliser=Normaliser(jnp.array([1.0, 0.0, -1.0]), jnp.array([2.0, 1.0, 0.5]), "zscore"),
-    )
-    if network.theta_normaliser is not None:
-        narrow = Normaliser(jnp.array([0.2, -0.3]), jnp.array([0.15, 0.5]), "zscore")
-        network = network.replace(theta_normaliser=narrow)
-    posterior = network.condition(X, box)
+
+    @jax.jit
+    def conditioned(key_start, key_noise):
+        network = untrained(key_start, estimator, 3, scale, LOG)
+        leaves, structure = jax.tree.flatten(network.params)
+        keys = jax.random.split(key_noise, len(leaves))
+        noisy = [leaf + 0.3 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
+        network = network.replace(
+            params=jax.tree.unflatten(structure, noisy),
+            normaliser=Normaliser(jnp.array([1.0, 0.0, -1.0]), jnp.array([2.0, 1.0, 0.5]), "zscore"),
+        )
+        if network.theta_normaliser is not None:
+            narrow = Normaliser(jnp.array([0.2, -0.3]), jnp.array([0.15, 0.5]), "zscore")
+            network = network.replace(theta_normaliser=narrow)
+        return network.condition(X, box)
+
+    return conditioned(jax.random.key(0), jax.random.key(1))
+
+
+@pytest.mark.parametrize("space", ["inference", "natural"])
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_the_density_of_a_network_is_that_of_its_draws(name, space):
+    posterior = perturbed(name)
     assert 0.02 < float(posterior.mass_inside) < 0.9  # a box that cuts nothing would test nothing
     check_density(posterior, space)
 
@@ -72,7 +84,7 @@ def test_the_density_of_a_network_is_that_of_its_draws(name, space):
 def test_the_density_of_a_mixture_is_its_own_within_the_support():
     mixture = gaussian_linear.posterior(np.array([-0.6, -0.3], np.float32))
     box = Support([-1.0, -2.0], [0.5, 0.5])
-    posterior = truncated(mixture, mixture, box, PLAIN)
+    posterior = jax.jit(truncated, static_argnums=3)(mixture, mixture, box, PLAIN)
     check_density(posterior, "inference")
     inside = mixture.log_prob(box.centre[None])[0] - jnp.log(posterior.mass_inside)
     assert float(posterior.log_prob(box.centre)) == pytest.approx(float(inside), abs=1e-4)

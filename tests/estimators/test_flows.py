@@ -24,9 +24,12 @@ def jitted(function, *args):
     return jax.jit(function)(*args)
 
 
+_start = jax.jit(lambda module, key, obs: module.init(key, jnp.zeros(obs)), static_argnums=(0, 2))
+
+
 def perturbed(module, seed: int = 0, size: float = 0.15, obs: int = 3):
     """Parameters away from the start, also in the last layers."""
-    params = jitted(module.init, jax.random.key(seed), jnp.zeros(obs))
+    params = _start(module, jax.random.key(seed), obs)
     leaves, tree = jax.tree.flatten(params)
     draw = np.random.default_rng(seed)
     return jax.tree.unflatten(tree, [leaf + size * draw.normal(size=leaf.shape).astype(np.float32) for leaf in leaves])
@@ -42,7 +45,7 @@ def flow3(request):
 @families
 def test_starts_as_a_standard_normal(family):
     module = FLOWS[family](2, **SMALL)
-    params = jitted(module.init, jax.random.key(3), jnp.zeros(3))
+    params = _start(module, jax.random.key(3), 3)
     theta = jnp.array([[0.0, 0.0], [1.0, -2.5], [30.0, 4.0]])
     log_prob = jitted(lambda params: module.apply(params, 2 * X).log_prob(theta), params)
     np.testing.assert_allclose(log_prob, stats.norm.logpdf(theta).sum(-1), rtol=1e-5)
@@ -172,10 +175,10 @@ def test_every_transformed_dimension_depends_on_x(family, dim):
 def test_batches_are_rows_by_themselves_and_axes_in_front_are_more_theta(family):
     """What all density estimators have in common, the mixture density network too."""
     module = MDN(2, 2, (6,), "tanh") if family == "mdn" else FLOWS[family](2, **SMALL)
-    members = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(perturbed(module, seed) for seed in (0, 1)))
+    members = jax.tree.map(lambda *leaves: np.stack(leaves), *(perturbed(module, seed) for seed in (0, 1)))
     draw = np.random.default_rng(6)
-    x = jnp.asarray(draw.normal(size=(4, 3)), jnp.float32)
-    theta = jnp.asarray(draw.normal(size=(5, 4, 2)), jnp.float32)
+    x = draw.normal(size=(4, 3)).astype(np.float32)
+    theta = draw.normal(size=(5, 4, 2)).astype(np.float32)
 
     def log_prob(params, x, theta):
         return module.apply(params, x).log_prob(theta)
@@ -227,8 +230,13 @@ def test_spline_is_that_of_distrax():
     unused = jnp.zeros((2, 302, 1))
     knobs = jnp.moveaxis(raw, 1, -1)
     knobs = jnp.concatenate([knobs[..., : 2 * bins], unused, knobs[..., 2 * bins :], unused], axis=-1)
-    theirs = distrax.RationalQuadraticSpline(knobs, -tail, tail, "identity", 2 * tail * 1e-3, 1e-3)
-    for inverse, expected in ((False, theirs.forward_and_log_det(x)), (True, theirs.inverse_and_log_det(x))):
+
+    @jax.jit
+    def theirs(knobs, x):
+        spline = distrax.RationalQuadraticSpline(knobs, -tail, tail, "identity", 2 * tail * 1e-3, 1e-3)
+        return spline.forward_and_log_det(x), spline.inverse_and_log_det(x)
+
+    for inverse, expected in zip((False, True), theirs(knobs, x), strict=True):
         value, log_slope = jax.jit(spline, static_argnums=(2, 3))(x, raw, tail, inverse)
         np.testing.assert_allclose(value, expected[0], rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(log_slope, expected[1], rtol=2e-3, atol=2e-3)
@@ -264,9 +272,9 @@ def test_fits_a_banana_that_moves_with_x(family):
         updates, moments = adam.update(gradient, moments, params)
         return optax.apply_updates(params, updates), moments
 
-    params = jitted(module.init, jax.random.key(0), jnp.zeros(1))
+    params = _start(module, jax.random.key(0), 1)
     fitted, _ = jax.jit(lambda p: jax.lax.fori_loop(0, 300, step, (p, adam.init(p))))(params)
-    x, theta, exact = target(jax.random.key(2), 4000)
+    x, theta, exact = jax.jit(target, static_argnums=1)(jax.random.key(2), 4000)
     np.testing.assert_allclose(-exact.mean(), np.log(2 * np.pi * np.e) + np.log(scales).sum(), atol=0.1)
     divergence = jax.jit(lambda p: jnp.mean(exact - module.apply(p, x).log_prob(theta)))
     assert divergence(params) > 0.8

@@ -48,8 +48,8 @@ def folder(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
 
 def test_what_is_exported(folder):
     pytest.importorskip("arviz")
-    data, run = to_inference_data(folder, 40, seed=2), load(folder)
-    draws = np.asarray(run.posterior.sample(jax.random.key(2), 40))
+    data, run = to_inference_data(folder, 1000, seed=2), load(folder)
+    draws = np.asarray(run.posterior.sample(jax.random.key(2), 1000))
     assert set(data.posterior.data_vars) == {"mass", "drag"}
     for d, name in enumerate(("mass", "drag")):
         np.testing.assert_array_equal(data.posterior[name].values, draws[None, :, d])
@@ -69,11 +69,11 @@ def test_what_is_exported(folder):
 def test_the_command_line_writes_netcdf(folder, tmp_path, capsys):
     arviz = pytest.importorskip("arviz")
     out = tmp_path / "draws.nc"
-    assert command("sample", folder, "-n", 30, "--out", out) == 0
+    assert command("sample", folder, "-n", 1000, "--out", out) == 0
     assert list(tmp_path.iterdir()) == [out]
     read = arviz.from_netcdf(str(out))
     assert {"posterior", "observed_data", "posterior_predictive"} <= set(read.groups())
-    draws = load(folder).posterior.sample(jax.random.key(0), 30)
+    draws = load(folder).posterior.sample(jax.random.key(0), 1000)
     np.testing.assert_array_equal(read.posterior["drag"].values[0], draws[:, 1])
     assert command("sample", folder, "--out", out) == 2 and "exists" in capsys.readouterr().err
 

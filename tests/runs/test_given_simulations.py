@@ -39,6 +39,10 @@ def host_task():
 
 
 ONE = settings(rounds=1, predictive=False)
+TRAINED = ONE.replace(
+    estimator=SETTINGS.estimator.replace(steps=1500, batch_size=100, learning_rate=1e-2, components=1)
+)
+"""Trained well; 600 pairs are one program."""
 
 
 def test_one_round_of_given_simulations_simulates_nothing():
@@ -56,12 +60,8 @@ def test_one_round_of_given_simulations_simulates_nothing():
 
 
 def test_their_posterior_is_the_exact_one():
-    estimator = SETTINGS.estimator.replace(steps=1500, batch_size=100, learning_rate=1e-2, components=1)
     given = pairs(600) | {"low": BOX[0], "high": BOX[1]}
-    run = jaxlfi.infer(
-        jax.random.key(1), host_task(), simulations=given, settings=ONE.replace(estimator=estimator),
-        heuristic=jaxlfi.Fixed(),
-    )  # fmt: skip
+    run = jaxlfi.infer(jax.random.key(1), host_task(), simulations=given, settings=TRAINED, heuristic=jaxlfi.Fixed())
     np.testing.assert_allclose([run.support.low, run.support.high], BOX)
     exact = posterior(OBSERVED)
     deviation = np.sqrt(np.diag(exact.covariance))
@@ -72,7 +72,7 @@ def test_their_posterior_is_the_exact_one():
 def test_later_rounds_simulate_as_ever(tmp_path):
     given = pairs(60)
     given["trajectory"][:7] = np.nan
-    arguments = {"simulations": given, "settings": SETTINGS, "heuristic": jaxlfi.Edge()}
+    arguments = {"simulations": given, "settings": settings(predictive=False), "heuristic": jaxlfi.Edge()}
     seen = []
     run = jaxlfi.infer(
         jax.random.key(2), gaussian(), OBSERVED, out=tmp_path / "run",
@@ -184,13 +184,12 @@ def test_one_weight_of_many_is_limited():
 
 
 def test_weights_change_what_is_learnt():
-    """Half of the pairs are given the weight of next to nothing: the posterior is that of the other half."""
-    given = pairs(200)
-    given["trajectory"][100:] -= 2.0
-    weighted = given | {"log_density": np.where(np.arange(200) < 100, 0.0, 14.0)}
-    estimator = SETTINGS.estimator.replace(steps=400, batch_size=100, learning_rate=1e-2, components=1)
+    """Two thirds of the pairs are given the weight of next to nothing: the posterior is that of the others."""
+    given = pairs(600)
+    given["trajectory"][200:] -= 1.5
+    weighted = given | {"log_density": np.where(np.arange(600) < 200, 0.0, 14.0)}
     infer = lambda simulations: jaxlfi.infer(
-        jax.random.key(0), host_task(), simulations=simulations, settings=ONE.replace(estimator=estimator),
+        jax.random.key(0), host_task(), simulations=simulations, settings=TRAINED,
         support=Support([-3.0, -3.0], [3.0, 3.0]), heuristic=jaxlfi.Fixed(),
     )  # fmt: skip
     exact = np.asarray(posterior(OBSERVED).mean)

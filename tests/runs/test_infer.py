@@ -11,7 +11,7 @@ import jaxlfi
 from jaxlfi import Support
 from jaxlfi.bayessim import programs
 from jaxlfi.envs import gaussian_linear
-from jaxlfi.heuristics import Edge, Fixed, Truncate
+from jaxlfi.heuristics import Choice, Edge, Fixed, Truncate
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.folder import StoreError, read_ledger
 from jaxlfi.runs.load import load
@@ -22,6 +22,22 @@ pytestmark = pytest.mark.filterwarnings("ignore::jaxlfi.SupportWarning")
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
 ARRAYS = ("posterior.npz", "dataset.npz", "history.npz", "observation.npz")
+ONE = settings(rounds=1)
+BOX = Support([0.5, -3.0], [3.0, 3.0])
+
+
+def fails_above(key, theta):
+    """The Gaussian task's simulator, which fails where the first parameter is large."""
+    return gaussian_linear.simulate(key, theta), theta[0] < 2.5
+
+
+OWN = dataclasses.replace(
+    gaussian(), simulate=fails_above, supports={"own": BOX, "failing": Support([2.6, -3.0], [3.0, 3.0])}, feasible=BOX,
+    log=("first",), observation=OBSERVED,
+)  # fmt: skip
+"""A task with a logarithm, failures and an observation of its own; one program serves all runs of it."""
+FIXED, TRUNCATE = (Choice(index, (Fixed(), Truncate())) for index in range(2))
+"""Two heuristics that never widen a support, in one program."""
 
 
 def infer(seed=0, task=None, observation=OBSERVED, **arguments):
@@ -64,16 +80,29 @@ def test_an_equal_task_made_anew_compiles_nothing(compilations):
     assert len(compilations()) > before
 
 
-def test_vmap_over_anything_equals_a_loop():
-    edges = [Edge(mass_threshold=tau) for tau in (0.005, 0.2, 0.9)]
-    observations = OBSERVED + np.array([[0.0], [0.5], [1.0]], np.float32)
-    low = np.array([[-3.0, -3.0], [-2.0, -2.0], [-1.0, -3.0]], np.float32)
-    high = jnp.array([0.0, 3.0])
-    together = jax.vmap(lambda h, o, low: infer(heuristic=h, observation=o, support=Support(low, high)))(
-        jaxlfi.stack(edges), jnp.asarray(observations), jnp.asarray(low)
-    )
-    for i, edge in enumerate(edges):
-        alone = infer(heuristic=edge, observation=observations[i], support=Support(low[i], np.asarray(high)))
+BATCH = {
+    "key": jax.random.split(jax.random.key(0), 3),
+    "heuristic": jaxlfi.stack([Edge(mass_threshold=tau) for tau in (0.005, 0.2, 0.9)]),
+    "observation": OBSERVED + np.array([[0.0], [0.5], [1.0]], np.float32),
+    "low": np.array([[-3.0, -3.0], [-2.0, -2.0], [-1.0, -3.0]], np.float32),
+}
+
+
+def one_of_batch(key, heuristic, observation, low):
+    """A run of everything that can be mapped over."""
+    support = Support(low, jnp.array([0.0, 3.0]))
+    return jaxlfi.infer(key, gaussian(), observation, support=support, heuristic=heuristic, settings=SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def together(whole_runs):  # noqa: F811 - the fixture
+    """Three runs under `vmap`."""
+    return jax.vmap(lambda batch: one_of_batch(**batch))(jax.tree.map(jnp.asarray, BATCH))
+
+
+def test_vmap_over_anything_equals_a_loop(together):
+    for i in range(3):
+        alone = one_of_batch(**jax.tree.map(lambda leaf, i=i: leaf[i], BATCH))
         own = jax.tree.map(lambda leaf, i=i: leaf[i], together)
         for a, b in zip(jax.tree.leaves(own.belief), jax.tree.leaves(alone.belief), strict=True):
             np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-3)
@@ -83,7 +112,19 @@ def test_vmap_over_anything_equals_a_loop():
     for what in ("save", "warnings"):
         with pytest.raises(ValueError, match=rf"^{what}: expected one run, got a batch .*jax\.tree\.map"):
             together.save("nowhere") if what == "save" else together.warnings
-    assert own.warnings is not None and own.posterior.sample(jax.random.key(0), 3).shape == (3, 2)
+    assert own.warnings is not None and own.posterior.sample(jax.random.key(0), 1000).shape == (1000, 2)
+
+
+def test_a_batch_under_vmap_is_not_saved(together, tmp_path):
+    with pytest.raises(ValueError, match=r"^save: expected one run, got a batch of them .*jax\.tree\.map\(") as refused:
+        together.save(tmp_path / "batch")
+    assert "\n" not in str(refused.value) and not (tmp_path / "batch").exists()
+    one = jax.tree.map(lambda leaf: leaf[1], together)
+    again = load(one.save(tmp_path / "one"), gaussian())
+    assert jax.tree.structure(again.belief) == jax.tree.structure(one.belief)
+    for a, b in zip(jax.tree.leaves(again.belief), jax.tree.leaves(one.belief), strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(jax.random.key_data(again.key), jax.random.key_data(BATCH["key"][1]))
 
 
 @pytest.mark.parametrize("argument", [{"progress": True}, {"callback": print}, {"out": "nowhere"}])
@@ -115,42 +156,48 @@ class Stopped(Exception):
 
 
 def test_a_run_in_a_folder_goes_on_where_a_callback_stopped_it(tmp_path):
-    three = settings(rounds=3)
     seen, rows = [], []
 
     def watch(index, row):
         seen.append(index)
         rows.append(row)
 
-    whole = infer(3, settings=three, callback=watch, out=tmp_path / "whole")
-    assert seen == [0, 1, 2]
+    whole = infer(3, callback=watch, out=tmp_path / "whole")
+    assert seen == [0, 1]
     for index, row in enumerate(rows):  # of the one run, by the names of its history
         np.testing.assert_array_equal(row["theta"], whole.history["theta"][index])
         assert row["sample_theta"].shape == (20, 2)
 
-    def stop(index, row):
-        if index == 1:
-            raise Stopped
+    def stop_at(last):
+        def stop(index, row):
+            left.append(index)
+            if index == last:
+                raise Stopped
 
-    with pytest.raises(Stopped):
-        infer(3, settings=three, callback=stop, out=tmp_path / "stopped")
-    with pytest.raises(StoreError, match=r"expected a finished run; go on with it by 'jaxlfi resume'"):
-        load(tmp_path / "stopped")
+        return stop
+
+    for last in (0, 1):  # before the last round, and after it, before anything is written of the result
+        left = []
+        with pytest.raises(Stopped):
+            infer(3, callback=stop_at(last), out=tmp_path / "stopped")
+        assert left == [last]
+        with pytest.raises(StoreError, match=r"expected a finished run; go on with it by 'jaxlfi resume'"):
+            load(tmp_path / "stopped")
     left = []
-    resumed = infer(3, settings=three, callback=lambda index, row: left.append(index), out=tmp_path / "stopped")
-    assert left == [2]
+    resumed = infer(3, callback=stop_at(0), out=tmp_path / "stopped")
+    assert left == []
     for name in ARRAYS:
         same_arrays(tmp_path / "whole" / name, tmp_path / "stopped" / name)
-    assert [line["round"] for line in read_ledger(tmp_path / "stopped")] == [0, 1, 2]
-    np.testing.assert_array_equal(resumed.draws(9), whole.draws(9))
+    assert [line["round"] for line in read_ledger(tmp_path / "stopped")] == [0, 1]
+    np.testing.assert_array_equal(resumed.draws(), whole.draws())
     assert not (tmp_path / "stopped" / "checkpoint").exists()
     # Finished: it is read, and nothing is done again.
-    done = infer(3, settings=three, callback=stop, out=tmp_path / "stopped")
+    done = infer(3, callback=stop_at(0), out=tmp_path / "stopped")
     np.testing.assert_array_equal(done.mixture.means, whole.mixture.means)
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
-    infer(0, settings=settings(rounds=1), out=tmp_path / "run")
+    infer(0, settings=ONE, out=tmp_path / "run")
     before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     others = {
         "seed": {"seed": 1},
@@ -160,26 +207,26 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
     }
     for name, changes in others.items():
         with pytest.raises(StoreError, match=f"^out: expected a new folder or one of the same run, got .* {name}$"):
-            infer(out=tmp_path / "run", **({"settings": settings(rounds=1)} | changes))
+            infer(out=tmp_path / "run", **({"settings": ONE} | changes))
     (tmp_path / "occupied").mkdir()
     (tmp_path / "occupied" / "notes.txt").write_text("mine")
     with pytest.raises(StoreError, match=r"^out: expected a new or empty folder"):
-        infer(settings=settings(rounds=1), out=tmp_path / "occupied")
+        infer(settings=ONE, out=tmp_path / "occupied")
     assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
 
 
 def test_another_observation_or_support_is_another_run(tmp_path):
     """They do not stand in the settings, but the result of the folder would not be the one that was asked for."""
-    infer(0, settings=settings(rounds=1), out=tmp_path / "run")
+    infer(0, settings=ONE, out=tmp_path / "run")
     for changes in ({"observation": OBSERVED + 1}, {"support": "ok"}):
         with pytest.raises(StoreError, match=r"^out: expected a new folder or one of the same run"):
-            infer(out=tmp_path / "run", settings=settings(rounds=1), **changes)
+            infer(out=tmp_path / "run", settings=ONE, **changes)
 
 
 def test_progress_is_shown_when_asked_for(capsys):
-    infer(settings=settings(rounds=1))
+    infer(settings=ONE)
     assert capsys.readouterr().out == ""
-    infer(settings=settings(rounds=1), progress=True)
+    infer(settings=ONE, progress=True)
     assert "gaussian_linear: 1 run" in capsys.readouterr().out
 
 
@@ -187,20 +234,21 @@ def test_progress_is_shown_when_asked_for(capsys):
 
 
 def test_draws_lie_in_the_support():
-    run = infer(heuristic=Fixed(), support="ok")
-    draws = run.posterior.sample(jax.random.key(1), 500)
-    assert draws.shape == (500, 2) and bool(run.belief.support.contains(draws).all())
+    run = infer(task=OWN, heuristic=FIXED, support="own", settings=ONE)
+    draws = run.posterior.sample(jax.random.key(1), 1000)
+    assert draws.shape == (1000, 2) and bool(BOX.contains(draws).all())
+    assert bool(run.belief.support.contains(run.space.to_inference(draws)).all())
 
 
 def test_a_network_of_one_round_knows_other_observations(tmp_path):
-    one = settings(rounds=1)
-    run = infer(settings=one, heuristic=Edge())
+    run = infer(settings=ONE, heuristic=Edge())
     assert run.amortised
     own, again = run.posterior, run.posterior_of(OBSERVED)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(own), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
     other = run.posterior_of(OBSERVED + 1)
-    assert np.abs(np.asarray(other.mean()) - np.asarray(own.mean())).max() > 0.05
+    means = [np.asarray(posterior.sample(jax.random.key(0), 1000)).mean(0) for posterior in (own, other)]
+    assert np.abs(means[1] - means[0]).max() > 0.05
     loaded = load(run.save(tmp_path / "run"), gaussian()).posterior_of(OBSERVED + 1)
     np.testing.assert_allclose(loaded.mixture.means, other.mixture.means, rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match=r"^observation: expected a trajectory of shape \[2\] .* got \[3\]$"):
@@ -218,9 +266,9 @@ def test_a_network_of_several_rounds_does_not():
 
 def test_a_fixed_support_that_is_wrong_warns():
     # Hardly trained, the posterior is nearly as wide as Phi: far wider than this support.
-    narrow = Support([-0.2, -0.2], [0.2, 0.2])
-    with pytest.warns(jaxlfi.SupportWarning, match="first: .* upper bound 0.2"):
-        run = infer(support=narrow, heuristic=Fixed())
+    narrow = Support([0.9, -0.2], [1.1, 0.2])
+    with pytest.warns(jaxlfi.SupportWarning, match="second: .* upper bound 0.2"):
+        run = infer(task=OWN, support=narrow, heuristic=FIXED, settings=ONE)
     assert any("widen the support" in text for text in run.warnings)
 
 
@@ -228,8 +276,8 @@ def test_without_an_observation_one_is_simulated_at_the_truth():
     a, b, c = infer(0, observation=None), infer(0, observation=None), infer(1, observation=None)
     np.testing.assert_array_equal(a.observed, b.observed)
     assert not np.allclose(a.observed, c.observed)
-    fixed = dataclasses.replace(gaussian(), observation=OBSERVED)
-    np.testing.assert_array_equal(infer(0, fixed, observation=None).observed, OBSERVED)
+    own = infer(0, OWN, observation=None, support="own", heuristic=FIXED, settings=ONE)
+    np.testing.assert_array_equal(own.observed, OBSERVED)
 
 
 # ------------------------------------------------------------------------------------------------- what is refused
@@ -275,21 +323,17 @@ def test_a_key_is_one_typed_key(key):
         (lambda key, theta: theta[0], r"expected one array"),
         (lambda key, theta: (theta, theta, theta), r"expected one array"),
         (lambda key, theta: (theta, theta > 0), "expected a scalar outcome"),
-        (lambda key, theta: (theta, False), r"got none \(failed: 25, non_finite: 0\)"),
+        (fails_above, r"got none \(failed: 25, non_finite: 0\)"),
     ],
 )
 def test_a_simulator_that_breaks_its_contract_is_named(simulate, message):
     with pytest.raises(SimulatorError, match=message):
-        infer(task=dataclasses.replace(gaussian(), simulate=simulate, summary=lambda trajectory: trajectory))
+        infer(task=dataclasses.replace(OWN, simulate=simulate), support="failing", heuristic=FIXED, settings=ONE)
 
 
 def test_bounds_are_natural_unless_asked_for_otherwise():
-    box = Support([0.5, -3.0], [3.0, 3.0])
-    task = dataclasses.replace(gaussian(), supports={"own": box}, feasible=box, log=("first",))
-    natural = infer(
-        task=task, support=Support([1.0, -1.0], [2.0, 1.0]), heuristic=Truncate(), settings=settings(rounds=1)
-    )
+    natural = infer(task=OWN, support=Support([1.0, -1.0], [2.0, 1.0]), heuristic=TRUNCATE, settings=ONE)
     inner = Support([0.0, -1.0], [float(np.log(2.0)), 1.0])
-    inference = infer(task=task, support=inner, space="inference", heuristic=Truncate(), settings=settings(rounds=1))
+    inference = infer(task=OWN, support=inner, space="inference", heuristic=TRUNCATE, settings=ONE)
     np.testing.assert_allclose(natural.support.low, [0.0, -1.0])
     np.testing.assert_allclose(natural.belief.mixture.means, inference.belief.mixture.means, rtol=1e-3, atol=1e-3)

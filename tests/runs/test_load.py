@@ -17,7 +17,7 @@ from jaxlfi.io import files as atomic
 from jaxlfi.runs.describe import settings_to_json
 from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.load import load
-from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
+from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
 CHOICE = Choice(1, (Edge(), Matched(Mode(proximity=0.3)), Fixed()))
@@ -85,8 +85,8 @@ def test_a_run_of_a_task_made_in_python_is_loaded_without_it(run, saved, tmp_pat
     assert json.loads((saved / "config.json").read_text())["task"] is None
     again = load(saved)
     assert again.task is None and again.space == run.space
-    np.testing.assert_array_equal(again.draws(50), run.draws(50))
-    assert np.isfinite(again.posterior.log_prob(again.posterior.mean()))
+    np.testing.assert_array_equal(again.draws(), run.draws())
+    assert np.isfinite(again.posterior.log_prob(again.draws())).all()
     with pytest.raises(
         StoreError, match=r"^save: expected a run whose task is known: jaxlfi\.load\(folder, task=\.\.\.\)"
     ):
@@ -100,7 +100,7 @@ def test_a_run_of_a_task_made_in_python_is_loaded_without_it(run, saved, tmp_pat
 def compared(tmp_path_factory):
     """A comparison of two configurations, of one seed each."""
     out = tmp_path_factory.mktemp("compare") / "comparison"
-    own = ("--configurations", "misspecified", "misspecified+edge", "--seeds", "1", "--rounds", "1")
+    own = ("--configurations", "misspecified", "misspecified+edge", "--seeds", "1", "--rounds", "1", "--no-predictive")
     assert command("compare", TASK, *FLAGS, *own, "--out", out) == 0
     return out
 
@@ -108,7 +108,7 @@ def compared(tmp_path_factory):
 FRESH = """
 import sys, jax, numpy as np, jaxlfi
 run = jaxlfi.load(sys.argv[1])
-draws = run.posterior.sample(jax.random.key(0), 200)
+draws = run.posterior.sample(jax.random.key(0), 1000)
 np.savez(sys.argv[2], draws=draws, means=run.mixture.means, task=run.task.name, amortised=run.amortised)
 """
 
@@ -123,25 +123,13 @@ def test_a_fresh_process_loads_a_run_of_a_comparison(compared, tmp_path):
     assert done.returncode == 0, done.stderr
     fresh = np.load(tmp_path / "fresh.npz")
     np.testing.assert_array_equal(fresh["means"], here.mixture.means)
-    np.testing.assert_allclose(fresh["draws"], here.posterior.sample(jax.random.key(0), 200), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(fresh["draws"], here.posterior.sample(jax.random.key(0), 1000), rtol=1e-4, atol=1e-5)
     assert str(fresh["task"]) == "gaussian_linear" and bool(fresh["amortised"])
 
 
 def test_the_folder_of_several_runs_is_refused_with_advice(compared):
     with pytest.raises(StoreError, match=r"expected the folder of one run, such as .*misspecified/seed_000$"):
         load(compared)
-
-
-def test_a_batch_under_vmap_is_not_saved(tmp_path):
-    keys = jax.random.split(jax.random.key(0), 2)
-    together = jax.vmap(lambda key: jaxlfi.infer(key, gaussian(), OBSERVED, settings=settings(rounds=1)))(keys)
-    with pytest.raises(ValueError, match=r"^save: expected one run, got a batch of them .*jax\.tree\.map\(") as refused:
-        together.save(tmp_path / "batch")
-    assert "\n" not in str(refused.value) and not (tmp_path / "batch").exists()
-    one = jax.tree.map(lambda leaf: leaf[1], together)
-    again = load(one.save(tmp_path / "one"), gaussian())
-    same_leaves(again.belief, one.belief)
-    np.testing.assert_array_equal(jax.random.key_data(again.key), jax.random.key_data(keys[1]))
 
 
 # ------------------------------------------------------------------------------------------------- damaged folders

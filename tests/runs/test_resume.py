@@ -11,6 +11,9 @@ from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.runs.folder import read_ledger
 from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401 - a fixture
 
+ARGUMENTS = ("infer", TASK, "--support", "misspecified", *FLAGS, "--seeds", "2", "--out")
+"""One program for all tests; what is killed has two runs, and so two of some files."""
+
 
 class Killed(BaseException):
     """The process dies here."""
@@ -40,15 +43,14 @@ def kill_at(monkeypatch, nth: int, midway: bool):
 
 
 def test_a_run_killed_at_any_write_resumes_to_the_same_bits(tmp_path, monkeypatch):
-    arguments = ("infer", TASK, "--support", "misspecified", *FLAGS, "--seeds", "2", "--out")
-    assert command(*arguments, tmp_path / "whole") == 0
+    assert command(*ARGUMENTS, tmp_path / "whole") == 0
     created, killed = 0, 0
     for nth in range(1, 100):
         out = tmp_path / f"killed_{nth}"
         with monkeypatch.context() as patch:
             kill_at(patch, nth, midway=nth % 3 == 0)
             try:
-                assert command(*arguments, out) == 0
+                assert command(*ARGUMENTS, out) == 0
                 break
             except Killed:
                 killed += 1
@@ -75,12 +77,12 @@ def assert_same_arrays(a, b):
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """A run that was killed after its first round."""
+    """Runs that were killed after their first round."""
     out = tmp_path_factory.mktemp("stopped") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        kill_at(patch, 5, midway=False)
+        kill_at(patch, 7, midway=False)  # with the first run's line in its ledger, and not yet the second's
         with pytest.raises(Killed):
-            command("infer", TASK, *FLAGS, "--out", out)
+            command(*ARGUMENTS, out)
     assert Checkpoint(out).rounds_done() == 1
     return out
 

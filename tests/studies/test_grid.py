@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import json
 import os
 import pathlib
@@ -40,6 +41,7 @@ QUIET = Console(quiet=True)
 CHUNKS = pathlib.Path("nowhere")
 
 
+@functools.cache
 def task():
     """The Gaussian task with a region where simulations fail, so that success rates differ."""
     base = gaussian_linear.task()

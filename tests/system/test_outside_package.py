@@ -5,6 +5,7 @@ with the entry points of its pyproject.toml. (The environment borrows the packag
 that nothing is downloaded and nothing needs to be built.)
 """
 
+import functools
 import json
 import os
 import shutil
@@ -135,6 +136,21 @@ PROBLEM = '''
             log=("slope",),
         )
 '''
+SESSION = """
+    import contextlib, io, json, sys
+
+    channel, sys.stdout = sys.stdout, sys.stderr  # what is printed by the way
+    for line in sys.stdin:
+        output, errors = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+            try:
+                exec(json.loads(line), {})
+                status = 0
+            except SystemExit as stop:
+                status = stop.code
+        print(json.dumps([status, output.getvalue(), errors.getvalue()]), file=channel, flush=True)
+"""
+"""A process that executes one script after another, and so compiles what they share once."""
 TINY = (
     "--estimator independent --units 4 --learning-rate 1e-2 --steps 40 --batch-size 20 --validation 0 --patience 0 "
     "--ensemble-size 1 --components 2 --simulations-per-round 20 --simulation-budget 25 --no-figures"
@@ -186,15 +202,15 @@ class Environment:
         }
         self.variables = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | own
 
-    def start(self, *words) -> subprocess.Popen:
+    def start(self, *words, **streams) -> subprocess.Popen:
         """A command of its own, in the working folder."""
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | streams
         return subprocess.Popen(
             [str(self.python), *map(str, words)],
             cwd=self.work,
             env=self.variables,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
             text=True,
+            **streams,
         )
 
     def run(self, *words) -> str:
@@ -204,15 +220,39 @@ class Environment:
         assert process.returncode == 0, errors
         return output
 
+    @functools.cached_property
+    def session(self) -> subprocess.Popen:
+        """The process of scripts and of our command line, where they need none of their own."""
+        with (self.work / "session.txt").open("w") as errors:
+            return self.start("-c", textwrap.dedent(SESSION), stdin=subprocess.PIPE, stderr=errors)
+
+    def script(self, text: str) -> str:
+        """What a script that has to succeed prints."""
+        self.session.stdin.write(json.dumps(textwrap.dedent(text)) + "\n")
+        self.session.stdin.flush()
+        answer = self.session.stdout.readline()
+        assert answer, (self.work / "session.txt").read_text()
+        status, output, errors = json.loads(answer)
+        assert status == 0, errors
+        return output
+
     def jaxlfi(self, *words) -> str:
         """The same of our command line."""
-        return self.run("-m", "jaxlfi", *words)
+        words = list(map(str, words))
+        return self.script(f"import sys; from jaxlfi.cli.parser import main; sys.exit(main({words!r}))")
+
+    def close(self) -> None:
+        """End the process of scripts."""
+        self.session.communicate(timeout=60)
+        assert self.session.returncode == 0, (self.work / "session.txt").read_text()
 
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory) -> Environment:
+def environment(tmp_path_factory):
     """The environment that all commands of this file share."""
-    return Environment(tmp_path_factory.mktemp("outside"), tmp_path_factory.mktemp("programs"))
+    shared = Environment(tmp_path_factory.mktemp("outside"), tmp_path_factory.mktemp("programs"))
+    yield shared
+    shared.close()
 
 
 @pytest.fixture(scope="module")
@@ -279,13 +319,13 @@ def test_load_gives_the_run_back(environment, inferred):
     script = f"""
         import jax, jaxlfi, json, numpy as np
         run = jaxlfi.load({inferred!r})
-        draws = np.asarray(run.posterior.sample(jax.random.key(0), 200))
+        draws = np.asarray(run.draws())
         log_prob = np.asarray(run.posterior.log_prob(draws))
         estimator = run.settings.estimator
         print(json.dumps([type(run.heuristic).__name__, type(estimator).__name__, estimator.units, run.task.name,
                           len(run.x), bool(np.isfinite(log_prob).all()), draws.mean(0).tolist()]))
     """
-    *described, mean = json.loads(environment.run("-c", textwrap.dedent(script)))
+    *described, mean = json.loads(environment.script(script))
     assert described == ["Widen", "IndependentNetwork", 4, "line seen at 3 places", 3, True]
     np.testing.assert_allclose(mean, [0.5, 0.7], atol=0.6)
 
@@ -320,12 +360,11 @@ def test_diagnose_repeats_its_runs(environment, compared):
         "diagnostics",
     ]
     script = """
-        import importlib, sys
+        import importlib
         importlib.import_module("jaxlfi.diagnostics.c2st").MAX_EPOCHS = 20  # the classifier would take longest
-        from jaxlfi.cli.parser import main
-        sys.exit(main(sys.argv[1:]))
     """
-    output = environment.run("-c", textwrap.dedent(script), "diagnose", *words)
+    environment.script(script)
+    output = environment.jaxlfi("diagnose", *words)
     assert "rank of ln slope" in output
     arrays = np.load(environment.work / "diagnostics" / "diagnostics.npz")
     assert arrays["draws"].shape == (20, 20, 2) and np.isfinite(arrays["log_prob"]).all()

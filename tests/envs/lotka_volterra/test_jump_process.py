@@ -12,9 +12,6 @@ from jaxlfi.envs.lotka_volterra import counter_rng
 from jaxlfi.envs.lotka_volterra import jump_process as lv
 from tests.oracles import gillespie
 
-OPTIMISED = True
-"""Its programs run for longer than they are compiled."""
-
 GOLDEN = pathlib.Path(__file__).parents[2] / "golden" / "gillespie.npz"
 TRUTH = np.log([0.01, 0.5, 1.0, 0.01]).astype(np.float32)
 GOLDEN_RATES = {"truth": (0.01, 0.5, 1.0, 0.01), "asymmetric": (0.004, 0.25, 0.4, 0.009)}
@@ -60,13 +57,18 @@ PILOT_SIZE = 1000
 
 simulate = lv.make_simulator()
 simulate_many = jax.jit(jax.vmap(simulate))
+# Thousands of simulations take longer than their program's compilation.
+simulate_thousands = jax.jit(jax.vmap(simulate), compiler_options={"xla_backend_optimization_level": 3})
+THOUSANDS = 4096
+"""Simulations in a batch of `simulate_thousands`."""
+summarise = jax.jit(lv.lotka_volterra_nine)
 summarise_many = jax.jit(jax.vmap(lv.lotka_volterra_nine))
 
 
 def draw(seed, log_rates, count, run=simulate_many):
     """Trajectories and failures of `count` simulations at one setting."""
     keys = jax.random.split(jax.random.key(seed), count)
-    trajectory, failure = run(keys, jnp.broadcast_to(jnp.asarray(log_rates), (count, 4)))
+    trajectory, failure = run(keys, np.broadcast_to(np.float32(log_rates), (count, 4)))
     return np.asarray(trajectory), np.asarray(failure)
 
 
@@ -74,9 +76,15 @@ def batched(process):
     return jax.jit(jax.vmap(lv.make_simulator(process)))
 
 
+def succeeded(trajectory, failure):
+    """States [N, 151, 2] and summaries [N, 9] of the simulations that succeeded."""
+    kept = failure == lv.SUCCESS
+    return trajectory[kept], np.asarray(summarise_many(trajectory))[kept]
+
+
 @pytest.fixture(scope="module")
 def at_truth():
-    return draw(1, TRUTH, 4096)
+    return draw(1, TRUTH, THOUSANDS, simulate_thousands)
 
 
 def prior_arguments():
@@ -93,17 +101,17 @@ def prior_arguments():
 @pytest.fixture(scope="module")
 def prior_batch():
     """Trajectories and failures of `prior_arguments()`."""
-    return simulate_many(*prior_arguments())
+    return jax.device_get(simulate_many(*prior_arguments()))
 
 
 class TestDistribution:
     @pytest.mark.parametrize("name", GOLDEN_RATES)
     def test_agrees_with_numpy_oracle(self, name):
         expected = np.load(GOLDEN)[name]
-        trajectory, failure = draw(4, np.log(np.float32(GOLDEN_RATES[name])), 4096)
-        trajectory = trajectory[failure == lv.SUCCESS]
+        log_rates = np.log(np.float32(GOLDEN_RATES[name]))
+        trajectory, summaries = succeeded(*draw(4, log_rates, THOUSANDS, simulate_thousands))
         states = trajectory[:, GOLDEN_RECORDS].reshape(len(trajectory), -1)
-        ours = np.concatenate([np.asarray(summarise_many(trajectory)), states], axis=1)
+        ours = np.concatenate([summaries, states], axis=1)
         pvalues = [stats.ks_2samp(*columns).pvalue for columns in zip(ours.T, expected.T, strict=True)]
         assert min(pvalues) > 1e-3 / len(pvalues), pvalues
 
@@ -166,17 +174,16 @@ class TestDistribution:
         assert abs(trajectory[:, -1, 0].mean() - initial * growth) < 4 * error
 
     def test_published_observation_is_a_plausible_draw(self, at_truth):
-        trajectory, failure = at_truth
-        summaries = np.asarray(summarise_many(trajectory[failure == lv.SUCCESS]))
+        _, summaries = succeeded(*at_truth)
         low, high = np.quantile(summaries, [0.001, 0.999], axis=0)
         assert np.all((low < OBSERVED) & (OBSERVED < high))
 
     def test_published_pilot_moments(self):
-        count = 24_000
-        keys = jax.random.split(jax.random.key(9), count)
-        log_rates = jax.random.uniform(jax.random.key(10), (count, 4), minval=-5, maxval=2)
-        trajectory, failure = simulate_many(keys, log_rates)
-        summaries = np.asarray(summarise_many(trajectory))[np.asarray(failure) == lv.SUCCESS][:20_000]
+        batches = 6
+        keys = jax.random.split(jax.random.key(9), (batches, THOUSANDS))
+        log_rates = jax.random.uniform(jax.random.key(10), (batches, THOUSANDS, 4), minval=-5, maxval=2)
+        runs = [jax.device_get(simulate_thousands(*batch)) for batch in zip(keys, log_rates, strict=True)]
+        summaries = np.concatenate([succeeded(*run)[1] for run in runs])[:20_000]
         assert len(summaries) == 20_000
         error = np.array(PILOT_STD) / np.sqrt(PILOT_SIZE)
         assert np.all(np.abs(summaries.mean(0) - PILOT_MEAN) < 4 * error)
@@ -187,7 +194,7 @@ class TestDistribution:
 class TestRecords:
     def test_shape_start_and_types(self, at_truth):
         trajectory, failure = at_truth
-        assert trajectory.shape == (4096, 151, 2) and trajectory.dtype == np.float32
+        assert trajectory.shape == (THOUSANDS, 151, 2) and trajectory.dtype == np.float32
         assert failure.dtype == np.int32
         assert (trajectory[:, 0] == [50, 100]).all()
         assert (trajectory >= 0).all() and (trajectory == np.round(trajectory)).all()
@@ -196,8 +203,8 @@ class TestRecords:
         after, failure = prior_batch
         before, failure_before = batched(lv.JumpProcess(record="before"))(*prior_arguments())
         assert (failure == failure_before).all()
-        succeeded = np.asarray(failure) == lv.SUCCESS
-        after, before = np.asarray(after)[succeeded], np.asarray(before)[succeeded]
+        kept = np.asarray(failure) == lv.SUCCESS
+        after, before = np.asarray(after)[kept], np.asarray(before)[kept]
         steps = np.abs(after - before).sum(-1)
         assert (before[:, 0] == [50, 100]).all() and not steps[:, 0].any()
         assert set(np.unique(steps)) == {0, 1}
@@ -246,10 +253,11 @@ class TestRecords:
         assert (result.trajectory[:, -1, 1] - 20 == result.steps).all()
 
     def test_nan_rate_fails_alone(self):
-        log_rates = jnp.zeros((256, 4)).at[:, 2].set(NEVER).at[7, 1].set(jnp.nan)
+        log_rates = np.zeros((256, 4), np.float32)
+        log_rates[:, 2], log_rates[7, 1] = NEVER, np.nan
         keys = jax.random.split(jax.random.key(17), 256)
         trajectory, failure = simulate_many(keys, log_rates)
-        assert failure.nonzero()[0].tolist() == [7] and failure[7] == lv.TOO_MANY_EVENTS
+        assert np.flatnonzero(failure).tolist() == [7] and failure[7] == lv.TOO_MANY_EVENTS
         assert np.isfinite(trajectory).all()
 
     def test_other_grid(self):
@@ -374,20 +382,20 @@ class TestSummaries:
 
     def test_small_spread_on_a_large_level(self):
         series = np.stack([10_000 + np.arange(151) % 2, 9_000 + np.arange(151) % 3], axis=1)
-        ours = lv.lotka_volterra_nine(jnp.asarray(series, jnp.float32))
+        ours = summarise(series.astype(np.float32))
         np.testing.assert_allclose(ours, gillespie.nine_summaries(series), rtol=1e-4, atol=2e-5)
 
     def test_one_spike_is_no_constant(self):
         series = np.full((151, 2), 7.0)
         series[0] = [50, 100]
-        ours = lv.lotka_volterra_nine(jnp.asarray(series, jnp.float32))
+        ours = summarise(series.astype(np.float32))
         np.testing.assert_allclose(ours, gillespie.nine_summaries(series), rtol=2e-5, atol=2e-5)
 
     @pytest.mark.parametrize("constant", [(0,), (1,), (0, 1)])
     def test_constant_series_has_no_correlation(self, constant):
         series = np.stack([np.arange(151) % 5, np.arange(151) % 7], axis=1).astype(np.float32)
         series[:, constant] = 3.3
-        ours = np.asarray(lv.lotka_volterra_nine(jnp.asarray(series)))
+        ours = np.asarray(summarise(series))
         undefined = {0: [2, 4, 5, 8], 1: [3, 6, 7, 8]}
         for species in constant:
             assert (ours[undefined[species]] == 0).all()
