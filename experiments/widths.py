@@ -3,9 +3,10 @@
     python -m experiments.widths --task lotka_volterra --configuration misspecified+edge --seeds 20 --truths 200
 
 Each candidate infers, by the same settings but one or two, (a) the task's own truth from `--seeds` observations and
-(b) `--truths` truths drawn over the support that holds the task's truth, each from an observation of its own. (a) gives
-the error and the runs that are lost, (b) whether 50 % and 90 % regions hold as many truths, and the ranks of simulation-
-based calibration. The two are different questions: most truths drawn over a box are easier than the task's own.
+(b) `--truths` truths drawn over the support that holds the task's truth, each from an observation of its own. (a)
+gives the error and the runs that are lost, (b) whether 50 % and 90 % regions hold as many truths, and the ranks of
+simulation-based calibration, under the posterior of the run and under that on the box of the truths, whose prior is
+theirs. The two are different questions: most truths drawn over a box are easier than the task's own.
 
 All runs of a candidate are stepped in batches of `--runs-per-batch`. A candidate whose arrays are there is not run
 again; the table is drawn from the arrays.
@@ -165,7 +166,7 @@ def infer_all(
 def table(folder: Path) -> str:
     """The comparison as Markdown, from the saved arrays."""
     lines = [
-        "| candidate | error, own truth | lost | 90 % holds it | 50 % | 90 % | SBC p | ... on the truths' box | lp | s |",
+        "| candidate | error, own truth | lost | 90 % holds it | 50 % | 90 % | SBC p | ... on the box | lp | s |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for path in sorted(folder.glob("*-own.npz")):
@@ -190,7 +191,7 @@ def table(folder: Path) -> str:
 
 
 def _coverage(arrays: dict[str, np.ndarray]) -> list[str]:
-    """Coverage at 50 % and 90 %, the least p-value of the ranks of any parameter, and the mean log-density of truths."""
+    """Coverage at 50 % and 90 %, the least p-value of any parameter's ranks, and the mean log-density of truths."""
     dim = arrays["theta"].shape[1]
     cells = []
     for level in (0.5, 0.9):

@@ -41,7 +41,7 @@ class Correction:
 
     Attributes:
         row_weights: (task, dataset, proposals, round, defensive fraction) -> weight of each row in the loss, shape [C].
-        change: (task, q, previous belief) -> (posterior, pairs not positive definite).
+        change: (task, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
     """
 
     row_weights: Callable[[Task, Dataset, Belief, Array, Array], Array]
