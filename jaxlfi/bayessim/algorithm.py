@@ -30,7 +30,7 @@ class State:
 
     Attributes:
         belief: the reference prior p_i on its support Theta_i.
-        proposals: the beliefs the rounds so far drew from, stacked, with room for all rounds.
+        proposals: what the rounds so far drew from, stacked, with room for all rounds.
         dataset: all simulations so far.
         network: the density estimator.
     """
@@ -53,7 +53,7 @@ class Round:
     Attributes:
         simulations: what was simulated.
         failed: failures by reason, shape [R].
-        proposal: the belief that was drawn from.
+        proposal: what was drawn from.
         belief: the posterior on the adapted support.
         adaptation: what the heuristic saw and did.
         correction: what the posterior's correction did.
@@ -101,6 +101,11 @@ def init(
     )
 
 
+def proposal(settings: Settings, belief: Belief) -> Belief:
+    """What a round draws from: the belief, `settings.inflation` times as wide."""
+    return belief.replace(mixture=belief.mixture.inflated(settings.inflation))
+
+
 def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> Float[Array, "attempts dim"]:
     """Draw theta ~ p_i (line 8): the prior over Theta_0 in the first round, then the restricted posterior.
 
@@ -109,6 +114,7 @@ def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> F
     support has gained, also where the posterior has locked itself onto a place where it learns nothing more.
     """
     key_prior, key_posterior, key_choice = jax.random.split(key, 3)
+    belief = proposal(settings, belief)
     informed = RESTRICTIONS[settings.restriction](key_posterior, belief, settings.simulation_budget)
     prior = prior_draws(key_prior, task.inference.prior, belief.support, settings.simulation_budget)
     from_prior = (
@@ -129,7 +135,8 @@ def update(
 ) -> tuple[State, Round]:
     """All of a round that comes after its simulations (lines 9-17)."""
     dataset = datasets.augment(state.dataset, simulations, round)
-    proposals = jax.tree.map(lambda all_, now: all_.at[round].set(now), state.proposals, state.belief)
+    proposed = proposal(settings, state.belief)
+    proposals = jax.tree.map(lambda all_, now: all_.at[round].set(now), state.proposals, proposed)
     correction = CORRECTIONS[settings.correction]
     weights = correction.row_weights(task, dataset, proposals, round, settings.defensive)
     prior = task.inference.prior
@@ -139,12 +146,12 @@ def update(
     key_fit, key_condition = state.network.estimator.keys(key)
     network, fit_info = fit(key_fit, _started(state, dataset), dataset, weights, expected, log_prior)
     posterior = network.condition(observed, state.belief.support, key_condition)
-    mixture, not_positive_definite = correction.change(task, posterior.mixture, state.belief)
+    mixture, not_positive_definite = correction.change(task, posterior.mixture, proposed)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     info = Round(
         simulations=simulations,
         failed=simulations.failed(len(task.reasons)),
-        proposal=state.belief,
+        proposal=proposed,
         belief=belief,
         adaptation=adaptation,
         correction=CorrectionInfo(effective_size(weights), not_positive_definite, posterior.mass_inside),

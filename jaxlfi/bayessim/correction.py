@@ -41,7 +41,7 @@ class Correction:
 
     Attributes:
         row_weights: (task, dataset, proposals, round, defensive fraction) -> weight of each row in the loss, shape [C].
-        change: (task, q, previous belief) -> (posterior, pairs not positive definite).
+        change: (task, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
     """
 
     row_weights: Callable[[Task, Dataset, Belief, Array, Array], Array]
@@ -77,6 +77,19 @@ def times_reference(task: Task, q: GaussianMixture, previous: Belief) -> tuple[G
     posterior = reduce(posterior, q.logits.shape[-1])
     posterior = jax.tree.map(lambda new, old: jnp.where(previous.informed, new, old), posterior, q)
     return posterior, jnp.where(previous.informed, bad, 0)
+
+
+def divided_by_proposal(task: Task, q: GaussianMixture, proposal: Belief) -> tuple[GaussianMixture, Array]:
+    """p-hat proportional to q / p~, with the round's proposal p~ as one Gaussian of its mean and covariance.
+
+    What rounds of proposals s times as wide as the posterior leave too narrow by sqrt(1 - 1/s^2) is widened again.
+    Exact for a Gaussian posterior once proposals have settled; wants proposals wider than the posterior.
+    """
+    mixture = proposal.mixture
+    gaussian = GaussianMixture(jnp.zeros(1), mixture.mean[None], jnp.linalg.cholesky(mixture.covariance)[None])
+    posterior, info = quotient(q, gaussian)
+    posterior = jax.tree.map(lambda new, old: jnp.where(proposal.informed, new, old), posterior, q)
+    return posterior, jnp.where(proposal.informed, info.not_positive_definite, 0)
 
 
 def importance_weights(
@@ -145,6 +158,7 @@ def gaussian_prior(prior) -> GaussianMixture:
 CORRECTIONS: dict[str, Correction] = {
     "none": Correction(equal_weights, unchanged),
     "paper": Correction(equal_weights, times_reference),
+    "quotient": Correction(equal_weights, divided_by_proposal),
     "importance": Correction(importance_weights, unchanged),
 }
 """Corrections by name."""

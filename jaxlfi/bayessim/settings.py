@@ -20,10 +20,13 @@ class Settings(Checked):
         rounds: inference iterations N_LFI.
         simulations_per_round: valid simulations added to the dataset each round, at most.
         simulation_budget: simulations attempted each round, at most, failures included.
-        correction: how q_phi becomes the posterior, "none", "paper" or "importance" (reading A).
+        correction: how q_phi becomes the posterior, "none", "paper", "quotient" or "importance" (reading A).
         restriction: how proposals are kept in the support, "clip" or "reject" (reading E).
         defensive: fraction of each round's proposals drawn from the prior over the current support instead of the
             posterior. 0 is the paper. A leaf.
+        inflation: how many times as wide as the posterior the proposals are drawn, about its mean; 1 is the paper.
+            Uncorrected, with proposals s times as wide, a Gaussian posterior settles at sqrt(1 - 1/s^2) of its width,
+            where with s = 1 it narrows every round (docs: calibration). A leaf.
         predictive: whether 20 draws of each round's posterior are simulated besides, to compare them with the
             observation (section V). These simulations are reported in the ledger; inference does not see them.
     """
@@ -39,6 +42,9 @@ class Settings(Checked):
     defensive: Float[Array, "*batch"] | float = hyperparameter(
         0.0, low=0.0, high=1.0, help="fraction of proposals drawn from the prior over the support"
     )
+    inflation: Float[Array, "*batch"] | float = hyperparameter(
+        1.0, low=1.0, high=100.0, help="how many times as wide as the posterior proposals are drawn"
+    )
     predictive: bool = option(True, help="simulate 20 draws of each round's posterior, to compare with the observation")
 
     def check(self) -> "Settings":
@@ -52,9 +58,9 @@ class Settings(Checked):
                 f"simulation_budget: expected at least the {self.simulations_per_round} simulations of a round, "
                 f"got {self.simulation_budget}"
             )
-        if self.correction == "paper" and not self.estimator.closed_form:
+        if self.correction in ("paper", "quotient") and not self.estimator.closed_form:
             raise ValueError(
                 f"correction: expected 'none' or 'importance' for {type(self.estimator).__name__}, as "
-                "'paper' multiplies mixtures of Gaussians, got 'paper'"
+                f"{self.correction!r} calculates with mixtures of Gaussians, got {self.correction!r}"
             )
         return self

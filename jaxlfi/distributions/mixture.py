@@ -140,6 +140,16 @@ class GaussianMixture:
             scale_tril=scale[:, None] * self.scale_tril,
         )
 
+    def inflated(self, factor: Float[Array, ""] | float) -> "GaussianMixture":
+        """The mixture of mean + factor * (theta - mean): `factor` times as wide about the same mean.
+
+        Example:
+            >>> one = GaussianMixture(jnp.zeros(1), jnp.array([[3.0]]), jnp.array([[[0.5]]]))
+            >>> float(one.inflated(2.0).scale_tril[0, 0, 0])
+            1.0
+        """
+        return self.affine(jnp.full_like(self.mean, factor), (1 - factor) * self.mean)
+
     def prune(self, least: Float[Array, ""] | float) -> "GaussianMixture":
         """The mixture without its components of less weight than `least` (logit -inf); the heaviest always stays."""
         kept = (self.weights >= least) | (self.weights == jnp.max(self.weights))

@@ -29,6 +29,7 @@ from jaxlfi.estimators.mixture_network import MixtureNetwork
         ({"correction": "exact"}, r"^correction: expected one of none, paper, importance, got 'exact'"),
         ({"restriction": "fold"}, r"^restriction: expected one of clip, reject, got 'fold'"),
         ({"defensive": 2}, r"^defensive: expected a number in \[0, 1\], got 2"),
+        ({"inflation": 0.5}, r"^inflation: expected a number in \[1, 100\], got 0.5"),
         ({"defensive": -0.1}, r"^defensive: expected a number in \[0, 1\], got -0.1"),
         ({"defensive": float("nan")}, r"^defensive: expected a number in \[0, 1\], got nan"),
         ({"predictive": "no"}, r"^predictive: expected True or False, got 'no'"),

@@ -28,6 +28,7 @@ EXAMPLE = GaussianMixture(
 SAMPLE = jax.jit(GaussianMixture.sample, static_argnums=2)
 LOW_VARIANCE_SAMPLE = jax.jit(GaussianMixture.low_variance_sample, static_argnums=2)
 AFFINE = jax.jit(GaussianMixture.affine)
+INFLATED = jax.jit(GaussianMixture.inflated)
 PERMUTE = jax.jit(GaussianMixture.permute)
 MOMENTS = jax.jit(lambda mixture: (mixture.mean, mixture.covariance))
 LOG_PROB = jax.jit(GaussianMixture.log_prob)
@@ -75,6 +76,24 @@ def test_component_log_prob_adds_up_to_log_prob(drawn):
     each = jax.jit(component_log_prob)(mixture, jnp.asarray(theta))
     expected = [stats.multivariate_normal(m, c).logpdf(theta) for m, c in zip(means, covariances, strict=True)]
     np.testing.assert_allclose(each, expected, rtol=1e-3, atol=1e-3)
+
+
+@given(shapes().flatmap(lambda kd: st.tuples(mixtures(*kd), vectors(-3.0, 3.0, kd[1]))), floats(0.5, 4.0))
+def test_inflated_is_the_density_of_points_moved_away_from_the_mean(drawn, factor):
+    mixture, theta = drawn
+    wide, (mean, covariance) = INFLATED(mixture, factor), MOMENTS(mixture)
+    wide_mean, wide_covariance = MOMENTS(wide)
+    scale = np.abs(np.asarray(covariance)).max()
+    np.testing.assert_allclose(wide_mean, mean, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(wide_covariance, factor**2 * covariance, rtol=2e-3, atol=2e-4 * factor**2 * scale)
+    mean = np.asarray(mean, np.float64)
+    expected = reference_log_prob(mixture, theta) - len(mean) * np.log(factor)
+    np.testing.assert_allclose(reference_log_prob(wide, mean + factor * (theta - mean)), expected, rtol=2e-3, atol=2e-2)
+
+
+@given(shapes().flatmap(lambda kd: mixtures(*kd)))
+def test_inflated_by_one_changes_no_bit(mixture):
+    chex.assert_trees_all_equal(INFLATED(mixture, 1.0), mixture)
 
 
 @given(shapes().flatmap(lambda kd: st.tuples(mixtures(*kd), vectors(-6.0, 6.0, 2, kd[1]))))

@@ -3,21 +3,37 @@
 import jax
 import numpy as np
 
+from jaxlfi.distributions.support import Support
 from jaxlfi.runs.run import Run
 from jaxlfi.studies.calibration.plan import TRUTHS, CalibrationPlan
 from jaxlfi.tasks.host import SimulatorError
+from jaxlfi.tasks.observation import Shapes
 from jaxlfi.tasks.priors import prior_draws
 from jaxlfi.tasks.simulation import simulate_batch
+from jaxlfi.tasks.task import Task
 
 TRIES = 16
 """Draws of a truth whose simulations may fail before it is given up."""
 
 
 def draw_truths(run: Run, plan: CalibrationPlan) -> dict[str, np.ndarray]:
-    """Truths from the prior over the reference support, with a simulation of each.
+    """Truths from the prior over the reference support, with a simulation of each (`simulated_truths`)."""
+    box = run.task.support(plan.reference)
+    return simulated_truths(plan.key(TRUTHS), run.task, box, plan.truths, Shapes(run.observed.shape, run.x.shape[0]))
+
+
+def simulated_truths(key: jax.Array, task: Task, box: Support, count: int, shapes: Shapes) -> dict[str, np.ndarray]:
+    """Truths from the prior over a box, with a simulation of each.
 
     A truth whose simulation fails is drawn again: inference learns from simulations that succeeded, so its posterior
     is that under the prior given success, and so must the truths be.
+
+    Args:
+        key: consumed.
+        task: the task.
+        box: in inference space.
+        count: number N of truths.
+        shapes: of a trajectory and its summary.
 
     Returns:
         `theta` [N, D], `observed` [N, ...], `x` [N, S], and `failed`, the failures by reason.
@@ -25,19 +41,17 @@ def draw_truths(run: Run, plan: CalibrationPlan) -> dict[str, np.ndarray]:
     Raises:
         SimulatorError: where a truth was drawn `TRIES` times in vain.
     """
-    task, box = run.task, run.task.support(plan.reference)
-    shape = run.observed.shape
-    missing = np.ones(plan.truths, bool)
+    missing = np.ones(count, bool)
     arrays = {
-        "theta": np.zeros((plan.truths, task.dim), np.float32),
-        "observed": np.zeros((plan.truths, *shape), np.float32),
-        "x": np.zeros((plan.truths, *run.x.shape), np.float32),
+        "theta": np.zeros((count, task.dim), np.float32),
+        "observed": np.zeros((count, *shapes.trajectory), np.float32),
+        "x": np.zeros((count, shapes.summary), np.float32),
     }
     failed = np.zeros(len(task.reasons), int)
     for attempt in range(TRIES):
-        key_theta, key_simulate = jax.random.split(jax.random.fold_in(plan.key(TRUTHS), attempt))
-        theta = prior_draws(key_theta, task.inference.prior, box, plan.truths)
-        observed, x, failure = simulate_batch(key_simulate, task, theta, shape, missing)
+        key_theta, key_simulate = jax.random.split(jax.random.fold_in(key, attempt))
+        theta = prior_draws(key_theta, task.inference.prior, box, count)
+        observed, x, failure = simulate_batch(key_simulate, task, theta, shapes.trajectory, missing)
         failure = np.where(missing, failure, 0)
         failed += np.sum(failure[:, None] == 1 + np.arange(len(task.reasons)), axis=0)
         taken = missing & (failure == 0)
@@ -47,6 +61,10 @@ def draw_truths(run: Run, plan: CalibrationPlan) -> dict[str, np.ndarray]:
         if not missing.any():
             return arrays | {"failed": failed}
     raise SimulatorError(
-        f"simulate: expected a valid simulation of each truth drawn over {plan.reference!r}, got none in {TRIES} tries "
-        f"for {missing.sum()} of {plan.truths}"
+        f"simulate: expected a valid simulation of each truth drawn over {_words(box)}, got none in {TRIES} "
+        f"tries for {missing.sum()} of {count}"
     )
+
+
+def _words(box: Support) -> str:
+    return " x ".join(f"[{low:g}, {high:g}]" for low, high in zip(box.low.tolist(), box.high.tolist(), strict=True))

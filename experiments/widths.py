@@ -1,0 +1,245 @@
+"""How far the widths of posteriors can be trusted, and what that costs: proposals, restrictions and corrections.
+
+    python -m experiments.widths --task lotka_volterra --configuration misspecified+edge --seeds 20 --truths 200
+
+Each candidate infers, by the same settings but one or two, (a) the task's own truth from `--seeds` observations and
+(b) `--truths` truths drawn over the support that holds the task's truth, each from an observation of its own. (a)
+gives the error and the runs that are lost, (b) whether 50 % and 90 % regions hold as many truths, and the ranks of
+simulation-based calibration, under the posterior of the run and under that on the box of the truths, whose prior is
+theirs. The two are different questions: most truths drawn over a box are easier than the task's own.
+
+All runs of a candidate are stepped in batches of `--runs-per-batch`. A candidate whose arrays are there is not run
+again; the table is drawn from the arrays.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import time
+from pathlib import Path
+
+from jaxlfi.io import compile_cache
+
+if __name__ == "__main__":  # before jax starts
+    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={os.cpu_count() or 1}")
+    compile_cache.enable()
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from jaxlfi import diagnostics
+from jaxlfi.bayessim.batch import RunSpec, posterior_after, stack_inputs
+from jaxlfi.bayessim.drive import drive
+from jaxlfi.bayessim.host import engine_for
+from jaxlfi.bayessim.keys import key_of, run_keys
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.estimators.posterior import Posterior
+from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Mode, paired
+from jaxlfi.io import files as atomic
+from jaxlfi.io.progress import RoundProgress
+from jaxlfi.runs.describe import settings_to_json
+from jaxlfi.runs.folder import environment
+from jaxlfi.studies.calibration.truths import simulated_truths
+from jaxlfi.tasks import registry
+from jaxlfi.tasks.observation import simulate_observation, simulator_shapes
+from jaxlfi.tasks.task import Task
+
+DRAWS = 200
+"""Draws of each posterior that the truth is ranked among."""
+LOST = 1.5
+"""Summed error above which a run counts as lost."""
+FLOOR = -30.0
+"""Least log-density of a truth: one truth outside of its posterior's support would make any mean minus infinity."""
+TUNING = 1000
+"""The first seed of those that settings are chosen on; results are reported on seeds from 0."""
+
+RULES: dict[str, Heuristic] = {"none": Fixed(), "edge": Edge(), "mode": Mode(), "centre": Centre()}
+
+
+def candidates(quick: Settings = QUICK) -> dict[str, Settings]:
+    """What is compared, by name: `quick` with other proposals and corrections."""
+    once = {"quick": quick, "reject": quick.replace(restriction="reject")}
+    wide = {
+        f"{restriction}-{factor:g}": quick.replace(restriction=restriction, inflation=factor)
+        for restriction in ("clip", "reject")
+        for factor in (1.5, 2.0, 3.0)
+    }
+    divided = {f"{name}-quotient": wide[name].replace(correction="quotient") for name in wide}
+    return once | wide | divided
+
+
+@dataclasses.dataclass(frozen=True)
+class Cases:
+    """Truths and their observations, one a row.
+
+    Attributes:
+        seeds: of the runs.
+        theta: truths in inference space, shape [N, D].
+        observed: trajectories, shape [N, ...].
+        x: summaries, shape [N, S].
+    """
+
+    seeds: np.ndarray
+    theta: np.ndarray
+    observed: np.ndarray
+    x: np.ndarray
+
+    def rows(self, rows: np.ndarray) -> "Cases":
+        """Some of them."""
+        return Cases(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
+
+
+def own_cases(task: Task, first: int, count: int) -> Cases:
+    """The task's own truth, simulated anew for each seed."""
+    seeds = first + np.arange(count)
+    observed = np.stack([simulate_observation(run_keys(key_of(int(seed))).observe, task) for seed in seeds])
+    theta = np.broadcast_to(np.asarray(task.inference.truth, np.float32), (count, task.dim))
+    return Cases(seeds, theta, observed, np.asarray(jax.vmap(task.summary)(observed)))
+
+
+def drawn_cases(task: Task, box: str, first: int, count: int) -> Cases:
+    """Truths from the prior over a named support."""
+    shapes = simulator_shapes(task)
+    found = simulated_truths(jax.random.key(first + 500_000), task, task.support(box), count, shapes)
+    seeds = first + 500_000 + np.arange(count)
+    return Cases(seeds, found["theta"], found["observed"], found["x"])
+
+
+def described(key: jax.Array, truth: jax.Array, posterior: Posterior, box) -> dict[str, jax.Array]:
+    """Where a truth lies among draws of its posterior, and of the posterior on the box that truths were drawn over."""
+    key_own, key_box = jax.random.split(key)
+    arrays = {}
+    for name, key_draw, one in (("own", key_own, posterior), ("box", key_box, posterior.on(box))):
+        theta = one.sample(key_draw, DRAWS, space="inference")
+        log_prob = one.log_prob(jnp.concatenate([truth[None], theta]), space="inference")
+        arrays |= {
+            f"{name}_density_rank": jnp.sum(log_prob[1:] > log_prob[0]),
+            f"{name}_ranks": jnp.sum(theta < truth, axis=0),
+            f"{name}_log_prob": log_prob[0],
+            f"{name}_error": jnp.mean(jnp.abs(theta - truth), axis=0),
+            f"{name}_deviation": jnp.std(theta, axis=0),
+        }
+    return arrays | {
+        "mass_inside": posterior.mass_inside,
+        "support_low": posterior.support.low,
+        "support_high": posterior.support.high,
+    }
+
+
+def infer_all(
+    task: Task, settings: Settings, support: str, rule: Heuristic, cases: Cases, box: str, batch: int, console: Console
+) -> dict[str, np.ndarray]:
+    """The posteriors of all cases, batch by batch, described."""
+    batches = [np.arange(start, start + batch) for start in range(0, len(cases.seeds), batch)]
+    one = jax.jit(jax.vmap(
+        lambda key, truth, x, state: described(
+            key, truth, posterior_after(state.belief, state.network, x), task.support(box)
+        )
+    ))  # fmt: skip
+    rule = paired(rule, settings.estimator.warm_start)
+    found, seconds = [], 0.0
+    with RoundProgress(console, settings.rounds * len(batches), 0, f"{len(cases.seeds)} runs") as progress:
+        for rows in batches:
+            part = cases.rows(np.minimum(rows, len(cases.seeds) - 1))
+            specs = [RunSpec("", support, task.support(support), rule, int(seed)) for seed in part.seeds]
+            inputs, _ = stack_inputs(specs, part.observed, part.x)
+            engine = engine_for(task, settings, inputs)
+            state = engine.start()
+            began = time.perf_counter()
+            compiled = lambda spent: progress.compiled(spent)
+            state = drive(engine, state, range(settings.rounds), lambda *_: progress.advance(), compiled)
+            state = engine.fetch(state)
+            seconds += time.perf_counter() - began
+            keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(77), jnp.asarray(part.seeds))
+            arrays = jax.device_get(one(keys, part.theta, part.x, state))
+            keep = np.sum(rows < len(cases.seeds))
+            found.append({name: value[:keep] for name, value in arrays.items()})
+    arrays = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
+    return arrays | {"theta": cases.theta, "seeds": cases.seeds, "seconds": np.asarray(seconds)}
+
+
+def table(folder: Path) -> str:
+    """The comparison as Markdown, from the saved arrays."""
+    lines = [
+        "| candidate | error, own truth | lost | 90 % holds it | 50 % | 90 % | SBC p | ... on the box | lp | s |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for path in sorted(folder.glob("*-own.npz")):
+        own = atomic.read_arrays(path)
+        error = own["own_error"].sum(axis=1)
+        low, high = bootstrap_interval(error)
+        lost = int(np.sum(error > LOST))
+        held = np.mean(own["own_density_rank"] < 0.9 * (DRAWS + 1))
+        cells = [
+            f"{error.mean():.2f} [{low:.2f}, {high:.2f}] ({np.median(error):.2f})",
+            f"{lost} of {len(error)}",
+            f"{held:.2f}",
+        ]
+        drawn = path.with_name(path.name.replace("-own.npz", "-drawn.npz"))
+        if drawn.exists():
+            cells += _coverage(atomic.read_arrays(drawn))
+        else:
+            cells += [""] * 5
+        cells.append(f"{float(own['seconds']) / len(error):.1f}")
+        lines.append("| ".join(["", f"`{path.name.removesuffix('-own.npz')}` ", *(cell + " " for cell in cells), ""]))
+    return "\n".join(lines) + "\n"
+
+
+def _coverage(arrays: dict[str, np.ndarray]) -> list[str]:
+    """Coverage at 50 % and 90 %, the least p-value of any parameter's ranks, and the mean log-density of truths."""
+    dim = arrays["theta"].shape[1]
+    cells = []
+    for level in (0.5, 0.9):
+        cells.append(f"{np.mean(arrays['own_density_rank'] < level * (DRAWS + 1)):.2f}")
+    for name in ("own", "box"):
+        ranks = arrays[f"{name}_ranks"]
+        p_value = min(diagnostics.uniformity(ranks[:, d], DRAWS, dim).p_value for d in range(dim))
+        cells.append(f"{p_value:.3f}" if p_value >= 0.001 else "< 0.001")
+    cells.append(f"{np.mean(np.maximum(arrays['own_log_prob'], FLOOR)):.1f}")
+    return cells
+
+
+def main() -> None:
+    """Run the candidates that are missing and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="lotka_volterra")
+    parser.add_argument("--configuration", default="misspecified+edge", help="support, or support+heuristic")
+    parser.add_argument("--box", default="ok", help="support that truths are drawn over")
+    parser.add_argument("--candidates", nargs="+", choices=list(candidates()), default=list(candidates()))
+    parser.add_argument("--seeds", type=int, default=20, help="observations of the task's own truth")
+    parser.add_argument("--truths", type=int, default=40, help="truths drawn over the box; 0: none")
+    parser.add_argument("--first-seed", type=int, default=TUNING, help="0 to report, from 1000 to choose settings")
+    parser.add_argument("--runs-per-batch", type=int, default=20)
+    parser.add_argument("--out", type=Path, default=Path("runs/widths"))
+    arguments = parser.parse_args()
+    folder = arguments.out / arguments.task / arguments.configuration
+    folder.mkdir(parents=True, exist_ok=True)
+    task, console = registry.load(arguments.task), Console()
+    support, _, rule = arguments.configuration.partition("+")
+    sets = {"own": own_cases(task, arguments.first_seed, arguments.seeds)}
+    if arguments.truths:
+        sets["drawn"] = drawn_cases(task, arguments.box, arguments.first_seed, arguments.truths)
+    for name in arguments.candidates:
+        settings = candidates()[name].replace(predictive=False)
+        for kind, cases in sets.items():
+            path = folder / f"{name}-{kind}.npz"
+            if path.exists():
+                continue
+            console.print(f"{name}, {kind}", highlight=False)
+            arrays = infer_all(
+                task, settings, support, RULES[rule or "none"], cases, arguments.box, arguments.runs_per_batch, console
+            )
+            atomic.write_arrays(path, arrays)
+            config = {"settings": settings_to_json(settings), "box": arguments.box, **environment()}
+            path.with_suffix(".json").write_text(json.dumps(config, indent=2) + "\n")
+    (folder / "table.md").write_text(table(folder))
+    print(table(folder))
+
+
+if __name__ == "__main__":
+    main()
