@@ -38,12 +38,14 @@ from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Mode, paired
 from jaxlfi.io import files as atomic
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs.describe import settings_to_json
 from jaxlfi.runs.folder import environment
+from jaxlfi.studies.calibration.repeat import described
 from jaxlfi.studies.calibration.truths import simulated_truths
 from jaxlfi.tasks import registry
 from jaxlfi.tasks.observation import simulate_observation, simulator_shapes
@@ -110,24 +112,13 @@ def drawn_cases(task: Task, box: str, first: int, count: int) -> Cases:
     return Cases(seeds, found["theta"], found["observed"], found["x"])
 
 
-def described(key: jax.Array, truth: jax.Array, posterior: Posterior, box) -> dict[str, jax.Array]:
-    """Where a truth lies among draws of its posterior, and of the posterior on the box that truths were drawn over."""
-    key_own, key_box = jax.random.split(key)
-    arrays = {}
-    for name, key_draw, one in (("own", key_own, posterior), ("box", key_box, posterior.on(box))):
-        theta = one.sample(key_draw, DRAWS, space="inference")
-        log_prob = one.log_prob(jnp.concatenate([truth[None], theta]), space="inference")
-        arrays |= {
-            f"{name}_density_rank": jnp.sum(log_prob[1:] > log_prob[0]),
-            f"{name}_ranks": jnp.sum(theta < truth, axis=0),
-            f"{name}_log_prob": log_prob[0],
-            f"{name}_error": jnp.mean(jnp.abs(theta - truth), axis=0),
-            f"{name}_deviation": jnp.std(theta, axis=0),
-        }
-    return arrays | {
-        "mass_inside": posterior.mass_inside,
-        "support_low": posterior.support.low,
-        "support_high": posterior.support.high,
+def both(key: jax.Array, truth: jax.Array, posterior: Posterior, box: Support) -> dict[str, jax.Array]:
+    """A posterior and its truth described, and the same on the box that truths were drawn over."""
+    keys = jax.random.split(key)
+    return {
+        f"{name}_{field}": value
+        for name, key, one in (("own", keys[0], posterior), ("box", keys[1], posterior.on(box)))
+        for field, value in described(key, truth, one, DRAWS).items()
     }
 
 
@@ -137,7 +128,7 @@ def infer_all(
     """The posteriors of all cases, batch by batch, described."""
     batches = [np.arange(start, start + batch) for start in range(0, len(cases.seeds), batch)]
     one = jax.jit(jax.vmap(
-        lambda key, truth, x, state: described(
+        lambda key, truth, x, state: both(
             key, truth, posterior_after(state.belief, state.network, x), task.support(box)
         )
     ))  # fmt: skip
@@ -151,8 +142,7 @@ def infer_all(
             engine = engine_for(task, settings, inputs)
             state = engine.start()
             began = time.perf_counter()
-            compiled = lambda spent: progress.compiled(spent)
-            state = drive(engine, state, range(settings.rounds), lambda *_: progress.advance(), compiled)
+            state = drive(engine, state, range(settings.rounds), lambda *_: progress.advance(), progress.compiled)
             state = engine.fetch(state)
             seconds += time.perf_counter() - began
             keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(77), jnp.asarray(part.seeds))
@@ -171,10 +161,10 @@ def table(folder: Path) -> str:
     ]
     for path in sorted(folder.glob("*-own.npz")):
         own = atomic.read_arrays(path)
-        error = own["own_error"].sum(axis=1)
+        error = np.abs(own["own_draws"] - own["theta"][:, None]).sum(axis=2).mean(axis=1)
         low, high = bootstrap_interval(error)
         lost = int(np.sum(error > LOST))
-        held = np.mean(own["own_density_rank"] < 0.9 * (DRAWS + 1))
+        held = np.mean(_density_rank(own) < 0.9 * (DRAWS + 1))
         cells = [
             f"{error.mean():.2f} [{low:.2f}, {high:.2f}] ({np.median(error):.2f})",
             f"{lost} of {len(error)}",
@@ -190,17 +180,22 @@ def table(folder: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _density_rank(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """How many draws have a higher density than the truth, shape [N]."""
+    return np.sum(arrays["own_log_prob"] > arrays["own_truth_log_prob"][:, None], axis=1)
+
+
 def _coverage(arrays: dict[str, np.ndarray]) -> list[str]:
     """Coverage at 50 % and 90 %, the least p-value of any parameter's ranks, and the mean log-density of truths."""
     dim = arrays["theta"].shape[1]
     cells = []
     for level in (0.5, 0.9):
-        cells.append(f"{np.mean(arrays['own_density_rank'] < level * (DRAWS + 1)):.2f}")
+        cells.append(f"{np.mean(_density_rank(arrays) < level * (DRAWS + 1)):.2f}")
     for name in ("own", "box"):
-        ranks = arrays[f"{name}_ranks"]
+        ranks = np.sum(arrays[f"{name}_draws"] < arrays["theta"][:, None], axis=1)
         p_value = min(diagnostics.uniformity(ranks[:, d], DRAWS, dim).p_value for d in range(dim))
         cells.append(f"{p_value:.3f}" if p_value >= 0.001 else "< 0.001")
-    cells.append(f"{np.mean(np.maximum(arrays['own_log_prob'], FLOOR)):.1f}")
+    cells.append(f"{np.mean(np.maximum(arrays['own_truth_log_prob'], FLOOR)):.1f}")
     return cells
 
 
