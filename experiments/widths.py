@@ -141,6 +141,7 @@ def infer_all(
             inputs, _ = stack_inputs(specs, part.observed, part.x)
             engine = engine_for(task, settings, inputs)
             state = engine.start()
+            engine.compile(state)
             began = time.perf_counter()
             state = drive(engine, state, range(settings.rounds), lambda *_: progress.advance(), progress.compiled)
             state = engine.fetch(state)
