@@ -15,8 +15,10 @@ again; the table is drawn from the arrays.
 import argparse
 import dataclasses
 import json
+import operator
 import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from jaxlfi.io import compile_cache
@@ -31,6 +33,7 @@ import numpy as np
 from rich.console import Console
 
 from jaxlfi import diagnostics
+from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import RunSpec, posterior_after, stack_inputs
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
@@ -122,21 +125,18 @@ def both(key: jax.Array, truth: jax.Array, posterior: Posterior, box: Support) -
     }
 
 
-def infer_all(
-    task: Task, settings: Settings, support: str, rule: Heuristic, cases: Cases, box: str, batch: int, console: Console
-) -> dict[str, np.ndarray]:
-    """The posteriors of all cases, batch by batch, described."""
-    batches = [np.arange(start, start + batch) for start in range(0, len(cases.seeds), batch)]
-    one = jax.jit(jax.vmap(
-        lambda key, truth, x, state: both(
-            key, truth, posterior_after(state.belief, state.network, x), task.support(box)
-        )
-    ))  # fmt: skip
+def final_states(
+    task: Task, settings: Settings, support: str, rule: Heuristic, cases: Cases, batch: int, console: Console
+) -> Iterator[tuple[np.ndarray, State, float]]:
+    """The runs of all cases, batch by batch: which cases, their last states, and the seconds without compiling.
+
+    The last batch is filled up by its last case, so that one program serves them all.
+    """
+    starts = range(0, len(cases.seeds), batch)
     rule = paired(rule, settings.estimator.warm_start)
-    found, seconds = [], 0.0
-    with RoundProgress(console, settings.rounds * len(batches), 0, f"{len(cases.seeds)} runs") as progress:
-        for rows in batches:
-            part = cases.rows(np.minimum(rows, len(cases.seeds) - 1))
+    with RoundProgress(console, settings.rounds * len(starts), 0, f"{len(cases.seeds)} runs") as progress:
+        for start in starts:
+            part = cases.rows(np.minimum(np.arange(start, start + batch), len(cases.seeds) - 1))
             specs = [RunSpec("", support, task.support(support), rule, int(seed)) for seed in part.seeds]
             inputs, _ = stack_inputs(specs, part.observed, part.x)
             engine = engine_for(task, settings, inputs)
@@ -145,11 +145,26 @@ def infer_all(
             began = time.perf_counter()
             state = drive(engine, state, range(settings.rounds), lambda *_: progress.advance(), progress.compiled)
             state = engine.fetch(state)
-            seconds += time.perf_counter() - began
-            keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(77), jnp.asarray(part.seeds))
-            arrays = jax.device_get(one(keys, part.theta, part.x, state))
-            keep = np.sum(rows < len(cases.seeds))
-            found.append({name: value[:keep] for name, value in arrays.items()})
+            rows = np.arange(start, min(start + batch, len(cases.seeds)))
+            yield rows, jax.tree.map(operator.itemgetter(slice(len(rows))), state), time.perf_counter() - began
+
+
+def infer_all(
+    task: Task, settings: Settings, support: str, rule: Heuristic, cases: Cases, box: str, batch: int, console: Console
+) -> dict[str, np.ndarray]:
+    """The posteriors of all cases, described."""
+
+    @jax.jit
+    @jax.vmap
+    def one(key, truth, x, state):
+        return both(key, truth, posterior_after(state.belief, state.network, x), task.support(box))
+
+    found, seconds = [], 0.0
+    for rows, state, took in final_states(task, settings, support, rule, cases, batch, console):
+        part = cases.rows(rows)
+        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(77), jnp.asarray(part.seeds))
+        found.append(jax.device_get(one(keys, part.theta, part.x, state)))
+        seconds += took
     arrays = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
     return arrays | {"theta": cases.theta, "seeds": cases.seeds, "seconds": np.asarray(seconds)}
 

@@ -38,6 +38,7 @@ _HOMES = {
     "infer": "jaxlfi.runs.infer",
     "load": "jaxlfi.runs.load",
     "option": "jaxlfi.fields",
+    "repeated": "jaxlfi.tasks.trials",
     "stack": "jaxlfi.bayessim.batch",
     "with_tails": "jaxlfi.tasks.priors",
 }

@@ -49,6 +49,7 @@ from jaxlfi.tasks.host import HostSimulator as HostSimulator
 from jaxlfi.tasks.host import SimulatorError as SimulatorError
 from jaxlfi.tasks.priors import with_tails as with_tails
 from jaxlfi.tasks.task import Task as Task
+from jaxlfi.tasks.trials import repeated as repeated
 
 __version__: str
 __all__: list[str]

@@ -455,7 +455,7 @@ def _support(arguments: argparse.Namespace, task: Task) -> tuple[str, Support]:
 
 
 def _observation(arguments: argparse.Namespace, task: Task) -> np.ndarray | None:
-    return None if arguments.observation is None else read_for(task, arguments.observation)
+    return None if arguments.observation is None else read_for(task, *arguments.observation)
 
 
 def _seeds(arguments: argparse.Namespace) -> range:

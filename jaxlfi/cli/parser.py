@@ -407,8 +407,10 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
     command.add_argument(
         "--observation",
         type=Path,
+        nargs="+",
         metavar="FILE",
-        help="the observed trajectory, .csv (a row a record, a column a channel) or .npz "
+        help="the observed trajectory, .csv (a row a record, a column a channel) or .npz; several files: independent "
+        "trials of the same parameters, believed together "
         "(default: the task's own, or one simulated at the known truth)",
     )
     _add_machine(command)
@@ -499,6 +501,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(error)
     if getattr(arguments, "object", None) is not None:
         arguments.task = f"{arguments.task},object={arguments.object}"
+    if len(getattr(arguments, "observation", None) or ()) > 1 and ",trials=" not in arguments.task:
+        arguments.task = f"{arguments.task},trials={len(arguments.observation)}"
     prepare_jax(arguments)
     prepared = None
     try:

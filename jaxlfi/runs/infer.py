@@ -27,7 +27,7 @@ from jaxlfi.runs import folder as folders
 from jaxlfi.runs.execute import BatchPlan
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Origin, Run, SupportWarning
-from jaxlfi.tasks.observation import observe
+from jaxlfi.tasks.observation import observe, trials_of
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
@@ -60,7 +60,8 @@ def infer(
     Args:
         key: consumed.
         task: simulator, names and bounds.
-        observation: the real trajectory, in the shape the simulator produces. By default the task's own, or,
+        observation: the real trajectory, in the shape the simulator produces; or a list of several, independent trials
+            of the same parameters, which are believed together (`jaxlfi.repeated`). By default the task's own, or,
             where the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
             box they fill.
@@ -92,6 +93,7 @@ def infer(
     if not isinstance(settings, Settings):
         raise ValueError(f"settings: expected jaxlfi.Settings such as jaxlfi.QUICK, got {settings!r}")
     registry.check(heuristic, task.dim)
+    task, observation = trials_of(task, observation)
     if not is_concrete((key, observation, support, heuristic, settings)):
         if task.on_host or simulations is not None or progress or callback is not None or out is not None:
             raise ValueError(

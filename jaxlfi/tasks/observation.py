@@ -13,6 +13,7 @@ import numpy as np
 from jaxlfi.tasks.host import SimulatorError
 from jaxlfi.tasks.simulation import trajectory_and_outcome, with_outcome
 from jaxlfi.tasks.task import Task
+from jaxlfi.tasks.trials import repeated, together
 
 TRIES = 16
 """Simulations at the truth that may fail before a task counts as unable to simulate its own truth."""
@@ -157,6 +158,17 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
     return observed, x
 
 
+def trials_of(task: Task, observation: Any) -> tuple[Task, Any]:
+    """The task and observation of an inference: where a list of trajectories is given, of all of them together."""
+    if not isinstance(observation, list | tuple) or not observation:
+        return task, observation
+    first = np.shape(observation[0])
+    trials = hasattr(observation[0], "shape") if task.on_host else first == simulator_shapes(task).trajectory
+    if not trials or first == ():
+        return task, observation
+    return repeated(task, len(observation)), together(observation)
+
+
 def read(path: str | Path) -> np.ndarray:
     """Read a trajectory from a file.
 
@@ -181,9 +193,12 @@ def read(path: str | Path) -> np.ndarray:
         raise ValueError(f"observation: cannot read {str(path)!r}: {_first_line(error)}") from error
 
 
-def read_for(task: Task, path: str | Path) -> np.ndarray:
-    """A trajectory from a file, in the shape of the task's simulator where that is known before it has run."""
-    trajectory = read(path)
+def read_for(task: Task, *paths: str | Path) -> np.ndarray:
+    """A trajectory from a file, in the shape of the task's simulator where that is known before it has run.
+
+    Several files are the trials of a repeated task (`jaxlfi.repeated`), one after another.
+    """
+    trajectory = together([read(path) for path in paths])
     if task.on_host:
         return trajectory
     shape = simulator_shapes(task).trajectory

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxlfi.tasks.task import Task
+from jaxlfi.tasks.trials import repeated
 
 GROUP = "jaxlfi.tasks"
 """The entry-point group; packages add tasks by `[project.entry-points."jaxlfi.tasks"]` in pyproject.toml."""
@@ -29,7 +30,8 @@ def load(reference: str) -> Task:
     Args:
         reference: a registered name, or "module:factory" for a callable that returns a `Task` (or a `Task`
             itself) in a module that can be imported from the current folder; then the factory's options, if any,
-            as in "whip,object=dlo-0,detector=clean".
+            as in "whip,object=dlo-0,detector=clean". Every task has those of `jaxlfi.repeated` besides, `trials` and
+            `pooling`: "lotka_volterra,trials=4" is the task of four observations together.
 
     Options are converted to the types that the factory's signature declares (int, float, bool, str, Path, Literal and
     unions of them).
@@ -43,10 +45,13 @@ def load(reference: str) -> Task:
         'gaussian_linear'
     """
     name, options = parse(reference)
+    together = {option: options.pop(option) for option in ("trials", "pooling") if option in options}
     made = _made(reference, _factory(name), options)
     if not isinstance(made, Task):
         raise ValueError(f"task: expected {reference!r} to give a jaxlfi.Task, got {type(made).__name__}")
-    return made
+    if not together:
+        return made
+    return repeated(made, convert(together.pop("trials", "1"), int, "trials"), **together)
 
 
 def parse(reference: str) -> tuple[str, dict[str, str]]:

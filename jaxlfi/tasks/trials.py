@@ -1,0 +1,117 @@
+"""Several observations of the same parameters: independent trials, summarised jointly."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxlfi.tasks.host import HostSimulator
+from jaxlfi.tasks.task import Task
+
+MAX_TRIALS = 1000
+"""Trials of a task, at most: each simulation is so many."""
+
+
+def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
+    """The task of observing several independent trials of the same parameters.
+
+    A simulation is then so many of the given task's, each with noise of its own; it fails where one of them fails. Its
+    trajectory is theirs, one after another along the first axis, and its summary pools theirs, in any order to the same
+    numbers. The posterior is that of all trials together.
+
+    Args:
+        task: of one trial. Its own observation, if it has one, is not taken over.
+        trials: how many, n.
+        pooling: how n summaries become one (`POOLINGS`).
+
+    Returns:
+        The task of n trials; the given one for n = 1.
+
+    Raises:
+        ValueError: for less than one trial or too many, and an unknown pooling.
+
+    Example:
+        >>> from jaxlfi.envs.gaussian_linear import task
+        >>> repeated(task(), 4).name
+        'gaussian_linear x 4'
+    """
+    if isinstance(trials, bool) or not isinstance(trials, int) or not 1 <= trials <= MAX_TRIALS:
+        raise ValueError(f"trials: expected a whole number from 1 to {MAX_TRIALS}, got {trials!r}")
+    if pooling not in POOLINGS:
+        raise ValueError(f"pooling: expected one of {sorted(POOLINGS)}, got {pooling!r}")
+    if trials == 1:
+        return task
+    if task.on_host:
+        simulate = HostSimulator(functools.partial(_on_host, task.simulate.function, trials))
+    else:
+        simulate = functools.partial(_in_jax, task.simulate, trials)
+    return dataclasses.replace(
+        task,
+        simulate=simulate,
+        summary=functools.partial(_summary, task.summary, trials, pooling),
+        observation=None,
+        times=None,
+        record_label=f"{task.record_label or 'record'} of {trials} trials, one after another",
+        summary_names=[f"{kind} of {name}" for kind in POOLINGS[pooling] for name in task.summary_names],
+        name=f"{task.name} x {trials}",
+    )
+
+
+def together(trials: Sequence[Any]) -> np.ndarray:
+    """Trajectories [T, ...] of several trials as the one of a repeated task, shape [n T, ...].
+
+    Raises:
+        ValueError: for none, or trajectories of different shapes.
+    """
+    arrays = [np.asarray(trial, np.float32) for trial in trials]
+    shapes = sorted({array.shape for array in arrays})
+    if len(shapes) != 1 or shapes[0] == ():
+        raise ValueError(f"observation: expected trials of one shape [T, ...], got {[list(shape) for shape in shapes]}")
+    return np.concatenate(arrays)
+
+
+STATISTICS: dict[str, Callable[[Array], Array]] = {
+    "mean": functools.partial(jnp.mean, axis=0),
+    "sd": functools.partial(jnp.std, axis=0, ddof=1),
+}
+"""Statistics of the trials' summaries [n, S], each a vector [S]."""
+
+POOLINGS: dict[str, tuple[str, ...]] = {"mean": ("mean",), "moments": ("mean", "sd")}
+"""Which statistics of the trials' summaries make the summary of them all, by name."""
+
+
+def _in_jax(simulate: Callable, trials: int, key: jax.Array, theta: Array) -> tuple[Array, Array]:
+    """Several simulations at one theta, and the first failure among them."""
+
+    def one(key):
+        result = simulate(key, theta)
+        return result if isinstance(result, tuple) else (result, jnp.asarray(0))
+
+    trajectory, outcome = jax.vmap(one)(jax.random.split(key, trials))
+    return trajectory.reshape(-1, *trajectory.shape[2:]), _first_failure(jnp, outcome)
+
+
+def _on_host(function: Callable, trials: int, rng: np.random.Generator, theta: np.ndarray):
+    """The same for a simulator on the host: all trials of all thetas in one call."""
+    simulated = HostSimulator(function).batch(rng, np.repeat(theta, trials, axis=0))
+    trajectory, outcome = (np.asarray(array).reshape(len(theta), trials, *array.shape[1:]) for array in simulated)
+    return trajectory.reshape(len(theta), -1, *trajectory.shape[3:]), _first_failure(np, outcome)
+
+
+def _first_failure(numpy: Any, outcome: Any) -> Any:
+    """The outcome of the first trial that failed, else of success; booleans are true for success."""
+    if outcome.dtype == bool:
+        return numpy.all(outcome, axis=-1)
+    first = numpy.argmax(outcome != 0, axis=-1)
+    return numpy.take_along_axis(outcome, first[..., None], axis=-1)[..., 0]
+
+
+def _summary(summary: Callable, trials: int, pooling: str, trajectory: Array) -> Array:
+    """The pooled summaries of trials that lie one after another."""
+    each = jax.vmap(summary)(trajectory.reshape(trials, -1, *trajectory.shape[1:]))
+    return jnp.concatenate([STATISTICS[kind](each) for kind in POOLINGS[pooling]])
