@@ -19,6 +19,7 @@ from jaxlfi import diagnostics
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
+from jaxlfi.bayessim.widths import expected_widths
 from jaxlfi.diagnostics.bounds import bound_summary
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import TRIES
@@ -36,6 +37,7 @@ from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Run
 from jaxlfi.studies import calibration, grid
+from jaxlfi.studies.calibration.widths import sentence
 from jaxlfi.studies.grid import Work
 from jaxlfi.tasks import priors
 from jaxlfi.tasks import registry as task_lookup
@@ -49,6 +51,8 @@ EXPECTED = (SimulatorError, CheckpointError, run_store.StoreError)
 """Errors that the input of a run causes; they are reported in one line."""
 LOW_MASS = 0.01
 """Mass of the posterior inside its support below which `jaxlfi sample` warns."""
+DIAGNOSTICS = "diagnostics"
+"""Folder of the diagnostics in that of their run, where no other is given; a run's page looks for them there."""
 BOOTSTRAP = 2000
 """Bootstrap resamples for the interval of a mean."""
 CONFIGURATION_DEFAULTS = ("ok", "misspecified", "broad")
@@ -241,20 +245,26 @@ def diagnose(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi diagnose DIR`."""
     task = None if arguments.task is None else task_lookup.load(arguments.task)
     run = calibration.read_run(arguments.folder, task)
-    name = arguments.reference or next(iter(run.task.supports))
-    if name not in run.task.supports:
-        raise ValueError(f"reference: expected one of {sorted(run.task.supports)}, got {name!r}")
-    plan = calibration.CalibrationPlan(name, arguments.truths, arguments.draws, arguments.seed)
+    asked = arguments.reference or f"{calibration.POSTERIOR},{next(iter(run.task.supports))}"
+    plans = calibration.plans_of(asked, run.task, arguments.truths, arguments.draws, arguments.seed)
     reference = None
     if arguments.against is not None:
         reference = arguments.against.name, calibration.read_reference(arguments.against, run.task)
-    out = arguments.out or arguments.folder / "diagnostics"
-    checks = calibration.diagnose(out, run, plan, console, reference)
-    console.print(checks_table(checks))
+    out = arguments.out or arguments.folder / DIAGNOSTICS
+    found = calibration.diagnose(out, run, plans, console, reference)
+    for widths in found.widths:
+        _say(console, f"{widths.heading}:")
+        for name, one in widths.rows:
+            _say(console, f"  {sentence(name, one)}")
+    console.print(checks_table(found.checks))
     _say(console, f"diagnostics: {out}")
-    if not arguments.no_figures:
-        for path in _figures().checks.report(out):
-            _say(console, f"picture: {path}")
+    if arguments.no_figures:
+        return
+    for path in _figures().checks.report(out):
+        _say(console, f"{'page' if path.suffix == '.html' else 'picture'}: {path}")
+    if out == arguments.folder / DIAGNOSTICS and (arguments.folder / "report.html").exists():
+        _figures().report(arguments.folder)  # it says how far widths can be trusted, and this is known now
+        _say(console, f"page of the run, again: {arguments.folder / 'report.html'}")
 
 
 def checks_table(checks: Sequence[calibration.Check]) -> Table:
@@ -289,10 +299,22 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     console.print(summary_table(plan, runs))
     for warning in (*training_warnings(plan, runs), *support_warnings(plan, runs)):
         _warn(console, warning)
+    for line in widths_lines(plan):
+        _say(console, line)
     kind = "table" if plan.kind == run_store.COMPARE else "results"
     _say(console, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")
     if not arguments.no_figures:
         draw(folder, console)
+
+
+def widths_lines(plan: BatchPlan) -> list[str]:
+    """How far the widths of the runs' posteriors can be trusted, in one line; several where heuristics differ in it."""
+    by_line: dict[str, list[str]] = {}
+    for spec in plan.specs:
+        names = by_line.setdefault(expected_widths(plan.settings, spec.heuristic), [])
+        names += [spec.configuration] * (spec.configuration not in names)
+    several = len(by_line) > 1
+    return [f"widths{' of ' + ', '.join(names) if several else ''}: {line}" for line, names in by_line.items()]
 
 
 def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:

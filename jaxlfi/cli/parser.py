@@ -87,23 +87,31 @@ examples:
 """
 
 DIAGNOSE_EXAMPLES = """\
-Truths are drawn from the prior over a support and simulated, and the run's method is asked for the posterior of each:
-by its network, where the run had one round and kept it (--method npe, or --rounds 1 --keep-network), else by repeating
-the whole inference side by side, in chunks that are saved as they end. A command that was stopped goes on when it is
-given again. It takes about as long as that many runs; a failed check does not change the exit status, 0.
+Truths are drawn from the run's own posterior, and from the prior over a support, and simulated. The run's method is
+asked for the posterior of each: by its network, where the run had one round and kept it (--method npe, or --rounds 1
+--keep-network), else by repeating the whole inference side by side, in chunks that are saved as they end. A command
+that was stopped goes on when it is given again. It takes about as long as that many runs; a failed check does not
+change the exit status, 0.
 
-checks:
+widths, of each parameter, at each reference:
+  honest        90 % intervals held 90 % of the truths, as far as so many truths can tell
+  too narrow    ... fewer; the number is how many times as wide they would have to be. too wide: more
+  biased        truths lie to one side of the intervals' medians
+  At the posterior: is the method honest where this run ended up? Over a support: for objects of all kinds?
+
+checks, over a support:
   rank          of each truth among its draws, by parameter (simulation-based calibration)
   coverage      how often the densest region of a level holds the truth; around random points (TARP)
   classifier    accuracy of a classifier that separates truths from draws, given the simulation
-  predictive    whether the run's own observation looks like simulations of its own posterior
+  predictive    (of the run itself) whether its own observation looks like simulations of its own posterior
 verdicts:
   over-confident, under-confident: posteriors are too narrow, too wide; biased low, high: they lie below, above
   the truths. A check fails at p up to 0.01, corrected for the number of parameters.
 
 examples:
   jaxlfi diagnose runs/npe
-  jaxlfi diagnose runs/edge --reference ok --truths 200
+  jaxlfi diagnose runs/edge --reference posterior,ok --truths 200
+  jaxlfi diagnose runs/edge --reference posterior --out runs/edge-at-its-posterior
   jaxlfi diagnose runs/gaussian --against reference.csv
 
 """
@@ -294,9 +302,12 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
     )
     diagnose.add_argument("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
     diagnose.add_argument(
-        "--reference", metavar="NAME", help="the support that truths are drawn over (default: the task's first)"
+        "--reference",
+        metavar="NAME[,NAME]",
+        help="where truths are drawn: posterior, the name of a support, or one of each (default: posterior, and the "
+        "task's first support)",
     )
-    diagnose.add_argument("--truths", type=int, default=100, metavar="N", help="simulated truths (default: 100)")
+    diagnose.add_argument("--truths", type=int, default=100, metavar="N", help="of each reference (default: 100)")
     diagnose.add_argument(
         "--draws", type=int, default=200, metavar="L", help="draws from the posterior of each (default: 200)"
     )

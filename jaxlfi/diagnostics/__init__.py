@@ -24,6 +24,7 @@ from jaxlfi.diagnostics.discrepancy import (
     not_simulated,
     trajectory_distance,
 )
+from jaxlfi.diagnostics.intervals import Estimate, Intervals, check_intervals, check_regions
 from jaxlfi.diagnostics.predictive import PredictiveCheck, predictive_check
 
 __all__ = [
@@ -31,13 +32,17 @@ __all__ = [
     "POSTERIOR_SAMPLES",
     "SIGNIFICANCE",
     "Discrepancy",
+    "Estimate",
     "Histogram",
+    "Intervals",
     "PredictiveCheck",
     "Uniformity",
     "bound_evidence",
     "bound_summary",
     "bound_warnings",
     "c2st",
+    "check_intervals",
+    "check_regions",
     "compared",
     "coverage_verdict",
     "density_ranks",

@@ -1,14 +1,17 @@
-"""Checks: the observation among simulations from the posterior, and all pictures of a folder of diagnostics."""
+"""Checks: the observation among simulations from the posterior; all pictures of diagnostics, and a page of them."""
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxlfi.figures import calibration, style
+from jaxlfi.figures import calibration, intervals, page, style
 from jaxlfi.figures.calibration import BAND, COLOUR, COVERAGE, DISTANCE, Arrays
 from jaxlfi.figures.history import read_arrays, robust_sd
+from jaxlfi.figures.page import Picture
 from jaxlfi.figures.predictive import QUANTILES
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
 
@@ -17,28 +20,43 @@ REACH = 8.0
 
 
 def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
-    """Draw all pictures that diagnostics.npz has the arrays of.
+    """Draw all pictures that diagnostics.npz has the arrays of, and write a page with them and the verdicts.
 
     Args:
         folder: of the diagnostics.
         dpi: resolution.
 
     Returns:
-        FOLDER/figures/*.png.
+        FOLDER/report.html, then FOLDER/figures/*.png in the order of the page.
 
     Raises:
-        ValueError: for a folder whose diagnostics.npz is missing or damaged.
+        ValueError: for a folder whose diagnostics.npz or diagnostics.json is missing or damaged.
     """
     folder = Path(folder)
     arrays = read_arrays(folder / "diagnostics.npz", ("names", "units"))
-    paths = []
+    found = _read(folder / "diagnostics.json")
+    pictures = []
     with style.context():
-        for name, (needed, size, draw) in PICTURES.items():
+        for name, (needed, size, draw, title, caption) in PICTURES.items():
             if needed in arrays:
                 figure = style.new_figure(*size(arrays))
                 draw(figure, arrays)
-                paths.append(style.save(figure, folder / "figures" / f"{name}.png", dpi))
-    return paths
+                path = style.save(figure, folder / "figures" / f"{name}.png", dpi)
+                pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
+    text = page.render_diagnostics(found, pictures)
+    index = folder / "report.html"
+    index.write_text(text, encoding="utf-8")
+    return [index, *(picture.path for picture in pictures)]
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    try:
+        found = json.loads(path.read_text())
+        if "widths" not in found or "checks" not in found:
+            raise ValueError("no verdicts")
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"{path}: expected the results of diagnostics, but they cannot be read ({error})") from error
+    return found
 
 
 def standardised(arrays: Arrays) -> tuple[np.ndarray, np.ndarray]:
@@ -92,10 +110,36 @@ def _predictive_size(arrays: Arrays) -> tuple[float, float]:
     return TEXT_WIDTH, 2.3
 
 
-PICTURES: dict[str, tuple[str, Callable[[Arrays], tuple[float, float]], Callable[[Figure, Arrays], None]]] = {
-    "ranks": ("bin_count", _ranks_size, calibration.draw_ranks),
-    "coverage": (COVERAGE, _square, calibration.draw_coverage),
-    "tarp": (DISTANCE, _square, calibration.draw_tarp),
-    "predictive": ("predictive_x", _predictive_size, draw),
-}
-"""By file name: an array the picture needs, its size in inches, and the function that draws it."""
+def _widths_size(arrays: Arrays) -> tuple[float, float]:
+    return TEXT_WIDTH, intervals.height(arrays)
+
+
+Maker = tuple[str, Callable[[Arrays], tuple[float, float]], Callable[[Figure, Arrays], None], str, str]
+
+PICTURES: dict[str, Maker] = {
+    "widths": (
+        "widths_held", _widths_size, intervals.draw, "Intervals",
+        "Left: the fraction of truths that intervals of each parameter, and densest regions of all parameters together "
+        "(last row), held; they should hold 50 % and 90 % (lines). Right: the factor by which the width of 90 % "
+        "intervals would have to be multiplied for them to hold 90 %. Bars are confidence intervals, of 95 % for all "
+        "parameters together.",
+    ),
+    "ranks": (
+        "bin_count", _ranks_size, calibration.draw_ranks, "Ranks (simulation-based calibration)",
+        "The rank of each truth among draws of its posterior, for truths over the support. U-shaped: too narrow; a "
+        "hill: too wide; a slope: biased.",
+    ),
+    "coverage": (
+        COVERAGE, _square, calibration.draw_coverage, "Coverage of densest regions",
+        "For truths over the support. Below the diagonal: over-confident.",
+    ),
+    "tarp": (
+        DISTANCE, _square, calibration.draw_tarp, "Coverage from random points (TARP)",
+        "The same with regions around random points, which sees what densities do not.",
+    ),
+    "predictive": (
+        "predictive_x", _predictive_size, draw, "Posterior predictive",
+        "The run's own observation among simulations of its own posterior.",
+    ),
+}  # fmt: skip
+"""By file name: an array the picture needs, its size in inches, the function that draws it, its title and caption."""

@@ -156,6 +156,15 @@ class History:
         return self.final_trajectory[valid] if valid.any() else None
 
     @property
+    def measured_widths(self) -> str | None:
+        """In words, what diagnostics in the run's folder found of its widths; None where there are none, or others."""
+        try:
+            found = json.loads((self.folder / "diagnostics" / "diagnostics.json").read_text())
+            return str(found["line"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
+    @property
     def final_theta_error(self) -> float:
         """Last round's |theta - theta_gt|, summed over parameters and averaged over samples."""
         return float("nan") if self.theta_error is None else float(self.theta_error[-1].sum(-1).mean())

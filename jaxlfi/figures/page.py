@@ -61,6 +61,8 @@ dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.2rem; m
   font-size: .92rem; }
 dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
 summary { cursor: pointer; }
+ul.verdicts { margin: .3rem 0 1rem; padding-left: 1.2rem; } ul.verdicts li { margin: .15rem 0; }
+.good { color: #1a7f37; } .bad { color: #b42318; }
 .note { background: #fff7e6; border-left: 3px solid #f5a025; padding: .5rem .9rem; }
 nav a { color: #174ea6; margin-right: .9rem; text-decoration: none; font-size: .92rem; }
 @media print { main { max-width: none; padding: 0; } h2 { break-after: avoid; }
@@ -91,7 +93,7 @@ def render(collection: Collection, pictures: Sequence[Picture]) -> str:
     title = f"{task}: {len(collection.table)} run{'s' if len(collection.table) != 1 else ''} of jaxlfi"
     return _document(
         title,
-        [_facts(collection), _notes(collection), f"<h2>Results</h2>{_table(collection)}"],
+        [_widths(collection), _facts(collection), _notes(collection), f"<h2>Results</h2>{_table(collection)}"],
         pictures,
         config,
     )
@@ -119,7 +121,95 @@ def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
     return _document(title, [_definitions(facts), note], pictures, config)
 
 
-def _document(title: str, parts: Sequence[str], pictures: Sequence[Picture], config: Mapping[str, Any]) -> str:
+def render_diagnostics(found: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
+    """The page of a run's diagnostics as text: first how far its widths can be trusted, in plain words.
+
+    Args:
+        found: diagnostics.json.
+        pictures: in their order on the page.
+    """
+    run = found["run"]
+    title = f"{_short(run['task'] or run['configuration'])}: can its widths be trusted?"
+    way = {
+        "amortised": "the run's network gave the posterior of each simulation",
+        "repeated": "the whole inference was repeated for each simulation",
+    }[found["way"]]
+    boxes = [one["name"] for one in found["references"] if "low" in one]
+    intro = (
+        "<p>Parameters were drawn, simulated, and inferred again from their simulations alone: "
+        f"{html.escape(way)}. An interval of 90 % is honest if it held nine of ten of these truths.</p>"
+    )
+    verdicts = "".join(
+        f"<h3>{html.escape(one['heading'])}</h3><ul class=\"verdicts\">"
+        + "".join(f'<li class="{_tone(row["verdict"])}">{html.escape(row["sentence"])}</li>' for row in one["found"])
+        + "</ul>"
+        for one in found["widths"]
+    )
+    questions = (
+        "<p>At this run's posterior: is the method honest where this run ended up? Over a support: is it honest for "
+        "objects of all kinds? Most truths over a support are unlike this run's. In brackets are confidence intervals, "
+        "of 95 % for all parameters together.</p>"
+    )
+    parts = [intro, verdicts, questions, f"<h2>Side by side</h2>{_widths_table(found)}"]
+    over = f" over the support {boxes[0]}, and of this run's own posterior" if boxes else " of this run's own posterior"
+    parts.append(f"<h2>Checks{html.escape(over)}</h2>{_checks_table(found['checks'])}")
+    shown = {name: value for name, value in found.items() if name not in ("widths", "checks")}
+    return _document(title, parts, pictures, shown, "diagnostics.json")
+
+
+def _tone(verdict: str) -> str:
+    return {"honest": "good", "ok": "good", "": "soft", "too few truths": "soft"}.get(verdict, "bad")
+
+
+def _widths_table(found: Mapping[str, Any]) -> str:
+    """Fractions held, factor and verdict of each parameter, the references side by side."""
+    levels = found["widths"][0]["levels"]
+    columns = [*(f"{100 * level:.0f} % held" for level in levels), "right width", "verdict"]
+    head = "".join(
+        f'<th class="first" colspan="{len(columns)}">{html.escape(one["heading"])}</th>' for one in found["widths"]
+    )
+    below = "".join(f'<th class="{"first" * (i == 0)}">{name}</th>' for i, name in enumerate(columns))
+    lines = []
+    for rows in zip(*(one["found"] for one in found["widths"]), strict=True):
+        cells = ""
+        for row in rows:
+            held = [_estimate(share, lambda x: f"{100 * x:.0f}") for share in row["held"]]
+            values = [*held, _estimate(row["factor"], _number), row["verdict"]]
+            cells += "".join(f'<td class="{"first" * (i == 0)}">{html.escape(v)}</td>' for i, v in enumerate(values))
+        lines.append(f"<tr><td>{html.escape(rows[0]['name'])}</td>{cells}</tr>")
+    return (
+        f'<div class="wide"><table><thead><tr><th></th>{head}</tr><tr><th></th>{below * len(found["widths"])}</tr>'
+        f"</thead><tbody>{''.join(lines)}</tbody><caption>Held: percentage of the truths inside intervals of that "
+        "level; all together: inside densest regions. Right width: how many times as wide 90 % intervals would have to "
+        "be to hold 90 %.</caption></table></div>"
+    )
+
+
+def _estimate(found: Mapping[str, float | None] | None, words: Callable[[float], str]) -> str:
+    if found is None:
+        return "–"
+    value, low, high = ("∞" if found[name] is None else words(found[name]) for name in ("value", "low", "high"))
+    return f"{value} [{low}, {high}]"
+
+
+def _checks_table(checks: Sequence[Mapping[str, Any]]) -> str:
+    lines = []
+    for check in checks:
+        p_value = "" if check["p_value"] is None else f"{check['p_value']:.2g}"
+        cells = (check["name"], check["statistic"], check["expected"], p_value)
+        row = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
+        lines.append(f'<tr>{row}<td class="{_tone(check["verdict"])}">{html.escape(check["verdict"])}</td></tr>')
+    head = "".join(f"<th>{name}</th>" for name in ("check", "statistic", "expected", "p-value", "verdict"))
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+
+
+def _document(
+    title: str,
+    parts: Sequence[str],
+    pictures: Sequence[Picture],
+    config: Mapping[str, Any],
+    name_of_config: str = "config.json",
+) -> str:
     """A whole page: a heading, its first parts, the pictures with links to them, and config.json."""
     shown = [(f"picture-{i}", picture) for i, picture in enumerate(pictures, 1)]
     links = "".join(f'<a href="#{name}">{html.escape(picture.title)}</a>' for name, picture in shown)
@@ -132,10 +222,27 @@ def _document(title: str, parts: Sequence[str], pictures: Sequence[Picture], con
         *parts,
         f"<nav>{links}</nav>",
         *(_figure(name, picture) for name, picture in shown),
-        f"<h2>Configuration</h2><details><summary>config.json</summary><pre>{_json(config)}</pre></details>",
+        f"<h2>Configuration</h2><details><summary>{name_of_config}</summary><pre>{_json(config)}</pre></details>",
         "</main></body></html>",
     ]
     return "\n".join(every) + "\n"
+
+
+def _widths(collection: Collection) -> str:
+    """How far the widths can be trusted, and how that is known: measured in a run's folder, or as its settings say."""
+    lines: dict[str, list[str]] = {}
+    for name, histories in collection.runs.items():
+        for history in histories:
+            measured = history.measured_widths
+            text = measured or history.config.get("widths")
+            own = f"{name}, seed {history.seed}" if measured and len(histories) > 1 else name
+            if text and own not in lines.setdefault(str(text), []):
+                lines[str(text)].append(own)
+    several = len(lines) > 1
+    return "".join(
+        f"<p><b>Widths{html.escape(' of ' + ', '.join(names)) if several else ''}:</b> {html.escape(text)}.</p>"
+        for text, names in lines.items()
+    )
 
 
 def _facts(collection: Collection) -> str:

@@ -29,7 +29,7 @@ from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
 
-OWN = ("configuration", "support", "heuristic", "seed")
+OWN = ("configuration", "support", "heuristic", "seed", "widths")
 """What the runs of a batch differ in, by the names of config.json."""
 VERSIONS = ("jax", "jaxlib", "jaxlfi")
 """Packages whose versions a resumed run has to share for the promise of the same bits."""

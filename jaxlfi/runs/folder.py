@@ -29,6 +29,7 @@ import jaxlfi
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.record import FINAL, ledger_line
 from jaxlfi.bayessim.settings import Settings
+from jaxlfi.bayessim.widths import expected_widths
 from jaxlfi.io import files as atomic
 from jaxlfi.io.serialise import json_safe
 from jaxlfi.runs import describe
@@ -288,6 +289,7 @@ def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) 
         "preset": origin.preset,
         "settings": describe.settings_to_json(settings),
         "seed": spec.seed,
+        "widths": expected_widths(settings, spec.heuristic),
         **environment(),
     }
 

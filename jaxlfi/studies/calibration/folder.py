@@ -3,6 +3,8 @@
 import dataclasses
 import hashlib
 import json
+import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +22,26 @@ from jaxlfi.studies.calibration.checks import Check, against, calibration, predi
 from jaxlfi.studies.calibration.plan import CalibrationPlan
 from jaxlfi.studies.calibration.repeat import chunk_length, posteriors, read_arrays
 from jaxlfi.studies.calibration.truths import draw_truths
+from jaxlfi.studies.calibration.widths import Widths, arrays_of, measured
+from jaxlfi.tasks.host import SimulatorError
 
 FORMAT, VERSION = "jaxlfi-diagnostics", run_store.VERSION
 
 
-def begin(out: Path, run: Run, plan: CalibrationPlan) -> dict[str, Any]:
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """What was found of a run.
+
+    Attributes:
+        widths: how far its method's widths can be trusted, one a reference.
+        checks: of its method over a support, where truths were drawn over one, and of its own posterior.
+    """
+
+    widths: tuple[Widths, ...]
+    checks: tuple[Check, ...]
+
+
+def begin(out: Path, run: Run, plans: Sequence[CalibrationPlan]) -> dict[str, Any]:
     """Bring the folder of the diagnostics into being, or find it as the same command left it.
 
     Returns:
@@ -33,7 +50,7 @@ def begin(out: Path, run: Run, plan: CalibrationPlan) -> dict[str, Any]:
     Raises:
         StoreError: where the folder holds something else, or diagnostics that were asked for differently.
     """
-    wanted = run_store.as_json(description(run, plan))
+    wanted = run_store.as_json(description(run, plans))
     path = out / "plan.json"
     if path.exists():
         found = read_plan(path)
@@ -47,7 +64,7 @@ def begin(out: Path, run: Run, plan: CalibrationPlan) -> dict[str, Any]:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StoreError(f"out: expected a new or empty folder, got {str(out)!r} which holds something")
     out.mkdir(parents=True, exist_ok=True)
-    found = wanted | {"chunk_length": chunk_length(run, plan), "devices": jax.local_device_count()}
+    found = wanted | {"chunk_length": chunk_length(run, plans[0]), "devices": jax.local_device_count()}
     atomic.write_json(path, found)
     return found
 
@@ -67,65 +84,100 @@ def read_plan(path: Path) -> dict[str, Any]:
     return found
 
 
-def description(run: Run, plan: CalibrationPlan) -> dict[str, Any]:
+def description(run: Run, plans: Sequence[CalibrationPlan]) -> dict[str, Any]:
     """All that the results depend on, as JSON values."""
     arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((run.belief, run.network))]
     content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
     config = run_store.run_config(run.task, run.origin, run.spec, run.settings)
     shared = ("task", "names", "units", "configuration", "support", "heuristic", "settings", "seed")
-    box = run.task.support(plan.reference)
+    plan = plans[0]
     return {
         "format": FORMAT,
         "version": VERSION,
         "run": {name: config[name] for name in shared} | {"arrays": hashlib.sha256(content).hexdigest()[:32]},
-        "reference": {"name": plan.reference} | describe.support_to_json(box),
+        "references": [_reference(run, plan) for plan in plans],
         "truths": plan.truths,
         "draws": plan.draws,
         "seed": plan.seed,
     }
 
 
+def _reference(run: Run, plan: CalibrationPlan) -> dict[str, Any]:
+    name = {"name": plan.reference}
+    return name if plan.at_posterior else name | describe.support_to_json(run.task.support(plan.reference))
+
+
 def diagnose(
-    out: Path, run: Run, plan: CalibrationPlan, console: Console, reference: tuple[str, np.ndarray] | None = None
-) -> list[Check]:
+    out: Path,
+    run: Run,
+    plans: Sequence[CalibrationPlan],
+    console: Console,
+    reference: tuple[str, np.ndarray] | None = None,
+) -> Diagnosis:
     """Make all checks, and write their numbers and arrays.
 
     Args:
         out: the folder of the diagnostics.
         run: the run under test.
-        plan: what is asked of it.
+        plans: what is asked of it: one a reference, of the same numbers of truths and draws and the same seed
+            (`plans_of`).
         console: for progress, and for what is left out.
         reference: the name of reference samples of the run's posterior, and they themselves in inference space [n, D].
 
     Raises:
         StoreError: for a folder that holds something else.
-        SimulatorError: for a simulator that breaks its contract or fails always.
+        SimulatorError: for a simulator that breaks its contract or fails always; a folder that is new is removed again.
     """
-    found = begin(out, run, plan)
-    fingerprint = hashlib.sha256(json.dumps(found, sort_keys=True).encode()).hexdigest()[:32]
-    truths = _truths(out / "truths.npz", run, plan)
-    failed = dict(zip(run.task.reasons, truths["failed"].tolist(), strict=True))
-    posterior = posteriors(out, run, plan, truths, found["chunk_length"], fingerprint, console)
-    lines, arrays = calibration(run, plan, truths, posterior)
-    arrays |= {name: truths[name] for name in ("theta", "x")} | posterior
-    own, of_own = predictive(run, plan)
-    lines, arrays = [*lines, own], arrays | of_own
+    new = not (out / "plan.json").exists()
+    found = begin(out, run, plans)
+    try:
+        truths = [_truths(out / plan.folder / "truths.npz", run, plan) for plan in plans]
+    except SimulatorError:
+        if new:
+            shutil.rmtree(out)  # there is nothing in it to go on from
+        raise
+    widths, lines, arrays = [], [], {}
+    for plan, own_truths in zip(plans, truths, strict=True):
+        posterior = posteriors(
+            out / plan.folder, run, plan, own_truths, found["chunk_length"], _fingerprint(found, plan), console
+        )
+        widths.append(measured(plan, run.task.space.labels, own_truths, posterior))
+        own_arrays = {name: own_truths[name] for name in ("theta", "x")} | posterior
+        if plan.at_posterior:
+            arrays |= {f"{plan.reference}/{name}": array for name, array in own_arrays.items()}
+            continue
+        over_box, of_box = calibration(run, plan, own_truths, posterior)
+        lines, arrays = [*lines, *over_box], arrays | of_box | own_arrays
+    last = plans[-1]
+    own, of_own = predictive(run, last)
+    lines, arrays = [*lines, own], arrays | of_own | arrays_of(widths)
     if reference is not None:
-        lines.append(against(run, plan, *reference))
+        lines.append(against(run, last, *reference))
     names = {"names": np.asarray(run.task.space.labels), "units": np.asarray(run.task.units)}
     atomic.write_arrays(out / "diagnostics.npz", arrays | names)
+    failed = {
+        plan.reference: dict(zip(run.task.reasons, own["failed"].tolist(), strict=True))
+        for plan, own in zip(plans, truths, strict=True)
+    }
     atomic.write_json(
         out / "diagnostics.json",
         found
         | {
             "way": "amortised" if run.amortised else "repeated",
             "failed_truths": failed,
+            "line": widths[0].line,
+            "widths": [one.as_json() for one in widths],
             "significance": diagnostics.SIGNIFICANCE,
             "checks": [dataclasses.asdict(check) for check in lines],
         }
         | run_store.environment(),
     )
-    return lines
+    return Diagnosis(tuple(widths), tuple(lines))
+
+
+def _fingerprint(found: dict[str, Any], plan: CalibrationPlan) -> str:
+    """A hash of all that the posteriors at one reference depend on."""
+    return hashlib.sha256(json.dumps([found, plan.reference], sort_keys=True).encode()).hexdigest()[:32]
 
 
 def _truths(path: Path, run: Run, plan: CalibrationPlan) -> dict[str, np.ndarray]:
@@ -133,5 +185,6 @@ def _truths(path: Path, run: Run, plan: CalibrationPlan) -> dict[str, np.ndarray
     if path.exists():
         return read_arrays(path)
     truths = draw_truths(run, plan)
+    path.parent.mkdir(exist_ok=True)
     atomic.write_arrays(path, truths, durable=True)
     return truths

@@ -19,6 +19,8 @@ STREAM = 0xD1A6
 """Sets the keys apart from those of a run of the same seed."""
 TRUTHS, RUNS, DRAWS, TIES, CLASSIFIER, PREDICTIVE, AGAINST = range(7)
 """Purposes of keys."""
+POSTERIOR = "posterior"
+"""The reference whose truths are drawn from the run's own posterior; any other is the name of a support."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +28,7 @@ class CalibrationPlan:
     """What is asked of a run.
 
     Attributes:
-        reference: name of the support that truths are drawn over.
+        reference: name of the support that truths are drawn over, or `POSTERIOR`.
         truths: how many, N.
         draws: from the posterior of each, L.
         seed: of all random numbers.
@@ -47,9 +49,49 @@ class CalibrationPlan:
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed: expected at least 0 and less than 2^31, got {self.seed}")
 
+    @property
+    def at_posterior(self) -> bool:
+        """Whether truths are drawn from the run's own posterior."""
+        return self.reference == POSTERIOR
+
+    @property
+    def folder(self) -> str:
+        """Of the truths and their posteriors, in the folder of the diagnostics."""
+        return POSTERIOR if self.at_posterior else "box"
+
+    @property
+    def where(self) -> str:
+        """Where truths are drawn, in words."""
+        return "at this run's posterior" if self.at_posterior else f"over the support {self.reference}"
+
     def key(self, purpose: int) -> jax.Array:
-        """A key for one purpose."""
-        return jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), STREAM), purpose)
+        """A key for one purpose; those of the two kinds of references are set apart."""
+        stream = STREAM + self.at_posterior
+        return jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), stream), purpose)
+
+
+def plans_of(references: str, task: Task, truths: int, draws: int, seed: int) -> tuple[CalibrationPlan, ...]:
+    """The plans of references that were asked for.
+
+    Args:
+        references: `POSTERIOR`, the name of a support, or one of each, with a comma between them.
+        task: that has the supports.
+        truths: of each reference.
+        draws: from the posterior of each truth.
+        seed: of all random numbers.
+
+    Raises:
+        ValueError: for other references, or too few truths or draws.
+    """
+    names = references.split(",")
+    boxes = [name for name in names if name != POSTERIOR]
+    if len(set(names)) < len(names) or len(boxes) > 1 or not set(boxes) <= set(task.supports):
+        known = ", ".join(sorted(task.supports))
+        raise ValueError(
+            f"reference: expected {POSTERIOR!r}, a support ({known}), or one of each with a comma between, "
+            f"got {references!r}"
+        )
+    return tuple(CalibrationPlan(name, truths, draws, seed) for name in sorted(names, key=POSTERIOR.__ne__))
 
 
 def read_run(folder: Path, task: Task | None = None) -> Run:

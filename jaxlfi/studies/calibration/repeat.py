@@ -155,11 +155,12 @@ def posteriors(
         return one
 
     if run.amortised:
-        console.print(f"{run.task.name}: conditioning the run's network on {plan.truths} simulations", markup=False)
+        label = f"{run.task.name}, {plan.where}: conditioning the run's network on {plan.truths} simulations"
+        console.print(label, markup=False, soft_wrap=True)
         store.compute(filled(amortised_chunks(run, plan)))
     else:
         chunks = len(store.chunks)
-        label = f"{run.task.name}: the run again for {plan.truths} simulations, in {chunks} chunks of {length}"
+        label = f"{plan.where}: the run again for {plan.truths} simulations, in {chunks} chunks of {length}"
         rounds = run.settings.rounds
         with RoundProgress(console, rounds * chunks, rounds * len(store.done()), label) as progress:
             store.compute(filled(repeated_chunks(run, plan, progress)))

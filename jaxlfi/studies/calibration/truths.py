@@ -1,7 +1,10 @@
-"""Truths: parameters drawn over the reference support, each with a simulation."""
+"""Truths: parameters drawn over a reference support or from the run's posterior, each with a simulation."""
+
+from collections.abc import Callable
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxlfi.distributions.support import Support
 from jaxlfi.runs.run import Run
@@ -17,9 +20,16 @@ TRIES = 16
 
 
 def draw_truths(run: Run, plan: CalibrationPlan) -> dict[str, np.ndarray]:
-    """Truths from the prior over the reference support, with a simulation of each (`simulated_truths`)."""
-    box = run.task.support(plan.reference)
-    return simulated_truths(plan.key(TRUTHS), run.task, box, plan.truths, Shapes(run.observed.shape, run.x.shape[0]))
+    """Truths from the prior over the reference support or from the run's posterior, with a simulation of each.
+
+    Raises:
+        SimulatorError: where a truth was drawn `TRIES` times in vain.
+    """
+    shapes = Shapes(run.observed.shape, run.x.shape[0])
+    if not plan.at_posterior:
+        return simulated_truths(plan.key(TRUTHS), run.task, run.task.support(plan.reference), plan.truths, shapes)
+    draw = lambda key, count: run.posterior.sample(key, count, space="inference")
+    return _simulated(plan.key(TRUTHS), run.task, draw, plan.truths, shapes, "from the run's posterior")
 
 
 def simulated_truths(key: jax.Array, task: Task, box: Support, count: int, shapes: Shapes) -> dict[str, np.ndarray]:
@@ -41,6 +51,19 @@ def simulated_truths(key: jax.Array, task: Task, box: Support, count: int, shape
     Raises:
         SimulatorError: where a truth was drawn `TRIES` times in vain.
     """
+    draw = lambda key, count: prior_draws(key, task.inference.prior, box, count)
+    return _simulated(key, task, draw, count, shapes, f"over {_words(box)}")
+
+
+def _simulated(
+    key: jax.Array,
+    task: Task,
+    draw: Callable[[jax.Array, int], Float[Array, "n dim"]],
+    count: int,
+    shapes: Shapes,
+    where: str,
+) -> dict[str, np.ndarray]:
+    """Truths by any way to draw them, each with a simulation."""
     missing = np.ones(count, bool)
     arrays = {
         "theta": np.zeros((count, task.dim), np.float32),
@@ -50,7 +73,7 @@ def simulated_truths(key: jax.Array, task: Task, box: Support, count: int, shape
     failed = np.zeros(len(task.reasons), int)
     for attempt in range(TRIES):
         key_theta, key_simulate = jax.random.split(jax.random.fold_in(key, attempt))
-        theta = prior_draws(key_theta, task.inference.prior, box, count)
+        theta = draw(key_theta, count)
         observed, x, failure = simulate_batch(key_simulate, task, theta, shapes.trajectory, missing)
         failure = np.where(missing, failure, 0)
         failed += np.sum(failure[:, None] == 1 + np.arange(len(task.reasons)), axis=0)
@@ -61,7 +84,7 @@ def simulated_truths(key: jax.Array, task: Task, box: Support, count: int, shape
         if not missing.any():
             return arrays | {"failed": failed}
     raise SimulatorError(
-        f"simulate: expected a valid simulation of each truth drawn over {_words(box)}, got none in {TRIES} "
+        f"simulate: expected a valid simulation of each truth drawn {where}, got none in {TRIES} "
         f"tries for {missing.sum()} of {count}"
     )
 

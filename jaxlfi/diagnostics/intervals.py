@@ -1,0 +1,213 @@
+"""Intervals: whether those of posteriors hold the truth as often as they say, and by how much their widths are off.
+
+The interval of a parameter reaches from the 5 % to the 95 % quantile of its posterior. Stretched about the median by a
+factor f it holds a truth whose distance from the median, in units of the interval's own half on that side, is at most
+f. The widths' factor is the 90 % quantile of these distances: that much wider, the intervals would have held 90 % of
+the truths. Its confidence interval reaches from one order statistic of the distances to another (no resampling, exact
+for any number of truths), which makes it the same statement as the exact binomial interval of the fraction held: one
+excludes a factor of 1 just where the other excludes 90 %.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxlfi.diagnostics.calibration import SIGNIFICANCE
+
+LEVELS = (0.5, 0.9)
+"""Levels of the intervals whose coverage is reported; the last one is judged."""
+CONFIDENCE = 0.95
+"""With which the intervals of fractions and factors hold for all parameters together."""
+HONEST, NARROW, WIDE, TOO_FEW = "honest", "too narrow", "too wide", "too few truths"
+BIASED_LOW, BIASED_HIGH = "biased low", "biased high"
+"""Words of a verdict; one that is too narrow or too wide may be biased besides."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """A number with its confidence interval.
+
+    Attributes:
+        value: the estimate.
+        low: lower end of the interval.
+        high: upper end.
+    """
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Intervals:
+    """What intervals of one parameter, or densest regions of all, were found to be worth.
+
+    Attributes:
+        truths: number N of truths.
+        needed: truths that a verdict needs.
+        held: fraction of the truths inside, at each of `LEVELS`.
+        factor: how many times as wide the intervals of the last level would have to be; None for regions.
+        above: fraction of the truths above the median; None for regions.
+        verdict: of the words above.
+    """
+
+    truths: int
+    needed: int
+    held: tuple[Estimate, ...]
+    factor: Estimate | None
+    above: Estimate | None
+    verdict: str
+
+
+def check_intervals(truths: Float[np.ndarray, "n dim"], draws: Float[np.ndarray, "n draws dim"]) -> list[Intervals]:
+    """Judge the intervals of each parameter.
+
+    A parameter is *too narrow* (*too wide*) where the confidence interval of its factor lies above (below) 1, and
+    *biased low* (*high*) where that of the truths above the median lies above (below) one half; else it is *honest*.
+    Of a biased one the width is judged by distances from where the truths are. All parameters of calibrated posteriors
+    together are found honest with a probability of at least `CONFIDENCE` - `SIGNIFICANCE`. Fewer truths than could
+    show that a posterior is too wide get no verdict.
+
+    Args:
+        truths: parameters that an observation was simulated at, in inference space, shape [N, D].
+        draws: from the posterior of each observation, shape [N, L, D].
+
+    Returns:
+        One a parameter.
+
+    Raises:
+        ValueError: for shapes that do not fit.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> centre = rng.normal(size=(100, 1))
+        >>> narrow = centre[:, None] + 0.5 * rng.normal(size=(100, 200, 1))
+        >>> check_intervals(centre + rng.normal(size=(100, 1)), narrow)[0].verdict
+        'too narrow'
+    """
+    truths, draws = np.asarray(truths, float), np.asarray(draws, float)
+    if draws.ndim != 3 or truths.shape != (draws.shape[0], draws.shape[2]):
+        raise ValueError(
+            f"truths, draws: expected shapes [N, D] and [N, L, D], got {list(truths.shape)} and {list(draws.shape)}"
+        )
+    distances = [distances_from_median(truths, draws, level) for level in LEVELS]
+    return [_one([signed[:, d] for signed in distances], truths.shape[1]) for d in range(truths.shape[1])]
+
+
+def check_regions(rank: Int[np.ndarray, " n"], draws: int) -> Intervals:
+    """Judge densest regions of all parameters together, which have no width and no direction.
+
+    Args:
+        rank: of `density_ranks`, shape [N].
+        draws: L.
+    """
+    rank = np.asarray(rank)
+    held = _held([(rank + 0.5) / (draws + 1) <= level for level in LEVELS], 1 - CONFIDENCE)
+    verdict = WIDE if held[-1].low >= LEVELS[-1] else NARROW if held[-1].high <= LEVELS[-1] else HONEST
+    return Intervals(len(rank), needed(1), held, None, None, verdict if len(rank) >= needed(1) else TOO_FEW)
+
+
+def distances_from_median(
+    truths: Float[np.ndarray, "n dim"], draws: Float[np.ndarray, "n draws dim"], level: float
+) -> Float[np.ndarray, "n dim"]:
+    """Of each truth from its posterior's median, in units of the interval's half on that side; negative below.
+
+    The interval holds the truth where this is at most 1 in magnitude. It is infinite where all draws are the same.
+    """
+    tail = (1 - level) / 2
+    # Weibull's quantiles: the next draw lies beyond them with that very probability, however few draws there are.
+    low, middle, high = np.quantile(draws, [tail, 0.5, 1 - tail], axis=1, method="weibull")
+    beyond = truths - middle
+    half = np.where(beyond < 0, middle - low, high - middle)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(beyond == 0, 0.0, beyond / half)
+
+
+def needed(tests: int) -> int:
+    """Fewest truths with which posteriors could be found too wide, of so many parameters judged together."""
+    return int(np.ceil(np.log((1 - CONFIDENCE) / tests / 2) / np.log(LEVELS[-1])))
+
+
+def binomial_interval(count: int, trials: int, error: float) -> tuple[float, float]:
+    """The exact interval of a probability (Clopper and Pearson 1934).
+
+    Args:
+        count: successes.
+        trials: of so many.
+        error: probability that it misses, at most, half of it on either side.
+    """
+    return 1 - _upper_end(trials - count, trials, error / 2), _upper_end(count, trials, error / 2)
+
+
+def _upper_end(count: int, trials: int, error: float) -> float:
+    """The probability at which so few successes have a probability of `error`, by bisection."""
+    if count == trials:
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = (low, middle) if _cumulative(trials, middle)[count] <= error else (middle, high)
+    return high
+
+
+def quantile_interval(values: Float[np.ndarray, " n"], level: float, error: float) -> tuple[float, float]:
+    """The interval of a quantile between two order statistics, of any distribution without ties.
+
+    Args:
+        values: not negative, shape [N].
+        level: of the quantile.
+        error: probability that it misses, at most, half of it on either side.
+
+    Returns:
+        Lower end, 0 where no value is that low, and upper end, infinite where none is that high.
+    """
+    ordered = np.concatenate([[0.0], np.sort(values), [np.inf]])
+    cumulative = _cumulative(len(values), level)
+    low = int(np.sum(cumulative <= error / 2))
+    high = 1 + int(np.sum(1 - cumulative[:-1] > error / 2))
+    return float(ordered[low]), float(ordered[high])
+
+
+def _one(signed: list[Float[np.ndarray, " n"]], tests: int) -> Intervals:
+    error = (1 - CONFIDENCE) / tests
+    count = len(signed[-1])
+    held = _held([np.abs(distance) <= 1 for distance in signed], error)
+    above = _fraction(signed[-1] > 0, SIGNIFICANCE / tests)
+    factor = _factor(signed[-1], error)
+    verdict = TOO_FEW if count < needed(tests) else _verdict(signed[-1], factor, above, error)
+    return Intervals(count, needed(tests), held, factor, above, verdict)
+
+
+def _verdict(signed: Float[np.ndarray, " n"], factor: Estimate, above: Estimate, error: float) -> str:
+    words = []
+    if not above.low < 0.5 < above.high:
+        words.append(BIASED_LOW if above.value > 0.5 else BIASED_HIGH)
+        finite = np.isfinite(signed).all()
+        factor = _factor(signed - np.median(signed), error) if finite else factor
+    if factor.low > 1 or factor.high < 1:
+        words.insert(0, NARROW if factor.low > 1 else WIDE)
+    return ", ".join(words) or HONEST
+
+
+def _factor(signed: Float[np.ndarray, " n"], error: float) -> Estimate:
+    distance = np.abs(signed)
+    value = float(np.quantile(distance, LEVELS[-1], method="inverted_cdf"))
+    return Estimate(value, *quantile_interval(distance, LEVELS[-1], error))
+
+
+def _held(inside: list[np.ndarray], error: float) -> tuple[Estimate, ...]:
+    return tuple(_fraction(one, error) for one in inside)
+
+
+def _fraction(true: np.ndarray, error: float) -> Estimate:
+    count = int(np.sum(true))
+    return Estimate(count / len(true), *binomial_interval(count, len(true), error))
+
+
+def _cumulative(trials: int, probability: float) -> Float[np.ndarray, " counts"]:
+    """P(at most k successes) for k from 0 to the number of trials."""
+    log_factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, trials + 1)))])
+    k = np.arange(trials + 1)
+    log_choose = log_factorial[-1] - log_factorial - log_factorial[::-1]
+    return np.cumsum(np.exp(log_choose + k * np.log(probability) + (trials - k) * np.log1p(-probability)))
