@@ -140,7 +140,7 @@ def render_diagnostics(found: Mapping[str, Any], pictures: Sequence[Picture]) ->
         f"{html.escape(way)}. An interval of 90 % is honest if it held nine of ten of these truths.</p>"
     )
     verdicts = "".join(
-        f"<h3>{html.escape(one['heading'])}</h3><ul class=\"verdicts\">"
+        f'<h3>{html.escape(one["heading"])}</h3><ul class="verdicts">'
         + "".join(f'<li class="{_tone(row["verdict"])}">{html.escape(row["sentence"])}</li>' for row in one["found"])
         + "</ul>"
         for one in found["widths"]
