@@ -45,6 +45,6 @@ def _expected(settings: Settings, heuristic: Heuristic) -> str:
             return f"right in principle, as proposals {inflation:g} times as wide are divided out"
         return "uncertain, as the correction 'quotient' divides by proposals as wide as the posterior (no inflation)"
     if inflation > 1:
-        share = math.sqrt(1 - 1 / inflation**2)
-        return f"about {100 * share:.0f} % of the right ones, as proposals are {inflation:g} times as wide, without a correction"
+        share = 100 * math.sqrt(1 - 1 / inflation**2)
+        return f"about {share:.0f} % of the right ones, as proposals are {inflation:g} times as wide and not corrected"
     return "too narrow as a rule, as every round counts the observation again (sequential, uncorrected)"

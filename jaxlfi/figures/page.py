@@ -238,11 +238,8 @@ def _widths(collection: Collection) -> str:
             own = f"{name}, seed {history.seed}" if measured and len(histories) > 1 else name
             if text and own not in lines.setdefault(str(text), []):
                 lines[str(text)].append(own)
-    several = len(lines) > 1
-    return "".join(
-        f"<p><b>Widths{html.escape(' of ' + ', '.join(names)) if several else ''}:</b> {html.escape(text)}.</p>"
-        for text, names in lines.items()
-    )
+    of = {text: html.escape(" of " + ", ".join(names)) if len(lines) > 1 else "" for text, names in lines.items()}
+    return "".join(f"<p><strong>Widths{of[text]}</strong>: {html.escape(text)}.</p>" for text in lines)
 
 
 def _facts(collection: Collection) -> str:

@@ -1,6 +1,7 @@
 """Diagnose: exact posteriors pass, wrong ones are called by name, and chunks are picked up where they were left."""
 
 import dataclasses
+import html
 import json
 import os
 import shutil
@@ -20,7 +21,9 @@ from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.base import untrained
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.normaliser import Normaliser
-from jaxlfi.figures import calibration, checks, style
+from jaxlfi.figures import calibration, checks, intervals, page, style
+from jaxlfi.figures.collection import Collection
+from jaxlfi.figures.history import History
 from jaxlfi.heuristics import Edge, Fixed
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import folder as run_store
@@ -97,16 +100,20 @@ def results(out) -> dict[str, dict]:
 
 NAMES = ("rank of first", "rank of second", "coverage of densest regions", "coverage from random points (TARP)")
 CASES = {
-    "exact": ((1.0,), ("ok", "ok", "ok", "ok")),
-    "narrow": ((0.4,), (OVER, OVER, OVER, OVER)),
-    "wide": ((2.5,), (UNDER, UNDER, UNDER, UNDER)),
-    "shifted": ((1.0, 1.2), ("miscalibrated: biased high", "miscalibrated: biased low", OVER, None)),
+    "exact": ((1.0,), ("ok", "ok", "ok", "ok"), ("honest", "honest")),
+    "narrow": ((0.4,), (OVER, OVER, OVER, OVER), ("too narrow", "too narrow")),
+    "wide": ((2.5,), (UNDER, UNDER, UNDER, UNDER), ("too wide", "too wide")),
+    "shifted": (
+        (1.0, 1.2),
+        ("miscalibrated: biased high", "miscalibrated: biased low", OVER, None),
+        ("biased high", "biased low"),
+    ),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_posteriors_are_called_what_they_are(case, pretend, tmp_path, capsys):
-    how, expected = CASES[case]
+    how, expected, widths = CASES[case]
     folder = make(tmp_path / "one", "ok", Fixed(), 1, *how)
     assert command("diagnose", folder, "--draws", 60, "--no-figures") == 0
     found = results(folder / "diagnostics")
@@ -116,18 +123,32 @@ def test_posteriors_are_called_what_they_are(case, pretend, tmp_path, capsys):
     assert (found["final support"]["numbers"]["truths_inside"], found["final support"]["verdict"]) == (100, "")
     # The run's own posterior is exact, whatever is pretended of others.
     assert found["posterior predictive"]["verdict"] == "ok"
+    posterior, box = json.loads((folder / "diagnostics" / "diagnostics.json").read_text())["widths"]
+    assert (posterior["reference"], box["reference"]) == ("posterior", "ok")
+    for reference in (posterior, box):
+        assert [row["name"] for row in reference["found"]] == ["first", "second", "all together"]
+        for row, verdict in zip(reference["found"], widths, strict=False):
+            assert row["verdict"] == verdict, row["sentence"]
+            factor = row["factor"]
+            if case != "shifted":  # the widths are off by what was pretended (within two confidence intervals)
+                assert factor["low"] / 1.3 < 1 / how[0] < 1.3 * factor["high"], row["sentence"]
     output = capsys.readouterr().out
+    assert f"  first: {widths[0]}" in output and "At this run's posterior (100 truths drawn from it)" in output
     assert "over-confident" in output if case == "narrow" else "rank of first" in output
     assert json.loads((folder / "diagnostics" / "diagnostics.json").read_text())["way"] == "amortised"
     arrays = atomic.read_arrays(folder / "diagnostics" / "diagnostics.npz")
     assert arrays["draws"].shape == (100, 60, 2) and arrays["ranks"].shape == (100, 2)
+    # Truths at the posterior are the run's own draws: exact ones of its observation.
+    exact, truths = gaussian_linear.posterior(X), arrays["posterior/theta"]
+    np.testing.assert_allclose(truths.mean(0), exact.mean, atol=0.5 * exact.marginal_scales.max())
+    assert np.all(truths.std(0) < 0.5 * arrays["theta"].std(0)) and np.asarray(BOX.contains(truths)).all()
     assert np.asarray(BOX.contains(arrays["draws"])).all()
     assert not (folder / "diagnostics" / "figures").exists()
 
 
 @pytest.fixture(scope="module")
 def repeated(folder):
-    """Diagnostics of a run of two rounds, in two chunks of runs, with pictures and reference samples."""
+    """Diagnostics of a run of two rounds, in two chunks of runs a reference, with pictures and reference samples."""
     out, reference = folder.parent / "repeated", folder.parent / "reference.csv"
     draws = np.asarray(gaussian_linear.posterior(X).sample(jax.random.key(5), 3000))
     draws = draws[np.asarray(gaussian().supports["misspecified"].contains(draws))][:200]
@@ -141,7 +162,8 @@ def repeated(folder):
 def test_a_run_of_several_rounds_is_repeated_for_each_truth(repeated, folder):
     begun, found = (json.loads((repeated / f"{name}.json").read_text()) for name in ("plan", "diagnostics"))
     assert found["way"] == "repeated" and begun["chunk_length"] == 10 and found["versions"]["jax"]
-    assert found["reference"]["name"] == "ok" and found["run"]["support"]["name"] == "misspecified"
+    assert [one["name"] for one in found["references"]] == ["posterior", "ok"]
+    assert found["run"]["support"]["name"] == "misspecified"
     arrays = atomic.read_arrays(repeated / "diagnostics.npz")
     theta = arrays["theta"]
     # Truths are drawn over the task's first support, also where the run's own does not reach.
@@ -160,7 +182,7 @@ def test_a_run_of_several_rounds_is_repeated_for_each_truth(repeated, folder):
 def test_pictures_and_reference_samples(repeated):
     """The classifier cannot tell the run's posterior from its reference, unless columns were mistaken."""
     assert {path.name for path in (repeated / "figures").iterdir()} == {
-        "ranks.png", "coverage.png", "tarp.png", "predictive.png",
+        "widths.png", "ranks.png", "coverage.png", "tarp.png", "predictive.png",
     }  # fmt: skip
     check = results(repeated)["classifier, reference.csv"]
     assert check["numbers"] == {"accuracy": pytest.approx(0.5, abs=0.15), "rows": 200}
@@ -192,10 +214,62 @@ def test_pictures_show_the_saved_arrays(repeated):
         np.testing.assert_array_equal(np.sign(observed), np.sign(X - middle))
 
 
+def test_the_page_says_first_what_the_widths_are_worth(repeated):
+    text, found = (repeated / "report.html").read_text(), json.loads((repeated / "diagnostics.json").read_text())
+    assert text.count("data:image/png;base64,") == 5
+    for reference in found["widths"]:
+        for row in reference["found"]:
+            assert html.escape(row["sentence"]) in text
+            assert text.index(html.escape(row["sentence"])) < text.index("<h2>")
+    assert "rank of first" in text and "classifier, reference.csv" in text
+    (repeated.parent / "empty").mkdir()
+    shutil.copy(repeated / "diagnostics.npz", repeated.parent / "empty")
+    with pytest.raises(ValueError, match=r"diagnostics\.json: expected the results of diagnostics"):
+        checks.report(repeated.parent / "empty")
+
+
+def test_the_picture_of_the_widths_shows_the_saved_arrays(repeated):
+    arrays = atomic.read_arrays(repeated / "diagnostics.npz")
+    with style.context():
+        figure = style.new_figure(7.0, 3.0)
+        intervals.draw(figure, arrays)
+    left, right = figure.axes
+    line = lambda axes, name: next(line for line in axes.lines if line.get_gid() == name)
+    for r, name in enumerate(("posterior/", "")):
+        theta, draws = arrays[f"{name}theta"], arrays[f"{name}draws"]
+        low, high = np.quantile(draws, [0.05, 0.95], axis=1, method="weibull")
+        held = np.mean((theta >= low) & (theta <= high), axis=0)
+        np.testing.assert_allclose(line(left, f"held-{r}-1").get_xdata()[:2], held)
+        np.testing.assert_allclose(line(right, f"factor-{r}").get_xdata(), arrays["widths_factor"][r, :, 0])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(arrays["widths_reference"])
+
+
+def test_the_page_of_the_run_says_what_was_measured(repeated, folder, tmp_path):
+    """Of diagnostics in its own folder; before, what its settings let expect."""
+    copy = tmp_path / "run"
+    shutil.copytree(folder, copy)
+    config = json.loads((copy / "config.json").read_text())
+    assert config["widths"].startswith("too narrow as a rule")
+    line = lambda: page._widths(collection(copy, config))
+    assert "too narrow as a rule" in line() and "expected from the settings" in line()
+    shutil.copytree(repeated, copy / "diagnostics")
+    assert "without a verdict (too few truths)" in line() and "measured at this run" in line()
+    (copy / "diagnostics" / "diagnostics.json").write_text("{")
+    assert "too narrow as a rule" in line()
+
+
+def collection(folder, config):
+    """As much of a run's folder as that line needs."""
+    history = History(
+        **{field.name: None for field in dataclasses.fields(History)} | {"folder": folder, "config": config}
+    )
+    return Collection(folder, config, {"ok": [history]}, (), ())
+
+
 def test_chunks_are_picked_up_to_the_same_arrays(repeated, folder, tmp_path):
     out = tmp_path / "again"
     shutil.copytree(repeated, out)
-    first, second = out / "chunks" / "000.npz", out / "chunks" / "001.npz"
+    first, second = out / "box" / "chunks" / "000.npz", out / "box" / "chunks" / "001.npz"
     second.unlink()
     before = first.stat().st_mtime_ns
     (out / "diagnostics.npz").unlink()
@@ -220,10 +294,10 @@ def refused(capsys, *arguments) -> str:
 def test_other_settings_need_another_folder(repeated, folder, tmp_path, capsys):
     asked = (folder, "--no-figures", "--out", repeated, "--draws", 20)
     assert "another truths: take another folder by --out" in refused(capsys, *asked, "--truths", 21)
-    assert "another reference" in refused(capsys, *asked, "--truths", 20, "--reference", "broad")
+    assert "another reference" in refused(capsys, *asked, "--truths", 20, "--reference", "posterior,broad")
     out = tmp_path / "out"
     shutil.copytree(repeated, out)
-    (out / "chunks" / "001.npz").write_bytes(b"cut")
+    (out / "box" / "chunks" / "001.npz").write_bytes(b"cut")
     asked = (folder, "--no-figures", "--draws", 20, "--truths", 20, "--out", out)
     assert "001.npz: expected a whole .npz" in refused(capsys, *asked)
     (out / "plan.json").write_text("{")
@@ -247,7 +321,10 @@ def test_bad_input_is_one_line(folder, tmp_path, capsys):
         (["--truths", 19], "truths: expected at least 20, got 19"),
         (["--draws", 0], "draws: expected at least 20, got 0"),
         (["--seed", -1], "seed: expected at least 0"),
-        (["--reference", "x"], "reference: expected one of ['broad', 'misspecified', 'ok'], got 'x'"),
+        (["--reference", "x"], "reference: expected 'posterior', a support (broad, misspecified, ok), or one of each"),
+        (["--reference", "ok,broad"], "or one of each with a comma between, got 'ok,broad'"),
+        (["--reference", "posterior,posterior"], "got 'posterior,posterior'"),
+        (["--reference", ""], "got ''"),
         (["--against", tmp_path / "none.csv"], "against: cannot read"),
         (["--against", tmp_path / "columns.csv"], "expected the columns first, second, got first, third"),
         (["--against", tmp_path / "few.csv"], "expected at least 20 rows of finite numbers"),
@@ -334,13 +411,51 @@ def on_host():
 
 def test_a_run_of_a_host_simulator_is_repeated(folder, tmp_path):
     out = tmp_path / "out"
-    asked = ("--task", "tests.studies.test_calibration_study:on_host", "--truths", 20, "--draws", 20)
+    asked = (
+        "--task",
+        "tests.studies.test_calibration_study:on_host",
+        "--truths",
+        20,
+        "--draws",
+        20,
+        "--reference",
+        "ok",
+    )
     assert command("diagnose", folder, *asked, "--no-figures", "--out", out) == 0
     assert json.loads((out / "diagnostics.json").read_text())["way"] == "repeated"
     arrays = atomic.read_arrays(out / "diagnostics.npz")
     residual = arrays["x"] - arrays["theta"] @ gaussian_linear.MIXING.T
     np.testing.assert_allclose(residual.std(0), gaussian_linear.NOISE, rtol=0.6)
     assert np.corrcoef(arrays["draws"].mean(1)[:, 1], arrays["theta"][:, 1])[0, 1] > 0.7
+
+
+def test_at_the_posterior_alone_only_what_holds_there_is_asked(folder, tmp_path, capsys):
+    """Ranks and the classifier compare truths with draws under the prior, which these truths are not from."""
+    out = tmp_path / "out"
+    asked = ("--reference", "posterior", "--truths", 20, "--draws", 20, "--no-figures", "--out", out)
+    assert command("diagnose", folder, *asked) == 0
+    assert list(results(out)) == ["posterior predictive"]
+    (widths,) = json.loads((out / "diagnostics.json").read_text())["widths"]
+    assert {row["verdict"] for row in widths["found"]} == {"too few truths"}
+    assert "first: no verdict, as 20 truths are too few and 42 the least" in capsys.readouterr().out
+    arrays = atomic.read_arrays(out / "diagnostics.npz")
+    assert "ranks" not in arrays and arrays["widths_held"].shape == (1, 2, 2, 3)
+    # Each truth is the run's draw, and its posterior another run's, from its simulation alone.
+    assert len(np.unique(arrays["posterior/theta"][:, 0])) == 20
+    assert len(np.unique(arrays["posterior/draws"][:, 0, 0])) == 20
+
+
+def test_a_posterior_where_simulations_fail_is_refused_in_one_line(folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    asked = ("--task", "tests.studies.test_calibration_study:failing", "--truths", 20, "--draws", 20, "--out", out)
+    message = refused(capsys, folder, *asked)
+    assert "expected a valid simulation of each truth drawn from the run's posterior, got none in 16 tries" in message
+    assert not out.exists()  # another reference can be asked for
+
+
+def failing():
+    """The Gaussian task, whose simulations all fail."""
+    return dataclasses.replace(gaussian(), simulate=lambda key, theta: (theta, theta[0] > 99))
 
 
 def test_chunks_are_divided_over_as_many_devices_as_they_were_begun_with(tmp_path, monkeypatch):

@@ -82,27 +82,17 @@ Chunk = Callable[[Mapping[str, np.ndarray], int], tuple[Mapping[str, Any], float
 def amortised_chunks(run: Run, plan: CalibrationPlan) -> Chunk:
     """Posteriors by the network of a run of one round."""
 
-    def one(run: Run, key: jax.Array, truth: jax.Array, x: jax.Array):
-        key_condition, key_draw = jax.random.split(key)
-        return described(key_draw, truth, run.conditioned(x, key_condition), plan.draws)
-
-    program = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)))
-
     def chunk(truths: Mapping[str, np.ndarray], first: int):
         began = time.perf_counter()
         keys = _keys(plan, DRAWS, first, len(truths["x"]))
-        return jax.device_get(program(run, keys, truths["theta"], truths["x"])), time.perf_counter() - began
+        found = jax.device_get(_by_network(run, keys, truths["theta"], truths["x"], plan.draws))
+        return found, time.perf_counter() - began
 
     return chunk
 
 
 def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) -> Chunk:
     """Posteriors by running the whole inference again for each truth."""
-
-    @jax.jit
-    @functools.partial(jax.vmap, in_axes=(0, 0, 0, 0))
-    def program(key: jax.Array, truth: jax.Array, x: jax.Array, state: Any):
-        return described(key, truth, posterior_after(state.belief, state.network, x), plan.draws)
 
     def chunk(truths: Mapping[str, np.ndarray], first: int):
         began = time.perf_counter()
@@ -111,10 +101,26 @@ def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) ->
         rounds = range(run.settings.rounds)
         state = drive(engine, engine.start(), rounds, lambda *_: progress.advance(), compiled)
         keys = _keys(plan, DRAWS, first, len(truths["x"]))
-        found = jax.device_get(program(keys, truths["theta"], truths["x"], engine.fetch(state)))
+        found = jax.device_get(_by_states(keys, truths["theta"], truths["x"], engine.fetch(state), plan.draws))
         return found, time.perf_counter() - began
 
     return chunk
+
+
+# Compiled once for all references and chunks.
+
+
+@functools.partial(jax.jit, static_argnums=4)
+@functools.partial(jax.vmap, in_axes=(None, 0, 0, 0, None))
+def _by_network(run: Run, key: jax.Array, truth: jax.Array, x: jax.Array, draws: int):
+    key_condition, key_draw = jax.random.split(key)
+    return described(key_draw, truth, run.conditioned(x, key_condition), draws)
+
+
+@functools.partial(jax.jit, static_argnums=4)
+@functools.partial(jax.vmap, in_axes=(0, 0, 0, 0, None))
+def _by_states(key: jax.Array, truth: jax.Array, x: jax.Array, state: Any, draws: int):
+    return described(key, truth, posterior_after(state.belief, state.network, x), draws)
 
 
 def _keys(plan: CalibrationPlan, purpose: int, first: int, count: int) -> jax.Array:

@@ -1,0 +1,132 @@
+"""Intervals: SciPy's binomial intervals, synthetic posteriors of known faults, and one statement in two forms."""
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxlfi.diagnostics import check_intervals, check_regions
+from jaxlfi.diagnostics import intervals as module
+
+SEEDS = range(20)
+LEVEL = 0.9
+
+
+def case(seed: int, scale: float, shift: float, truths: int = 100, dim: int = 2):
+    """Truths, and draws of normal posteriors of another width and place than theirs."""
+    rng = np.random.default_rng(seed)
+    centre = rng.normal(size=(truths, dim))
+    draws = centre[:, None] + shift + scale * rng.normal(size=(truths, 200, dim))
+    return centre + rng.normal(size=(truths, dim)), draws
+
+
+@given(st.integers(1, 300).flatmap(lambda n: st.tuples(st.just(n), st.integers(0, n))), st.sampled_from([0.05, 0.01]))
+def test_the_interval_of_a_fraction_is_scipys(counts, error):
+    trials, count = counts
+    exact = scipy.stats.binomtest(count, trials).proportion_ci(1 - error, "exact")
+    np.testing.assert_allclose(module.binomial_interval(count, trials, error), exact, atol=1e-9)
+
+
+def test_the_interval_of_a_quantile_holds_it_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    values = rng.exponential(size=(2000, 100))
+    ends = np.array([module.quantile_interval(row, LEVEL, 0.05) for row in values])
+    right = np.log(10)  # the 90 % quantile
+    held = np.mean((ends[:, 0] <= right) & (right <= ends[:, 1]))
+    # Its own probability, by the binomial numbers of values below the quantile.
+    ranks = 1 + np.searchsorted(np.sort(values[0]), ends[0])
+    binomial = scipy.stats.binom(100, LEVEL)
+    expected = binomial.cdf(ranks[1] - 1) - binomial.cdf(ranks[0] - 1)
+    assert expected >= 0.95 and abs(held - expected) < 4 * np.sqrt(expected * (1 - expected) / 2000)
+
+
+@given(st.integers(1, 200), st.integers(0, 10_000))
+def test_fraction_and_factor_are_one_statement(truths, seed):
+    """The factor's interval excludes 1 just where the fraction's excludes 90 %."""
+    rng = np.random.default_rng(seed)
+    distances = rng.exponential(rng.uniform(0.1, 1.5), truths)
+    low, high = module.quantile_interval(distances, LEVEL, 0.05)
+    exact = scipy.stats.binomtest(int(np.sum(distances <= 1)), truths).proportion_ci(0.95, "exact")
+    assert (low > 1) == (exact.high < LEVEL) and (high < 1) == (exact.low > LEVEL)
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "verdict"),
+    [
+        (1.0, 0.0, "honest"),
+        (0.5, 0.0, "too narrow"),
+        (2.0, 0.0, "too wide"),
+        (1.0, 1.2, "biased high"),
+        (1.0, -1.2, "biased low"),
+        (0.5, 0.8, "too narrow, biased high"),
+        (2.0, -0.9, "too wide, biased low"),
+    ],
+)
+def test_faults_are_called_by_name(scale, shift, verdict):
+    """At all but few of many seeds, as the level of confidence promises."""
+    found = [check_intervals(*case(seed, scale, shift))[0] for seed in SEEDS]
+    assert sum(one.verdict == verdict for one in found) >= 17
+    if shift == 0:  # stretched by the right factor, intervals hold what they should
+        covered = sum(one.factor.low <= 1 / scale <= one.factor.high for one in found)
+        assert covered >= 17
+        np.testing.assert_allclose(np.median([one.factor.value for one in found]), 1 / scale, rtol=0.12)
+        inside = 2 * scipy.stats.norm.cdf(scale * scipy.stats.norm.ppf(0.95)) - 1
+        np.testing.assert_allclose(np.mean([one.held[1].value for one in found]), inside, atol=0.03)
+
+
+def test_all_parameters_of_calibrated_posteriors_are_honest_together():
+    """With a probability of 94 % at least; 5 parameters."""
+    honest = sum(all(one.verdict == "honest" for one in check_intervals(*case(seed, 1.0, 0.0, 60, 5)))
+                 for seed in range(100))  # fmt: skip
+    assert honest >= scipy.stats.binom.ppf(0.001, 100, 0.94)
+
+
+def test_a_factor_is_what_the_intervals_lacked():
+    """Skewed posteriors, exact but for a stretch about their medians, which the factor undoes in each direction."""
+    rng = np.random.default_rng(1)
+    truths, draws = rng.exponential(size=(4000, 1)), rng.exponential(size=(4000, 200, 1))
+    middle = np.median(draws, axis=1, keepdims=True)
+    (found,) = check_intervals(truths, middle + (draws - middle) / 3)
+    assert found.factor.low < 3 < found.factor.high and found.factor.high / found.factor.low < 1.2
+    (exact,) = check_intervals(truths, draws)
+    assert exact.verdict == "honest"
+
+
+def test_few_draws_do_not_make_intervals_narrow():
+    """Quantiles of 20 draws are those of the next draw."""
+    held = [check_intervals(t, d[:, :20])[0].held[1].value for t, d in (case(seed, 1.0, 0.0, 400, 1) for seed in SEEDS)]
+    np.testing.assert_allclose(np.mean(held), 0.9, atol=0.015)
+
+
+def test_too_few_truths_get_no_verdict():
+    """As many are needed as could show a posterior that is too wide."""
+    for dim in (1, 3):
+        least = module.needed(dim)
+        truths, draws = np.zeros((least, dim)), np.random.default_rng(0).normal(size=(least, 50, dim))
+        assert check_intervals(truths, draws)[0].verdict == "too wide"
+        few = check_intervals(truths[1:], draws[1:])[0]
+        assert few.verdict == "too few truths" and few.needed == least and few.factor.high == np.inf
+    assert check_regions(np.zeros(module.needed(1) - 1, int), 50).verdict == "too few truths"
+
+
+def test_posteriors_without_width_and_truths_far_away():
+    truths, _ = case(0, 1.0, 0.0, 60, 1)
+    (point,) = check_intervals(truths, np.zeros((60, 50, 1)))
+    assert point.verdict == "too narrow" and point.factor.low == np.inf and point.held[1].value == 0
+    (right,) = check_intervals(np.zeros((60, 1)), np.zeros((60, 50, 1)))
+    assert right.factor.value == 0
+
+
+def test_regions():
+    rng = np.random.default_rng(0)
+    uniform = rng.integers(0, 201, 2000)
+    exact = check_regions(uniform, 200)
+    assert exact.verdict == "honest" and exact.factor is None and abs(exact.held[0].value - 0.5) < 0.04
+    assert check_regions(200 - uniform // 2, 200).verdict == "too narrow"
+    assert check_regions(uniform // 2, 200).verdict == "too wide"
+
+
+def test_shapes_that_do_not_fit():
+    with pytest.raises(ValueError, match=r"expected shapes \[N, D\] and \[N, L, D\], got \[3, 2\] and \[3, 4\]"):
+        check_intervals(np.zeros((3, 2)), np.zeros((3, 4)))
