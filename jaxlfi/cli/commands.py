@@ -245,7 +245,9 @@ def diagnose(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi diagnose DIR`."""
     task = None if arguments.task is None else task_lookup.load(arguments.task)
     run = calibration.read_run(arguments.folder, task)
-    asked = arguments.reference or f"{calibration.POSTERIOR},{next(iter(run.task.supports))}"
+    asked = arguments.reference
+    if asked is None:
+        asked = f"{calibration.POSTERIOR},{next(iter(run.task.supports))}"
     plans = calibration.plans_of(asked, run.task, arguments.truths, arguments.draws, arguments.seed)
     reference = None
     if arguments.against is not None:

@@ -19,7 +19,11 @@ LEVELS = (0.5, 0.9)
 """Levels of the intervals whose coverage is reported; the last one is judged."""
 CONFIDENCE = 0.95
 """With which the intervals of fractions and factors hold for all parameters together."""
-HONEST, NARROW, WIDE, TOO_FEW = "honest", "too narrow", "too wide", "too few truths"
+TOLERANCE = 1.5
+"""Intervals are honest only if their widths are known to be right to within this factor, up or down."""
+LEAST_HELD = 0.75
+"""Densest regions of the last level, which have no width, are honest only if they are known to hold as much."""
+HONEST, NARROW, WIDE, UNDECIDED = "honest", "too narrow", "too wide", "undecided"
 BIASED_LOW, BIASED_HIGH = "biased low", "biased high"
 """Words of a verdict; one that is too narrow or too wide may be biased besides."""
 
@@ -45,7 +49,6 @@ class Intervals:
 
     Attributes:
         truths: number N of truths.
-        needed: truths that a verdict needs.
         held: fraction of the truths inside, at each of `LEVELS`.
         factor: how many times as wide the intervals of the last level would have to be; None for regions.
         above: fraction of the truths above the median; None for regions.
@@ -53,7 +56,6 @@ class Intervals:
     """
 
     truths: int
-    needed: int
     held: tuple[Estimate, ...]
     factor: Estimate | None
     above: Estimate | None
@@ -64,10 +66,10 @@ def check_intervals(truths: Float[np.ndarray, "n dim"], draws: Float[np.ndarray,
     """Judge the intervals of each parameter.
 
     A parameter is *too narrow* (*too wide*) where the confidence interval of its factor lies above (below) 1, and
-    *biased low* (*high*) where that of the truths above the median lies above (below) one half; else it is *honest*.
-    Of a biased one the width is judged by distances from where the truths are. All parameters of calibrated posteriors
-    together are found honest with a probability of at least `CONFIDENCE` - `SIGNIFICANCE`. Fewer truths than could
-    show that a posterior is too wide get no verdict.
+    *biased low* (*high*) where that of the truths above the median lies above (below) one half; of a biased one the
+    width is judged by distances from where the truths are. Else it is *honest* where the factor's interval lies between
+    1 / `TOLERANCE` and `TOLERANCE`, and *undecided* where there are too few truths to tell. No parameter of calibrated
+    posteriors is found too narrow, too wide or biased with a probability of at least `CONFIDENCE` - `SIGNIFICANCE`.
 
     Args:
         truths: parameters that an observation was simulated at, in inference space, shape [N, D].
@@ -104,8 +106,10 @@ def check_regions(rank: Int[np.ndarray, " n"], draws: int) -> Intervals:
     """
     rank = np.asarray(rank)
     held = _held([(rank + 0.5) / (draws + 1) <= level for level in LEVELS], 1 - CONFIDENCE)
-    verdict = WIDE if held[-1].low >= LEVELS[-1] else NARROW if held[-1].high <= LEVELS[-1] else HONEST
-    return Intervals(len(rank), needed(1), held, None, None, verdict if len(rank) >= needed(1) else TOO_FEW)
+    last = held[-1]
+    otherwise = HONEST if last.low >= LEAST_HELD else UNDECIDED
+    verdict = WIDE if last.low >= LEVELS[-1] else NARROW if last.high <= LEVELS[-1] else otherwise
+    return Intervals(len(rank), held, None, None, verdict)
 
 
 def distances_from_median(
@@ -122,11 +126,6 @@ def distances_from_median(
     half = np.where(beyond < 0, middle - low, high - middle)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(beyond == 0, 0.0, beyond / half)
-
-
-def needed(tests: int) -> int:
-    """Fewest truths with which posteriors could be found too wide, of so many parameters judged together."""
-    return int(np.ceil(np.log((1 - CONFIDENCE) / tests / 2) / np.log(LEVELS[-1])))
 
 
 def binomial_interval(count: int, trials: int, error: float) -> tuple[float, float]:
@@ -171,12 +170,10 @@ def quantile_interval(values: Float[np.ndarray, " n"], level: float, error: floa
 
 def _one(signed: list[Float[np.ndarray, " n"]], tests: int) -> Intervals:
     error = (1 - CONFIDENCE) / tests
-    count = len(signed[-1])
     held = _held([np.abs(distance) <= 1 for distance in signed], error)
     above = _fraction(signed[-1] > 0, SIGNIFICANCE / tests)
     factor = _factor(signed[-1], error)
-    verdict = TOO_FEW if count < needed(tests) else _verdict(signed[-1], factor, above, error)
-    return Intervals(count, needed(tests), held, factor, above, verdict)
+    return Intervals(len(signed[-1]), held, factor, above, _verdict(signed[-1], factor, above, error))
 
 
 def _verdict(signed: Float[np.ndarray, " n"], factor: Estimate, above: Estimate, error: float) -> str:
@@ -187,7 +184,8 @@ def _verdict(signed: Float[np.ndarray, " n"], factor: Estimate, above: Estimate,
         factor = _factor(signed - np.median(signed), error) if finite else factor
     if factor.low > 1 or factor.high < 1:
         words.insert(0, NARROW if factor.low > 1 else WIDE)
-    return ", ".join(words) or HONEST
+    known = 1 / TOLERANCE <= factor.low and factor.high <= TOLERANCE
+    return ", ".join(words) or (HONEST if known else UNDECIDED)
 
 
 def _factor(signed: Float[np.ndarray, " n"], error: float) -> Estimate:

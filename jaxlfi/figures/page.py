@@ -158,7 +158,7 @@ def render_diagnostics(found: Mapping[str, Any], pictures: Sequence[Picture]) ->
 
 
 def _tone(verdict: str) -> str:
-    return {"honest": "good", "ok": "good", "": "soft", "too few truths": "soft"}.get(verdict, "bad")
+    return {"honest": "good", "ok": "good", "": "soft", "undecided": "soft"}.get(verdict, "bad")
 
 
 def _widths_table(found: Mapping[str, Any]) -> str:

@@ -128,12 +128,16 @@ def test_posteriors_are_called_what_they_are(case, pretend, tmp_path, capsys):
     for reference in (posterior, box):
         assert [row["name"] for row in reference["found"]] == ["first", "second", "all together"]
         for row, verdict in zip(reference["found"], widths, strict=False):
-            assert row["verdict"] == verdict, row["sentence"]
+            assert verdict in row["verdict"] or (case, row["verdict"]) == ("exact", "undecided"), row["sentence"]
+            assert row["sentence"].startswith(f"{row['name']}: {row['verdict']}")
             factor = row["factor"]
-            if case != "shifted":  # the widths are off by what was pretended (within two confidence intervals)
-                assert factor["low"] / 1.3 < 1 / how[0] < 1.3 * factor["high"], row["sentence"]
+            if case in ("exact", "narrow"):  # off by what was pretended; the box cuts wide ones off
+                assert factor["low"] / 1.2 < 1 / how[0] < 1.2 * factor["high"], row["sentence"]
     output = capsys.readouterr().out
-    assert f"  first: {widths[0]}" in output and "At this run's posterior (100 truths drawn from it)" in output
+    assert (
+        f"  {posterior['found'][0]['sentence']}" in output
+        and "At this run's posterior (100 truths drawn from it)" in output
+    )
     assert "over-confident" in output if case == "narrow" else "rank of first" in output
     assert json.loads((folder / "diagnostics" / "diagnostics.json").read_text())["way"] == "amortised"
     arrays = atomic.read_arrays(folder / "diagnostics" / "diagnostics.npz")
@@ -253,7 +257,8 @@ def test_the_page_of_the_run_says_what_was_measured(repeated, folder, tmp_path):
     line = lambda: page._widths(collection(copy, config))
     assert "too narrow as a rule" in line() and "expected from the settings" in line()
     shutil.copytree(repeated, copy / "diagnostics")
-    assert "without a verdict (too few truths)" in line() and "measured at this run" in line()
+    found = json.loads((repeated / "diagnostics.json").read_text())
+    assert html.escape(found["line"]) in line() and "(measured at this run's posterior with 20" in found["line"]
     (copy / "diagnostics" / "diagnostics.json").write_text("{")
     assert "too narrow as a rule" in line()
 
@@ -436,8 +441,9 @@ def test_at_the_posterior_alone_only_what_holds_there_is_asked(folder, tmp_path,
     assert command("diagnose", folder, *asked) == 0
     assert list(results(out)) == ["posterior predictive"]
     (widths,) = json.loads((out / "diagnostics.json").read_text())["widths"]
-    assert {row["verdict"] for row in widths["found"]} == {"too few truths"}
-    assert "first: no verdict, as 20 truths are too few and 42 the least" in capsys.readouterr().out
+    # Two lines say that 20 truths do not tell, or what even they show; none that intervals are honest.
+    assert "honest" not in {row["verdict"] for row in widths["found"][:2]}
+    assert "At this run's posterior (20 truths drawn from it)" in capsys.readouterr().out
     arrays = atomic.read_arrays(out / "diagnostics.npz")
     assert "ranks" not in arrays and arrays["widths_held"].shape == (1, 2, 2, 3)
     # Each truth is the run's draw, and its posterior another run's, from its simulation alone.

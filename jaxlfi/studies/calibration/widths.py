@@ -9,8 +9,20 @@ import jax
 import numpy as np
 
 from jaxlfi import diagnostics
-from jaxlfi.diagnostics.intervals import HONEST, LEVELS, NARROW, TOO_FEW, WIDE, Estimate, Intervals
+from jaxlfi.diagnostics.intervals import (
+    BIASED_HIGH,
+    BIASED_LOW,
+    HONEST,
+    LEVELS,
+    NARROW,
+    UNDECIDED,
+    WIDE,
+    Estimate,
+    Intervals,
+)
 from jaxlfi.studies.calibration.plan import TIES, CalibrationPlan
+
+_LEVEL = f"{100 * LEVELS[-1]:.0f} %"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +56,7 @@ class Widths:
     @property
     def line(self) -> str:
         """The verdicts in one line."""
-        found = "; ".join(f"{name} {_short(one)}" for name, one in self.rows[:-1])
+        found = "; ".join(f"{name} {_short(one)}" for name, one in self.rows)
         return f"{found} (measured {self.plan.where} with {self.plan.truths} truths by jaxlfi diagnose)"
 
     def as_json(self) -> dict[str, Any]:
@@ -72,25 +84,20 @@ _density_ranks = jax.jit(diagnostics.density_ranks)
 
 def sentence(name: str, found: Intervals) -> str:
     """What was found of a parameter, as one says it."""
-    held = found.held[-1]
-    numbers = f"{100 * LEVELS[-1]:.0f} % {'regions' if found.factor is None else 'intervals'} held {_percent(held)}"
-    if found.verdict == TOO_FEW:
-        return (
-            f"{name}: no verdict, as {found.truths} truths are too few and {found.needed} the least ({numbers} of them)"
-        )
-    if found.factor is not None and found.verdict != _width_word(found.verdict):
-        side = "above" if found.above.value > 0.5 else "below"
-        share = found.above if side == "above" else Estimate(
-            1 - found.above.value, 1 - found.above.high, 1 - found.above.low
-        )  # fmt: skip
-        return (
-            f"{name}: {found.verdict}, {_percent(share)} of {found.truths} truths lie {side} its median ({numbers}; to "
-            f"hold {100 * LEVELS[-1]:.0f} % they would have to be {_number(found.factor.value)} times as wide)"
-        )
-    right = ""
-    if found.factor is not None and found.verdict == HONEST:
-        right = f"; the right width is {_number(found.factor.low)} to {_number(found.factor.high)} times theirs"
-    return f"{name}: {found.verdict}{_by(found)} ({numbers} of {found.truths} truths{right})"
+    held, factor = found.held[-1], found.factor
+    kind = "regions" if factor is None else "intervals"
+    numbers = f"{_LEVEL} {kind} held {_percent(held)} of {found.truths} truths"
+    if BIASED_LOW in found.verdict or BIASED_HIGH in found.verdict:
+        above = found.above
+        below = Estimate(1 - above.value, 1 - above.high, 1 - above.low)
+        side, share = ("above", above) if BIASED_LOW in found.verdict else ("below", below)
+        rest = f"to hold {_LEVEL} they would have to be {_number(factor.value)} times as wide"
+        return f"{name}: {found.verdict}, {_percent(share)} of the truths lie {side} its median ({numbers}; {rest})"
+    if found.verdict in (HONEST, UNDECIDED) and factor is not None:
+        numbers = f"{numbers}; {_right(factor)}"
+    if found.verdict == UNDECIDED:
+        numbers = f"{numbers}; more truths would tell"
+    return f"{name}: {found.verdict}{_by(found)} ({numbers})"
 
 
 def arrays_of(widths: Sequence[Widths]) -> dict[str, np.ndarray]:
@@ -109,7 +116,13 @@ def _triples(estimates: Sequence[Estimate]) -> list[tuple[float, float, float]]:
 
 
 def _short(found: Intervals) -> str:
-    return {TOO_FEW: "without a verdict (too few truths)"}.get(found.verdict, f"{found.verdict}{_by(found)}")
+    undecided = found.verdict == UNDECIDED and found.factor is not None
+    return f"{found.verdict}{f' ({_right(found.factor)})' if undecided else _by(found)}"
+
+
+def _right(factor: Estimate) -> str:
+    high = "any number of" if math.isinf(factor.high) else _number(factor.high)
+    return f"the right width is {_number(factor.low)} to {high} times theirs"
 
 
 def _by(found: Intervals) -> str:
@@ -120,11 +133,6 @@ def _by(found: Intervals) -> str:
     if found.verdict == WIDE:
         factor = Estimate(*(math.inf if end == 0 else 1 / end for end in (factor.value, factor.high, factor.low)))
     return f", by {_number(factor.value)} [{_number(factor.low)}, {_number(factor.high)}]"
-
-
-def _width_word(verdict: str) -> str:
-    """What a verdict says of the width alone."""
-    return next((word for word in (NARROW, WIDE) if verdict.startswith(word)), HONEST)
 
 
 def _percent(share: Estimate) -> str:
