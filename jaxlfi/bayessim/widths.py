@@ -47,4 +47,4 @@ def _expected(settings: Settings, heuristic: Heuristic) -> str:
     if inflation > 1:
         share = 100 * math.sqrt(1 - 1 / inflation**2)
         return f"about {share:.0f} % of the right ones, as proposals are {inflation:g} times as wide and not corrected"
-    return "too narrow as a rule, as every round counts the observation again (sequential, uncorrected)"
+    return "too narrow as a rule, as every round counts the observation again, uncorrected"

@@ -94,9 +94,10 @@ that was stopped goes on when it is given again. It takes about as long as that 
 change the exit status, 0.
 
 widths, of each parameter, at each reference:
-  honest        90 % intervals held 90 % of the truths, as far as so many truths can tell
-  too narrow    ... fewer; the number is how many times as wide they would have to be. too wide: more
+  honest        90 % intervals held 90 % of the truths, and are known to be of the right width to within 1.5
+  too narrow    they held fewer; the number is how many times as wide they would have to be. too wide: more
   biased        truths lie to one side of the intervals' medians
+  undecided     too few truths to tell
   At the posterior: is the method honest where this run ended up? Over a support: for objects of all kinds?
 
 checks, over a support:
