@@ -1,0 +1,24 @@
+"""The line on widths that a run ends with: one for all its configurations, or one for each kind of them."""
+
+import types
+
+from jaxlfi.cli.commands import widths_lines
+from jaxlfi.heuristics import Edge, Fixed, Truncate
+from tests.small import SETTINGS
+
+
+def plan_of(**rules):
+    """What the lines are made from: the heuristic of each configuration, with two seeds."""
+    specs = [types.SimpleNamespace(configuration=name, heuristic=rule) for name, rule in rules.items()]
+    return types.SimpleNamespace(settings=SETTINGS.replace(correction="none", inflation=1.0), specs=specs * 2)
+
+
+def test_configurations_of_the_same_widths_share_a_line():
+    (line,) = widths_lines(plan_of(ok=Fixed(), edge=Edge()))
+    assert line.startswith("widths: too narrow as a rule") and "\n" not in line
+
+
+def test_configurations_of_other_widths_are_named():
+    lines = widths_lines(plan_of(ok=Fixed(), truncate=Truncate(), edge=Edge()))
+    assert [line.partition(":")[0] for line in lines] == ["widths of ok, edge", "widths of truncate"]
+    assert "right in principle" in lines[1]
