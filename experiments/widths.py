@@ -65,6 +65,10 @@ TUNING = 1000
 
 RULES: dict[str, Heuristic] = {"none": Fixed(), "edge": Edge(), "mode": Mode(), "centre": Centre()}
 
+PACED = QUICK.estimator.replace(steps=0, epochs=100, learning_rate=3e-3, schedule="cosine")
+"""Training in proportion to the simulations there are, where `quick` makes as many steps in the first round as in the
+last: it overfits the first hundred simulations within fifty steps, and is not done with the thousand of the end."""
+
 
 def candidates(quick: Settings = QUICK) -> dict[str, Settings]:
     """What is compared, by name: `quick` with other proposals and corrections."""
@@ -75,7 +79,8 @@ def candidates(quick: Settings = QUICK) -> dict[str, Settings]:
         for factor in (1.5, 2.0, 3.0)
     }
     divided = {f"{name}-quotient": wide[name].replace(correction="quotient") for name in wide}
-    return once | wide | divided
+    paced = {f"paced-{name}": settings.replace(estimator=PACED) for name, settings in (once | wide).items()}
+    return once | wide | divided | paced
 
 
 @dataclasses.dataclass(frozen=True)
