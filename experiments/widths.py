@@ -38,7 +38,7 @@ from jaxlfi.bayessim.batch import RunSpec, posterior_after, stack_inputs
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.keys import key_of, run_keys
-from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.bayessim.presets import QUICK, snle
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli.commands import bootstrap_interval
 from jaxlfi.distributions.support import Support
@@ -71,8 +71,8 @@ last: it overfits the first hundred simulations within fifty steps, and is not d
 
 
 def candidates(quick: Settings = QUICK) -> dict[str, Settings]:
-    """What is compared, by name: `quick` with other proposals and corrections."""
-    once = {"quick": quick, "reject": quick.replace(restriction="reject")}
+    """What is compared, by name: `quick` with other proposals and corrections, and the likelihood."""
+    once = {"quick": quick, "reject": quick.replace(restriction="reject"), "snle": snle(quick)}
     wide = {
         f"{restriction}-{factor:g}": quick.replace(restriction=restriction, inflation=factor)
         for restriction in ("clip", "reject")

@@ -97,7 +97,9 @@ def init(
         belief=belief,
         proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.rounds, *leaf.shape)), belief),
         dataset=datasets.empty(capacity, task.dim, obs),
-        network=untrained(key, settings.estimator, obs, task.inference.feasible.hull(support), task.space),
+        network=untrained(
+            key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior
+        ),
     )
 
 

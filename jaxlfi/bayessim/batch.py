@@ -29,7 +29,7 @@ from jaxlfi.diagnostics.discrepancy import POSTERIOR_SAMPLES, Discrepancy, discr
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network
-from jaxlfi.estimators.posterior import Posterior, truncated
+from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.heuristics import Choice, Heuristic
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
@@ -116,8 +116,7 @@ def posterior_after(belief: Belief, network: Network, x: Float[Array, " obs"]) -
 
     Where the density is a mixture of Gaussians it is the belief's own, after correction and heuristic.
     """
-    density = belief.mixture if network.estimator.closed_form else network.estimator.density(network, x)
-    return truncated(density, belief.mixture, belief.support, network.space)
+    return network.estimator.posterior(network, x, belief.mixture, belief.support)
 
 
 def start_one(task: Task, first: int | None, settings: Settings, run: RunInputs) -> State:

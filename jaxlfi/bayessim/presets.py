@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.estimators.flow_estimators import SplineFlow
+from jaxlfi.estimators.likelihood_estimators import MixtureLikelihood
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 
 PAPER = Settings()
@@ -76,5 +77,29 @@ def npe(settings: Settings) -> Settings:
     )
 
 
-METHODS: dict[str, Callable[[Settings], Settings]] = {"bayessim": lambda settings: settings, "apt": apt, "npe": npe}
+LIKELIHOOD = MixtureLikelihood(
+    hidden=(50, 50),
+    activation="tanh",
+    components=2,
+    ensemble_size=4,
+    learning_rate=1e-3,
+    epochs=0,
+    steps=1000,
+    validation=0.1,
+    warm_start=False,
+    normaliser="asinh",
+)
+
+
+def snle(settings: Settings) -> Settings:
+    """Sequential neural likelihood: an ensemble of mixture networks for the summary given the parameters."""
+    return settings.replace(estimator=LIKELIHOOD, restriction="reject")
+
+
+METHODS: dict[str, Callable[[Settings], Settings]] = {
+    "bayessim": lambda settings: settings,
+    "apt": apt,
+    "npe": npe,
+    "snle": snle,
+}
 """What a method makes of a preset, by the name the command line gives it. All are Algorithm 1 with other parts."""

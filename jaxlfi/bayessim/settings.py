@@ -63,4 +63,9 @@ class Settings(Checked):
                 f"correction: expected 'none' or 'importance' for {type(self.estimator).__name__}, as "
                 f"{self.correction!r} calculates with mixtures of Gaussians, got {self.correction!r}"
             )
+        if self.correction != "none" and self.estimator.of_summaries:
+            raise ValueError(
+                f"correction: expected 'none' for {type(self.estimator).__name__}, as a likelihood does not depend on "
+                f"the proposals, got {self.correction!r}"
+            )
         return self

@@ -25,7 +25,7 @@ from jaxlfi import flags, source_fields
 from jaxlfi.fields import Declared
 
 PRESETS = ("quick", "paper")
-METHODS = ("bayessim", "apt", "npe")
+METHODS = ("bayessim", "apt", "npe", "snle")
 HEURISTICS, ESTIMATORS = "jaxlfi.heuristics", "jaxlfi.estimators"
 """The entry-point groups of classes whose fields have flags."""
 SETTINGS = "jaxlfi.bayessim.settings:Settings"
@@ -409,7 +409,8 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         "--method",
         choices=METHODS,
         default="bayessim",
-        help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: flows, one round (default: bayessim)",
+        help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: flows, one round; snle: sequential, likelihoods "
+        "(default: bayessim)",
     )
     command.add_argument(
         "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"

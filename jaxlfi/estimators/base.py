@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import flax.linen as nn
 import jax
@@ -16,7 +16,7 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset, empty
 from jaxlfi.estimators.density import Density, EnsembleDensity
-from jaxlfi.estimators.losses import LOSSES
+from jaxlfi.estimators.losses import LOSSES, Loss, Rows
 from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.fields import Checked, check_fields, hyperparameter, option
@@ -82,6 +82,8 @@ class Estimator(Checked, abc.ABC):
 
     closed_form: ClassVar[bool] = False
     """Whether the density is a mixture of Gaussians, which needs no fit and can be corrected in closed form."""
+    of_summaries: ClassVar[bool] = False
+    """Whether the density is that of the summary given the parameters: a likelihood, whatever was proposed."""
 
     @abc.abstractmethod
     def module(self, dim: int) -> nn.Module:
@@ -96,14 +98,14 @@ class Estimator(Checked, abc.ABC):
             raise ValueError("patience: expected validation above 0 to stop by, got validation=0")
         return self
 
-    def check_for(self, dim: int) -> None:
-        """Refuse settings that make no network for D parameters.
+    def check_for(self, dim: int, obs: int = 1) -> None:
+        """Refuse settings that make no network for D parameters and S summaries.
 
         Raises:
             ValueError: in one line.
         """
         try:
-            jax.eval_shape(self.module(dim).init, jax.random.key(0), jnp.zeros(1))
+            jax.eval_shape(self.module(dim).init, jax.random.key(0), jnp.zeros(obs))
         except ValueError as error:
             raise ValueError(str(error).splitlines()[0]) from error
 
@@ -115,6 +117,34 @@ class Estimator(Checked, abc.ABC):
         """Fresh weights for every network of the ensemble."""
         module = self.module(dim)
         return jax.vmap(lambda k: module.init(k, jnp.zeros(obs)))(jax.random.split(key, self.ensemble_size))
+
+    def rows(
+        self,
+        theta: Float[Array, "n dim"],
+        x: Float[Array, "n obs"],
+        weights: Float[Array, " n"],
+        log_prior: Float[Array, " n"],
+        from_prior: Float[Array, " n"],
+    ) -> Rows:
+        """Simulations as the network is trained on them, from both as the network sees them (`Rows`)."""
+        return Rows(value=theta, given=x, weights=weights, log_prior=log_prior, from_prior=from_prior)
+
+    def objective(self) -> Loss:
+        """What the network is trained by."""
+        return LOSSES[self.loss]
+
+    def condition(
+        self, network: "Network", x: Float[Array, " obs"], support: Support, key: jax.Array | None
+    ) -> Posterior:
+        """See `Network.condition`."""
+        density = self.density(network, x)
+        return truncated(density, self.mixture(key, density, support), support, network.space)
+
+    def posterior(
+        self, network: "Network", x: Float[Array, " obs"], mixture: GaussianMixture, support: Support
+    ) -> Posterior:
+        """The same posterior on another support, where the mixture that goes with it is known already."""
+        return truncated(self.density(network, x), mixture, support, network.space)
 
     def density(self, network: "Network", x: Float[Array, " obs"]) -> Density:
         """q_phi(theta | x) in inference space, not truncated: the whole ensemble."""
@@ -147,6 +177,8 @@ class Network:
             standard normal; none for a mixture density network (reading D).
         scale: the box in inference space that [-1, 1]^D stands for, Phi.
         space: the map between inference space and natural units.
+        prior: the task's own prior over inference space, where a likelihood is to be multiplied by it; None for a
+            uniform one, and where the density is the posterior, which has the prior in it.
     """
 
     estimator: Estimator
@@ -155,6 +187,7 @@ class Network:
     theta_normaliser: Normaliser | None
     scale: Support
     space: Space = struct.field(pytree_node=False)
+    prior: Any = struct.field(pytree_node=False, default=None)
 
     def condition(self, x: Float[Array, " obs"], support: Support, key: jax.Array | None = None) -> Posterior:
         """The posterior of a raw summary (Algorithm 1, line 11), truncated to a support.
@@ -164,8 +197,7 @@ class Network:
             support: in inference space; for the posterior under the prior, the box the simulations were drawn from.
             key: for the mixture fitted to draws; a mixture density network needs none. Always the same by default.
         """
-        density = self.estimator.density(self, x)
-        return truncated(density, self.estimator.mixture(key, density, support), support, self.space)
+        return self.estimator.condition(self, x, support, key)
 
     def to_network(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n dim"]:
         """Parameters in inference space as the network sees them."""
@@ -192,12 +224,15 @@ class Network:
         return self.replace(params=params).with_normalisers(dataset)
 
 
-def untrained(key: jax.Array, estimator: Estimator, obs: int, scale: Support, space: Space) -> Network:
-    """A network before any training, for summaries of length `obs`."""
+def untrained(
+    key: jax.Array, estimator: Estimator, obs: int, scale: Support, space: Space, prior: Any = None
+) -> Network:
+    """A network before any training, for summaries of length `obs`; the prior is `Task.inference.prior`."""
     estimator = jax.tree.map(jnp.asarray, estimator)  # its leaves are carried through loops
     nothing = empty(1, scale.dim, obs)
     params = estimator.initialise(key, scale.dim, obs)
-    return Network(estimator, params, *_normalisers(estimator, nothing, scale), scale, space)
+    prior = prior if estimator.of_summaries else None
+    return Network(estimator, params, *_normalisers(estimator, nothing, scale), scale, space, prior)
 
 
 def _normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tuple[Normaliser, Normaliser | None]:

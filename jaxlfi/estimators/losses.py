@@ -19,16 +19,19 @@ ATOMS = 10
 class Rows:
     """Simulations as the network sees them.
 
+    A posterior network gives a density of parameters for a summary, a likelihood network one of summaries for
+    parameters (`Estimator.rows`).
+
     Attributes:
-        theta: parameters as the network sees them, shape [N, D].
-        x: normalised summaries, shape [N, S].
+        value: what q is a density of, shape [N, V].
+        given: what the network is given, shape [N, G].
         weights: weight of each in the loss, shape [N].
         log_prior: log-density of the prior, up to a constant, shape [N].
         from_prior: 1 for those drawn from the prior itself, in the first round, 0 for others, shape [N].
     """
 
-    theta: Float[Array, "n dim"]
-    x: Float[Array, "n obs"]
+    value: Float[Array, "n value"]
+    given: Float[Array, "n given"]
     weights: Float[Array, " n"]
     log_prior: Float[Array, " n"]
     from_prior: Float[Array, " n"]
@@ -52,24 +55,43 @@ class Loss:
 
 
 def likelihood(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
-    """-log q(theta | x), weighted: q becomes the posterior under what the rows were drawn from, or weighted to."""
-    return -jnp.mean(rows.weights * q.log_prob(rows.theta))
+    """-log q, weighted: q becomes the posterior under what the rows were drawn from, or weighted to, or a likelihood."""
+    return -jnp.mean(rows.weights * q.log_prob(rows.value))
 
 
 def held_out_likelihood(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
     """The same, divided by the weights' sum."""
-    return nll(q.log_prob(rows.theta), rows.weights)
+    return nll(q.log_prob(rows.value), rows.weights)
 
 
 def contrastive(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
     """The atomic loss of APT (`jaxlfi.estimators.atomic_loss`): q becomes the posterior under the prior."""
-    return atomic(key, q.log_prob, rows.theta, rows.log_prior, rows.weights, min(ATOMS, rows.theta.shape[0]))
+    return atomic(key, q.log_prob, rows.value, rows.log_prior, rows.weights, min(ATOMS, rows.value.shape[0]))
 
 
 def combined(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
     """The atomic loss, and -log q of the rows drawn from the prior: they hold q down where no proposal is made."""
-    atoms = min(ATOMS, rows.theta.shape[0])
-    return atomic(key, q.log_prob, rows.theta, rows.log_prior, rows.weights, atoms, rows.from_prior)
+    atoms = min(ATOMS, rows.value.shape[0])
+    return atomic(key, q.log_prob, rows.value, rows.log_prior, rows.weights, atoms, rows.from_prior)
+
+
+def smoothed(loss: Loss, noise: Float[Array, ""] | float) -> Loss:
+    """A loss of values with normal noise added, drawn anew each time: q becomes the density of the noisy value.
+
+    Args:
+        loss: of the values with noise.
+        noise: standard deviation.
+    """
+
+    def noisy(part):
+        def smooth(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
+            key_noise, key_loss = jax.random.split(key)
+            value = rows.value + noise * jax.random.normal(key_noise, rows.value.shape)
+            return part(key_loss, q, rows.replace(value=value))
+
+        return smooth
+
+    return Loss(noisy(loss.training), noisy(loss.held_out))
 
 
 LOSSES: dict[str, Loss] = {

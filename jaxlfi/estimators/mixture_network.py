@@ -11,6 +11,7 @@ from jaxlfi.distributions.mixture_algebra import pool
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Estimator, Network
 from jaxlfi.estimators.mdn import ACTIVATIONS, MDN
+from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.fields import hyperparameter, option
 
 
@@ -55,6 +56,12 @@ class MixtureNetwork(Estimator):
         each = jax.vmap(lambda params: module.apply(params, x).mixture().prune(self.prune))(network.params)
         shift, scale = network.from_network()
         return pool(each).affine(scale, shift)
+
+    def posterior(
+        self, network: Network, x: Float[Array, " obs"], mixture: GaussianMixture, support: Support
+    ) -> Posterior:
+        """The mixture, which is the density itself, truncated."""
+        return truncated(mixture, mixture, support, network.space)
 
     def mixture(self, key: jax.Array | None, density: GaussianMixture, support: Support) -> GaussianMixture:
         """The density itself."""

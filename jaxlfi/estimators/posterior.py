@@ -88,6 +88,12 @@ class Posterior:
         draws = self.sample(jax.random.key(0), MAP_DRAWS, space="inference")
         return _maximum(self, draws, is_natural(space))
 
+    def inner_draws(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
+        """`n` draws in inference space, by rejection; pure, where `sample` is checked and compiled."""
+        box = self.support
+        fallback = lambda key, n: truncated_mixture_draws(key, self.mixture, box, n)
+        return rejection_sample(key, self.density.sample, box, n, fallback)
+
     def on(self, support: Support) -> "Posterior":
         """The same density truncated to another support, in inference space."""
         return truncated(self.density, self.mixture, support, self.space)
@@ -103,9 +109,7 @@ def truncated(density: Density, mixture: GaussianMixture, support: Support, spac
 
 @functools.partial(jax.jit, static_argnums=2)
 def _sample(key: jax.Array, posterior: Posterior, n: int) -> Array:
-    box = posterior.support
-    fallback = lambda key, n: truncated_mixture_draws(key, posterior.mixture, box, n)
-    return rejection_sample(key, posterior.density.sample, box, n, fallback)
+    return posterior.inner_draws(key, n)
 
 
 @functools.partial(jax.jit, static_argnums=2)

@@ -8,7 +8,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.estimators.base import SCHEDULES, Network
 from jaxlfi.estimators.dataset import Dataset
-from jaxlfi.estimators.losses import LOSSES, Rows
 
 STEPS_PER_EPOCH = 50
 """Maximum gradient steps in an epoch, where steps are counted; the validation loss is computed after each epoch."""
@@ -19,7 +18,8 @@ class FitInfo:
     """What happened while fitting; P epochs, E networks in the ensemble.
 
     Attributes:
-        loss: mean training loss of each epoch, negative log-density of theta scaled to [-1, 1]^D, shape [E, P].
+        loss: mean training loss of each epoch, negative log-density of theta, or of the
+            summary, as the network sees it, shape [E, P].
         validation_loss: the same over the held-out simulations after each epoch; NaN without any, shape [E, P].
         chosen_epoch: the epoch the weights were taken from, shape [E].
         nonfinite: gradient steps skipped because the loss or its gradient was not finite, shape [E].
@@ -76,7 +76,7 @@ def fit(
     x = network.normaliser(dataset.x)
     theta = network.to_network(dataset.theta)
     log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
-    data = Rows(theta, x, weights, log_prior, from_prior=(dataset.round == 0).astype(weights.dtype))
+    data = estimator.rows(theta, x, weights, log_prior, from_prior=(dataset.round == 0).astype(weights.dtype))
 
     def one(key, params):
         return _fit_one(key, estimator, params, data, dataset.size, expected_size)
@@ -87,9 +87,9 @@ def fit(
 
 def _fit_one(key, estimator, params, data, size, expected_size):
     """Training of one network: epochs over the data, each a loop over minibatches."""
-    capacity, dim = data.theta.shape
+    capacity, dim = data.value.shape
     module = estimator.module(dim)
-    objective = LOSSES[estimator.loss]
+    objective = estimator.objective()
     epochs = estimator.epochs or -(-estimator.steps // STEPS_PER_EPOCH)
     batches = -(-expected_size // estimator.batch_size) if estimator.epochs else -(-estimator.steps // epochs)
 
@@ -112,7 +112,7 @@ def _fit_one(key, estimator, params, data, size, expected_size):
     key_loss, key_held_out = jax.random.fold_in(key_epochs, epochs), jax.random.fold_in(key_epochs, epochs + 1)
 
     def loss_of(params, key, batch):
-        return objective.training(key, module.apply(params, batch.x), batch)
+        return objective.training(key, module.apply(params, batch.given), batch)
 
     def gradient_step(key, state, batch):
         loss, gradient = jax.value_and_grad(loss_of)(state.params, key, batch)
@@ -143,7 +143,7 @@ def _fit_one(key, estimator, params, data, size, expected_size):
             return (state, best), (loss, jnp.nan)
         nothing_held_out = jnp.sum(held_out_data.weights) == 0
         # The same key for all epochs: their losses are compared.
-        q = module.apply(state.params, held_out_data.x)
+        q = module.apply(state.params, held_out_data.given)
         validation = objective.held_out(jax.random.clone(key_held_out), q, held_out_data)
         validation = jnp.where(nothing_held_out, jnp.nan, validation)
         # With too few simulations to hold any out, the last weights are as good as any.

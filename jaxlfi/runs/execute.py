@@ -98,7 +98,6 @@ def prepare(plan: BatchPlan, observation: Any = None, first: Simulations | None 
         ValueError: for anything that does not fit.
     """
     plan.settings.check()
-    plan.settings.estimator.check_for(plan.task.dim)
     prior = plan.task.inference.prior
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
         priors.require_mass(prior, box, name)
@@ -107,6 +106,7 @@ def prepare(plan: BatchPlan, observation: Any = None, first: Simulations | None 
     seeds = dict.fromkeys(spec.seed for spec in plan.specs)
     by_seed = {seed: observe(run_keys(key_of(seed)).observe, plan.task, observation) for seed in seeds}
     observed, x = (np.stack([np.asarray(by_seed[spec.seed][i]) for spec in plan.specs]) for i in range(2))
+    plan.settings.estimator.check_for(plan.task.dim, x.shape[1])
     if first is not None and first.x.shape[1] != x.shape[1]:
         raise ValueError(f"simulations: expected summaries of length {x.shape[1]}, got {first.x.shape[1]}")
     given = Observed(observed, x, first)

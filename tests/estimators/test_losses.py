@@ -20,7 +20,7 @@ def key():
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def evaluated(name, part, key, rows):
     """One part of a loss of these rows."""
-    return getattr(LOSSES[name], part)(key, Location(rows.x), rows)
+    return getattr(LOSSES[name], part)(key, Location(rows.given), rows)
 
 
 class Location:
@@ -44,8 +44,8 @@ def rows():
     rng = np.random.default_rng(0)
     n = 14
     return Rows(
-        theta=jnp.asarray(rng.normal(size=(n, 2)), jnp.float32),
-        x=jnp.asarray(rng.normal(size=(n, 2)), jnp.float32),
+        value=jnp.asarray(rng.normal(size=(n, 2)), jnp.float32),
+        given=jnp.asarray(rng.normal(size=(n, 2)), jnp.float32),
         weights=jnp.asarray(rng.uniform(0.2, 2.0, n), jnp.float32),
         log_prior=jnp.asarray(rng.normal(size=n), jnp.float32),
         from_prior=jnp.asarray(rng.integers(0, 2, n), jnp.float32),
@@ -54,7 +54,7 @@ def rows():
 
 def oracle(rows: Rows) -> np.ndarray:
     """log q(theta_j | x_i), shape [i, j]."""
-    theta, x = np.asarray(rows.theta, np.float64), np.asarray(rows.x, np.float64)
+    theta, x = np.asarray(rows.value, np.float64), np.asarray(rows.given, np.float64)
     normal = stats.norm(0, Location.scale)
     return np.array([[normal.logpdf(theta[j] - x[i]).sum() for j in range(len(theta))] for i in range(len(x))])
 
@@ -90,8 +90,8 @@ def test_padding_does_not_count_among_the_held_out(rows, name):
     padded = jax.tree.map(lambda leaf: np.concatenate([leaf, 100 + leaf[:5]]), rows)
     padded.weights[14:] = 0.0
     moved = jax.tree.map(np.copy, padded)
-    moved.theta[14:] -= 7.0
-    moved.x[14:] += 3.0
+    moved.value[14:] -= 7.0
+    moved.given[14:] += 3.0
     losses = [evaluated(name, "held_out", key(), jax.tree.map(jnp.asarray, r)) for r in (padded, moved)]
     np.testing.assert_array_equal(*losses)
 

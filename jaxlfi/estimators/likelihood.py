@@ -1,0 +1,189 @@
+"""Likelihoods: networks for the density of the summary given the parameters, and the posterior that follows from one.
+
+Sequential neural likelihood (Papamakarios, Sterratt and Murray 2019). What parameters were proposed has no part in the
+density of the summary given them, so that the simulations of all rounds can be pooled as they are.
+"""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.mixture_fit import fit_mixture
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.base import Estimator, Network
+from jaxlfi.estimators.losses import LOSSES, Loss, Rows, smoothed
+from jaxlfi.estimators.posterior import Posterior
+from jaxlfi.estimators.tempering import LEAST, require_blackjax, tempered
+from jaxlfi.fields import hyperparameter, option
+from jaxlfi.tasks.priors import prior_draws
+
+EVERYWHERE = 8
+"""Candidates of each draw that are uniform over the support: where the mixture misses something, they do not."""
+CANDIDATES = 32
+"""Candidates that each draw is picked from, those and draws of the mixture."""
+EVIDENCE = 128
+"""Sets of candidates that the evidence is the mean weight of."""
+BLOCK = 256
+"""Draws made at a time, which bounds the memory for their candidates."""
+
+
+class Likelihood(Estimator):
+    """What all likelihood networks have in common.
+
+    Their Flax module maps parameters to a density of the normalised summary; the ensemble's likelihood is the mean of
+    its networks'. The posterior on a support is the likelihood of the observation times the prior, drawn from by
+    tempered sequential Monte Carlo (`jaxlfi.estimators.tempering`).
+
+    The likelihood is that of *valid* simulations: where parameters differ in how often their simulations fail, the
+    posterior is that of an observation that would have been discarded, had it failed, and not told of.
+
+    Attributes:
+        noise_floor: standard deviation of the normal noise that is added to normalised summaries in training. Summaries
+            that hardly vary for given parameters make a likelihood that is as sharp as a network can be, and wrong
+            where it is: with the noise, the likelihood is that of an observation which is known to so much of the
+            summaries' spread. A leaf.
+        particles: of sequential Monte Carlo.
+    """
+
+    noise_floor: Float[Array, "*batch"] | float = hyperparameter(
+        0.03, low=0.0, high=1.0, help="noise added to normalised summaries, of a likelihood"
+    )
+    particles: int = option(1000, low=10, help="draws that a likelihood's posterior is found by")
+
+    of_summaries: ClassVar[bool] = True
+
+    def check(self) -> "Likelihood":
+        """Refuse settings that cannot work, by name; returns the settings."""
+        super().check()
+        if self.loss != "likelihood":
+            raise ValueError(f"loss: expected 'likelihood' for {type(self).__name__}, got {self.loss!r}")
+        require_blackjax()
+        return self
+
+    def check_for(self, dim: int, obs: int = 1) -> None:
+        """Refuse settings that make no network for S summaries given D parameters."""
+        super().check_for(obs, dim)
+
+    def initialise(self, key: jax.Array, dim: int, obs: int) -> dict:
+        """Fresh weights for every network of the ensemble."""
+        return super().initialise(key, obs, dim)
+
+    def rows(
+        self,
+        theta: Float[Array, "n dim"],
+        x: Float[Array, "n obs"],
+        weights: Float[Array, " n"],
+        log_prior: Float[Array, " n"],
+        from_prior: Float[Array, " n"],
+    ) -> Rows:
+        """Summaries given parameters. All rows count the same: weights say how the parameters were drawn."""
+        return Rows(x, theta, (weights > 0).astype(weights.dtype), log_prior, from_prior)
+
+    def objective(self) -> Loss:
+        """The likelihood's, of summaries with noise."""
+        return smoothed(LOSSES[self.loss], self.noise_floor)
+
+    def log_likelihood(
+        self, network: Network, x: Float[Array, " obs"], theta: Float[Array, "*n dim"]
+    ) -> Float[Array, "*n"]:
+        """Log-density of the normalised summary of x given theta, numbers [..., D] in inference space."""
+        module, given = self.module(x.shape[-1]), network.to_network(theta)
+        value = jnp.broadcast_to(network.normaliser(x), (*theta.shape[:-1], x.shape[-1]))
+        each = jax.vmap(lambda params: module.apply(params, given).log_prob(value))(network.params)
+        return jax.nn.logsumexp(each, axis=0) - jnp.log(self.ensemble_size)
+
+    def condition(
+        self, network: Network, x: Float[Array, " obs"], support: Support, key: jax.Array | None
+    ) -> "LikelihoodPosterior":
+        """The posterior on a support, by sequential Monte Carlo from the prior there; see `Network.condition`."""
+        key_start, key_draw, key_fit = jax.random.split(jax.random.key(0) if key is None else key, 3)
+        start = prior_draws(key_start, network.prior, support, self.particles)
+        draws = tempered(
+            key_draw,
+            start,
+            lambda theta: jnp.where(support.contains(theta), _log_prior(network, theta), -jnp.inf),
+            lambda theta: self.log_likelihood(network, x, theta),
+        ).theta
+        mixture, _ = fit_mixture(key_fit, draws, jnp.ones(self.particles), self.ensemble_size * self.components)
+        return self.posterior(network, x, mixture, support)
+
+    def posterior(
+        self, network: Network, x: Float[Array, " obs"], mixture: GaussianMixture, support: Support
+    ) -> "LikelihoodPosterior":
+        """The posterior on a support, where a mixture like it is known."""
+        density = LikelihoodDensity(network, x, mixture, support, jnp.zeros(()))
+        _, log_weight = density.candidates(jax.random.key(0), EVIDENCE)
+        density = density.replace(log_evidence=jax.nn.logsumexp(log_weight) - jnp.log(log_weight.size))
+        return LikelihoodPosterior(density, mixture, support, jnp.ones(()), network.space)
+
+
+def _log_prior(network: Network, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
+    """Log-density of the prior in inference space, up to a constant."""
+    return jnp.zeros(theta.shape[:-1]) if network.prior is None else network.prior.log_prob(theta)
+
+
+@struct.dataclass
+class LikelihoodDensity:
+    """Likelihood times prior on a box, divided by the evidence: a posterior that has been truncated already.
+
+    Attributes:
+        network: the likelihood.
+        x: the observed summary, shape [S].
+        mixture: like the posterior; draws are picked from its draws, by weight.
+        support: the box, in inference space.
+        log_evidence: logarithm of the integral of likelihood times prior over the box. The likelihood is over
+            normalised summaries, and a uniform prior is 1 everywhere.
+    """
+
+    network: Network
+    x: Float[Array, "*batch obs"]
+    mixture: GaussianMixture
+    support: Support
+    log_evidence: Float[Array, "*batch"]
+
+    def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
+        """Log-density at theta; -inf outside of the box."""
+        log_likelihood = self.network.estimator.log_likelihood(self.network, self.x, theta)
+        joint = jnp.maximum(jnp.nan_to_num(log_likelihood, nan=LEAST), LEAST) + _log_prior(self.network, theta)
+        return jnp.where(self.support.contains(theta), joint - self.log_evidence, -jnp.inf)
+
+    def candidates(self, key: jax.Array, n: int) -> tuple[Float[Array, "n m dim"], Float[Array, "n m"]]:
+        """`n` sets of `CANDIDATES` draws of mixture and box, and the logarithms of their importance weights.
+
+        The weights are relative to all that a set is drawn from (the balance heuristic; Veach 1997).
+        """
+        key_box, key_mixture = jax.random.split(key)
+        box = self.support.sample(key_box, n * EVERYWHERE).reshape(n, EVERYWHERE, -1)
+        mixture = self.mixture.sample(key_mixture, n * (CANDIDATES - EVERYWHERE)).reshape(n, CANDIDATES - EVERYWHERE, -1)
+        theta = jnp.concatenate([box, mixture], axis=1)
+        share = EVERYWHERE / CANDIDATES
+        uniform = jnp.log(share) - jnp.sum(jnp.log(self.support.width))
+        log_drawn = jnp.logaddexp(uniform, jnp.log1p(-share) + self.mixture.log_prob(theta))
+        return theta, self.log_prob(theta) - log_drawn
+
+    def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
+        """`n` independent draws, each picked by weight from candidates of its own (Rubin 1988)."""
+        if n > BLOCK:
+            keys = jax.random.split(key, -(-n // BLOCK))
+            return jax.lax.map(lambda key: self.sample(key, BLOCK), keys).reshape(-1, self.support.dim)[:n]
+        key_candidates, key_pick = jax.random.split(key)
+        theta, log_weight = self.candidates(key_candidates, n)
+        picked = jax.random.categorical(key_pick, log_weight)
+        return jnp.take_along_axis(theta, picked[:, None, None], axis=1)[:, 0]
+
+
+@struct.dataclass
+class LikelihoodPosterior(Posterior):
+    """The posterior by a likelihood: nothing of it is outside of its support, and on another one it is found anew."""
+
+    def inner_draws(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
+        """`n` draws in inference space."""
+        return self.density.sample(key, n)
+
+    def on(self, support: Support) -> "LikelihoodPosterior":
+        """The posterior under the prior on another support, in inference space."""
+        return self.density.network.condition(self.density.x, support)
