@@ -20,6 +20,7 @@ _HOMES = {
     "METHODS": "jaxlfi.bayessim.presets",
     "MaskedFlow": "jaxlfi.estimators.flow_estimators",
     "Matched": "jaxlfi.heuristics",
+    "MixtureLikelihood": "jaxlfi.estimators.likelihood_estimators",
     "MixtureNetwork": "jaxlfi.estimators.mixture_network",
     "Mode": "jaxlfi.heuristics",
     "PAPER": "jaxlfi.bayessim.presets",

@@ -13,6 +13,7 @@ from jaxlfi.distributions.support import Support as Support
 from jaxlfi.estimators.base import Estimator as Estimator
 from jaxlfi.estimators.flow_estimators import MaskedFlow as MaskedFlow
 from jaxlfi.estimators.flow_estimators import SplineFlow as SplineFlow
+from jaxlfi.estimators.likelihood_estimators import MixtureLikelihood as MixtureLikelihood
 from jaxlfi.estimators.mixture_network import MixtureNetwork as MixtureNetwork
 from jaxlfi.estimators.posterior import Posterior as Posterior
 from jaxlfi.fields import hyperparameter as hyperparameter

@@ -409,8 +409,8 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         "--method",
         choices=METHODS,
         default="bayessim",
-        help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: flows, one round; snle: sequential, likelihoods "
-        "(default: bayessim)",
+        help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: flows, one round; snle: sequential, "
+        "likelihoods (default: bayessim)",
     )
     command.add_argument(
         "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"

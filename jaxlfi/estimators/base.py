@@ -16,7 +16,7 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset, empty
 from jaxlfi.estimators.density import Density, EnsembleDensity
-from jaxlfi.estimators.losses import LOSSES, Loss, Rows
+from jaxlfi.estimators.losses import LOSSES, Rows
 from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.fields import Checked, check_fields, hyperparameter, option
@@ -120,18 +120,15 @@ class Estimator(Checked, abc.ABC):
 
     def rows(
         self,
+        key: jax.Array,
         theta: Float[Array, "n dim"],
         x: Float[Array, "n obs"],
         weights: Float[Array, " n"],
         log_prior: Float[Array, " n"],
         from_prior: Float[Array, " n"],
     ) -> Rows:
-        """Simulations as the network is trained on them, from both as the network sees them (`Rows`)."""
+        """What a round trains on (`Rows`), from parameters and summaries as the network sees them."""
         return Rows(value=theta, given=x, weights=weights, log_prior=log_prior, from_prior=from_prior)
-
-    def objective(self) -> Loss:
-        """What the network is trained by."""
-        return LOSSES[self.loss]
 
     def condition(
         self, network: "Network", x: Float[Array, " obs"], support: Support, key: jax.Array | None

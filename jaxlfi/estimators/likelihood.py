@@ -15,7 +15,7 @@ from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_fit import fit_mixture
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Estimator, Network
-from jaxlfi.estimators.losses import LOSSES, Loss, Rows, smoothed
+from jaxlfi.estimators.losses import Rows
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.estimators.tempering import LEAST, require_blackjax, tempered
 from jaxlfi.fields import hyperparameter, option
@@ -42,10 +42,10 @@ class Likelihood(Estimator):
     posterior is that of an observation that would have been discarded, had it failed, and not told of.
 
     Attributes:
-        noise_floor: standard deviation of the normal noise that is added to normalised summaries in training. Summaries
-            that hardly vary for given parameters make a likelihood that is as sharp as a network can be, and wrong
-            where it is: with the noise, the likelihood is that of an observation which is known to so much of the
-            summaries' spread. A leaf.
+        noise_floor: standard deviation of the normal noise that is added to normalised summaries before each round's
+            training. Summaries that hardly vary for given parameters make a likelihood that is as sharp as a network
+            can be, and wrong by more than its width: with the noise, the likelihood is that of an observation which
+            is known to so much of the summaries' spread. A leaf.
         particles: of sequential Monte Carlo.
     """
 
@@ -74,18 +74,16 @@ class Likelihood(Estimator):
 
     def rows(
         self,
+        key: jax.Array,
         theta: Float[Array, "n dim"],
         x: Float[Array, "n obs"],
         weights: Float[Array, " n"],
         log_prior: Float[Array, " n"],
         from_prior: Float[Array, " n"],
     ) -> Rows:
-        """Summaries given parameters. All rows count the same: weights say how the parameters were drawn."""
+        """Noisy summaries given parameters. All rows count the same: weights say how the parameters were drawn."""
+        x = x + self.noise_floor * jax.random.normal(key, x.shape)
         return Rows(x, theta, (weights > 0).astype(weights.dtype), log_prior, from_prior)
-
-    def objective(self) -> Loss:
-        """The likelihood's, of summaries with noise."""
-        return smoothed(LOSSES[self.loss], self.noise_floor)
 
     def log_likelihood(
         self, network: Network, x: Float[Array, " obs"], theta: Float[Array, "*n dim"]
@@ -158,7 +156,9 @@ class LikelihoodDensity:
         """
         key_box, key_mixture = jax.random.split(key)
         box = self.support.sample(key_box, n * EVERYWHERE).reshape(n, EVERYWHERE, -1)
-        mixture = self.mixture.sample(key_mixture, n * (CANDIDATES - EVERYWHERE)).reshape(n, CANDIDATES - EVERYWHERE, -1)
+        mixture = self.mixture.sample(key_mixture, n * (CANDIDATES - EVERYWHERE)).reshape(
+            n, CANDIDATES - EVERYWHERE, -1
+        )
         theta = jnp.concatenate([box, mixture], axis=1)
         share = EVERYWHERE / CANDIDATES
         uniform = jnp.log(share) - jnp.sum(jnp.log(self.support.width))

@@ -55,7 +55,7 @@ class Loss:
 
 
 def likelihood(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
-    """-log q, weighted: q becomes the posterior under what the rows were drawn from, or weighted to, or a likelihood."""
+    """-log q, weighted: q becomes the density of the values under what rows were drawn from or weighted to."""
     return -jnp.mean(rows.weights * q.log_prob(rows.value))
 
 
@@ -73,25 +73,6 @@ def combined(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
     """The atomic loss, and -log q of the rows drawn from the prior: they hold q down where no proposal is made."""
     atoms = min(ATOMS, rows.value.shape[0])
     return atomic(key, q.log_prob, rows.value, rows.log_prior, rows.weights, atoms, rows.from_prior)
-
-
-def smoothed(loss: Loss, noise: Float[Array, ""] | float) -> Loss:
-    """A loss of values with normal noise added, drawn anew each time: q becomes the density of the noisy value.
-
-    Args:
-        loss: of the values with noise.
-        noise: standard deviation.
-    """
-
-    def noisy(part):
-        def smooth(key: jax.Array, q: Any, rows: Rows) -> Float[Array, ""]:
-            key_noise, key_loss = jax.random.split(key)
-            value = rows.value + noise * jax.random.normal(key_noise, rows.value.shape)
-            return part(key_loss, q, rows.replace(value=value))
-
-        return smooth
-
-    return Loss(noisy(loss.training), noisy(loss.held_out))
 
 
 LOSSES: dict[str, Loss] = {

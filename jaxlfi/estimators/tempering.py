@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 TARGET_ESS = 0.5
 """Fraction of the particles that are effective after each stage; it sets how far a stage goes."""
-MOVES = 8
+MOVES = 6
 """Metropolis steps of each particle in each stage."""
 STAGES = 60
 """Stages at most. A stage divides the volume by about two: 60 reach a posterior of 1e-18 of the prior's volume."""
@@ -111,7 +111,8 @@ def tempered(
         state, info = adaptive(jax.random.fold_in(key_stages, stage), state, MOVES, shared(state.particles))
         return stage + 1, state, log_evidence + info.log_likelihood_increment
 
-    key_stages, key_last, key_pick = jax.random.split(key, 3)
+    # As plain numbers: the checker of keys that are used twice takes BlackJAX's scans under vmap for such (JAX 0.9).
+    key_stages, key_last, key_pick = jax.random.key_data(jax.random.split(key, 3))
     state = fixed.init(start)._replace(tempering_param=jnp.zeros(()))
     stages, state, log_evidence = jax.lax.while_loop(running, one_stage, (jnp.asarray(0), state, jnp.zeros(())))
     temperature = state.tempering_param

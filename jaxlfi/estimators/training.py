@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.estimators.base import SCHEDULES, Network
 from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.estimators.losses import LOSSES
 
 STEPS_PER_EPOCH = 50
 """Maximum gradient steps in an epoch, where steps are counted; the validation loss is computed after each epoch."""
@@ -76,7 +77,9 @@ def fit(
     x = network.normaliser(dataset.x)
     theta = network.to_network(dataset.theta)
     log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
-    data = estimator.rows(theta, x, weights, log_prior, from_prior=(dataset.round == 0).astype(weights.dtype))
+    key_rows = jax.random.fold_in(jax.random.clone(key_init), 1)
+    from_prior = (dataset.round == 0).astype(weights.dtype)
+    data = estimator.rows(key_rows, theta, x, weights, log_prior, from_prior)
 
     def one(key, params):
         return _fit_one(key, estimator, params, data, dataset.size, expected_size)
@@ -89,7 +92,7 @@ def _fit_one(key, estimator, params, data, size, expected_size):
     """Training of one network: epochs over the data, each a loop over minibatches."""
     capacity, dim = data.value.shape
     module = estimator.module(dim)
-    objective = estimator.objective()
+    objective = LOSSES[estimator.loss]
     epochs = estimator.epochs or -(-estimator.steps // STEPS_PER_EPOCH)
     batches = -(-expected_size // estimator.batch_size) if estimator.epochs else -(-estimator.steps // epochs)
 

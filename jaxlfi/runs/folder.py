@@ -281,6 +281,7 @@ def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) 
         "log": list(task.space.log),
         "names": list(task.space.labels),
         "units": list(task.units),
+        "prior": None if task.prior is None else type(task.prior).__name__,
         "feasible_low": np.asarray(feasible.low).tolist(),
         "feasible_high": np.asarray(feasible.high).tolist(),
         "configuration": spec.configuration,

@@ -61,6 +61,8 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         key = key_of(config["seed"])
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise StoreError(f"{folder / 'config.json'}: expected a complete description of the run: {error}") from error
+    task = _task(folder, config, task, space)
+    prior = _prior(folder, config, task, settings)
     observation = _arrays(folder / "observation.npz", ("trajectory", "x"))
     observed, x = jnp.asarray(observation["trajectory"]), jnp.asarray(observation["x"])
     return Run(
@@ -69,7 +71,7 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
             name: value for name, value in _arrays(folder / "history.npz", ("theta",)).items() if name not in LABELS
         },
         dataset=_dataset(folder / "dataset.npz", settings),
-        network=_network(folder / "network.npz", settings, x.shape[0], feasible, space),
+        network=_network(folder / "network.npz", settings, x.shape[0], feasible, space, prior),
         observed=observed,
         x=x,
         key=key,
@@ -78,7 +80,7 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         heuristic=heuristic,
         settings=settings,
         space=space,
-        task=_task(folder, config, task, space),
+        task=task,
         origin=origin,
     )
 
@@ -97,6 +99,18 @@ def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space
             f"got {list(task.space.labels)}"
         )
     return task
+
+
+def _prior(folder: Path, config: dict[str, Any], task: Task | None, settings: Settings) -> Any:
+    """The prior that a likelihood is multiplied by: it is a part of the task, and in no file."""
+    if task is not None:
+        return task.inference.prior
+    if settings.estimator.of_summaries and config.get("prior") is not None:
+        raise StoreError(
+            f"{folder}: expected the task, whose prior ({config['prior']}) the posterior by a likelihood needs: "
+            "pass task=..."
+        )
+    return None
 
 
 def _belief(path: Path, space: Space) -> Belief:
@@ -121,15 +135,15 @@ def _dataset(path: Path, settings: Settings) -> Dataset:
     return Dataset(round=jnp.asarray(rounds), size=jnp.asarray(size, jnp.int32), **filled)
 
 
-def _network(path: Path, settings: Settings, obs: int, feasible: Support, space: Space) -> Network | None:
+def _network(path: Path, settings: Settings, obs: int, feasible: Support, space: Space, prior: Any) -> Network | None:
     """The trained network; None where a mixture density network was not kept.
 
     Raises:
-        StoreError: where it is damaged or another estimator's, or a flow's is missing.
+        StoreError: where it is damaged or another estimator's, or that of a flow or a likelihood is missing.
     """
     if not path.exists() and settings.estimator.closed_form:
         return None
-    make: Callable[[], Network] = lambda: untrained(jax.random.key(0), settings.estimator, obs, feasible, space)
+    make: Callable[[], Network] = lambda: untrained(jax.random.key(0), settings.estimator, obs, feasible, space, prior)
     template = jax.eval_shape(make)
     expected = folders.named_leaves(template)
     arrays = _arrays(path, tuple(expected))

@@ -200,9 +200,14 @@ ASKED = {
         "jaxlfi.estimators.base": "declares it: a mixture of Gaussians needs no fit, and no key to be read off",
         "jaxlfi.estimators.mixture_network": "is one",
         "jaxlfi.bayessim.settings": "refuses the paper's correction, a quotient of Gaussians, for other densities",
-        "jaxlfi.bayessim.batch": "a belief's mixture is the density itself, corrected, or else fitted to the density",
         "jaxlfi.runs.folder": "a folder keeps the networks that its posterior cannot do without",
         "jaxlfi.runs.load": "and reads them",
+    },
+    "of_summaries": {
+        "jaxlfi.estimators.base": "declares it: the density is that of the summary, and its network has the prior",
+        "jaxlfi.estimators.likelihood": "is one",
+        "jaxlfi.bayessim.settings": "refuses corrections, which a likelihood does not need",
+        "jaxlfi.runs.load": "needs the prior, which is not saved",
     },
     "on_host": {
         "jaxlfi.tasks.task": "declares it",
