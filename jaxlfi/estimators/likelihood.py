@@ -186,4 +186,7 @@ class LikelihoodPosterior(Posterior):
 
     def on(self, support: Support) -> "LikelihoodPosterior":
         """The posterior under the prior on another support, in inference space."""
-        return self.density.network.condition(self.density.x, support)
+        return _condition(self.density.network, self.density.x, support)
+
+
+_condition = jax.jit(lambda network, x, support: network.condition(x, support))

@@ -8,6 +8,7 @@ import pytest
 from jaxlfi.bayessim.presets import METHODS, PAPER, PRESETS, QUICK
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.estimators.flow_estimators import MaskedFlow, SplineFlow
+from jaxlfi.estimators.likelihood_estimators import MixtureLikelihood
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 
 
@@ -61,6 +62,10 @@ def test_wrong_settings_are_refused_where_they_are_made_or_replaced(changes, mes
         (
             Settings(estimator=SplineFlow(), correction="paper"),
             r"^correction: expected 'none' or 'importance' for Spli",
+        ),
+        (
+            Settings(estimator=MixtureLikelihood(), correction="importance"),
+            r"^correction: expected 'none' for MixtureLikelihood, as a likelihood does not depend",
         ),
         (Settings(estimator=MixtureNetwork(patience=3)), r"^patience: expected validation above 0 to stop by"),
     ],

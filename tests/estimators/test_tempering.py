@@ -87,7 +87,7 @@ def test_a_likelihood_that_is_next_to_a_point_is_reached():
 
 def test_a_likelihood_that_is_not_finite_ends():
     """An observation that no network has an answer to: draws stay in the box."""
-    nowhere = gaussians([[0.0, 0.0]] * 2, [[1.0, 1.0]] * 2).replace(means=jnp.full((2, 2), jnp.nan))
+    nowhere = gaussians([[jnp.nan, 0.0]] * 2, [[1.0, 1.0]] * 2)
     found = run(0, nowhere)
     assert BOX.contains(found.theta).all() and int(found.stages) <= STAGES
 
