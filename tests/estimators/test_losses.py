@@ -99,5 +99,5 @@ def test_padding_does_not_count_among_the_held_out(rows, name):
 def test_taking_rows():
     rows = Rows(jnp.arange(6.0).reshape(3, 2), jnp.ones((3, 1)), jnp.arange(3.0), jnp.arange(3.0), jnp.zeros(3))
     taken = rows.take(jnp.array([2, 0]))
-    np.testing.assert_array_equal(taken.theta, [[4, 5], [0, 1]])
+    np.testing.assert_array_equal(taken.value, [[4, 5], [0, 1]])
     np.testing.assert_array_equal(taken.weights, [2, 0])
