@@ -92,8 +92,12 @@ LIKELIHOOD = MixtureLikelihood(
 
 
 def snle(settings: Settings) -> Settings:
-    """Sequential neural likelihood: an ensemble of mixture networks for the summary given the parameters."""
-    return settings.replace(estimator=LIKELIHOOD, restriction="reject")
+    """Sequential neural likelihood: an ensemble of mixture networks for the summary given the parameters.
+
+    As no correction is needed whatever was proposed, proposals are wider than the posterior, and some are the prior's:
+    a likelihood is an extrapolation where nothing was simulated, and may be high there by mistake.
+    """
+    return settings.replace(estimator=LIKELIHOOD, restriction="reject", inflation=2.0, defensive=0.2)
 
 
 METHODS: dict[str, Callable[[Settings], Settings]] = {
