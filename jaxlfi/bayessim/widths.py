@@ -27,6 +27,8 @@ def _expected(settings: Settings, heuristic: Heuristic) -> str:
     inflation, correction = float(settings.inflation), settings.correction
     if settings.rounds == 1:
         return "right in principle, as all simulations are drawn from the prior"
+    if settings.estimator.of_summaries:
+        return "right in principle, as a likelihood does not depend on the proposals"
     if isinstance(heuristic, Truncate) or float(settings.defensive) == 1:
         return "right in principle, as every round draws from the prior over its support"
     if settings.estimator.loss != "likelihood":

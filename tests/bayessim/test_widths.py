@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxlfi.bayessim.presets import PAPER, QUICK, apt, npe
+from jaxlfi.bayessim.presets import PAPER, QUICK, apt, npe, snle
 from jaxlfi.bayessim.widths import expected_widths
 from jaxlfi.heuristics import Edge, Fixed, Truncate
 from tests.small import settings
@@ -31,6 +31,7 @@ ATOMIC = PLAIN.replace(estimator=PLAIN.estimator.replace(loss="atomic"))
         (ATOMIC.replace(correction="importance"), Edge(), "uncertain, as the atomic loss allows for the proposals and"),
         (PAPER, Edge(), "too narrow as a rule"),
         (apt(QUICK), Edge(), "right in principle, as the combined loss allows for the proposals"),
+        (snle(QUICK), Edge(), "right in principle, as a likelihood does not depend on the proposals"),
         (npe(QUICK), Fixed(), "right in principle, as all simulations are drawn from the prior"),
     ],
 )  # fmt: skip
