@@ -75,7 +75,7 @@ def candidates(quick: Settings = QUICK) -> dict[str, Settings]:
     once = {"quick": quick, "reject": quick.replace(restriction="reject"), "snle": snle(quick)}
     wide = {
         f"{restriction}-{factor:g}": quick.replace(restriction=restriction, inflation=factor)
-        for restriction in ("clip", "reject")
+        for restriction in ("clip", "reject", "mixed")
         for factor in (1.5, 2.0, 3.0)
     }
     divided = {f"{name}-quotient": wide[name].replace(correction="quotient") for name in wide}

@@ -116,8 +116,8 @@ def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> F
     support has gained, also where the posterior has locked itself onto a place where it learns nothing more.
     """
     key_prior, key_posterior, key_choice = jax.random.split(key, 3)
-    belief = proposal(settings, belief)
-    informed = RESTRICTIONS[settings.restriction](key_posterior, belief, settings.simulation_budget)
+    restricted = RESTRICTIONS[settings.restriction]
+    informed = restricted(key_posterior, belief, settings.simulation_budget, settings.inflation)
     prior = prior_draws(key_prior, task.inference.prior, belief.support, settings.simulation_budget)
     from_prior = (
         jax.random.bernoulli(key_choice, settings.defensive, (settings.simulation_budget, 1)) | ~belief.informed

@@ -21,7 +21,7 @@ class Settings(Checked):
         simulations_per_round: valid simulations added to the dataset each round, at most.
         simulation_budget: simulations attempted each round, at most, failures included.
         correction: how q_phi becomes the posterior, "none", "paper", "quotient" or "importance" (reading A).
-        restriction: how proposals are kept in the support, "clip" or "reject" (reading E).
+        restriction: how proposals are kept in the support, "clip", "reject" or "mixed" (reading E).
         defensive: fraction of each round's proposals drawn from the prior over the current support instead of the
             posterior. 0 is the paper. A leaf.
         inflation: how many times as wide as the posterior the proposals are drawn, about its mean; 1 is the paper.

@@ -1,4 +1,4 @@
-"""Belief: the two ways to keep draws in the box, and the belief before any data."""
+"""Belief: the ways to keep draws in the box, and the belief before any data."""
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from tests.strategies import keys, problems
 
 CLIPPED = jax.jit(RESTRICTIONS["clip"], static_argnames="n")
 REJECTED = jax.jit(RESTRICTIONS["reject"], static_argnames="n")
+MIXED = jax.jit(RESTRICTIONS["mixed"], static_argnames="n")
 
 N = 20_000
 MEAN, SCALE = np.array([0.4, 5.0]), np.array([1.5, 0.7])
@@ -32,11 +33,11 @@ def truncated(d: int):
     return stats.truncnorm((low - MEAN[d]) / SCALE[d], (high - MEAN[d]) / SCALE[d], MEAN[d], SCALE[d])
 
 
-def test_both_ways_are_tested():
-    assert set(RESTRICTIONS) == {"clip", "reject"}
+def test_all_ways_are_tested():
+    assert set(RESTRICTIONS) == {"clip", "reject", "mixed"}
 
 
-@pytest.mark.parametrize("restriction", [CLIPPED, REJECTED], ids=["clip", "reject"])
+@pytest.mark.parametrize("restriction", [CLIPPED, REJECTED, MIXED], ids=["clip", "reject", "mixed"])
 @given(problems(), keys())
 def test_draws_stay_in_the_box(restriction, problem, key):
     belief, _, _ = problem
@@ -61,6 +62,24 @@ def test_rejection_draws_the_truncated_density(key):
     for d in range(2):
         assert stats.kstest(draws[:, d], truncated(d).cdf).pvalue > 1e-3
     assert abs(np.corrcoef(draws.T)[0, 1]) < 5 / np.sqrt(N)
+
+
+def test_mixed_draws_have_the_posteriors_own_mass_on_the_bounds_and_are_wide_inside(key):
+    draws, box = np.asarray(MIXED(key, GAUSSIAN, n=N, inflation=2.0)), GAUSSIAN.support
+    clear = ((draws > np.asarray(box.low)) & (draws < np.asarray(box.high))).all(axis=1)
+    marginals = [stats.norm(MEAN[d], SCALE[d]) for d in range(2)]
+    mass = np.prod([one.cdf(box.high[d]) - one.cdf(box.low[d]) for d, one in enumerate(marginals)])
+    assert abs(clear.mean() - mass) < 5 * np.sqrt(mass * (1 - mass) / N)
+    for d in range(2):
+        ends = (np.array([box.low[d], box.high[d]]) - MEAN[d]) / (2 * SCALE[d])
+        assert stats.kstest(draws[clear, d], stats.truncnorm(*ends, MEAN[d], 2 * SCALE[d]).cdf).pvalue > 1e-3
+
+
+def test_mixed_draws_of_a_posterior_inside_leave_the_bounds_free(key):
+    inside = GAUSSIAN.replace(support=Support([-20.0, -5.0], [10.0, 12.0]))
+    draws = np.asarray(MIXED(key, inside, n=N, inflation=3.0))
+    assert ((draws > np.asarray(inside.support.low)) & (draws < np.asarray(inside.support.high))).all()
+    assert draws[:, 1].std() > 2 * SCALE[1]
 
 
 def test_rejection_far_outside_falls_back_to_uniform_draws(key):
