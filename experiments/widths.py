@@ -171,7 +171,24 @@ def infer_all(
         found.append(jax.device_get(one(keys, part.theta, part.x, state)))
         seconds += took
     arrays = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
-    return arrays | {"theta": cases.theta, "seeds": cases.seeds, "seconds": np.asarray(seconds)}
+    return judged(cases.theta, arrays) | {"seeds": cases.seeds, "seconds": np.asarray(seconds)}
+
+
+def judged(theta: np.ndarray, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What the table is made from, of posteriors described (`both`) and their truths [N, D].
+
+    Returns:
+        `error` [N], summed over parameters and averaged over draws; `density_rank` [N], how many draws are denser than
+        the truth, and `log_prob` [N] of the truth, under the run's posterior; `own_rank` and `box_rank` [N, D], how
+        many draws are below the truth, under that posterior and on the box.
+    """
+    return {
+        "error": np.abs(arrays["own_draws"] - theta[:, None]).sum(axis=2).mean(axis=1),
+        "density_rank": np.sum(arrays["own_log_prob"] > arrays["own_truth_log_prob"][:, None], axis=1),
+        "log_prob": arrays["own_truth_log_prob"],
+        "own_rank": np.sum(arrays["own_draws"] < theta[:, None], axis=1),
+        "box_rank": np.sum(arrays["box_draws"] < theta[:, None], axis=1),
+    }
 
 
 def table(folder: Path) -> str:
@@ -182,10 +199,10 @@ def table(folder: Path) -> str:
     ]
     for path in sorted(folder.glob("*-own.npz")):
         own = atomic.read_arrays(path)
-        error = np.abs(own["own_draws"] - own["theta"][:, None]).sum(axis=2).mean(axis=1)
+        error = own["error"]
         low, high = bootstrap_interval(error)
         lost = int(np.sum(error > LOST))
-        held = np.mean(_density_rank(own) < 0.9 * (DRAWS + 1))
+        held = np.mean(own["density_rank"] < 0.9 * (DRAWS + 1))
         cells = [
             f"{error.mean():.2f} [{low:.2f}, {high:.2f}] ({np.median(error):.2f})",
             f"{lost} of {len(error)}",
@@ -201,22 +218,17 @@ def table(folder: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _density_rank(arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """How many draws have a higher density than the truth, shape [N]."""
-    return np.sum(arrays["own_log_prob"] > arrays["own_truth_log_prob"][:, None], axis=1)
-
-
 def _coverage(arrays: dict[str, np.ndarray]) -> list[str]:
     """Coverage at 50 % and 90 %, the least p-value of any parameter's ranks, and the mean log-density of truths."""
-    dim = arrays["theta"].shape[1]
+    dim = arrays["own_rank"].shape[1]
     cells = []
     for level in (0.5, 0.9):
-        cells.append(f"{np.mean(_density_rank(arrays) < level * (DRAWS + 1)):.2f}")
+        cells.append(f"{np.mean(arrays['density_rank'] < level * (DRAWS + 1)):.2f}")
     for name in ("own", "box"):
-        ranks = np.sum(arrays[f"{name}_draws"] < arrays["theta"][:, None], axis=1)
+        ranks = arrays[f"{name}_rank"]
         p_value = min(diagnostics.uniformity(ranks[:, d], DRAWS, dim).p_value for d in range(dim))
         cells.append(f"{p_value:.3f}" if p_value >= 0.001 else "< 0.001")
-    cells.append(f"{np.mean(np.maximum(arrays['own_truth_log_prob'], FLOOR)):.1f}")
+    cells.append(f"{np.mean(np.maximum(arrays['log_prob'], FLOOR)):.1f}")
     return cells
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.widths import DRAWS, table
+from experiments.widths import DRAWS, judged, table
 from jaxlfi.io import files as atomic
 
 
@@ -14,7 +14,7 @@ def arrays(offset: np.ndarray, outranked: np.ndarray) -> dict[str, np.ndarray]:
     truth = np.where(np.arange(len(offset)) == 0, -np.inf, -0.5)
     one = {"draws": draws, "log_prob": log_prob, "truth_log_prob": truth}
     named = {f"{name}_{field}": value for name in ("own", "box") for field, value in one.items()}
-    return named | {"theta": theta, "seeds": np.arange(len(offset)), "seconds": np.asarray(8.0)}
+    return judged(theta, named) | {"seeds": np.arange(len(offset)), "seconds": np.asarray(8.0)}
 
 
 def test_the_table_counts_errors_lost_runs_and_coverage(tmp_path):
