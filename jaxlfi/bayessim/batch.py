@@ -31,6 +31,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.heuristics import Choice, Heuristic
+from jaxlfi.tasks import summaries
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
 
@@ -121,7 +122,14 @@ def posterior_after(belief: Belief, network: Network, x: Float[Array, " obs"]) -
 
 def start_one(task: Task, first: int | None, settings: Settings, run: RunInputs) -> State:
     """The state before the first round."""
+    settings = _reading(task, settings, run)
     return algorithm.init(init_key(run_keys(run.key).run), task, run.support, settings, run.x, first)
+
+
+def _reading(task: Task, settings: Settings, run: RunInputs) -> Settings:
+    """The settings with an estimator that knows of what records the task's summary is made."""
+    layout = summaries.layout(task.summary, run.observed.shape, run.x.shape[-1])
+    return settings.replace(estimator=settings.estimator.reading(layout))
 
 
 def propose_one(
@@ -175,6 +183,7 @@ def given_one(
 def run_one(task: Task, settings: Settings, run: RunInputs) -> tuple[State, dict[str, Array]]:
     """A whole run as one scan, and the records of its rounds, stacked: for traced functions (`jax.vmap` of `infer`)."""
     look = lambda index, state, info: record(info, check_one(task, settings, run, state, index))
+    settings = _reading(task, settings, run)
     return algorithm.run(run_keys(run.key).run, task, settings, run.heuristic, run.x, run.support, look)
 
 

@@ -16,6 +16,7 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset, empty
 from jaxlfi.estimators.density import Density, EnsembleDensity
+from jaxlfi.estimators.embeddings import EMBEDDINGS, Embedded
 from jaxlfi.estimators.losses import LOSSES, Rows
 from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser
 from jaxlfi.estimators.posterior import Posterior, truncated
@@ -54,6 +55,13 @@ class Estimator(Checked, abc.ABC):
             (`jaxlfi.estimators.losses.LOSSES`).
         normaliser: "zscore", "asinh" or "none" (`jaxlfi.estimators.normaliser.TRANSFORMS`): what is done to the raw
             summaries. It belongs to the network: computed where the network starts and kept while it is trained on.
+        embedding: "none", or a network before the family's own that makes a few features of a long summary and is
+            trained with it (`jaxlfi.estimators.embeddings`): "mlp" of any summary, "series" of a raw trajectory,
+            "trials" of records in no order. With the last two, numbers at the same place of all records are
+            normalised alike.
+        features: numbers F that the embedding makes of a summary.
+        record_size: numbers of a record in the summary that is embedded: the channels of a series, the length of one
+            trial. 0 is what the task's summary has (`jaxlfi.tasks.summaries.layout`).
 
     Raises:
         ValueError: from `check` for settings that contradict each other.
@@ -79,6 +87,13 @@ class Estimator(Checked, abc.ABC):
         help="likelihood; atomic, combined: no correction for the proposals needed",
     )
     normaliser: str = option("zscore", choices=tuple(TRANSFORMS), help="what is done to the summaries")
+    embedding: str = option(
+        "none", choices=("none", *EMBEDDINGS), help="network that makes features of long summaries, trained with the other"
+    )
+    features: int = option(16, low=1, help="numbers that the embedding makes of a summary")
+    record_size: int = option(
+        0, low=0, help="numbers of a record (channels of a series, length of a trial) in the summary; 0: the task's"
+    )
 
     closed_form: ClassVar[bool] = False
     """Whether the density is a mixture of Gaussians, which needs no fit and can be corrected in closed form."""
@@ -109,13 +124,33 @@ class Estimator(Checked, abc.ABC):
         except ValueError as error:
             raise ValueError(str(error).splitlines()[0]) from error
 
+    def embedded(self, dim: int) -> nn.Module:
+        """The whole network of one ensemble member for D parameters: the family's own, behind its embedding."""
+        head = self.module(dim)
+        if self.embedding == "none":
+            return head
+        return Embedded(EMBEDDINGS[self.embedding].module(self.features), head, self.record_size)
+
+    def reading(self, layout: tuple[int, ...]) -> "Estimator":
+        """The same settings for summaries of this layout (`jaxlfi.tasks.summaries.layout`).
+
+        Raises:
+            ValueError: where the summary is not made of whole records.
+        """
+        if self.embedding == "none":
+            return self
+        size, record_size = math.prod(layout), self.record_size or EMBEDDINGS[self.embedding].record_size(layout)
+        if size % record_size:
+            raise ValueError(f"record_size: expected a divisor of the summary's {size} numbers, got {record_size}")
+        return self.replace(record_size=record_size)
+
     def keys(self, key: jax.Array) -> tuple[jax.Array, jax.Array | None]:
         """Keys to fit by and to condition by; a mixture of Gaussians is read off the network without one."""
         return (key, None) if self.closed_form else tuple(jax.random.split(key))
 
     def initialise(self, key: jax.Array, dim: int, obs: int) -> dict:
         """Fresh weights for every network of the ensemble."""
-        module = self.module(dim)
+        module = self.embedded(dim)
         return jax.vmap(lambda k: module.init(k, jnp.zeros(obs)))(jax.random.split(key, self.ensemble_size))
 
     def rows(
@@ -145,7 +180,7 @@ class Estimator(Checked, abc.ABC):
 
     def density(self, network: "Network", x: Float[Array, " obs"]) -> Density:
         """q_phi(theta | x) in inference space, not truncated: the whole ensemble."""
-        module = self.module(network.scale.dim)
+        module = self.embedded(network.scale.dim)
         each = jax.vmap(lambda params: module.apply(params, network.normaliser(x)))(network.params)
         shift, scale = network.from_network()
         return EnsembleDensity(each, shift, scale, self.ensemble_size)
@@ -225,7 +260,7 @@ def untrained(
     key: jax.Array, estimator: Estimator, obs: int, scale: Support, space: Space, prior: Any = None
 ) -> Network:
     """A network before any training, for summaries of length `obs`; the prior is `Task.inference.prior`."""
-    estimator = jax.tree.map(jnp.asarray, estimator)  # its leaves are carried through loops
+    estimator = jax.tree.map(jnp.asarray, estimator).reading((obs, 1))  # its leaves are carried through loops
     nothing = empty(1, scale.dim, obs)
     params = estimator.initialise(key, scale.dim, obs)
     prior = prior if estimator.of_summaries else None
@@ -233,7 +268,7 @@ def untrained(
 
 
 def _normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tuple[Normaliser, Normaliser | None]:
-    of_x = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid)
+    of_x = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid, estimator.record_size)
     if estimator.closed_form:
         return of_x, None
     return of_x, fit_normaliser("zscore", scale.to_unit(dataset.theta), dataset.valid)

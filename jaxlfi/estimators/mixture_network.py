@@ -51,7 +51,7 @@ class MixtureNetwork(Estimator):
 
     def density(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
         """q_phi(theta | x) in inference space, the whole ensemble pooled: E K components."""
-        module = self.module(network.scale.dim)
+        module = self.embedded(network.scale.dim)
         x = network.normaliser(x)
         each = jax.vmap(lambda params: module.apply(params, x).mixture().prune(self.prune))(network.params)
         shift, scale = network.from_network()

@@ -39,13 +39,27 @@ can span many orders of magnitude, and then a plain z-score squeezes everything 
 """
 
 
-def fit_normaliser(name: str, x: Float[Array, "cap obs"], valid: Bool[Array, " cap"]) -> Normaliser:
+def fit_normaliser(
+    name: str, x: Float[Array, "cap obs"], valid: Bool[Array, " cap"], record_size: int = 0
+) -> Normaliser:
     """Mean and standard deviation of each transformed summary over the valid rows; (0, 1) for "none".
 
     A summary that does not vary is centred only.
+
+    Args:
+        name: of the transform.
+        x: raw summaries, shape [C, S].
+        valid: the rows that count, shape [C].
+        record_size: where it is not 0, summaries are records of so many numbers, all of them normalised alike: a
+            series is scaled by channel, not by time, and trials can be exchanged.
     """
+    size = x.shape[-1]
+    if 0 < record_size < size:
+        count = size // record_size
+        one = fit_normaliser(name, x.reshape(-1, record_size), jnp.repeat(valid, count))
+        return one.replace(mean=jnp.tile(one.mean, count), scale=jnp.tile(one.scale, count))
     if name == "none":
-        return Normaliser(jnp.zeros(x.shape[-1]), jnp.ones(x.shape[-1]), name)
+        return Normaliser(jnp.zeros(size), jnp.ones(size), name)
     values = TRANSFORMS[name](x)
     count = jnp.maximum(jnp.sum(valid), 1)
     mean = jnp.sum(values, axis=0, where=valid[:, None]) / count

@@ -91,7 +91,7 @@ def fit(
 def _fit_one(key, estimator, params, data, size, expected_size):
     """Training of one network: epochs over the data, each a loop over minibatches."""
     capacity, dim = data.value.shape
-    module = estimator.module(dim)
+    module = estimator.embedded(dim)
     objective = LOSSES[estimator.loss]
     epochs = estimator.epochs or -(-estimator.steps // STEPS_PER_EPOCH)
     batches = -(-expected_size // estimator.batch_size) if estimator.epochs else -(-estimator.steps // epochs)

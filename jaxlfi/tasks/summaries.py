@@ -1,5 +1,6 @@
 """Named summaries: what the network sees of a trajectory."""
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -63,6 +64,41 @@ def cross_correlation(trajectory: Float[Array, "time columns"], actions: int) ->
     states, applied = jnp.split(trajectory, [trajectory.shape[-1] - actions], axis=-1)
     products = jnp.einsum("ti,tj->ij", states, applied)
     return jnp.concatenate([products.ravel(), jnp.mean(states, axis=0), jnp.std(states, axis=0)])
+
+
+def one_after_another(summary: Summary, trials: int, trajectory: Float[Array, "..."]) -> Float[Array, " obs"]:
+    """The summaries of trials that lie one after another, one after another, shape [n S].
+
+    Args:
+        summary: of one trial.
+        trials: how many, n.
+        trajectory: shape [n T, ...].
+    """
+    return jnp.ravel(jax.vmap(summary)(trajectory.reshape(trials, -1, *trajectory.shape[1:])))
+
+
+def layout(summary: Summary, trajectory: tuple[int, ...], size: int) -> tuple[int, ...]:
+    """The shape that the vector of a summary is the flattening of, row by row: what an embedding sees.
+
+    Args:
+        summary: of a task.
+        trajectory: shape of its argument, [T, ...].
+        size: length S of its result.
+
+    Returns:
+        [T, C] of the trajectory itself, else S single numbers [S, 1]; with a first axis of trials where they are
+        summarised one after another.
+
+    Example:
+        >>> layout(identity, (151, 2), 302), layout(series, (151, 2), 9)
+        ((151, 2), (9, 1))
+    """
+    if summary is identity:
+        return trajectory[0], size // trajectory[0]
+    if isinstance(summary, functools.partial) and summary.func is one_after_another:
+        one, trials = summary.args
+        return trials, *layout(one, (trajectory[0] // trials, *trajectory[1:]), size // trials)
+    return size, 1
 
 
 SUMMARIES: dict[str, Summary] = {"identity": identity, "series": series}

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxlfi.tasks.host import HostSimulator
+from jaxlfi.tasks.summaries import one_after_another
 from jaxlfi.tasks.task import Task
 
 MAX_TRIALS = 1000
@@ -21,13 +22,14 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
     """The task of observing several independent trials of the same parameters.
 
     A simulation is then so many of the given task's, each with noise of its own; it fails where one of them fails. Its
-    trajectory is theirs, one after another along the first axis, and its summary pools theirs, in any order to the same
-    numbers. The posterior is that of all trials together.
+    trajectory is theirs, one after another along the first axis. Its summary pools theirs by moments, in any order to
+    the same numbers; or it is "all" of theirs, one after another, for a network that learns how to pool them
+    (`embedding="trials"`). The posterior is that of all trials together.
 
     Args:
         task: of one trial. Its own observation, if it has one, is not taken over.
         trials: how many, n.
-        pooling: how n summaries become one (`POOLINGS`).
+        pooling: how n summaries become one: a name in `POOLINGS`, or "all".
 
     Returns:
         The task of n trials; the given one for n = 1.
@@ -42,8 +44,8 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
     """
     if isinstance(trials, bool) or not isinstance(trials, int) or not 1 <= trials <= MAX_TRIALS:
         raise ValueError(f"trials: expected a whole number from 1 to {MAX_TRIALS}, got {trials!r}")
-    if pooling not in POOLINGS:
-        raise ValueError(f"pooling: expected one of {sorted(POOLINGS)}, got {pooling!r}")
+    if pooling not in (ALL, *POOLINGS):
+        raise ValueError(f"pooling: expected one of {sorted((ALL, *POOLINGS))}, got {pooling!r}")
     if trials == 1:
         return task
     if task.on_host:
@@ -53,11 +55,11 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
     return dataclasses.replace(
         task,
         simulate=simulate,
-        summary=functools.partial(_summary, task.summary, trials, pooling),
+        summary=_pooled(task.summary, trials, pooling),
         observation=None,
         times=None,
         record_label=f"{task.record_label or 'record'} of {trials} trials, one after another",
-        summary_names=[f"{kind} of {name}" for kind in POOLINGS[pooling] for name in task.summary_names],
+        summary_names=_names(task.summary_names, trials, pooling),
         name=f"{task.name} x {trials}",
     )
 
@@ -85,6 +87,10 @@ POOLINGS: dict[str, tuple[str, ...]] = {"mean": ("mean",), "moments": ("mean", "
 """Which statistics of the trials' summaries make the summary of them all, by name."""
 
 
+ALL = "all"
+"""The pooling that keeps every trial's summary."""
+
+
 def _in_jax(simulate: Callable, trials: int, key: jax.Array, theta: Array) -> tuple[Array, Array]:
     """Several simulations at one theta, and the first failure among them."""
 
@@ -109,6 +115,20 @@ def _first_failure(numpy: Any, outcome: Any) -> Any:
         return numpy.all(outcome, axis=-1)
     first = numpy.argmax(outcome != 0, axis=-1)
     return numpy.take_along_axis(outcome, first[..., None], axis=-1)[..., 0]
+
+
+def _pooled(summary: Callable, trials: int, pooling: str) -> Callable:
+    """The summary of so many trials."""
+    if pooling == ALL:
+        return functools.partial(one_after_another, summary, trials)
+    return functools.partial(_summary, summary, trials, pooling)
+
+
+def _names(names: Sequence[str], trials: int, pooling: str) -> list[str]:
+    """Names of that summary's numbers, from those of one trial's."""
+    if pooling == ALL:
+        return [f"{name} of trial {trial + 1}" for trial in range(trials) for name in names]
+    return [f"{kind} of {name}" for kind in POOLINGS[pooling] for name in names]
 
 
 def _summary(summary: Callable, trials: int, pooling: str, trajectory: Array) -> Array:

@@ -1,0 +1,132 @@
+"""Embeddings: a few features of a long summary, learnt together with the density that is conditioned on them.
+
+An embedding sees a summary as records: the rows [T, C] of a series, or n trials of S numbers each. Windows and records
+are rows of matrix products. Flax's `nn.Conv` under the `vmap` over an ensemble is a grouped convolution, whose gradient
+is slow on CPU.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxlfi.estimators.mdn import Dense
+
+UNITS = 64
+"""Units of the hidden layers of a multilayer perceptron."""
+CHANNELS = 32
+"""Channels between the convolutions of a series."""
+STRIDE = 3
+"""Records that each convolution moves on by; its windows are twice as long."""
+PLACES = 8
+"""Records, at most, that convolutions leave of a series."""
+
+
+class Perceptron(nn.Module):
+    """Features of all records together, by a multilayer perceptron of two layers.
+
+    Attributes:
+        features: F.
+    """
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch records size"]) -> Float[Array, "*batch features"]:
+        """Features within [-1, 1]."""
+        x = x.reshape(*x.shape[:-2], -1)
+        return nn.tanh(Dense(self.features)(nn.relu(Dense(UNITS)(x))))
+
+
+class Series(nn.Module):
+    """Features of a series, by strided convolutions over time until `PLACES` are left, then their mean and maximum.
+
+    A pattern is recognised wherever it lies: the same kernels see every part of the series.
+
+    Attributes:
+        features: F.
+    """
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch records size"]) -> Float[Array, "*batch features"]:
+        """Features within [-1, 1]."""
+        x = nn.relu(Dense(CHANNELS)(windows(x, STRIDE)))
+        while x.shape[-2] > PLACES:
+            x = nn.relu(Dense(CHANNELS)(windows(x, STRIDE)))
+        pooled = jnp.concatenate([jnp.mean(x, axis=-2), jnp.max(x, axis=-2)], axis=-1)
+        return nn.tanh(Dense(self.features)(pooled))
+
+
+class Trials(nn.Module):
+    """Features of records in no order: the same perceptron of each, their mean, a last layer (Zaheer et al. 2017).
+
+    Attributes:
+        features: F.
+    """
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch records size"]) -> Float[Array, "*batch features"]:
+        """Features within [-1, 1], the same for any order of the records."""
+        each = nn.relu(Dense(UNITS)(nn.relu(Dense(UNITS)(x))))
+        return nn.tanh(Dense(self.features)(jnp.mean(each, axis=-2)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Embedding:
+    """A kind of embedding.
+
+    Attributes:
+        module: makes the Flax network of the number of features.
+        record_size: numbers of a record in a summary of that layout (`jaxlfi.tasks.summaries.layout`).
+    """
+
+    module: Callable[[int], nn.Module]
+    record_size: Callable[[tuple[int, ...]], int]
+
+
+EMBEDDINGS: dict[str, Embedding] = {
+    "mlp": Embedding(Perceptron, math.prod),
+    "series": Embedding(Series, lambda layout: layout[-1]),
+    "trials": Embedding(Trials, lambda layout: math.prod(layout[1:])),
+}
+"""Embeddings by name."""
+
+
+class Embedded(nn.Module):
+    """An embedding and a conditional density of its features, as one network.
+
+    Attributes:
+        embedding: maps records to features.
+        head: maps features to a density.
+        record_size: numbers of a record.
+    """
+
+    embedding: nn.Module
+    head: nn.Module
+    record_size: int
+
+    def __call__(self, x: Float[Array, "*batch obs"]):
+        """The density for each normalised summary."""
+        return self.head(self.embedding(x.reshape(*x.shape[:-1], -1, self.record_size)))
+
+
+def windows(x: Float[Array, "*batch time size"], stride: int) -> Float[Array, "*batch windows both"]:
+    """The windows of a strided convolution, a row each: of 2 `stride` records, one for every `stride` records.
+
+    `stride` zeros are put in front, and as many behind as fill the last window.
+
+    Example:
+        >>> windows(jnp.arange(1.0, 6.0)[:, None], 2).tolist()
+        [[0.0, 0.0, 1.0, 2.0], [1.0, 2.0, 3.0, 4.0], [3.0, 4.0, 5.0, 0.0]]
+    """
+    *batch, time, size = x.shape
+    x = jnp.pad(x, [*[(0, 0)] * len(batch), (stride, -time % stride), (0, 0)])
+    blocks = x.reshape(*batch, -1, stride * size)
+    return jnp.concatenate([blocks[..., :-1, :], blocks[..., 1:, :]], axis=-1)
