@@ -515,7 +515,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if getattr(arguments, "object", None) is not None:
         arguments.task = f"{arguments.task},object={arguments.object}"
     if len(getattr(arguments, "observation", None) or ()) > 1 and ",trials=" not in arguments.task:
-        arguments.task = f"{arguments.task},trials={len(arguments.observation)}"
+        learnt = arguments.settings.get("embedding") == "trials" and ",pooling=" not in arguments.task
+        arguments.task = f"{arguments.task},trials={len(arguments.observation)}{',pooling=all' * learnt}"
     prepare_jax(arguments)
     prepared = None
     try:

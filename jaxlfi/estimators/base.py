@@ -111,6 +111,8 @@ class Estimator(Checked, abc.ABC):
             raise ValueError(f"expected epochs or steps, one of them above 0, got {self.epochs} and {self.steps}")
         if self.patience and not self.validation:
             raise ValueError("patience: expected validation above 0 to stop by, got validation=0")
+        if self.record_size and self.embedding == "none":
+            raise ValueError(f"record_size: expected 0 without an embedding, got {self.record_size}")
         return self
 
     def check_for(self, dim: int, obs: int = 1) -> None:

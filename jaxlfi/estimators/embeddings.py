@@ -42,9 +42,10 @@ class Perceptron(nn.Module):
 
 
 class Series(nn.Module):
-    """Features of a series, by strided convolutions over time until `PLACES` are left, then their mean and maximum.
+    """Features of a series, by strided convolutions over time until no more than `PLACES` records are left.
 
-    A pattern is recognised wherever it lies: the same kernels see every part of the series.
+    A pattern is recognised wherever it lies, as the same kernels see every part of the series; a last layer knows
+    roughly where. (The mean and the maximum over time alone do not tell how fast a vibration decays.)
 
     Attributes:
         features: F.
@@ -58,8 +59,7 @@ class Series(nn.Module):
         x = nn.relu(Dense(CHANNELS)(windows(x, STRIDE)))
         while x.shape[-2] > PLACES:
             x = nn.relu(Dense(CHANNELS)(windows(x, STRIDE)))
-        pooled = jnp.concatenate([jnp.mean(x, axis=-2), jnp.max(x, axis=-2)], axis=-1)
-        return nn.tanh(Dense(self.features)(pooled))
+        return nn.tanh(Dense(self.features)(x.reshape(*x.shape[:-2], -1)))
 
 
 class Trials(nn.Module):

@@ -33,6 +33,7 @@ from jaxlfi.bayessim.widths import expected_widths
 from jaxlfi.io import files as atomic
 from jaxlfi.io.serialise import json_safe
 from jaxlfi.runs import describe
+from jaxlfi.tasks import summaries
 from jaxlfi.tasks.task import Task
 
 if TYPE_CHECKING:  # runs know how to save themselves
@@ -226,6 +227,7 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
         {
             "trajectory": run.observed,
             "x": run.x,
+            "layout": np.asarray(summaries.layout(task.summary, run.observed.shape, len(run.x))),
             "truth": unknown if task.truth is None else task.inference.truth,
             "names": labels,
             "summaries": np.asarray(task.named_summaries(len(run.x)), dtype=str),

@@ -93,7 +93,8 @@ def infer(
     if not isinstance(settings, Settings):
         raise ValueError(f"settings: expected jaxlfi.Settings such as jaxlfi.QUICK, got {settings!r}")
     registry.check(heuristic, task.dim)
-    task, observation = trials_of(task, observation)
+    learnt = getattr(settings.estimator, "embedding", "none") == "trials"  # what it is, is checked later
+    task, observation = trials_of(task, observation, "all" if learnt else "moments")
     if not is_concrete((key, observation, support, heuristic, settings)):
         if task.on_host or simulations is not None or progress or callback is not None or out is not None:
             raise ValueError(

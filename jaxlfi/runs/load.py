@@ -1,5 +1,6 @@
 """load: a run folder as the run that `infer` returned."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -65,13 +66,14 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
     prior = _prior(folder, config, task, settings)
     observation = _arrays(folder / "observation.npz", ("trajectory", "x"))
     observed, x = jnp.asarray(observation["trajectory"]), jnp.asarray(observation["x"])
+    layout = tuple(map(int, observation.get("layout", (len(x), 1))))
     return Run(
         belief=_belief(folder / "posterior.npz", space),
         history={
             name: value for name, value in _arrays(folder / "history.npz", ("theta",)).items() if name not in LABELS
         },
         dataset=_dataset(folder / "dataset.npz", settings),
-        network=_network(folder / "network.npz", settings, x.shape[0], feasible, space, prior),
+        network=_network(folder / "network.npz", settings, layout, feasible, space, prior),
         observed=observed,
         x=x,
         key=key,
@@ -135,7 +137,9 @@ def _dataset(path: Path, settings: Settings) -> Dataset:
     return Dataset(round=jnp.asarray(rounds), size=jnp.asarray(size, jnp.int32), **filled)
 
 
-def _network(path: Path, settings: Settings, obs: int, feasible: Support, space: Space, prior: Any) -> Network | None:
+def _network(
+    path: Path, settings: Settings, layout: tuple[int, ...], feasible: Support, space: Space, prior: Any
+) -> Network | None:
     """The trained network; None where a mixture density network was not kept.
 
     Raises:
@@ -143,7 +147,8 @@ def _network(path: Path, settings: Settings, obs: int, feasible: Support, space:
     """
     if not path.exists() and settings.estimator.closed_form:
         return None
-    make: Callable[[], Network] = lambda: untrained(jax.random.key(0), settings.estimator, obs, feasible, space, prior)
+    estimator, obs = settings.estimator.reading(layout), math.prod(layout)
+    make: Callable[[], Network] = lambda: untrained(jax.random.key(0), estimator, obs, feasible, space, prior)
     template = jax.eval_shape(make)
     expected = folders.named_leaves(template)
     arrays = _arrays(path, tuple(expected))

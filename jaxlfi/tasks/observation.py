@@ -158,7 +158,7 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
     return observed, x
 
 
-def trials_of(task: Task, observation: Any) -> tuple[Task, Any]:
+def trials_of(task: Task, observation: Any, pooling: str = "moments") -> tuple[Task, Any]:
     """The task and observation of an inference: where a list of trajectories is given, of all of them together."""
     if not isinstance(observation, list | tuple) or not observation:
         return task, observation
@@ -166,7 +166,7 @@ def trials_of(task: Task, observation: Any) -> tuple[Task, Any]:
     trials = hasattr(observation[0], "shape") if task.on_host else first == simulator_shapes(task).trajectory
     if not trials or first == ():
         return task, observation
-    return repeated(task, len(observation)), together(observation)
+    return repeated(task, len(observation), pooling), together(observation)
 
 
 def read(path: str | Path) -> np.ndarray:

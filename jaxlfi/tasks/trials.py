@@ -24,7 +24,7 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
     A simulation is then so many of the given task's, each with noise of its own; it fails where one of them fails. Its
     trajectory is theirs, one after another along the first axis. Its summary pools theirs by moments, in any order to
     the same numbers; or it is "all" of theirs, one after another, for a network that learns how to pool them
-    (`embedding="trials"`). The posterior is that of all trials together.
+    (`embedding="trials"`, which the command line then takes by itself). The posterior is that of all trials together.
 
     Args:
         task: of one trial. Its own observation, if it has one, is not taken over.
@@ -60,6 +60,7 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
         times=None,
         record_label=f"{task.record_label or 'record'} of {trials} trials, one after another",
         summary_names=_names(task.summary_names, trials, pooling),
+        settings={**task.settings, "embedding": "trials"} if pooling == ALL else task.settings,
         name=f"{task.name} x {trials}",
     )
 
