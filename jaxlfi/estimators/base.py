@@ -88,7 +88,9 @@ class Estimator(Checked, abc.ABC):
     )
     normaliser: str = option("zscore", choices=tuple(TRANSFORMS), help="what is done to the summaries")
     embedding: str = option(
-        "none", choices=("none", *EMBEDDINGS), help="network that makes features of long summaries, trained with the other"
+        "none",
+        choices=("none", *EMBEDDINGS),
+        help="network that makes features of long summaries, trained with the other",
     )
     features: int = option(16, low=1, help="numbers that the embedding makes of a summary")
     record_size: int = option(

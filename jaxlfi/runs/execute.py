@@ -27,6 +27,7 @@ from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks import priors, registry
 from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.simulation import Simulations
+from jaxlfi.tasks.summaries import layout
 from jaxlfi.tasks.task import Task
 
 OWN = ("configuration", "support", "heuristic", "seed", "widths")
@@ -107,6 +108,7 @@ def prepare(plan: BatchPlan, observation: Any = None, first: Simulations | None 
     by_seed = {seed: observe(run_keys(key_of(seed)).observe, plan.task, observation) for seed in seeds}
     observed, x = (np.stack([np.asarray(by_seed[spec.seed][i]) for spec in plan.specs]) for i in range(2))
     plan.settings.estimator.check_for(plan.task.dim, x.shape[1])
+    plan.settings.estimator.reading(layout(plan.task.summary, observed.shape[1:], x.shape[1]))
     if first is not None and first.x.shape[1] != x.shape[1]:
         raise ValueError(f"simulations: expected summaries of length {x.shape[1]}, got {first.x.shape[1]}")
     given = Observed(observed, x, first)

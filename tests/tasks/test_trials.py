@@ -92,7 +92,10 @@ def test_a_host_simulator_makes_all_trials_in_one_call():
     ("call", "said"),
     [
         (lambda: repeated(gaussian(), 0), "trials: expected a whole number from 1 to 1000, got 0"),
-        (lambda: repeated(gaussian(), 2, "median"), r"pooling: expected one of \['mean', 'moments'\], got 'median'"),
+        (
+            lambda: repeated(gaussian(), 2, "median"),
+            r"pooling: expected one of \['all', 'mean', 'moments'\], got 'median'",
+        ),
         (lambda: registry.load(f"{TASK},trials=two"), "trials: expected a value of type int, got 'two'"),
         (lambda: together([np.zeros(2), np.zeros(3)]), r"observation: expected trials of one shape .*\[2\], \[3\]"),
     ],
