@@ -61,6 +61,11 @@ class Likelihood(Estimator):
         super().check()
         if self.loss != "likelihood":
             raise ValueError(f"loss: expected 'likelihood' for {type(self).__name__}, got {self.loss!r}")
+        if self.embedding != "none":
+            raise ValueError(
+                f"embedding: expected 'none' for {type(self).__name__}, which learns the density of the summary, "
+                f"got {self.embedding!r}"
+            )
         require_blackjax()
         return self
 

@@ -79,6 +79,12 @@ def test_an_amortised_posterior_holds_the_truths():
     assert np.all(held > 0.8)
 
 
+def test_a_raw_series_is_enough():
+    draws = ran("raw_series")
+    np.testing.assert_array_less(far(draws, [4.0, 0.3]), 3.0)
+    np.testing.assert_array_less(draws.std(axis=0), [0.4, 0.1])  # a quarter of the prior's
+
+
 def test_simulations_made_before_give_the_exact_posterior():
     near_exact(*ran("presimulated"))
 
