@@ -11,15 +11,16 @@ import jax.numpy as jnp
 
 import jaxlfi
 
-TIMES = jnp.linspace(0.0, 6.0, 60)
+TIMES = jnp.linspace(0.0, 6.0, 40)
 TRUTH = jnp.array([4.0, 0.3])
+ESTIMATOR = jaxlfi.QUICK.estimator.replace(embedding="series", ensemble_size=2)
 SETTINGS = jaxlfi.QUICK.replace(
-    estimator=jaxlfi.QUICK.estimator.replace(embedding="series", ensemble_size=2), rounds=3, predictive=False
+    estimator=ESTIMATOR, rounds=2, simulations_per_round=400, simulation_budget=400, predictive=False
 )
 
 
 def simulate(key, theta):
-    """Displacement [mm] at 60 times, from an unknown phase on."""
+    """Displacement [mm] at 40 times, from an unknown phase on."""
     frequency, damping = theta
     key_phase, key_noise = jax.random.split(key)
     phase = jax.random.uniform(key_phase, maxval=2 * jnp.pi)
@@ -27,7 +28,7 @@ def simulate(key, theta):
     return clean + 0.5 * jax.random.normal(key_noise, TIMES.shape)
 
 
-def main(settings=SETTINGS):
+def main():
     """Infer frequency and damping from the recording as it is."""
     box = jaxlfi.Support([1.0, 0.0], [6.0, 1.0])
     task = jaxlfi.Task(
@@ -39,7 +40,7 @@ def main(settings=SETTINGS):
         name="vibration",
     )
     x_real = simulate(jax.random.key(1), TRUTH)
-    run = jaxlfi.infer(jax.random.key(0), task, x_real, heuristic=jaxlfi.Fixed(), settings=settings)
+    run = jaxlfi.infer(jax.random.key(0), task, x_real, heuristic=jaxlfi.Fixed(), settings=SETTINGS)
     draws = run.posterior.sample(jax.random.key(2), 1000)
     print("           truth  posterior mean +- sd")
     for name, unit, true, values in zip(task.names, task.units, TRUTH, draws.T, strict=True):

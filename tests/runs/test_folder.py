@@ -102,6 +102,7 @@ def test_arrays_have_the_documented_shapes(folder):
             "x": (OBS,),
             "truth": (DIM,),
             "names": (DIM,),
+            "layout": (2,),
             "summaries": (OBS,),
             "channels": (1,),
             "times": (2,),
