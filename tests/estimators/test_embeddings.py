@@ -159,6 +159,6 @@ def test_a_frequency_is_found_that_no_number_of_the_series_shows_by_itself(vibra
     with jax.debug_key_reuse(False):
         network, found, info = trained(jax.random.key(3))
     assert int(info.nonfinite.sum()) == 0
-    assert np.sqrt(np.mean((np.asarray(found) - theta[500:]) ** 2)) < 0.4 * spread
+    assert np.sqrt(np.mean((np.asarray(found) - theta[500:]) ** 2)) < 0.25 * spread
     eager = network.estimator.density(network, jnp.asarray(x[500])).means[0]
     np.testing.assert_allclose(eager, found[0], atol=2e-3)

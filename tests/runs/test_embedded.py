@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
+from jaxlfi.cli import commands
 from jaxlfi.envs.gaussian_linear import posterior
 from jaxlfi.tasks import registry, summaries
 from jaxlfi.tasks.trials import repeated
@@ -54,6 +55,11 @@ def test_a_run_on_a_raw_series_goes_on_to_the_same_bits_and_is_loaded_without_it
     np.testing.assert_array_equal(mean, np.tile(mean[:2], 9))
 
 
+def test_a_traced_run_reads_the_same_records():
+    traced = lambda key: jaxlfi.infer(key, TASK, settings=SERIES).network
+    assert jax.eval_shape(traced, jax.random.key(0)).estimator.record_size == 2
+
+
 def test_a_series_of_other_channels_is_refused_before_anything_is_simulated(tmp_path):
     wrong = SERIES.replace(estimator=FLOW.replace(record_size=4))
     said = r"^record_size: expected a divisor of the summary's 18 numbers, got 4"
@@ -68,6 +74,21 @@ def test_the_command_line_says_so_in_one_line(tmp_path, capsys):
     words = ("--embedding", "series", "--record-size", "3", "--out", tmp_path / "run")
     assert command("infer", "gaussian_linear", *words) == 2
     assert "record_size: expected a divisor of the summary's 2 numbers, got 3" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("task", "embedding", "asked"),
+    [
+        ("own", "trials", "own,trials=2,pooling=all"),
+        ("own,pooling=mean", "trials", "own,pooling=mean,trials=2"),
+        ("own", "series", "own,trials=2"),
+    ],
+)
+def test_files_of_several_trials_are_pooled_by_the_embedding_of_trials(task, embedding, asked, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setitem(commands.COMMANDS, "infer", lambda arguments, console: seen.append(arguments.task))
+    command("infer", task, "--observation", "a.csv", "b.csv", "--embedding", embedding, "--out", tmp_path / "run")
+    assert seen == [asked]
 
 
 def test_layouts_are_the_shapes_that_summaries_flatten():
@@ -106,7 +127,7 @@ def test_the_posterior_of_four_trials_is_found_without_a_word_on_how_to_pool_the
     exact = posterior(trials.mean(axis=0))
     deviation = np.sqrt(np.diag(np.asarray(exact.covariance)) / 4)
     found = run.posterior.mixture
-    np.testing.assert_allclose(found.mean, exact.mean, atol=0.7 * deviation.min())
+    np.testing.assert_allclose(found.mean, exact.mean, atol=1.5 * deviation.min())
     np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), deviation, rtol=0.35)
     assert run.task == repeated(gaussian(), 4, "all") and run.network.estimator.record_size == 2
     swapped = run.posterior_of(run.x.reshape(4, 2)[::-1].ravel()).mixture
