@@ -180,6 +180,7 @@ def test_summaries_that_hardly_vary_do_not_make_it_spuriously_sharp():
     ("changes", "message"),
     [
         ({"loss": "atomic"}, r"^loss: expected 'likelihood' for MixtureLikelihood, got 'atomic'$"),
+        ({"embedding": "mlp"}, r"^embedding: expected 'none' for MixtureLikelihood"),
         ({"noise_floor": -0.1}, r"^noise_floor: expected a number in \[0, 1\]"),
         ({"particles": 1}, r"^particles: expected a whole number"),
     ],
