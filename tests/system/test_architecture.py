@@ -207,6 +207,7 @@ ASKED = {
         "jaxlfi.estimators.base": "declares it: the density is that of the summary, and its network has the prior",
         "jaxlfi.estimators.likelihood": "is one",
         "jaxlfi.bayessim.settings": "refuses corrections, which a likelihood does not need",
+        "jaxlfi.bayessim.widths": "says that its widths do not hang on the proposals",
         "jaxlfi.runs.load": "needs the prior, which is not saved",
     },
     "on_host": {
