@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments import widths
 from jaxlfi.cli.commands import bootstrap_interval
 
 ROOT = Path(__file__).parents[2] / "experiments"
@@ -45,6 +46,11 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     """Summed errors of each configuration, shape [seeds]."""
     kept = arrays(f"ablation/{variant}")
     return dict(zip(kept["configurations"].tolist(), kept["theta_error"], strict=True))
+
+
+@pytest.mark.parametrize("line", widths.table(RESULTS / "widths/lotka_volterra/misspecified+edge").splitlines())
+def test_widths(line):
+    assert " ".join(line.split()) in README
 
 
 VARIANTS = sorted(path.stem for path in (RESULTS / "ablation").glob("*.npz"))
