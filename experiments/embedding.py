@@ -13,7 +13,6 @@ A candidate whose arrays are there is not run again; the table is drawn from the
 
 import argparse
 import dataclasses
-import json
 import os
 from pathlib import Path
 
@@ -26,13 +25,11 @@ if __name__ == "__main__":  # before jax starts
 import numpy as np
 from rich.console import Console
 
-from experiments.widths import DRAWS, FLOOR, RULES, TUNING, drawn_cases, infer_all, own_cases
+from experiments.widths import DRAWS, FLOOR, RULES, TUNING, drawn_cases, infer_all, own_cases, save
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli.commands import bootstrap_interval, with_settings
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import environment
 from jaxlfi.tasks import registry
 from jaxlfi.tasks.task import Task
 
@@ -122,9 +119,7 @@ def main() -> None:
             found = infer_all(
                 task, settings, support, RULES[rule or "none"], cases, arguments.box, batch, console
             )  # fmt: skip
-            atomic.write_arrays(path, found | {"width": np.asarray(box.width)})
-            config = {"settings": settings_to_json(settings), "box": arguments.box, **environment()}
-            path.with_suffix(".json").write_text(json.dumps(config, indent=2) + "\n")
+            save(path, found | {"width": np.asarray(box.width)}, settings, box=arguments.box)
     (folder / "table.md").write_text(table(folder))
     print(table(folder))
 

@@ -13,7 +13,6 @@ known: the table has the median standard deviation relative to it.
 """
 
 import argparse
-import json
 import operator
 import os
 from pathlib import Path
@@ -29,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from experiments.widths import DRAWS, LOST, TUNING, Cases, final_states
+from experiments.widths import DRAWS, LOST, TUNING, Cases, final_states, save
 from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import QUICK
@@ -41,8 +40,6 @@ from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Fixed
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import environment
 from jaxlfi.studies.calibration.repeat import described
 from jaxlfi.tasks import registry
 from jaxlfi.tasks.observation import simulate_observation
@@ -120,7 +117,8 @@ def compare(task: Task, arguments: argparse.Namespace, console: Console) -> None
             )
             console.print(f"{trials} trials, {name}", highlight=False)
             cases = cases_of(joint, first, now.reshape(len(now), -1, *now.shape[3:]))
-            save(path, task, summarised(task, beliefs(joint, numbers, cases, batch, console), first), now, numbers)
+            found = summarised(task, beliefs(joint, numbers, cases, batch, console), first)
+            save(path, with_exact(task, found, now), numbers)
         path = arguments.folder / f"{trials}-product.npz"
         if path.exists() or trials == 1:
             continue
@@ -131,21 +129,17 @@ def compare(task: Task, arguments: argparse.Namespace, console: Console) -> None
             each = jax.tree.map(lambda leaf: leaf.reshape(-1, most, *leaf.shape[1:]), alone)
         mixture = jax.jit(jax.vmap(multiplied))(jax.tree.map(operator.itemgetter(np.s_[:, :trials]), each))
         posteriors = jax.vmap(lambda mixture: truncated(mixture, mixture, support, task.space))(mixture)
-        save(path, task, summarised(task, posteriors, first), now, settings)
+        save(path, with_exact(task, summarised(task, posteriors, first), now), settings)
     (arguments.folder / "table.md").write_text(table(arguments.folder))
 
 
-def save(path: Path, task: Task, found: dict[str, np.ndarray], observed: np.ndarray, settings: Settings) -> None:
-    """Arrays, and beside them what they were made with."""
-    theta = np.asarray(task.inference.truth)
+def with_exact(task: Task, found: dict[str, np.ndarray], observed: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays with the truth and, where they are known, the exact posteriors' means and standard deviations."""
     if task.name == "gaussian_linear":
         exact = [gaussian_linear.posterior(one.mean(axis=0)) for one in observed]
         deviation = [np.sqrt(np.diag(np.asarray(one.covariance)) / observed.shape[1]) for one in exact]
         found = found | {"exact_sd": np.stack(deviation), "exact_mean": np.stack([one.mean for one in exact])}
-    atomic.write_arrays(path, found | {"theta": theta})
-    path.with_suffix(".json").write_text(
-        json.dumps({"settings": settings_to_json(settings), **environment()}, indent=2) + "\n"
-    )
+    return found | {"theta": np.asarray(task.inference.truth)}
 
 
 def table(folder: Path) -> str:

@@ -191,6 +191,13 @@ def judged(theta: np.ndarray, arrays: dict[str, np.ndarray]) -> dict[str, np.nda
     }
 
 
+def save(path: Path, arrays: dict[str, np.ndarray], settings: Settings, **more: str) -> None:
+    """Write the arrays, and the settings and versions they were computed with in a .json file of the same name."""
+    atomic.write_arrays(path, arrays)
+    config = {"settings": settings_to_json(settings), **more, **environment()}
+    path.with_suffix(".json").write_text(json.dumps(config, indent=2) + "\n")
+
+
 def table(folder: Path) -> str:
     """The comparison as Markdown, from the saved arrays."""
     lines = [
@@ -262,9 +269,7 @@ def main() -> None:
             arrays = infer_all(
                 task, settings, support, RULES[rule or "none"], cases, arguments.box, arguments.runs_per_batch, console
             )
-            atomic.write_arrays(path, arrays)
-            config = {"settings": settings_to_json(settings), "box": arguments.box, **environment()}
-            path.with_suffix(".json").write_text(json.dumps(config, indent=2) + "\n")
+            save(path, arrays, settings, box=arguments.box)
     (folder / "table.md").write_text(table(folder))
     print(table(folder))
 

@@ -10,20 +10,19 @@ from jaxlfi.estimators.mixture_network import MixtureNetwork
 PAPER = Settings()
 """The paper's numbers to the letter (section III-C); they are the defaults of `Settings` and `MixtureNetwork`."""
 
-QUICK = Settings(
-    estimator=MixtureNetwork(
-        hidden=(64, 64),
-        activation="tanh",
-        ensemble_size=4,
-        prune=0.1,
-        learning_rate=1e-3,
-        epochs=0,
-        steps=1000,
-        validation=0.1,
-        warm_start=False,
-        normaliser="asinh",
-    )
-)
+ENSEMBLE = {
+    "activation": "tanh",
+    "ensemble_size": 4,
+    "learning_rate": 1e-3,
+    "epochs": 0,
+    "steps": 1000,
+    "validation": 0.1,
+    "warm_start": False,
+    "normaliser": "asinh",
+}
+"""Training of four networks that start anew every round."""
+
+QUICK = Settings(estimator=MixtureNetwork(hidden=(64, 64), prune=0.1, **ENSEMBLE))
 """An ensemble of four small networks that start anew every round: minutes on two cores.
 
 Chosen by the ablation in experiments/README.md. Where an observation is unlike everything simulated, as it
@@ -77,18 +76,8 @@ def npe(settings: Settings) -> Settings:
     )
 
 
-LIKELIHOOD = MixtureLikelihood(
-    hidden=(50, 50),
-    activation="tanh",
-    components=2,
-    ensemble_size=4,
-    learning_rate=1e-3,
-    epochs=0,
-    steps=1000,
-    validation=0.1,
-    warm_start=False,
-    normaliser="asinh",
-)
+LIKELIHOOD = MixtureLikelihood(hidden=(50, 50), components=2, **ENSEMBLE)
+"""Four networks of two Gaussians over the summaries; hardly tuned."""
 
 
 def snle(settings: Settings) -> Settings:

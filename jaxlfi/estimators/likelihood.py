@@ -38,8 +38,8 @@ class Likelihood(Estimator):
     its networks'. The posterior on a support is the likelihood of the observation times the prior, drawn from by
     tempered sequential Monte Carlo (`jaxlfi.estimators.tempering`).
 
-    The likelihood is that of *valid* simulations: where parameters differ in how often their simulations fail, the
-    posterior is that of an observation that would have been discarded, had it failed, and not told of.
+    The likelihood is that of *valid* simulations, p(x | theta, valid). The probability of a valid simulation given
+    theta is not learnt: parameters whose simulations nearly always fail are not less probable for that.
 
     Attributes:
         noise_floor: standard deviation of the normal noise that is added to normalised summaries before each round's
