@@ -63,27 +63,25 @@ def table(folder: Path) -> str:
         drawn = folder / f"{name}-drawn.npz"
         if drawn.exists():
             arrays = atomic.read_arrays(drawn)
-            density = np.mean(np.maximum(arrays["own_truth_log_prob"], FLOOR))
+            density = np.mean(np.maximum(arrays["log_prob"], FLOOR))
             cells += [_error(arrays), *(f"{_held(arrays, level):.2f}" for level in (0.5, 0.9)), f"{density:.2f}"]
         else:
             cells += [""] * 4
-        cells.append(f"{float(own['seconds']) / len(own['theta']):.1f}")
+        cells.append(f"{float(own['seconds']) / len(own['error']):.1f}")
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def _error(arrays: dict[str, np.ndarray]) -> str:
     """Mean distance of posterior draws from the truth with its interval, and the median over runs."""
-    distance = np.abs(arrays["own_draws"] - arrays["theta"][:, None]) / arrays["width"]
-    error = distance.mean(axis=(1, 2))
+    error = (arrays["parameter_error"] / arrays["width"]).mean(axis=1)
     low, high = bootstrap_interval(error)
     return f"{error.mean():.3f} [{low:.3f}, {high:.3f}] ({np.median(error):.3f})"
 
 
 def _held(arrays: dict[str, np.ndarray], level: float) -> float:
     """The fraction of truths that densest regions of that level hold."""
-    denser = np.sum(arrays["own_log_prob"] > arrays["own_truth_log_prob"][:, None], axis=1)
-    return float(np.mean(denser < level * (DRAWS + 1)))
+    return float(np.mean(arrays["density_rank"] < level * (DRAWS + 1)))
 
 
 def main() -> None:
@@ -116,9 +114,7 @@ def main() -> None:
             first = arguments.first_seed
             cases = own_cases(task, first, count) if kind == "own" else drawn_cases(task, arguments.box, first, count)
             batch = min(arguments.runs_per_batch, count)
-            found = infer_all(
-                task, settings, support, RULES[rule or "none"], cases, arguments.box, batch, console
-            )  # fmt: skip
+            found = infer_all(task, settings, support, RULES[rule or "none"], cases, arguments.box, batch, console)
             save(path, found | {"width": np.asarray(box.width)}, settings, box=arguments.box)
     (folder / "table.md").write_text(table(folder))
     print(table(folder))

@@ -178,12 +178,15 @@ def judged(theta: np.ndarray, arrays: dict[str, np.ndarray]) -> dict[str, np.nda
     """What the table is made from, of posteriors described (`both`) and their truths [N, D].
 
     Returns:
-        `error` [N], summed over parameters and averaged over draws; `density_rank` [N], how many draws are denser than
-        the truth, and `log_prob` [N] of the truth, under the run's posterior; `own_rank` and `box_rank` [N, D], how
-        many draws are below the truth, under that posterior and on the box.
+        `error` [N], averaged over draws and summed over parameters, `parameter_error` [N, D], the same before the sum;
+        `density_rank` [N], how many draws are denser than the truth, and `log_prob` [N] of the truth, under the run's
+        posterior; `own_rank` and `box_rank` [N, D], how many draws are below the truth, under that posterior and on
+        the box.
     """
+    parameter_error = np.abs(arrays["own_draws"] - theta[:, None]).mean(axis=1)
     return {
-        "error": np.abs(arrays["own_draws"] - theta[:, None]).sum(axis=2).mean(axis=1),
+        "error": parameter_error.sum(axis=1),
+        "parameter_error": parameter_error,
         "density_rank": np.sum(arrays["own_log_prob"] > arrays["own_truth_log_prob"][:, None], axis=1),
         "log_prob": arrays["own_truth_log_prob"],
         "own_rank": np.sum(arrays["own_draws"] < theta[:, None], axis=1),
