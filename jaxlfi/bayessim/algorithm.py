@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from jaxlfi.bayessim.convergence import Progress, advanced, not_begun
 from jaxlfi.bayessim.correction import CORRECTIONS, CorrectionInfo, effective_size
 from jaxlfi.bayessim.keys import RoundKeys, init_key, round_keys
 from jaxlfi.bayessim.settings import Settings
@@ -33,12 +34,14 @@ class State:
         proposals: what the rounds so far drew from, stacked, with room for all rounds.
         dataset: all simulations so far.
         network: the density estimator.
+        progress: rounds made, and whether the posterior still moves.
     """
 
     belief: Belief
     proposals: Belief
     dataset: Dataset
     network: Network
+    progress: Progress
 
     @property
     def feasible(self) -> Support:
@@ -92,14 +95,15 @@ def init(
     belief = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
     obs = observed.shape[-1]
     first = settings.simulations_per_round if first is None else first
-    capacity = first + (settings.rounds - 1) * settings.simulations_per_round
+    capacity = first + (settings.max_rounds - 1) * settings.simulations_per_round
     return State(
         belief=belief,
-        proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.rounds, *leaf.shape)), belief),
+        proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.max_rounds, *leaf.shape)), belief),
         dataset=datasets.empty(capacity, task.dim, obs),
         network=untrained(
             key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior
         ),
+        progress=not_begun(task.dim),
     )
 
 
@@ -144,7 +148,7 @@ def update(
     prior = task.inference.prior
     log_prior = None if prior is None else prior.log_prob(dataset.theta)
     # The rows that the rounds still to come have room for are not there yet.
-    expected = dataset.capacity - (settings.rounds - 1 - round) * settings.simulations_per_round
+    expected = dataset.capacity - (settings.max_rounds - 1 - round) * settings.simulations_per_round
     key_fit, key_condition = state.network.estimator.keys(key)
     network, fit_info = fit(key_fit, _started(state, dataset), dataset, weights, expected, log_prior)
     posterior = network.condition(observed, state.belief.support, key_condition)
@@ -159,7 +163,27 @@ def update(
         correction=CorrectionInfo(effective_size(weights), not_positive_definite, posterior.mass_inside),
         fit=fit_info,
     )
-    return State(belief, proposals, dataset, network), info
+    progress = advanced(state.progress, mixture, settings.rounds)
+    after = State(belief, proposals, dataset, network, progress)
+    return _unless_settled(state, after, info) if settings.extra_rounds else (after, info)
+
+
+def _unless_settled(before: State, after: State, info: Round) -> tuple[State, Round]:
+    """The round that was made; or, of a run at its end, a state that stays as it was and a round of no simulations."""
+    settled = before.progress.settled
+    state = jax.tree.map(lambda was, now: jnp.where(settled, was, now), before, after)
+    simulations, adaptation = info.simulations, info.adaptation
+    nothing = info.replace(
+        simulations=simulations.replace(
+            counted=jnp.zeros_like(simulations.counted), kept=jnp.zeros_like(simulations.kept)
+        ),
+        failed=jnp.zeros_like(info.failed),
+        belief=before.belief,
+        adaptation=adaptation.replace(
+            low_shift=jnp.zeros_like(adaptation.low_shift), high_shift=jnp.zeros_like(adaptation.high_shift)
+        ),
+    )
+    return state, jax.tree.map(lambda was, now: jnp.where(settled, was, now), nothing, info)
 
 
 def _started(state: State, dataset: Dataset) -> Network:
@@ -220,7 +244,8 @@ def run(
         look: what is kept of a round, from its index, the state after it and what it did; all of it by default.
 
     Returns:
-        The last state, and what was kept of every round, stacked along a leading axis of length `settings.rounds`.
+        The last state, and what was kept of every round, stacked along a leading axis of length `settings.max_rounds`:
+        after the last round of a run that settled, rounds of no simulations that leave its state as it is.
     """
     state = init(init_key(key), task, support, settings, observed)
 
@@ -228,4 +253,4 @@ def run(
         state, info = step(round_keys(key, index), task, settings, heuristic, observed, state, index)
         return state, look(index, state, info)
 
-    return jax.lax.scan(body, state, jnp.arange(settings.rounds))
+    return jax.lax.scan(body, state, jnp.arange(settings.max_rounds))

@@ -148,16 +148,16 @@ def update_one(
     return algorithm.update(keys.update, task, settings, run.heuristic, run.x, state, index, simulations)
 
 
-def check_draws(run: RunInputs, state: State, index: Int[Array, ""] | int) -> tuple[Float[Array, "samples dim"], Array]:
-    """Draws of the posterior after a round, in inference space, and the key of their simulations."""
-    key_draw, key_simulate = run_keys(run.key).of_predictive(index)
+def check_draws(run: RunInputs, state: State) -> tuple[Float[Array, "samples dim"], Array]:
+    """Draws of the posterior after a run's last round, in inference space, and the key of their simulations."""
+    key_draw, key_simulate = run_keys(run.key).of_predictive(state.progress.rounds - 1)
     posterior = posterior_after(state.belief, state.network, run.x)
     return posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference"), key_simulate
 
 
-def check_one(task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int) -> Discrepancy:
-    """How far the posterior after a round is from truth and observation, for a simulator in JAX."""
-    theta, key_simulate = check_draws(run, state, index)
+def check_one(task: Task, settings: Settings, run: RunInputs, state: State) -> Discrepancy:
+    """How far the posterior after a run's last round is from truth and observation, for a simulator in JAX."""
+    theta, key_simulate = check_draws(run, state)
     if not settings.predictive:
         return not_simulated(task, theta, run.observed, run.x.shape[-1])
     return discrepancy(key_simulate, task, theta, run.observed)
@@ -169,7 +169,7 @@ def round_one(
     """One round of one run, and its record."""
     keys = round_keys(run_keys(run.key).run, index)
     state, info = algorithm.step(keys, task, settings, run.heuristic, run.x, state, index)
-    return state, record(info, check_one(task, settings, run, state, index))
+    return state, record(info, state.progress, check_one(task, settings, run, state))
 
 
 def given_one(
@@ -177,12 +177,12 @@ def given_one(
 ) -> tuple[State, dict[str, Array]]:
     """One round of one run on simulations that were given, and its record."""
     state, info = update_one(task, settings, run, state, index, simulations)
-    return state, record(info, check_one(task, settings, run, state, index))
+    return state, record(info, state.progress, check_one(task, settings, run, state))
 
 
 def run_one(task: Task, settings: Settings, run: RunInputs) -> tuple[State, dict[str, Array]]:
     """A whole run as one scan, and the records of its rounds, stacked: for traced functions (`jax.vmap` of `infer`)."""
-    look = lambda index, state, info: record(info, check_one(task, settings, run, state, index))
+    look = lambda index, state, info: record(info, state.progress, check_one(task, settings, run, state))
     settings = _reading(task, settings, run)
     return algorithm.run(run_keys(run.key).run, task, settings, run.heuristic, run.x, run.support, look)
 

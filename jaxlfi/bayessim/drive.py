@@ -22,7 +22,7 @@ def drive(
     on_round: OnRound,
     on_compiled: Callable[[float], Any] = lambda seconds: None,
 ) -> State:
-    """Step a batch through its rounds.
+    """Step a batch through its rounds, or until all of its runs have settled.
 
     Args:
         engine: of the batch.
@@ -47,6 +47,8 @@ def drive(
         if index == 0:
             require_success(row["succeeded"], row["failed"], engine.task)
         on_round(index, state, row, time.perf_counter() - began)
+        if np.all(row["settled"]):
+            break
     return state
 
 

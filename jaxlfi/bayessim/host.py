@@ -42,11 +42,9 @@ class HostEngine(BatchEngine):
         if index == 0 and self.first is not None:
             simulations = self.first_round()
         else:
-            flags = jnp.zeros(theta.shape[:2], bool)
-            x = jnp.zeros((*theta.shape[:2], self.inputs.x.shape[-1]))
-            simulations = Simulations(theta, x, jnp.zeros(flags.shape, jnp.int32), flags, flags, jnp.ones(flags.shape))
+            simulations = _stacked([self._nothing(own) for own in theta])
         compiled(self._update_many, (self.settings, self.inputs, state, place, simulations))
-        compiled(_check_draws, (self.inputs, state, place))
+        compiled(_check_draws, (self.inputs, state))
 
     def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
         """Step every run; see `BatchEngine.round`."""
@@ -54,21 +52,31 @@ class HostEngine(BatchEngine):
         if index == 0 and self.first is not None:
             simulations = self.first_round()
         else:
-            simulations = self._simulated(*self._propose(state, place))
+            simulations = self._simulated(*self._propose(state, place), state.progress.settled)
         state, info = _call(self._update_many, self.settings, self.inputs, state, place, simulations)
-        return state, jax.device_get(record(info, self._checked(state, place)))
+        return state, jax.device_get(record(info, state.progress, self._checked(state)))
 
     def _propose(self, state: State, place: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _call(self._propose_many, self.settings, self.inputs, state, place)
 
-    def _simulated(self, theta: jax.Array, keys: jax.Array) -> Simulations:
+    def _simulated(self, theta: jax.Array, keys: jax.Array, settled: jax.Array) -> Simulations:
         shape, wanted = self.inputs.observed.shape[1:], self.settings.simulations_per_round
-        each = [simulate_in_waves(key, self.task, own, wanted, shape) for key, own in zip(keys, theta, strict=True)]
-        return _stacked(each)
+        return _stacked(
+            [
+                self._nothing(own) if over else simulate_in_waves(key, self.task, own, wanted, shape)
+                for key, own, over in zip(keys, theta, np.asarray(settled), strict=True)
+            ]
+        )
 
-    def _checked(self, state: State, index: jax.Array) -> Discrepancy:
+    def _nothing(self, theta: jax.Array) -> Simulations:
+        """No simulations of the parameters [A, D]: of a run at its end."""
+        flags = jnp.zeros(len(theta), bool)
+        x = jnp.zeros((len(theta), self.inputs.x.shape[-1]))
+        return Simulations(theta, x, jnp.zeros(len(theta), jnp.int32), flags, flags, jnp.ones(len(theta)))
+
+    def _checked(self, state: State) -> Discrepancy:
         """How far the runs' posteriors are from truth and observation."""
-        theta, keys = _call(_check_draws, self.inputs, state, index)
+        theta, keys = _call(_check_draws, self.inputs, state)
         observed = self.inputs.observed
         if not self.settings.predictive:
             return _stacked([not_simulated(self.task, own, observed[0], self.inputs.x.shape[-1]) for own in theta])
@@ -82,7 +90,7 @@ class HostEngine(BatchEngine):
         )
 
 
-_check_draws = jax.jit(jax.vmap(check_draws, in_axes=(0, 0, None)))
+_check_draws = jax.jit(jax.vmap(check_draws))
 
 
 def _call(many: Any, *arguments: Any) -> Any:

@@ -71,6 +71,7 @@ def npe(settings: Settings) -> Settings:
         estimator=FLOW.replace(loss="likelihood", activation="relu", ensemble_size=4),
         restriction="reject",
         rounds=1,
+        extra_rounds=0,
         simulations_per_round=settings.rounds * settings.simulations_per_round,
         simulation_budget=settings.rounds * settings.simulation_budget,
     )

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from jaxlfi.bayessim.algorithm import Round
+from jaxlfi.bayessim.convergence import Progress
 from jaxlfi.diagnostics.discrepancy import Discrepancy
 
 EVIDENCE = "evidence/"
@@ -17,7 +18,7 @@ PER_SIMULATION = ("theta", "counted", "kept", "failure")
 """Named arrays whose first axis is the simulations of a round."""
 
 
-def record(info: Round, seen: Discrepancy) -> dict[str, jax.Array]:
+def record(info: Round, progress: Progress, seen: Discrepancy) -> dict[str, jax.Array]:
     """One round as named arrays: the rows of history.npz, and all that the ledger is made from."""
     proposal, belief = info.proposal.support, info.belief.support
     return {
@@ -45,6 +46,8 @@ def record(info: Round, seen: Discrepancy) -> dict[str, jax.Array]:
         "effective_size": info.correction.effective_size,
         "not_positive_definite": info.correction.not_positive_definite,
         "mass_inside": info.correction.mass_inside,
+        "moved": progress.moved,
+        "settled": progress.settled,
         "predictive_simulations": seen.simulated,
         "sample_theta": seen.theta,
         "sample_theta_error": seen.theta_error,
@@ -99,6 +102,8 @@ def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, .
         "effective_size": float(row["effective_size"]),
         "not_positive_definite": int(row["not_positive_definite"]),
         "mass_inside": float(row["mass_inside"]),
+        "moved": float(row["moved"]),
+        "settled": bool(row["settled"]),
         "predictive_simulations": int(row["predictive_simulations"]),
         "theta_error": theta_error(row),
         "trajectory_error": trajectory_error(row),

@@ -290,7 +290,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     label = f"{plan.task.name}: {count} {'run' if count == 1 else 'runs in a batch'}"
     done = executing.rounds_done(folder)
     try:
-        with RoundProgress(console, plan.settings.rounds, done, label) as progress:
+        with RoundProgress(console, plan.settings.max_rounds, done, label) as progress:
             on_round = lambda index, row: progress.advance()
             runs = executing.execute(plan, observed, folder, on_round, progress.compiled)
     except Exception:

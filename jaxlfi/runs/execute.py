@@ -180,7 +180,8 @@ def execute(
                 folders.append_ledger(folder / name, index, own, plan.task.reasons, seconds[-1])
         on_round(index, row)
 
-    state = drive(engine, _state(engine, checkpoint, done), range(done, plan.settings.rounds), keep, on_compiled)
+    last = done if rows and np.all(rows[-1]["settled"]) else plan.settings.max_rounds
+    state = drive(engine, _state(engine, checkpoint, done), range(done, last), keep, on_compiled)
     state = engine.fetch(state)
     return [
         _run(plan, spec, jax.tree.map(lambda leaf, i=i: leaf[i], state), observed, i, rows, seconds, final, places[i])

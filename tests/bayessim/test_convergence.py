@@ -1,0 +1,139 @@
+"""Rounds while the posterior moves: the rule against NumPy, and runs that end by themselves when they settle."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlfi
+from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
+from jaxlfi.bayessim.convergence import LAG, STILL, advanced, not_begun
+from jaxlfi.bayessim.drive import drive
+from jaxlfi.bayessim.host import HostEngine
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.heuristics import Edge
+from jaxlfi.runs import execute as executing
+from jaxlfi.runs.describe import settings_from_json, settings_to_json
+from jaxlfi.runs.folder import RUN
+from jaxlfi.tasks.host import HostSimulator
+from tests.small import TASK, gaussian, settings, whole_runs  # noqa: F401 - a fixture
+from tests.tasks.test_host import Counting
+
+SETTINGS = settings(predictive=False, rounds=4, extra_rounds=4, inflation=2.0, restriction="reject")
+OBSERVED = np.array([0.8, -0.6], np.float32)
+SEEDS = range(6)
+
+
+def narrow(mean, sd) -> GaussianMixture:
+    """One Gaussian."""
+    return GaussianMixture(jnp.zeros(1), jnp.asarray([mean]), jnp.diag(jnp.asarray(sd))[None])
+
+
+def test_movement_is_that_of_the_mean_in_standard_deviations_over_the_last_rounds():
+    rng = np.random.default_rng(0)
+    means, sd = rng.normal(size=(9, 3)).cumsum(axis=0), np.array([0.5, 2.0, 7.0])
+    progress, moved = not_begun(3), []
+    for mean in means:
+        progress = advanced(progress, narrow(mean, sd), rounds=1)
+        moved.append(float(progress.moved))
+        assert bool(progress.settled) == (moved[-1] < STILL)
+    expected = [np.max(np.abs(means[i] - means[i - LAG]) / sd) if i >= LAG else np.inf for i in range(len(means))]
+    np.testing.assert_allclose(moved, expected, rtol=1e-5)
+    assert int(progress.rounds) == 9
+
+
+def test_a_run_does_not_settle_before_its_rounds():
+    progress = not_begun(1)
+    settled = []
+    for _ in range(7):
+        progress = advanced(progress, narrow([1.0], [1.0]), rounds=6)
+        settled.append(bool(progress.settled))
+    assert settled == [False] * 5 + [True] * 2  # it stands still from the fourth round on
+
+
+def batch(engine=BatchEngine, task=None, seeds=SEEDS):
+    """Runs on a wrong support, stepped together: the last states, and the records of all rounds, [rounds, runs]."""
+    task = task or gaussian()
+    specs = [RunSpec("", "misspecified", task.support("misspecified"), Edge(), seed) for seed in seeds]
+    observed = np.tile(OBSERVED, (len(specs), 1))
+    inputs, _ = stack_inputs(specs, observed, observed)
+    one, rows = engine(task, SETTINGS, inputs), []
+    state = drive(one, one.start(), range(SETTINGS.max_rounds), lambda i, state, row, s: rows.append(row))
+    return one.fetch(state), {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+@pytest.fixture(scope="module")
+def together(whole_runs):  # noqa: F811 - the fixture
+    """Six runs, stepped until all have settled."""
+    return batch()
+
+
+def test_runs_end_one_by_one_and_stay_as_they_are(together):
+    state, rows = together
+    own = np.asarray(state.progress.rounds)
+    assert np.all(own >= SETTINGS.rounds) and len(set(own.tolist())) > 1, "expected runs of different lengths"
+    made = np.arange(len(rows["settled"]))[:, None] < own
+    assert np.array_equal(rows["attempted"] > 0, made)
+    assert np.array_equal(rows["settled"], np.arange(len(made))[:, None] >= np.where(rows["settled"][-1], own - 1, 99))
+    assert np.array_equal(np.asarray(state.dataset.size), rows["succeeded"].sum(axis=0))
+    for run, rounds in enumerate(own):
+        for name in ("means", "scale_tril", "support_low", "support_high", "moved", "sample_theta_error"):
+            after = rows[name][rounds - 1 :, run]
+            assert np.array_equal(after, np.broadcast_to(after[:1], after.shape)), name
+        assert not np.any(rows["low_shift"][rounds:, run])
+
+
+def test_a_run_by_itself_makes_the_same_rounds(together):
+    state, rows = together
+    run = jaxlfi.infer(
+        jax.random.key(2), gaussian(), OBSERVED, support="misspecified", heuristic=Edge(), settings=SETTINGS
+    )
+    rounds = int(state.progress.rounds[2])
+    assert len(run.history["attempted"]) == rounds and run.history["settled"][-1]
+    np.testing.assert_allclose(run.history["means"], rows["means"][:rounds, 2], atol=2e-3)
+
+
+def test_a_traced_run_makes_the_same_rounds(together):
+    state, rows = together
+    infer = lambda key: jaxlfi.infer(
+        key, gaussian(), OBSERVED, support="misspecified", heuristic=Edge(), settings=SETTINGS
+    )
+    runs = jax.jit(jax.vmap(infer))(jax.vmap(jax.random.key)(jnp.arange(2)))
+    assert runs.history["attempted"].shape == (2, SETTINGS.max_rounds)
+    made = np.sum(np.asarray(runs.history["attempted"]) > 0, axis=1)
+    assert np.array_equal(made, np.asarray(state.progress.rounds)[:2])
+    np.testing.assert_allclose(runs.belief.mixture.means, rows["means"][-1, :2], atol=2e-3)
+
+
+def test_a_host_simulator_is_not_called_for_runs_at_their_end(whole_runs):  # noqa: F811 - the fixture
+    counting = Counting()
+    task = dataclasses.replace(gaussian(), simulate=HostSimulator(counting))
+    state, rows = batch(HostEngine, task, seeds=range(3))
+    assert len(set(np.asarray(state.progress.rounds).tolist())) > 1, "expected runs of different lengths"
+    assert sum(counting.calls) == rows["attempted"].sum()
+
+
+def test_a_run_that_settled_before_it_was_killed_resumes_to_the_same_bits(tmp_path, whole_runs):  # noqa: F811
+    rule = Edge()
+    spec = RunSpec("misspecified+edge", "misspecified", gaussian().support("misspecified"), rule, 2)
+    plan = executing.BatchPlan(RUN, TASK, gaussian(), None, SETTINGS, (spec,), True)
+    observed = executing.prepare(plan, OBSERVED)
+    executing.begin(tmp_path / "run", plan, observed)
+    (first,) = executing.execute(plan, observed, tmp_path / "run")  # and killed before its results are written
+    seen = []
+    plan, observed = executing.reopen(tmp_path / "run")
+    (again,) = executing.execute(plan, observed, tmp_path / "run", lambda index, row: seen.append(index))
+    assert seen == [] and len(again.history["attempted"]) == len(first.history["attempted"]) < SETTINGS.max_rounds
+    for was, now in zip(jax.tree.leaves(first.belief), jax.tree.leaves(again.belief), strict=True):
+        assert np.asarray(was).tobytes() == np.asarray(now).tobytes()
+    executing.finish(tmp_path / "run", plan, [again])
+    loaded = jaxlfi.load(tmp_path / "run", gaussian())
+    assert loaded.settings == SETTINGS and len(loaded.history["settled"]) == len(first.history["settled"])
+
+
+def test_settings_from_before_there_were_extra_rounds_have_none():
+    described = settings_to_json(SETTINGS)
+    del described["extra_rounds"]
+    assert settings_from_json(described) == SETTINGS.replace(extra_rounds=0)
