@@ -48,12 +48,23 @@ MATRIX: dict[str, tuple[str, str]] = {
 """Configurations: (support, heuristic)."""
 
 
+CLIPPED = QUICK.replace(
+    restriction="clip",
+    inflation=1.0,
+    rounds=10,
+    min_rounds=0,
+    estimator=QUICK.estimator.replace(epochs=0, steps=1000, learning_rate=1e-3, schedule="constant"),
+)
+"""Proposals from the posterior itself, clipped, and a thousand gradient steps in every round: what `quick` was before
+the study of widths, and what most studies were made with."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Variant:
     """One row of the ablation.
 
     Attributes:
-        change: what differs from `quick`, in words.
+        change: what differs from `single`, in words.
         settings: the numbers of the run.
         edge: EDGE as this variant reads it.
         configurations: which of `MATRIX` are run.
@@ -70,14 +81,14 @@ class Variant:
         return {"none": Fixed(), "edge": self.edge, "mode": mode, "centre": Centre()}[name]
 
 
-def variants(quick: Settings = QUICK) -> dict[str, Variant]:
+def variants(quick: Settings = QUICK, clipped: Settings = CLIPPED) -> dict[str, Variant]:
     """The rows of the table, by name.
 
-    All but the first change one thing of `single`, which is `quick` with one network instead of four: a quarter of
-    the work, and nothing that an ensemble averages away. EDGE's own readings move nothing else, so that the other
+    All but the first two change one thing of `single`, which is `clipped` with one network instead of four: a quarter
+    of the work, and nothing that an ensemble averages away. EDGE's own readings move nothing else, so that the other
     configurations are left out there.
     """
-    base = quick.replace(estimator=quick.estimator.replace(ensemble_size=1))
+    base = clipped.replace(estimator=clipped.estimator.replace(ensemble_size=1))
 
     def estimator(change: str, **fields) -> Variant:
         return Variant(change, base.replace(estimator=base.estimator.replace(**fields)))
@@ -89,7 +100,8 @@ def variants(quick: Settings = QUICK) -> dict[str, Variant]:
         return Variant(change, base, rule, configurations=("misspecified+edge",))
 
     return {
-        "quick": Variant("the preset: four networks", quick),
+        "quick": Variant("the preset: four networks, wide proposals, training by epochs", quick),
+        "clipped": Variant("four networks", clipped),
         "single": Variant("one network", base),
         "no-prune": estimator("components of little weight kept", prune=0.0),
         "narrow": estimator("32 units a layer", hidden=(32, 32)),

@@ -24,10 +24,10 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from experiments.ablation import CLIPPED
 from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.keys import key_of, run_keys
-from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.record import theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli.commands import bootstrap_interval
@@ -194,11 +194,12 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), metavar="ROW")
-    parser.add_argument("--rounds", type=int, default=QUICK.rounds)
-    parser.add_argument("--steps", type=int, default=QUICK.estimator.steps, help="gradient steps each round")
+    parser.add_argument("--rounds", type=int, default=CLIPPED.rounds)
+    parser.add_argument("--steps", type=int, default=CLIPPED.estimator.steps, help="gradient steps each round")
     parser.add_argument("--out", type=Path, default=Path("experiments/results/baselines"))
     arguments = parser.parse_args(argv)
-    settings = QUICK.replace(rounds=arguments.rounds, estimator=QUICK.estimator.replace(steps=arguments.steps)).check()
+    estimator = CLIPPED.estimator.replace(steps=arguments.steps)
+    settings = CLIPPED.replace(rounds=arguments.rounds, estimator=estimator).check()
     arguments.out.mkdir(parents=True, exist_ok=True)
     configs = {
         name: {

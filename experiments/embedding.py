@@ -26,9 +26,8 @@ import numpy as np
 from rich.console import Console
 
 from experiments.widths import DRAWS, FLOOR, RULES, TUNING, drawn_cases, infer_all, own_cases, save
-from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.cli.commands import bootstrap_interval, with_settings
+from jaxlfi.cli.commands import bootstrap_interval, preset_for
 from jaxlfi.io import files as atomic
 from jaxlfi.tasks import registry
 from jaxlfi.tasks.task import Task
@@ -39,7 +38,7 @@ NAMES = ("summaries", "raw", "mlp", "series")
 
 def candidate(name: str, task: Task) -> tuple[Task, Settings]:
     """What a candidate observes, and the settings it infers by."""
-    quick = with_settings(QUICK, task.settings, partly=True).replace(predictive=False)
+    quick = preset_for(task, "bayessim", "quick").replace(predictive=False)
     if name == "summaries":
         return task, quick
     raw = dataclasses.replace(task, summary="identity", summary_names=())

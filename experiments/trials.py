@@ -69,11 +69,8 @@ def cases_of(task: Task, first: int, observed: np.ndarray) -> Cases:
 
 def beliefs(task: Task, settings: Settings, cases: Cases, batch: int, console: Console) -> Posterior:
     """The posteriors of all cases, stacked."""
-    found = [
-        jax.vmap(lambda state, x: posterior_after(state.belief, state.network, x))(state, cases.x[rows])
-        for rows, state, _ in final_states(task, settings, SUPPORT, Fixed(), cases, batch, console)
-    ]
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
+    states, _ = final_states(task, settings, SUPPORT, Fixed(), cases, batch, console)
+    return jax.vmap(lambda state, x: posterior_after(state.belief, state.network, x))(states, cases.x)
 
 
 def multiplied(each: GaussianMixture) -> GaussianMixture:

@@ -18,7 +18,6 @@ import json
 import operator
 import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from jaxlfi.io import compile_cache
@@ -32,10 +31,10 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
+from experiments.ablation import CLIPPED
 from jaxlfi import diagnostics
 from jaxlfi.bayessim.algorithm import State
-from jaxlfi.bayessim.batch import RunSpec, posterior_after, stack_inputs
-from jaxlfi.bayessim.drive import drive
+from jaxlfi.bayessim.batch import RunSpec, posterior_after, stack, stack_inputs
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import QUICK, snle
@@ -65,22 +64,22 @@ TUNING = 1000
 
 RULES: dict[str, Heuristic] = {"none": Fixed(), "edge": Edge(), "mode": Mode(), "centre": Centre()}
 
-PACED = QUICK.estimator.replace(steps=0, epochs=100, learning_rate=3e-3, schedule="cosine")
-"""Training in proportion to the simulations there are, where `quick` makes as many steps in the first round as in the
+PACED = QUICK.estimator
+"""Training in proportion to the simulations there are, where `CLIPPED` makes as many steps in the first round as in the
 last: it overfits the first hundred simulations within fifty steps, and is not done with the thousand of the end."""
 
 
-def candidates(quick: Settings = QUICK) -> dict[str, Settings]:
-    """What is compared, by name: `quick` with other proposals and corrections, and the likelihood."""
-    once = {"quick": quick, "reject": quick.replace(restriction="reject"), "snle": snle(quick)}
+def candidates(clipped: Settings = CLIPPED) -> dict[str, Settings]:
+    """What is compared, by name: other proposals and corrections, other training, and the likelihood."""
+    once = {"clipped": clipped, "reject": clipped.replace(restriction="reject")}
     wide = {
-        f"{restriction}-{factor:g}": quick.replace(restriction=restriction, inflation=factor)
+        f"{restriction}-{factor:g}": clipped.replace(restriction=restriction, inflation=factor)
         for restriction in ("clip", "reject", "mixed")
         for factor in (1.5, 2.0, 3.0)
     }
     divided = {f"{name}-quotient": wide[name].replace(correction="quotient") for name in wide}
     paced = {f"paced-{name}": settings.replace(estimator=PACED) for name, settings in (once | wide).items()}
-    return once | wide | divided | paced
+    return {"quick": QUICK, "snle": snle(QUICK)} | once | wide | divided | paced
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,26 +131,33 @@ def both(key: jax.Array, truth: jax.Array, posterior: Posterior, box: Support) -
 
 def final_states(
     task: Task, settings: Settings, support: str, rule: Heuristic, cases: Cases, batch: int, console: Console
-) -> Iterator[tuple[np.ndarray, State, float]]:
-    """The runs of all cases, batch by batch: which cases, their last states, and the seconds without compiling.
+) -> tuple[State, float]:
+    """The last states of all cases' runs, stacked, and the seconds they took without compiling.
 
-    The last batch is filled up by its last case, so that one program serves them all.
+    All make their first round, then all their second, a batch at a time; those that have settled are left out of the
+    rounds that follow. A batch is filled up by its last run, so that one program serves them all.
     """
-    starts = range(0, len(cases.seeds), batch)
     rule = paired(rule, settings.estimator.warm_start)
-    with RoundProgress(console, settings.rounds * len(starts), 0, f"{len(cases.seeds)} runs") as progress:
-        for start in starts:
-            part = cases.rows(np.minimum(np.arange(start, start + batch), len(cases.seeds) - 1))
-            specs = [RunSpec("", support, task.support(support), rule, int(seed)) for seed in part.seeds]
-            inputs, _ = stack_inputs(specs, part.observed, part.x)
-            engine = engine_for(task, settings, inputs)
-            state = engine.start()
-            engine.compile(state)
-            began = time.perf_counter()
-            state = drive(engine, state, range(settings.rounds), lambda *_: progress.advance(), progress.compiled)
-            state = engine.fetch(state)
-            rows = np.arange(start, min(start + batch, len(cases.seeds)))
-            yield rows, jax.tree.map(operator.itemgetter(slice(len(rows))), state), time.perf_counter() - began
+    states: dict[int, State] = {}
+    active, seconds = np.arange(len(cases.seeds)), 0.0
+    with RoundProgress(console, settings.rounds, 0, f"{len(cases.seeds)} runs") as progress:
+        for index in range(settings.rounds):
+            for start in range(0, len(active), batch):
+                rows = active[start : start + batch]
+                part = cases.rows(np.resize(rows, batch))
+                specs = [RunSpec("", support, task.support(support), rule, int(seed)) for seed in part.seeds]
+                engine = engine_for(task, settings, stack_inputs(specs, part.observed, part.x)[0])
+                state = (
+                    engine.place(stack([states[row] for row in np.resize(rows, batch)])) if index else engine.start()
+                )
+                engine.compile(state, index)
+                began = time.perf_counter()
+                state = engine.fetch(engine.round(state, index)[0])
+                seconds += time.perf_counter() - began
+                states |= {row: jax.tree.map(operator.itemgetter(place), state) for place, row in enumerate(rows)}
+            active = np.array([row for row in active if not states[row].progress.settled], int)
+            progress.advance()
+    return stack([states[row] for row in range(len(states))]), seconds
 
 
 def infer_all(
@@ -162,16 +168,19 @@ def infer_all(
     @jax.jit
     @jax.vmap
     def one(key, truth, x, state):
-        return both(key, truth, posterior_after(state.belief, state.network, x), task.support(box))
+        found = both(key, truth, posterior_after(state.belief, state.network, x), task.support(box))
+        return found | {"rounds": state.progress.rounds, "moved": state.progress.moved}
 
-    found, seconds = [], 0.0
-    for rows, state, took in final_states(task, settings, support, rule, cases, batch, console):
-        part = cases.rows(rows)
+    states, seconds = final_states(task, settings, support, rule, cases, batch, console)
+    found = []
+    for start in range(0, len(cases.seeds), batch):
+        rows = np.resize(np.arange(start, min(start + batch, len(cases.seeds))), batch)
+        part, state = cases.rows(rows), jax.tree.map(operator.itemgetter(rows), states)
         keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(77), jnp.asarray(part.seeds))
         found.append(jax.device_get(one(keys, part.theta, part.x, state)))
-        seconds += took
-    arrays = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
-    return judged(cases.theta, arrays) | {"seeds": cases.seeds, "seconds": np.asarray(seconds)}
+    arrays = {name: np.concatenate([part[name] for part in found])[: len(cases.seeds)] for name in found[0]}
+    progress = {name: arrays[name] for name in ("rounds", "moved")}
+    return judged(cases.theta, arrays) | progress | {"seeds": cases.seeds, "seconds": np.asarray(seconds)}
 
 
 def judged(theta: np.ndarray, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -204,8 +213,8 @@ def save(path: Path, arrays: dict[str, np.ndarray], settings: Settings, **more: 
 def table(folder: Path) -> str:
     """The comparison as Markdown, from the saved arrays."""
     lines = [
-        "| candidate | error, own truth | lost | 90 % holds it | 50 % | 90 % | SBC p | ... on the box | lp | s |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| candidate | rounds | error, own truth | lost | 90 % holds it | 50 % | 90 % | SBC p | on the box | lp | s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for path in sorted(folder.glob("*-own.npz")):
         own = atomic.read_arrays(path)
@@ -214,6 +223,7 @@ def table(folder: Path) -> str:
         lost = int(np.sum(error > LOST))
         held = np.mean(own["density_rank"] < 0.9 * (DRAWS + 1))
         cells = [
+            f"{np.mean(own['rounds']):.1f}",
             f"{error.mean():.2f} [{low:.2f}, {high:.2f}] ({np.median(error):.2f})",
             f"{lost} of {len(error)}",
             f"{held:.2f}",

@@ -95,10 +95,10 @@ def init(
     belief = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
     obs = observed.shape[-1]
     first = settings.simulations_per_round if first is None else first
-    capacity = first + (settings.max_rounds - 1) * settings.simulations_per_round
+    capacity = first + (settings.rounds - 1) * settings.simulations_per_round
     return State(
         belief=belief,
-        proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.max_rounds, *leaf.shape)), belief),
+        proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.rounds, *leaf.shape)), belief),
         dataset=datasets.empty(capacity, task.dim, obs),
         network=untrained(
             key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior
@@ -148,7 +148,7 @@ def update(
     prior = task.inference.prior
     log_prior = None if prior is None else prior.log_prob(dataset.theta)
     # The rows that the rounds still to come have room for are not there yet.
-    expected = dataset.capacity - (settings.max_rounds - 1 - round) * settings.simulations_per_round
+    expected = dataset.capacity - (settings.rounds - 1 - round) * settings.simulations_per_round
     key_fit, key_condition = state.network.estimator.keys(key)
     network, fit_info = fit(key_fit, _started(state, dataset), dataset, weights, expected, log_prior)
     posterior = network.condition(observed, state.belief.support, key_condition)
@@ -163,9 +163,9 @@ def update(
         correction=CorrectionInfo(effective_size(weights), not_positive_definite, posterior.mass_inside),
         fit=fit_info,
     )
-    progress = advanced(state.progress, mixture, settings.rounds)
+    progress = advanced(state.progress, mixture, settings.min_rounds)
     after = State(belief, proposals, dataset, network, progress)
-    return _unless_settled(state, after, info) if settings.extra_rounds else (after, info)
+    return _unless_settled(state, after, info) if settings.min_rounds else (after, info)
 
 
 def _unless_settled(before: State, after: State, info: Round) -> tuple[State, Round]:
@@ -244,7 +244,7 @@ def run(
         look: what is kept of a round, from its index, the state after it and what it did; all of it by default.
 
     Returns:
-        The last state, and what was kept of every round, stacked along a leading axis of length `settings.max_rounds`:
+        The last state, and what was kept of every round, stacked along a leading axis of length `settings.rounds`:
         after the last round of a run that settled, rounds of no simulations that leave its state as it is.
     """
     state = init(init_key(key), task, support, settings, observed)
@@ -253,4 +253,4 @@ def run(
         state, info = step(round_keys(key, index), task, settings, heuristic, observed, state, index)
         return state, look(index, state, info)
 
-    return jax.lax.scan(body, state, jnp.arange(settings.max_rounds))
+    return jax.lax.scan(body, state, jnp.arange(settings.rounds))

@@ -40,17 +40,17 @@ def not_begun(dim: int) -> Progress:
     )
 
 
-def advanced(progress: Progress, posterior: GaussianMixture, rounds: int) -> Progress:
+def advanced(progress: Progress, posterior: GaussianMixture, min_rounds: int) -> Progress:
     """After one more round.
 
     Args:
         progress: before it.
         posterior: after it, before it was restricted to a support.
-        rounds: that a run makes at least.
+        min_rounds: that a run makes before it may settle; 0: it never does.
     """
     mean, variance = posterior.mean, jnp.diagonal(posterior.covariance)
     distance = jnp.max(jnp.abs(mean - progress.means[0]) / jnp.sqrt(variance))
     moved = jnp.where(jnp.isnan(distance), jnp.inf, distance)
     done = progress.rounds + 1
     means = jnp.concatenate([progress.means[1:], mean[None]])
-    return Progress(done, means, moved, settled=(done >= rounds) & (moved < STILL))
+    return Progress(done, means, moved, settled=(0 < min_rounds) & (min_rounds <= done) & (moved < STILL))

@@ -17,9 +17,9 @@ class Settings(Checked):
     Attributes:
         estimator: the density estimator and its training: an instance of one of the families
             (`jaxlfi.MixtureNetwork`, `jaxlfi.SplineFlow`, `jaxlfi.MaskedFlow`).
-        rounds: inference iterations N_LFI.
-        extra_rounds: further rounds, at most, that a run makes while its posterior still moves
-            (`jaxlfi.bayessim.convergence`). 0 is the paper.
+        rounds: inference iterations N_LFI, at most.
+        min_rounds: rounds after which a run ends as soon as its posterior has settled
+            (`jaxlfi.bayessim.convergence`); 0 is the paper: all rounds are made.
         simulations_per_round: valid simulations added to the dataset each round, at most.
         simulation_budget: simulations attempted each round, at most, failures included.
         correction: how q_phi becomes the posterior, "none", "paper", "quotient" or "importance" (reading A).
@@ -34,8 +34,10 @@ class Settings(Checked):
     """
 
     estimator: Estimator = dataclasses.field(default=MixtureNetwork())
-    rounds: int = option(10, low=1, high=100_000, help="inference rounds, N_LFI")
-    extra_rounds: int = option(0, low=0, high=100_000, help="further rounds, at most, while the posterior still moves")
+    rounds: int = option(10, low=1, high=100_000, help="inference rounds, N_LFI, at most")
+    min_rounds: int = option(
+        0, low=0, high=100_000, help="rounds after which a run ends once its posterior has settled; 0: it makes all"
+    )
     simulations_per_round: int = option(100, low=1, high=100_000_000, help="simulations added each round, at most")
     simulation_budget: int = option(
         125, low=1, high=100_000_000, help="simulations attempted each round, at most, failures included"
@@ -49,11 +51,6 @@ class Settings(Checked):
         1.0, low=1.0, high=100.0, help="how many times as wide as the posterior proposals are drawn"
     )
     predictive: bool = option(True, help="simulate 20 draws of each round's posterior, to compare with the observation")
-
-    @property
-    def max_rounds(self) -> int:
-        """Rounds that a run makes at most."""
-        return self.rounds + self.extra_rounds
 
     def check(self) -> "Settings":
         """Refuse settings that cannot work, by name; returns the settings."""

@@ -25,7 +25,7 @@ def expected_widths(settings: Settings, heuristic: Heuristic) -> str:
 
 def _expected(settings: Settings, heuristic: Heuristic) -> str:
     inflation, correction = float(settings.inflation), settings.correction
-    if settings.max_rounds == 1:
+    if settings.rounds == 1:
         return "right in principle, as all simulations are drawn from the prior"
     if settings.estimator.of_summaries:
         return "right in principle, as a likelihood does not depend on the proposals"

@@ -290,7 +290,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     label = f"{plan.task.name}: {count} {'run' if count == 1 else 'runs in a batch'}"
     done = executing.rounds_done(folder)
     try:
-        with RoundProgress(console, plan.settings.max_rounds, done, label) as progress:
+        with RoundProgress(console, plan.settings.rounds, done, label) as progress:
             on_round = lambda index, row: progress.advance()
             runs = executing.execute(plan, observed, folder, on_round, progress.compiled)
     except Exception:
@@ -412,7 +412,7 @@ def default_configurations(task: Task) -> list[str]:
 
 def build_settings(arguments: argparse.Namespace, task: Task) -> Settings:
     """The preset, with what the task asks for in its place, and what was given in place of both."""
-    preset = with_settings(METHODS[arguments.method](PRESETS[arguments.preset]), task.settings, partly=True)
+    preset = preset_for(task, arguments.method, arguments.preset)
     given = dict(arguments.settings)
     if "steps" in given and "epochs" not in given:
         given["epochs"] = 0
@@ -429,21 +429,26 @@ def build_settings(arguments: argparse.Namespace, task: Task) -> Settings:
     return with_settings(preset, given).check()
 
 
-def with_settings(settings: Settings, given: Mapping[str, Any], partly: bool = False) -> Settings:
+def preset_for(task: Task, method: str, preset: str) -> Settings:
+    """A method at a preset, with the numbers that the task asks for in place of the preset's."""
+    wanted = lambda fields: {name: value for name, value in task.settings.items() if name in declared(fields)}
+    settings = PRESETS[preset]
+    settings = METHODS[method](dataclasses.replace(settings, **wanted(settings)))  # it divides the rounds in its way
+    return with_settings(settings, wanted(settings.estimator))
+
+
+def with_settings(settings: Settings, given: Mapping[str, Any]) -> Settings:
     """Settings with those numbers replaced that are named, be they of the run or of its estimator.
 
     Args:
         settings: to begin with.
         given: by name.
-        partly: leave out what this estimator does not have, as a task's wishes may be for another one.
 
     Raises:
         ValueError: for a name that neither has.
     """
     own = {name: value for name, value in given.items() if name in declared(settings)}
     others = {name: value for name, value in given.items() if name not in own}
-    if partly:
-        others = {name: value for name, value in others.items() if name in declared(settings.estimator)}
     estimator = estimators.converted(settings.estimator, type(settings.estimator), others)
     return dataclasses.replace(settings, estimator=estimator, **own)
 

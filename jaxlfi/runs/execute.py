@@ -180,7 +180,7 @@ def execute(
                 folders.append_ledger(folder / name, index, own, plan.task.reasons, seconds[-1])
         on_round(index, row)
 
-    last = done if rows and np.all(rows[-1]["settled"]) else plan.settings.max_rounds
+    last = done if rows and np.all(rows[-1]["settled"]) else plan.settings.rounds
     state = drive(engine, _state(engine, checkpoint, done), range(done, last), keep, on_compiled)
     state = engine.fetch(state)
     return [

@@ -138,7 +138,7 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
         _require_simulations(out, _kept(recorded.first), _kept(observed.first))
         observed = recorded
     console = Console(quiet=not progress)
-    with RoundProgress(console, plan.settings.max_rounds, 0, f"{plan.task.name}: 1 run") as bar:
+    with RoundProgress(console, plan.settings.rounds, 0, f"{plan.task.name}: 1 run") as bar:
 
         def each(index: int, row: dict[str, np.ndarray]) -> None:
             bar.advance()
@@ -204,7 +204,7 @@ def _traced(key, task: Task, observation, support: Support, heuristic, settings:
     history = {name: value[-1] if name.startswith(FINAL) else value for name, value in records.items()}
     return Run(
         belief=state.belief,
-        history=history | {"seconds": jnp.full(settings.max_rounds, jnp.nan)},
+        history=history | {"seconds": jnp.full(settings.rounds, jnp.nan)},
         dataset=state.dataset,
         network=state.network,
         observed=observed,

@@ -128,7 +128,7 @@ def _dataset(path: Path, settings: Settings) -> Dataset:
     arrays = _arrays(path, ("theta", "x", "round", "weight"))
     size = len(arrays["theta"])
     first = int(np.sum(arrays["round"] == 0))
-    room = max(first, settings.simulations_per_round) + (settings.max_rounds - 1) * settings.simulations_per_round
+    room = max(first, settings.simulations_per_round) + (settings.rounds - 1) * settings.simulations_per_round
     filled = {
         name: jnp.asarray(np.concatenate([arrays[name], np.zeros((max(room - size, 0), *arrays[name].shape[1:]))]))
         for name in ("theta", "x", "weight")

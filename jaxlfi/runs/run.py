@@ -99,7 +99,7 @@ class Run:
     @property
     def amortised(self) -> bool:
         """Whether the network has learnt the posterior of any observation: it was kept, and had one round."""
-        return self.settings.max_rounds == 1 and self.network is not None
+        return self.settings.rounds == 1 and self.network is not None
 
     def posterior_of(self, observation: Any) -> Posterior:
         """The posterior of another observation, by the network of a run of one round.
@@ -111,9 +111,9 @@ class Run:
             ValueError: for a run of several rounds, whose network has learnt the posterior of its own observation only;
                 one whose network was not kept; or an observation of another shape.
         """
-        if self.settings.max_rounds != 1:
+        if self.settings.rounds != 1:
             raise ValueError(
-                f"posterior_of: expected a run of one round, got one of {self.settings.max_rounds}, whose network "
+                f"posterior_of: expected a run of one round, got one of {self.settings.rounds}, whose network "
                 "has learnt the posterior of its own observation alone: infer with settings.replace(rounds=1), or "
                 "--method npe"
             )
@@ -145,7 +145,7 @@ class Run:
 
     def draws(self, n: int = DRAWS) -> Float[Array, "n dim"]:
         """The posterior draws that are saved with the run, in natural units; the same each time."""
-        return self.posterior.sample(run_keys(self.key).of_check(self.settings.max_rounds), n)
+        return self.posterior.sample(run_keys(self.key).of_check(self.settings.rounds), n)
 
     def save(self, path: str | Path) -> Path:
         """Write a run folder, which `jaxlfi.load` reads and the command line's `sample`, `diagnose` and `report` take.

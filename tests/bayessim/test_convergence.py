@@ -21,7 +21,7 @@ from jaxlfi.tasks.host import HostSimulator
 from tests.small import TASK, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 from tests.tasks.test_host import Counting
 
-SETTINGS = settings(predictive=False, rounds=4, extra_rounds=4, inflation=2.0, restriction="reject")
+SETTINGS = settings(predictive=False, rounds=8, min_rounds=4, inflation=2.0, restriction="reject")
 OBSERVED = np.array([0.8, -0.6], np.float32)
 SEEDS = range(6)
 
@@ -36,7 +36,7 @@ def test_movement_is_that_of_the_mean_in_standard_deviations_over_the_last_round
     means, sd = rng.normal(size=(9, 3)).cumsum(axis=0), np.array([0.5, 2.0, 7.0])
     progress, moved = not_begun(3), []
     for mean in means:
-        progress = advanced(progress, narrow(mean, sd), rounds=1)
+        progress = advanced(progress, narrow(mean, sd), min_rounds=1)
         moved.append(float(progress.moved))
         assert bool(progress.settled) == (moved[-1] < STILL)
     expected = [np.max(np.abs(means[i] - means[i - LAG]) / sd) if i >= LAG else np.inf for i in range(len(means))]
@@ -44,11 +44,11 @@ def test_movement_is_that_of_the_mean_in_standard_deviations_over_the_last_round
     assert int(progress.rounds) == 9
 
 
-def test_a_run_does_not_settle_before_its_rounds():
+def test_a_run_does_not_settle_before_its_least_rounds():
     progress = not_begun(1)
     settled = []
     for _ in range(7):
-        progress = advanced(progress, narrow([1.0], [1.0]), rounds=6)
+        progress = advanced(progress, narrow([1.0], [1.0]), min_rounds=6)
         settled.append(bool(progress.settled))
     assert settled == [False] * 5 + [True] * 2  # it stands still from the fourth round on
 
@@ -60,7 +60,7 @@ def batch(engine=BatchEngine, task=None, seeds=SEEDS):
     observed = np.tile(OBSERVED, (len(specs), 1))
     inputs, _ = stack_inputs(specs, observed, observed)
     one, rows = engine(task, SETTINGS, inputs), []
-    state = drive(one, one.start(), range(SETTINGS.max_rounds), lambda i, state, row, s: rows.append(row))
+    state = drive(one, one.start(), range(SETTINGS.rounds), lambda i, state, row, s: rows.append(row))
     return one.fetch(state), {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
@@ -73,7 +73,7 @@ def together(whole_runs):  # noqa: F811 - the fixture
 def test_runs_end_one_by_one_and_stay_as_they_are(together):
     state, rows = together
     own = np.asarray(state.progress.rounds)
-    assert np.all(own >= SETTINGS.rounds) and len(set(own.tolist())) > 1, "expected runs of different lengths"
+    assert np.all(own >= SETTINGS.min_rounds) and len(set(own.tolist())) > 1, "expected runs of different lengths"
     made = np.arange(len(rows["settled"]))[:, None] < own
     assert np.array_equal(rows["attempted"] > 0, made)
     assert np.array_equal(rows["settled"], np.arange(len(made))[:, None] >= np.where(rows["settled"][-1], own - 1, 99))
@@ -101,7 +101,7 @@ def test_a_traced_run_makes_the_same_rounds(together):
         key, gaussian(), OBSERVED, support="misspecified", heuristic=Edge(), settings=SETTINGS
     )
     runs = jax.jit(jax.vmap(infer))(jax.vmap(jax.random.key)(jnp.arange(2)))
-    assert runs.history["attempted"].shape == (2, SETTINGS.max_rounds)
+    assert runs.history["attempted"].shape == (2, SETTINGS.rounds)
     made = np.sum(np.asarray(runs.history["attempted"]) > 0, axis=1)
     assert np.array_equal(made, np.asarray(state.progress.rounds)[:2])
     np.testing.assert_allclose(runs.belief.mixture.means, rows["means"][-1, :2], atol=2e-3)
@@ -125,7 +125,7 @@ def test_a_run_that_settled_before_it_was_killed_resumes_to_the_same_bits(tmp_pa
     seen = []
     plan, observed = executing.reopen(tmp_path / "run")
     (again,) = executing.execute(plan, observed, tmp_path / "run", lambda index, row: seen.append(index))
-    assert seen == [] and len(again.history["attempted"]) == len(first.history["attempted"]) < SETTINGS.max_rounds
+    assert seen == [] and len(again.history["attempted"]) == len(first.history["attempted"]) < SETTINGS.rounds
     for was, now in zip(jax.tree.leaves(first.belief), jax.tree.leaves(again.belief), strict=True):
         assert np.asarray(was).tobytes() == np.asarray(now).tobytes()
     executing.finish(tmp_path / "run", plan, [again])
@@ -133,7 +133,7 @@ def test_a_run_that_settled_before_it_was_killed_resumes_to_the_same_bits(tmp_pa
     assert loaded.settings == SETTINGS and len(loaded.history["settled"]) == len(first.history["settled"])
 
 
-def test_settings_from_before_there_were_extra_rounds_have_none():
+def test_settings_from_before_runs_could_settle_make_all_rounds():
     described = settings_to_json(SETTINGS)
-    del described["extra_rounds"]
-    assert settings_from_json(described) == SETTINGS.replace(extra_rounds=0)
+    del described["min_rounds"]
+    assert settings_from_json(described) == SETTINGS.replace(min_rounds=0)

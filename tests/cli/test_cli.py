@@ -438,6 +438,7 @@ def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line
     assert settings.estimator.hidden == PRESETS["quick"].estimator.hidden
     given = commands.build_settings(parse("--rounds", "7"), task)
     assert (given.rounds, given.estimator.learning_rate) == (7, 0.25)
+    assert commands.build_settings(parse("--method", "npe"), task).rounds == 1  # of all simulations of the three
     edge = commands.build_heuristic(parse("--expansion", "0.1"), "edge", settings, task)
     np.testing.assert_array_equal(edge.mass_threshold, [0.125, 0.5])
     assert edge.expansion == 0.1

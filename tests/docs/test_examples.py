@@ -28,7 +28,7 @@ def ran(name: str):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     if hasattr(module, "SETTINGS"):
-        module.SETTINGS = module.SETTINGS.replace(estimator=module.SETTINGS.estimator.replace(steps=STEPS))
+        module.SETTINGS = module.SETTINGS.replace(estimator=module.SETTINGS.estimator.replace(epochs=0, steps=STEPS))
     return module.main()
 
 

@@ -14,7 +14,8 @@ def arrays(offset: np.ndarray, outranked: np.ndarray) -> dict[str, np.ndarray]:
     truth = np.where(np.arange(len(offset)) == 0, -np.inf, -0.5)
     one = {"draws": draws, "log_prob": log_prob, "truth_log_prob": truth}
     named = {f"{name}_{field}": value for name in ("own", "box") for field, value in one.items()}
-    return judged(theta, named) | {"seeds": np.arange(len(offset)), "seconds": np.asarray(8.0)}
+    seeds = np.arange(len(offset))
+    return judged(theta, named) | {"rounds": seeds + 10, "seeds": seeds, "seconds": np.asarray(8.0)}
 
 
 def test_the_table_counts_errors_lost_runs_and_coverage(tmp_path):
@@ -23,6 +24,6 @@ def test_the_table_counts_errors_lost_runs_and_coverage(tmp_path):
     for kind, values in (("own", own), ("drawn", drawn)):
         atomic.write_arrays(tmp_path / f"quick-{kind}.npz", values)
     cells = [cell.strip() for cell in table(tmp_path).splitlines()[-1].split("|")[1:-1]]
-    assert cells[0] == "`quick`" and cells[1].startswith("0.80 [") and cells[1].endswith("(0.50)")
-    assert cells[2:6] == ["1 of 4", "0.75", "0.50", "0.75"]
-    assert cells[8] == f"{(-30 - 0.5 * 3) / 4:.1f}" and cells[9] == "2.0"
+    assert cells[:2] == ["`quick`", "11.5"] and cells[2].startswith("0.80 [") and cells[2].endswith("(0.50)")
+    assert cells[3:7] == ["1 of 4", "0.75", "0.50", "0.75"]
+    assert cells[9] == f"{(-30 - 0.5 * 3) / 4:.1f}" and cells[10] == "2.0"

@@ -98,7 +98,7 @@ def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) ->
         began = time.perf_counter()
         engine = engine_for(run.task, run.settings, run_inputs(run, plan, truths["observed"], truths["x"], first))
         compiled = lambda seconds: progress.compiled(seconds) if first == 0 else None
-        rounds = range(run.settings.max_rounds)
+        rounds = range(run.settings.rounds)
         state = drive(engine, engine.start(), rounds, lambda *_: progress.advance(), compiled)
         keys = _keys(plan, DRAWS, first, len(truths["x"]))
         found = jax.device_get(_by_states(keys, truths["theta"], truths["x"], engine.fetch(state), plan.draws))
@@ -167,7 +167,7 @@ def posteriors(
     else:
         chunks = len(store.chunks)
         label = f"{plan.where}: the run again for {plan.truths} simulations, in {chunks} chunks of {length}"
-        rounds = run.settings.max_rounds
+        rounds = run.settings.rounds
         with RoundProgress(console, rounds * chunks, rounds * len(store.done()), label) as progress:
             store.compute(filled(repeated_chunks(run, plan, progress)))
     return store.results()[0]

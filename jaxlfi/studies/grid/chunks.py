@@ -147,7 +147,7 @@ def run_chunk(
 
     compiled: list[float] = []
     began = time.perf_counter()
-    drive(engine, engine.start(), range(work.grid.settings.max_rounds), keep, compiled.append)
+    drive(engine, engine.start(), range(work.grid.settings.rounds), keep, compiled.append)
     seconds = time.perf_counter() - began - sum(compiled)
     if sum(compiled) > 1.0:  # later chunks find the program
         on_compiled(sum(compiled))

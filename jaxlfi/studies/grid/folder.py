@@ -201,7 +201,7 @@ def advance(folder: Path, work: Work, console: Console) -> dict[str, np.ndarray]
         StoreError: for a damaged chunk, before anything is computed.
         SimulatorError: for a simulator that fails always.
     """
-    store, rounds = store_of(folder, work), work.grid.settings.max_rounds
+    store, rounds = store_of(folder, work), work.grid.settings.rounds
     own = range(jax.process_index(), len(store.chunks), jax.process_count())
     done = [index for index in store.done() if index in own]
     label = f"{work.grid.task.name}: {work.grid.size} runs in {len(store.chunks)} chunks of {work.length}"
