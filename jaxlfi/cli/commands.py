@@ -17,6 +17,7 @@ from rich.table import Table
 
 from jaxlfi import diagnostics
 from jaxlfi.bayessim.batch import RunSpec
+from jaxlfi.bayessim.convergence import LAG
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.widths import expected_widths
@@ -301,12 +302,32 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     console.print(summary_table(plan, runs))
     for warning in (*training_warnings(plan, runs), *support_warnings(plan, runs)):
         _warn(console, warning)
-    for line in widths_lines(plan):
+    for line in (*rounds_lines(plan, runs), *widths_lines(plan)):
         _say(console, line)
     kind = "table" if plan.kind == run_store.COMPARE else "results"
     _say(console, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")
     if not arguments.no_figures:
         draw(folder, console)
+
+
+def rounds_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
+    """Whether runs that may end once they have settled have done so, in a line for each configuration."""
+    lines: list[str] = []
+    if not 0 < plan.settings.min_rounds <= plan.settings.rounds:
+        return lines
+    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
+        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+        made = [np.count_nonzero(~np.asarray(run.history["settled"][:-1])) + 1 for run in own]
+        moved = [float(run.history["moved"][-1]) for run in own if not run.history["settled"][-1]]
+        extent = f"{made[0]}" if len(set(made)) == 1 else f"{min(made)} to {max(made)}"
+        verdict = "the posterior has settled"
+        if moved:
+            verdict = (
+                f"{len(moved)} of {len(own)} posteriors still moved, by up to {max(moved):.1f} of their standard "
+                f"deviations over the last {LAG} rounds (--rounds allows for more)"
+            )
+        lines.append(f"rounds of {configuration}: {extent}; {verdict}")
+    return lines
 
 
 def widths_lines(plan: BatchPlan) -> list[str]:
