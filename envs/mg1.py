@@ -275,7 +275,7 @@ def task(
         summary_names=_summary_names(percentiles, whiten),
         channels=("inter-departure time",),
         record_label="rank" if order == "sorted" else "job",
-        settings={"rounds": 15},  # appendix C
+        settings={"rounds": 15, "min_rounds": 15},  # appendix C
         hyperparameters={"edge": {"mass_threshold": 0.001}},
     )
 

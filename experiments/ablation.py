@@ -100,7 +100,7 @@ def variants(quick: Settings = QUICK, clipped: Settings = CLIPPED) -> dict[str, 
         return Variant(change, base, rule, configurations=("misspecified+edge",))
 
     return {
-        "quick": Variant("the preset: four networks, wide proposals, training by epochs", quick),
+        "quick": Variant("the preset, ten rounds: wide proposals, training by epochs", quick.replace(rounds=10)),
         "clipped": Variant("four networks", clipped),
         "single": Variant("one network", base),
         "no-prune": estimator("components of little weight kept", prune=0.0),

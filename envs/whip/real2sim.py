@@ -145,7 +145,7 @@ def whip_task(
         summary_names=SUMMARY_NAMES,
         channels=CHANNELS,
         record_label="control step",
-        settings={"rounds": 15, "batch_size": 10},
+        settings={"rounds": 15, "min_rounds": 15, "batch_size": 10},
         hyperparameters={"edge": {"mass_threshold": (0.003, 0.005)}},
     )
 

@@ -61,14 +61,14 @@ lost.
 """
 
 
-def _without_end(settings: Settings) -> Settings:
-    """As many rounds as a run makes at least, whether its posterior has settled or not."""
+def all_rounds(settings: Settings) -> Settings:
+    """Every run makes as many rounds as the shortest would: equal budgets, whether posteriors have settled or not."""
     return settings.replace(rounds=settings.min_rounds or settings.rounds, min_rounds=0)
 
 
 def apt(settings: Settings) -> Settings:
     """Automatic posterior transformation, SNPE-C: a flow, the atomic loss, proposals from the truncated posterior."""
-    return _without_end(settings).replace(estimator=FLOW, restriction="reject", inflation=1.0)
+    return all_rounds(settings).replace(estimator=FLOW, restriction="reject", inflation=1.0)
 
 
 def npe(settings: Settings) -> Settings:
@@ -77,7 +77,7 @@ def npe(settings: Settings) -> Settings:
     One round leaves time for an ensemble: averaged over four, flows are better than each. And as no round follows,
     there is no need to hold back where nothing was simulated: ReLU fits better than tanh where something was.
     """
-    settings = _without_end(settings)
+    settings = all_rounds(settings)
     return settings.replace(
         estimator=FLOW.replace(loss="likelihood", activation="relu", ensemble_size=4),
         restriction="reject",
@@ -98,7 +98,7 @@ def snle(settings: Settings) -> Settings:
     As no correction is needed whatever was proposed, proposals are wider than the posterior, and some are the prior's:
     a likelihood is an extrapolation where nothing was simulated, and may be high there by mistake.
     """
-    return _without_end(settings).replace(estimator=LIKELIHOOD, restriction="reject", inflation=2.0, defensive=0.2)
+    return all_rounds(settings).replace(estimator=LIKELIHOOD, restriction="reject", inflation=2.0, defensive=0.2)
 
 
 METHODS: dict[str, Callable[[Settings], Settings]] = {

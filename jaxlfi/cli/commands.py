@@ -18,7 +18,7 @@ from rich.table import Table
 from jaxlfi import diagnostics
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.convergence import LAG
-from jaxlfi.bayessim.presets import METHODS, PRESETS
+from jaxlfi.bayessim.presets import METHODS, PRESETS, all_rounds
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.widths import expected_widths
 from jaxlfi.diagnostics.bounds import bound_summary
@@ -115,7 +115,7 @@ def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
 def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi compare`."""
     task = task_lookup.load(arguments.task)
-    settings = build_settings(arguments, task)
+    settings = build_settings(arguments, task, all_rounds)
     configurations = arguments.configurations or default_configurations(task)
     if len(set(configurations)) < len(configurations):
         raise ValueError(f"configurations: expected distinct ones, got {configurations}")
@@ -149,7 +149,7 @@ def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, fir
 def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi grid`."""
     task = task_lookup.load(arguments.task)
-    settings = build_settings(arguments, task)
+    settings = build_settings(arguments, task, all_rounds)
     axes = grid.parse_axes(arguments.vary)
     heuristics.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
     for axis in axes:
@@ -431,9 +431,11 @@ def default_configurations(task: Task) -> list[str]:
     return [*supports, *(f"{adapted}+{heuristic}" for heuristic in ("edge", "mode", "centre"))]
 
 
-def build_settings(arguments: argparse.Namespace, task: Task) -> Settings:
-    """The preset, with what the task asks for in its place, and what was given in place of both."""
-    preset = preset_for(task, arguments.method, arguments.preset)
+def build_settings(
+    arguments: argparse.Namespace, task: Task, change: Callable[[Settings], Settings] = lambda preset: preset
+) -> Settings:
+    """The preset, with what the task asks for in its place, then changed, and what was given in place of all that."""
+    preset = change(preset_for(task, arguments.method, arguments.preset))
     given = dict(arguments.settings)
     if "steps" in given and "epochs" not in given:
         given["epochs"] = 0

@@ -66,7 +66,8 @@ examples:
 
 COMPARE_EXAMPLES = """\
 A configuration is SUPPORT (kept fixed) or SUPPORT+HEURISTIC. All configurations and seeds run side by side;
-the same seed means the same observation in all of them.
+the same seed means the same observation in all of them. All make the same number of rounds, whether their
+posteriors have settled or not.
 
 examples:
   jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
