@@ -153,7 +153,7 @@ SESSION = """
 """A process that executes one script after another, and so compiles what they share once."""
 TINY = (
     "--estimator independent --units 4 --learning-rate 1e-2 --steps 40 --batch-size 20 --validation 0 --patience 0 "
-    "--ensemble-size 1 --components 2 --simulations-per-round 20 --simulation-budget 25 --no-figures"
+    "--ensemble-size 1 --components 2 --min-rounds 0 --simulations-per-round 20 --simulation-budget 25 --no-figures"
 ).split()
 
 
