@@ -150,6 +150,7 @@ def main() -> None:
     there = rows.read(path)
     left = rows.missing(cases, there)
     functions = {method: inference(method) for method in dict.fromkeys(one["method"] for one in left)}
+    arguments.out.mkdir(parents=True, exist_ok=True)
     if left:
         budgets = {*arguments.simulations, *(int(row["simulations"]) for row in there)}
         atomic.write_json(arguments.out / "config.json", config(sorted(budgets), arguments.limit))

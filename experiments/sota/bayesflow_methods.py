@@ -5,6 +5,7 @@ not its defaults, both as its guides advise: the summaries are standardised, not
 with a uniform prior are constrained to their box, so that no draw lies outside. Failed simulations are dropped.
 """
 
+import logging
 import os
 import time
 
@@ -23,7 +24,7 @@ try:
 except ImportError as error:
     raise ImportError("methods of BayesFlow: expected bayesflow, got none: pip install -e '.[bench]'") from error
 
-NAMES = ("bayesflow-npe",)
+logging.getLogger("bayesflow").setLevel(logging.WARNING)
 
 
 def infer(method: str, case: Case, simulations: int) -> Found:

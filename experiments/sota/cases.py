@@ -64,7 +64,7 @@ def case_of(setting: str, seed: int) -> Case:
     if name not in benchmark.TASKS:
         task = _task(name)
         observed = simulate_observation(run_keys(key_of(seed)).observe, task)
-        x, truth = np.asarray(task.summary(observed)), np.asarray(task.inference.truth)
+        x, truth = np.asarray(task.summary(jnp.asarray(observed))), np.asarray(task.inference.truth)
         return Case(task, task.support(support), seed, x, truth, None)
     task, box = _task(name), _task(name).support(support)
     number, truth = seed % PUBLISHED_OBSERVATIONS + 1, None

@@ -27,7 +27,9 @@ def read(path: Path) -> list[Row]:
 def append(path: Path, row: Row) -> None:
     """Write one row at once, under the headings if it is the first; it is on the disk before this returns."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    cut_short = path.exists() and not path.read_bytes().endswith(b"\n")
     with path.open("a", newline="") as file:
+        file.write("\n" * cut_short)
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         if file.tell() == 0:
             writer.writeheader()
@@ -46,7 +48,7 @@ def tables(rows: Sequence[Row], settings: Sequence[str], methods: Sequence[str])
     """Markdown: for each budget and measure a table of methods by settings, in the order given.
 
     A cell is the mean and standard deviation over seeds, and how many there are, of how many where some gave nothing.
-    The best mean of a column is bold. Rows and columns without a value are left out.
+    The best mean of a column is bold. Columns without a value are left out, and methods that were not run.
     """
     parts = []
     for simulations in sorted({row["simulations"] for row in rows}, key=int):
@@ -87,7 +89,7 @@ def _table(of_budget: Sequence[Row], measure, best, settings: Sequence[str], met
     }
     kept = {place: [value for value in all_ if value is not None] for place, all_ in values.items()}
     columns = [setting for setting in settings if any(kept[method, setting] for method in methods)]
-    chosen = [method for method in methods if any(kept[method, setting] for setting in columns)]
+    chosen = [method for method in methods if any(values[method, setting] for setting in columns)]
     if not columns:
         return []
     lines = ["| method | " + " | ".join(f"`{name}`" for name in columns) + " |", "|---" * (len(columns) + 1) + "|"]

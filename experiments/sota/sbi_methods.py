@@ -37,7 +37,7 @@ except ImportError as error:
     raise ImportError("methods of sbi: expected sbi and torch, got none: pip install -e '.[bench]'") from error
 
 ROUNDS = 10
-PATIENCE = 60.0
+PATIENCE = 20.0
 """Seconds after which rejection is given up."""
 LEAST_ACCEPTED = 1e-4
 """Fraction of the prior below which TSNPE does not draw from it by rejection."""
