@@ -42,12 +42,12 @@ PACKAGES = ("sbi", "torch", "nflows", "bayesflow", "keras")
 """Of others, whose versions are recorded."""
 
 
-def wanted(settings: list[str], methods: list[str], simulations: list[int], seeds: int) -> list[rows.Row]:
+def wanted(settings: list[str], methods: list[str], simulations: list[int], seeds: range) -> list[rows.Row]:
     """The cases, in the order they are run in: those that share a compiled program one after another.
 
     A heuristic has nothing to adapt where the support is right, so `bayessim+edge` is run on the wrong one only.
     """
-    every = itertools.product(simulations, settings, methods, range(seeds))
+    every = itertools.product(simulations, settings, methods, seeds)
     return [
         dict(zip(rows.IDENTITY, (setting, method, str(budget), str(seed)), strict=True))
         for budget, setting, method, seed in every
@@ -137,7 +137,8 @@ def main() -> None:
     parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=list(SETTINGS))
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--simulations", nargs="+", type=int, default=[1000, 10_000], help="budgets, failures included")
-    parser.add_argument("--seeds", type=int, default=5, help="from 0")
+    parser.add_argument("--seeds", type=int, default=5, help="how many")
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument(
         "--limit", type=int, default=900, help="seconds after which a case of another library is given up"
     )
@@ -146,7 +147,8 @@ def main() -> None:
     if min(arguments.simulations) < 100:
         parser.error(f"--simulations: expected at least 100, ten a round, got {min(arguments.simulations)}")
     path, console = arguments.out / "results.csv", Console(soft_wrap=True)
-    cases = wanted(arguments.settings, arguments.methods, arguments.simulations, arguments.seeds)
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    cases = wanted(arguments.settings, arguments.methods, arguments.simulations, seeds)
     there = rows.read(path)
     left = rows.missing(cases, there)
     functions = {method: inference(method) for method in dict.fromkeys(one["method"] for one in left)}

@@ -9,7 +9,8 @@ A method's loop over rounds is written as in sbi's own examples. What had to be 
   seconds draws are made by sbi's slice sampler, as its warning advises; the note says "mcmc".
 - SNLE draws by its default sampler, which is the vectorised slice sampler (20 chains, 200 steps of warm-up).
 - TSNPE draws truncated proposals by rejection from the prior, which is `RestrictedPrior`'s default, and by
-  sampling-importance-resampling, the other sampler it has, where no more than `LEAST_ACCEPTED` of it is accepted.
+  sampling-importance-resampling, the other sampler it has, where no more than `LEAST_ACCEPTED` of it is accepted. The
+  threshold of density is found by `THRESHOLD_DRAWS`, a tenth of the default: a million takes minutes a round.
 - PyTorch computes on one thread: with two, networks of this size train more slowly, and on a busy machine by far.
 """
 
@@ -39,6 +40,8 @@ except ImportError as error:
 ROUNDS = 10
 PATIENCE = 20.0
 """Seconds after which rejection is given up."""
+THRESHOLD_DRAWS = 100_000
+"""Draws of a posterior by which TSNPE finds the density that all but 1e-4 of its mass exceeds."""
 LEAST_ACCEPTED = 1e-4
 """Fraction of the prior below which TSNPE does not draw from it by rejection."""
 PROBES = 10_000
@@ -66,9 +69,9 @@ def infer(method: str, case: Case, simulations: int) -> Found:
     torch.set_num_threads(1)
     prior = _prior(case)
     simulator = Simulator(case.task, jax.random.fold_in(run_keys(key_of(seed)).run, 1))
-    rounds = 1 if method == "sbi-npe" else ROUNDS
+    rounds, said = 1 if method == "sbi-npe" else ROUNDS, io.StringIO()
     simulator.compile(prior.sample((simulations // rounds,)).numpy())
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+    with warnings.catch_warnings(), contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         warnings.simplefilter("ignore")
         began = time.perf_counter()
         posterior = METHODS[method](simulator, prior, torch.as_tensor(case.x)[None], simulations // rounds)
@@ -144,7 +147,7 @@ def _tsnpe(simulator: Simulator, prior, x, count: int):
         trainer.append_simulations(*_simulated(simulator, proposal, count)).train(force_first_round_loss=True)
         posterior = trainer.build_posterior().set_default_x(x)
         if index < ROUNDS - 1:  # the last posterior proposes nothing
-            accepts = get_density_thresholder(posterior, quantile=1e-4)
+            accepts = get_density_thresholder(posterior, num_samples_to_estimate_support=THRESHOLD_DRAWS)
             accepted = accepts(prior.sample((PROBES,))).float().mean()
             proposal = RestrictedPrior(
                 prior, accepts, posterior, sample_with="rejection" if accepted > LEAST_ACCEPTED else "sir"

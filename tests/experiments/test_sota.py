@@ -112,7 +112,7 @@ def test_rows_are_kept_one_by_one_and_half_a_line_is_none(tmp_path):
     assert len(rows.read(path)) == 2
     rows.append(path, row("mg1", "npe", 2))
     assert [one["seed"] for one in rows.read(path)] == ["0", "1", "2"]
-    wanted = program.wanted(["mg1", "two_moons"], ["npe"], [1000], 2)
+    wanted = program.wanted(["mg1", "two_moons"], ["npe"], [1000], range(2))
     assert [one["setting"] for one in rows.missing(wanted, rows.read(path))] == ["two_moons", "two_moons"]
 
 
@@ -148,7 +148,7 @@ def test_tables_have_means_deviations_counts_and_the_best():
 
 
 def test_a_heuristic_is_for_the_wrong_support():
-    every = program.wanted(list(SETTINGS), ["bayessim", "bayessim+edge"], [1000], 1)
+    every = program.wanted(list(SETTINGS), ["bayessim", "bayessim+edge"], [1000], range(1))
     adapted = [one["setting"] for one in every if one["method"] == "bayessim+edge"]
     assert adapted == ["lotka_volterra-misspecified"] and len(every) == len(SETTINGS) + 1
 
@@ -166,7 +166,7 @@ class Absent(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path, target=None):
         if name.partition(".")[0] in ("torch", "sbi", "bayesflow"):
             raise ModuleNotFoundError(f"No module named {name!r}")
-        return None
+        return
 
 
 @pytest.mark.parametrize("method", ["sbi-npe", "bayesflow-npe"])
@@ -206,6 +206,7 @@ def test_a_case_that_is_there_is_not_run_again(monkeypatch, tmp_path, capsys):
 
     run("--methods", "npe", "sbi-npe", "sbi-apt", "--seeds", "1")
     kept = run("--methods", "npe", "--seeds", "2")
+    run("--methods", "npe", "--first-seed", "1", "--seeds", "1")
     assert calls == [("npe", 0, 1000), ("sbi-npe", 0, 1000), ("sbi-apt", 0, 1000), ("npe", 1, 1000)]
     assert [one["note"] for one in kept] == [
         "as usual",
