@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 
 from experiments import widths
+from experiments.sota import rows as sota
+from experiments.sota.__main__ import METHODS as SOTA_METHODS
+from experiments.sota.cases import SETTINGS as SOTA_SETTINGS
 from jaxlfi.cli.commands import bootstrap_interval
 
 ROOT = Path(__file__).parents[2] / "experiments"
@@ -236,6 +239,14 @@ def test_sbibm():
     for cell, found in values.items():  # the table keeps four digits
         off = np.abs(printed - [np.mean(found), np.std(found, ddof=1)])
         assert np.any(np.all(off < 6e-4, axis=1)), cell
+
+
+SOTA_TABLES = sota.tables(sota.read(RESULTS / "sota/results.csv"), list(SOTA_SETTINGS), SOTA_METHODS)
+
+
+@pytest.mark.parametrize("line", sorted({line for line in SOTA_TABLES.splitlines() if line}))
+def test_sota(line):
+    assert " ".join(line.split()) in README
 
 
 def same(text: str, value: float) -> bool:

@@ -225,3 +225,24 @@ def test_a_small_budget_is_refused(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         program.main()
     assert "--simulations: expected at least 100" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------------- where sbi is installed
+
+
+def test_the_prior_of_sbi_is_ours():
+    """Uniform on the box in inference space, or the task's Gaussian; skipped without the `bench` extra."""
+    pytest.importorskip("sbi")
+    import torch
+
+    from experiments.sota import sbi_methods
+
+    linear, volterra = case_of("gaussian_linear", 0), case_of("lotka_volterra-misspecified", 0)
+    theta = np.linspace(-0.5, 0.4, 10, dtype=np.float32)
+    expected = stats.norm.logpdf(theta, scale=np.sqrt(0.1)).sum()
+    assert sbi_methods._prior(linear).log_prob(torch.as_tensor(theta)).item() == pytest.approx(expected, rel=1e-4)
+    box = sbi_methods._prior(volterra)
+    inside, outside = np.asarray(volterra.box.centre), np.asarray(volterra.truth)
+    width = np.asarray(volterra.box.width, float)
+    assert box.log_prob(torch.as_tensor(inside)).item() == pytest.approx(-np.log(width).sum(), rel=1e-5)
+    assert box.log_prob(torch.as_tensor(outside)).item() == -np.inf
