@@ -53,8 +53,8 @@ def tables(rows: Sequence[Row], settings: Sequence[str], methods: Sequence[str])
     parts = []
     for simulations in sorted({row["simulations"] for row in rows}, key=int):
         of_budget = [row for row in rows if row["simulations"] == simulations]
-        for title, measure, best in MEASURES:
-            lines = _table(of_budget, measure, best, settings, methods)
+        for title, measure, best, digits in MEASURES:
+            lines = _table(of_budget, measure, best, digits, settings, methods)
             if lines:
                 parts.append("\n".join([f"{int(simulations):,} simulations, {title}:", "", *lines]))
     return "\n\n".join(parts) + "\n"
@@ -73,15 +73,17 @@ def _held(row: Row) -> float | None:
 
 
 MEASURES = (
-    ("C2ST where there is an exact posterior, else the summed error", _accuracy_or_error, min),
-    ("mean log-density of the exact posterior's draws, or of the truth", _number("log_prob"), max),
-    ("fraction of parameters whose central 90 % interval holds the truth", _held, None),
-    ("seconds, without compiling ahead", _number("seconds"), None),
+    ("C2ST where there is an exact posterior, else the summed error", _accuracy_or_error, min, 2),
+    ("mean log-density of the exact posterior's draws, or of the truth", _number("log_prob"), max, 2),
+    ("fraction of parameters whose central 90 % interval holds the truth", _held, None, 2),
+    ("seconds, without compiling ahead", _number("seconds"), None, 0),
 )
-"""Title, measure of a row, and which of the means is the best."""
+"""Title, measure of a row, which of the means is the best, and digits."""
 
 
-def _table(of_budget: Sequence[Row], measure, best, settings: Sequence[str], methods: Sequence[str]) -> list[str]:
+def _table(
+    of_budget: Sequence[Row], measure, best, digits: int, settings: Sequence[str], methods: Sequence[str]
+) -> list[str]:
     values = {
         (method, setting): [measure(row) for row in of_budget if (row["method"], row["setting"]) == (method, setting)]
         for method in methods
@@ -98,17 +100,17 @@ def _table(of_budget: Sequence[Row], measure, best, settings: Sequence[str], met
         for setting in columns
     }
     for method in chosen:
-        cells = [_cell(values[method, setting], kept[method, setting], top[setting]) for setting in columns]
+        cells = [_cell(values[method, setting], kept[method, setting], top[setting], digits) for setting in columns]
         lines.append(f"| `{method}` | " + " | ".join(cells) + " |")
     return lines
 
 
-def _cell(every: Sequence[float | None], kept: Sequence[float], best: float | None) -> str:
+def _cell(every: Sequence[float | None], kept: Sequence[float], best: float | None, digits: int) -> str:
     if not every:
         return ""
     count = f"({len(kept)})" if len(kept) == len(every) else f"({len(kept)} of {len(every)})"
     if not kept:
         return f"nothing {count}"
     mean = np.mean(kept)
-    text = f"{mean:.2f}" + (f" ± {np.std(kept, ddof=1):.2f}" if len(kept) > 1 else "")
+    text = f"{mean:.{digits}f}" + (f" ± {np.std(kept, ddof=1):.{digits}f}" if len(kept) > 1 else "")
     return f"**{text}** {count}" if best is not None and mean == best else f"{text} {count}"
