@@ -12,13 +12,14 @@ from experiments.sota.measures import DRAWS, Found, points
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.keys import key_of, run_keys
-from jaxlfi.bayessim.presets import METHODS, QUICK
+from jaxlfi.bayessim.presets import METHODS, QUICK, all_rounds
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics import Edge, Fixed
 from jaxlfi.tasks.task import Task
 
-ROUNDS = QUICK.rounds
+PRESET = all_rounds(QUICK).replace(predictive=False)
+"""The same budget for all: ten rounds, whether posteriors have settled or not."""
 NAMES = ("bayessim", "bayessim+edge", "npe", "apt", "snle")
 
 _COMPILED: dict[tuple, tuple] = {}
@@ -27,9 +28,9 @@ _COMPILED: dict[tuple, tuple] = {}
 
 def settings_of(method: str, simulations: int) -> Settings:
     """A method's defaults at a budget that ten rounds share, failures included."""
-    each = simulations // ROUNDS
+    each = simulations // PRESET.rounds
     method = METHODS[method.partition("+")[0]]
-    return method(QUICK.replace(simulations_per_round=each, simulation_budget=each, predictive=False)).check()
+    return method(PRESET.replace(simulations_per_round=each, simulation_budget=each)).check()
 
 
 def infer(method: str, case: Case, simulations: int) -> Found:
