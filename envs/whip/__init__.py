@@ -7,10 +7,11 @@ from typing import Literal
 
 
 def task(
-    object: str | None = None,
+    object: tuple[str, ...] | str | None = None,
     detector: Literal["clean", "mask", "noisy", "transporter"] = "mask",
     nuisances: Literal["fixed", "random"] = "fixed",
     engine: Literal["auto", "native", "mjx", "warp"] = "auto",
+    pooling: Literal["all", "mean", "moments"] = "all",
 ):
     """The Real2Sim task; its options are those of `jaxlfi.envs.whip.real2sim.task`.
 
@@ -20,7 +21,7 @@ def task(
     require_mujoco()
     from jaxlfi.envs.whip.real2sim import task as make
 
-    return make(object=object, detector=detector, nuisances=nuisances, engine=engine)
+    return make(object=object, detector=detector, nuisances=nuisances, engine=engine, pooling=pooling)
 
 
 def require_mujoco() -> None:

@@ -1,7 +1,7 @@
-"""Real2Sim: the length and stiffness of a DLO from one whip, as an inference task (section VI-F)."""
+"""Real2Sim: the length and stiffness of a DLO from one whip or several, as an inference task (section VI-F)."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +23,7 @@ from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS, Detector
 from jaxlfi.tasks.summaries import cross_correlation
 from jaxlfi.tasks.task import Task
+from jaxlfi.tasks.trials import ALL, check_pooling, summarised_jointly, together
 
 TRUTH = (0.23, 8e3)
 """Length (m) and Young's modulus (Pa) of the simulated DLO that is observed where no object is named."""
@@ -53,39 +54,53 @@ SUMMARY_NAMES = (
 
 
 def task(
-    object: str | None = None,
+    object: str | Sequence[str] | None = None,
     detector: Literal["clean", "mask", "noisy", "transporter"] = "mask",
     nuisances: Literal["fixed", "random"] = "fixed",
     engine: Literal["auto", "native", "mjx", "warp"] = "auto",
+    pooling: Literal["all", "mean", "moments"] = ALL,
 ) -> Task:
-    """Infer length and Young's modulus of a DLO from keypoints of one whip.
+    """Infer length and Young's modulus of a DLO from keypoints of one whip, or of several.
 
     A trajectory is 16 rows: the state before each action (28 numbers) and the action. It is summarised by the
-    cross-correlations of states and actions, and the means and standard deviations of the states (112 numbers).
+    cross-correlations of states and actions, and the means and standard deviations of the states (112 numbers). Of
+    several rollouts the rows lie one after another, and `pooling` makes one summary of theirs.
 
     Args:
         object: the observed object: an FEM reference object by name ("dlo-0" to "dlo-3"), or the path of a recorded
             rollout's .npz (`recording`), which `jaxlfi whip render` writes, too. Simulations apply its actions and are
-            seen through its camera. By default, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory
+            seen through its camera. Several recorded rollouts of one object, a name or path each, are believed
+            together (`whip_task`). By default, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory
             actions.
         detector: the errors of simulated keypoints (`vision.keypoints.DETECTORS`). They should resemble those of the
             detector that the observation was made with; for the reference objects, that is "mask".
         nuisances: "fixed": density, cubes and placement are as in mu; "random": only their ranges are known.
         engine: the physics: "auto" is the one that suits the platform.
+        pooling: how the summaries of several rollouts become one: "all" of them, one after another, in the order of
+            the objects; or a name in `jaxlfi.tasks.trials.POOLINGS`.
 
     Raises:
-        ValueError: for unknown names and recordings that do not fit.
+        ValueError: for unknown names, recordings that do not fit, and recordings that are given twice or have
+            different control intervals.
     """
     for name, choice, known in (("detector", detector, DETECTORS), ("nuisances", nuisances, NUISANCES)):
         if choice not in known:
             raise ValueError(f"{name}: expected one of {sorted(known)}, got {choice!r}")
-    observed = None if object is None else recorded(object)
-    actions = exploratory_actions() if observed is None else observed.actions
-    camera = None if observed is None else observed.camera
-    make = functools.partial(whip_task, pick(engine), DETECTORS[detector], NUISANCES[nuisances], actions, camera)
-    if observed is None:
-        return make(truth=TRUTH)
-    return make(observation=recordings.trajectory(observed))
+    check_pooling(pooling)
+    make = functools.partial(whip_task, pick(engine), DETECTORS[detector], NUISANCES[nuisances])
+    if object is None:
+        return make(exploratory_actions(), truth=TRUTH)
+    names = [object] if isinstance(object, str | Path) else list(object)
+    observed = [recorded(name) for name in names]
+    if len(observed) == 1:
+        return make(observed[0].actions, observed[0].camera, observation=recordings.trajectory(observed[0]))
+    _check_together(names, observed)
+    return make(
+        np.stack([one.actions for one in observed]),
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one.camera for one in observed)),
+        observation=together([recordings.trajectory(one) for one in observed]),
+        pooling=pooling,
+    )
 
 
 def recorded(object: str) -> recordings.Recording:
@@ -105,33 +120,53 @@ def whip_task(
     engine: Engine,
     detector: Detector,
     nuisances: Callable[..., WhipParameters],
-    actions: Float[Array, "time 2"],
+    actions: Float[Array, "time 2"] | Float[Array, "rollouts time 2"],
     camera=None,
     truth=None,
     observation=None,
+    pooling: str = ALL,
 ) -> Task:
     """The task made of its parts, for studies that choose them.
 
+    A simulation of several rollouts is so many simulations of one, each with a key of its own, of the same length,
+    modulus and nuisances but for where the stack of cubes stands, which is built up anew. It fails where one fails.
+
     Args:
         engine: the physics.
-        detector: of simulated keypoints.
+        detector: of simulated keypoints; what it draws once a trajectory, it draws once a rollout.
         nuisances: makes a scene of a key, a length (m) and a modulus (Pa).
-        actions: of every rollout, shape [T, 2], in m.
-        camera: through which every rollout is seen; by default the side camera of each scene.
+        actions: of every simulation, shape [T, 2], in m; of several rollouts shape [n, T, 2].
+        camera: through which every simulation is seen; with several rollouts one for each, stacked. By default the side
+            camera of each scene.
         truth: length (m) and Young's modulus (Pa) of the observed DLO, if they are known.
-        observation: the observed trajectory, shape [T, 30].
+        observation: the observed trajectory, shape [T, 30]; of several rollouts one after another, shape [n T, 30].
+        pooling: of the summaries of several rollouts; see `task`.
+
+    Raises:
+        ValueError: for actions of another shape, and an unknown pooling.
     """
     actions = jnp.asarray(actions, jnp.float32)
+    if actions.ndim not in (2, 3) or actions.shape[-1] != 2 or 0 in actions.shape:
+        raise ValueError(f"actions: expected shape [T, 2], or [n, T, 2] of rollouts, got {list(actions.shape)}")
 
-    def simulate(key: jax.Array, theta: Float[Array, "2"]):
+    def one(key: jax.Array, theta: Float[Array, "2"]):
         key_scene, key_keypoints = jax.random.split(key)
-        length, young = theta / MILLIMETRES
-        scene = nuisances(key_scene, length, young)
+        scene = nuisances(key_scene, *(theta / MILLIMETRES))
         view = side_camera(scene) if camera is None else camera
         return trajectory(key_keypoints, engine, detector, view, scene, actions)
 
-    return Task(
-        simulate,
+    def several(key: jax.Array, theta: Float[Array, "2"]):
+        keys = jax.vmap(jax.random.split)(jax.random.split(key, len(actions)))
+        scenes = jax.vmap(lambda key: nuisances(key, *(theta / MILLIMETRES)))(keys[:, 0])
+        first = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[0], leaf.shape), scenes)
+        scenes = first.replace(stack=scenes.stack)
+        views = jax.vmap(side_camera)(scenes) if camera is None else camera
+        look = jax.vmap(trajectory, in_axes=(0, None, None, 0, 0, 0))
+        rows, valid = look(keys[:, 1], engine, detector, views, scenes, actions)
+        return rows.reshape(-1, rows.shape[-1]), jnp.all(valid)
+
+    made = Task(
+        one if actions.ndim == 2 else several,
         name="whip",
         names=("length", "young"),
         units=("mm", "Pa"),
@@ -148,6 +183,18 @@ def whip_task(
         settings={"rounds": 15, "min_rounds": 15, "batch_size": 10},
         hyperparameters={"edge": {"mass_threshold": (0.003, 0.005)}},
     )
+    return made if actions.ndim == 2 else summarised_jointly(made, len(actions), pooling, "rollout")
+
+
+def _check_together(names: Sequence[str], observed: Sequence[recordings.Recording]) -> None:
+    """Refuse recordings that are no several rollouts of one rig."""
+    if not observed:
+        raise ValueError("object: expected at least one, got none")
+    if len(set(names)) < len(names):
+        raise ValueError(f"object: expected different recordings, got {', '.join(map(str, names))}")
+    intervals = [one.control_interval for one in observed]
+    if len(set(intervals)) > 1:
+        raise ValueError(f"object: expected recordings of one control interval, got {', '.join(map(str, intervals))} s")
 
 
 def _in_task_units(box: Support) -> Support:

@@ -61,6 +61,7 @@ examples:
   jaxlfi infer spring:task --observation real.csv --support-low 1 0.1 --support-high 10 1 --out runs/spring
   jaxlfi infer lotka_volterra --preset paper --seeds 4 --out runs/paper
   jaxlfi infer whip --object dlo-0 --heuristic edge --out runs/dlo-0
+  jaxlfi infer whip --object dlo-2 rollout-7.npz --out runs/two-rollouts
 
 """
 
@@ -402,8 +403,11 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
     )
     command.add_argument(
         "--object",
+        nargs="+",
+        action="extend",
         metavar="NAME",
-        help="what is observed, where the task knows several objects (short for TASK,object=NAME)",
+        help="what is observed, where the task knows several objects (short for TASK,object=NAME); several recordings of "
+        "one object, names or files, are believed together where the task can (short for TASK,object=NAME;NAME)",
     )
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results")
     command.add_argument(
@@ -514,7 +518,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ValueError as error:
         return _refuse(error)
     if getattr(arguments, "object", None) is not None:
-        arguments.task = f"{arguments.task},object={arguments.object}"
+        arguments.task = f"{arguments.task},object={';'.join(arguments.object)}"
     if len(getattr(arguments, "observation", None) or ()) > 1 and ",trials=" not in arguments.task:
         learnt = arguments.settings.get("embedding") == "trials" and ",pooling=" not in arguments.task
         arguments.task = f"{arguments.task},trials={len(arguments.observation)}{',pooling=all' * learnt}"

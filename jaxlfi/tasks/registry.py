@@ -15,6 +15,8 @@ from jaxlfi.tasks.trials import repeated
 
 GROUP = "jaxlfi.tasks"
 """The entry-point group; packages add tasks by `[project.entry-points."jaxlfi.tasks"]` in pyproject.toml."""
+SEPARATOR = ";"
+"""Between the items of an option of a tuple's type."""
 BOOLEANS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 """Words for an option of type bool."""
 
@@ -31,10 +33,12 @@ def load(reference: str) -> Task:
         reference: a registered name, or "module:factory" for a callable that returns a `Task` (or a `Task`
             itself) in a module that can be imported from the current folder; then the factory's options, if any,
             as in "whip,object=dlo-0,detector=clean". Every task has those of `jaxlfi.repeated` besides, `trials` and
-            `pooling`: "lotka_volterra,trials=4" is the task of four observations together.
+            `pooling`: "lotka_volterra,trials=4" is the task of four observations together. A factory's own `pooling` is
+            meant where `trials` is not given.
 
-    Options are converted to the types that the factory's signature declares (int, float, bool, str, Path, Literal and
-    unions of them).
+    Options are converted to the types that the factory's signature declares: int, float, bool, str, Path, Literal,
+    unions of them, and tuples of any number of one of them, whose items ";" separates, as in
+    "whip,object=dlo-0;mine.npz". A comma separates options, a colon and a plus may be part of a path.
 
     Raises:
         ValueError: for unknown names, modules that cannot be imported, options that the factory does not have or of
@@ -45,8 +49,10 @@ def load(reference: str) -> Task:
         'gaussian_linear'
     """
     name, options = parse(reference)
-    together = {option: options.pop(option) for option in ("trials", "pooling") if option in options}
-    made = _made(reference, _factory(name), options)
+    factory = _factory(name)
+    ours = ("trials", "pooling") if "trials" in options or "pooling" not in _parameters(factory) else ()
+    together = {option: options.pop(option) for option in ours if option in options}
+    made = _made(reference, factory, options)
     if not isinstance(made, Task):
         raise ValueError(f"task: expected {reference!r} to give a jaxlfi.Task, got {type(made).__name__}")
     if not together:
@@ -94,16 +100,27 @@ def _factory(reference: str):
         ) from error
 
 
+def _signature(factory) -> inspect.Signature | None:
+    """The signature of a factory, where it has one."""
+    try:
+        return inspect.signature(factory, eval_str=True)
+    except (TypeError, ValueError, NameError):  # not every callable has one
+        return None
+
+
+def _parameters(factory) -> tuple[str, ...]:
+    """Names of a factory's options; none of a task."""
+    signature = None if isinstance(factory, Task) else _signature(factory)
+    return () if signature is None else tuple(signature.parameters)
+
+
 def _made(reference: str, factory, options: dict[str, str]) -> object:
     """Call a factory."""
     if isinstance(factory, Task) or not callable(factory):
         if options:
             raise ValueError(f"task: expected no options of {reference!r}, which is not made by a function")
         return factory
-    try:
-        signature = inspect.signature(factory, eval_str=True)
-    except (TypeError, ValueError, NameError):  # not every callable has one
-        signature = None
+    signature = _signature(factory)
     if signature is not None:
         try:
             signature.bind(**options)
@@ -130,6 +147,8 @@ def convert(text: str, kind: Any, name: str) -> Any:
     Example:
         >>> convert("20", float | None, "duration")
         20.0
+        >>> convert("a;b", tuple[str, ...], "object")
+        ('a', 'b')
     """
     if isinstance(kind, str):  # an annotation that was not evaluated
         kind = {"int": int, "float": float, "bool": bool}.get(kind, str)
@@ -142,6 +161,8 @@ def convert(text: str, kind: Any, name: str) -> Any:
             except ValueError as error:
                 refused = error
         raise refused
+    if typing.get_origin(kind) is tuple and typing.get_args(kind)[1:] == (...,):
+        return tuple(convert(item, typing.get_args(kind)[0], name) for item in text.split(SEPARATOR))
     if typing.get_origin(kind) is typing.Literal:
         known = {str(value): value for value in typing.get_args(kind)}
         if text not in known:

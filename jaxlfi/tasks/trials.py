@@ -44,8 +44,7 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
     """
     if isinstance(trials, bool) or not isinstance(trials, int) or not 1 <= trials <= MAX_TRIALS:
         raise ValueError(f"trials: expected a whole number from 1 to {MAX_TRIALS}, got {trials!r}")
-    if pooling not in (ALL, *POOLINGS):
-        raise ValueError(f"pooling: expected one of {sorted((ALL, *POOLINGS))}, got {pooling!r}")
+    check_pooling(pooling)
     if trials == 1:
         return task
     if task.on_host:
@@ -53,16 +52,48 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
     else:
         simulate = functools.partial(_in_jax, task.simulate, trials)
     return dataclasses.replace(
-        task,
+        summarised_jointly(task, trials, pooling),
         simulate=simulate,
-        summary=_pooled(task.summary, trials, pooling),
         observation=None,
-        times=None,
-        record_label=f"{task.record_label or 'record'} of {trials} trials, one after another",
-        summary_names=_names(task.summary_names, trials, pooling),
         settings={**task.settings, "embedding": "trials"} if pooling == ALL else task.settings,
+    )
+
+
+def summarised_jointly(task: Task, trials: int, pooling: str, kind: str = "trial") -> Task:
+    """The task with the joint summary of several trajectories that lie one after another.
+
+    `repeated` is this with independent trials of one simulator. A simulator of its own makes trials that differ in what
+    is known of them, such as their actions (`jaxlfi.envs.whip.real2sim.whip_task`); they are in a fixed order, which
+    "all" keeps.
+
+    Args:
+        task: whose simulator gives all trajectories [n T, ...], and whose summary and its names are those of one.
+        trials: how many, n.
+        pooling: as in `repeated`.
+        kind: what one of them is called in the names of summaries and records.
+
+    Raises:
+        ValueError: for an unknown pooling.
+    """
+    check_pooling(pooling)
+    return dataclasses.replace(
+        task,
+        summary=_pooled(task.summary, trials, pooling),
+        times=None,
+        record_label=f"{task.record_label or 'record'} of {trials} {kind}s, one after another",
+        summary_names=_names(task.summary_names, trials, pooling, kind),
         name=f"{task.name} x {trials}",
     )
+
+
+def check_pooling(pooling: str) -> None:
+    """Refuse an unknown pooling.
+
+    Raises:
+        ValueError: which names those that there are.
+    """
+    if pooling not in (ALL, *POOLINGS):
+        raise ValueError(f"pooling: expected one of {sorted((ALL, *POOLINGS))}, got {pooling!r}")
 
 
 def together(trials: Sequence[Any]) -> np.ndarray:
@@ -125,11 +156,11 @@ def _pooled(summary: Callable, trials: int, pooling: str) -> Callable:
     return functools.partial(_summary, summary, trials, pooling)
 
 
-def _names(names: Sequence[str], trials: int, pooling: str) -> list[str]:
+def _names(names: Sequence[str], trials: int, pooling: str, kind: str) -> list[str]:
     """Names of that summary's numbers, from those of one trial's."""
     if pooling == ALL:
-        return [f"{name} of trial {trial + 1}" for trial in range(trials) for name in names]
-    return [f"{kind} of {name}" for kind in POOLINGS[pooling] for name in names]
+        return [f"{name} of {kind} {trial + 1}" for trial in range(trials) for name in names]
+    return [f"{statistic} of {name}" for statistic in POOLINGS[pooling] for name in names]
 
 
 def _summary(summary: Callable, trials: int, pooling: str, trajectory: Array) -> Array:
