@@ -1,9 +1,12 @@
 """The FEM reference objects: calibrated, whipped once each, and recorded.
 
     python -m experiments.reference_objects --out experiments/results/reference-objects --data envs/whip/data
+    python -m experiments.reference_objects --seeds 1 2 3 --data experiments/results/real2sim/rollouts
 
-Writes objects.json and a recording of each object to the folder of data, which must not contain them, and a table of
-the calibration and a sheet of pictures of each rollout to the folder of results. Takes some minutes.
+The first writes objects.json and a recording of each object to the folder of data, which must not contain them, and a
+table of the calibration and a sheet of pictures of each rollout to the folder of results. Takes some minutes. The
+second records the calibrated objects again, under the exploratory actions of other seeds: dlo-0-1.npz is dlo-0 under
+those of seed 1. The stack stands where it did, as inference takes it to.
 """
 
 import argparse
@@ -17,7 +20,7 @@ from matplotlib.figure import Figure
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.reference_objects.calibration import Calibration, calibrated
-from jaxlfi.envs.whip.reference_objects.objects import TABLE, ReferenceObject
+from jaxlfi.envs.whip.reference_objects.objects import TABLE, ReferenceObject, load
 from jaxlfi.envs.whip.reference_objects.observation import in_every_frame, look, record
 from jaxlfi.envs.whip.reference_objects.scene import SIMULATOR
 from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig
@@ -89,6 +92,17 @@ def draw(figure: Figure, recording: recordings.Recording, labels: np.ndarray) ->
     figure.suptitle(recording.description.split(":")[0])
 
 
+def record_again(data: Path, seeds: list[int]) -> None:
+    """Record the calibrated objects under the exploratory actions of other seeds."""
+    for number, dlo in enumerate(load(one.name) for one in TABLE):
+        rig = ReferenceRig(dlo)
+        for seed in seeds:
+            key = jax.random.fold_in(jax.random.key(number), seed)  # of the camera's noise
+            recording, _ = record(key, rig, exploratory_actions(seed))
+            recordings.write(data / f"{dlo.name}-{seed}.npz", recording)
+            print(f"wrote {data / dlo.name}-{seed}.npz")
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Calibrate, record and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -96,7 +110,12 @@ def main(arguments: list[str] | None = None) -> None:
         "--out", type=Path, default=Path("experiments/results/reference-objects"), help="folder of results"
     )
     parser.add_argument("--data", type=Path, required=True, help="folder of the recordings and objects.json")
+    parser.add_argument("--seeds", type=int, nargs="+", help="record again, under the exploratory actions of these")
     given = parser.parse_args(arguments)
+    if given.seeds:
+        given.data.mkdir(parents=True, exist_ok=True)
+        record_again(given.data, given.seeds)
+        return
     objects = given.data / "objects.json"
     for path in (objects, *(given.data / f"{dlo.name}.npz" for dlo in TABLE)):
         if path.exists():

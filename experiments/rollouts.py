@@ -1,0 +1,212 @@
+"""The whip: several rollouts of one object, each under its own actions, believed together.
+
+    python -m experiments.rollouts known --first-seed 0 --out experiments/results/rollouts
+    python -m experiments.rollouts objects --runs runs/rollouts --out experiments/results/rollouts
+
+`known` observes simulated DLOs inside Theta_0 once, twice and four times, and infers each by the settings of
+`experiments.sim2sim`, EDGE and the detector `mask`, with two ways of making one summary of several rollouts' (the
+whip's option `pooling`) and, for comparison, four rollouts under the same actions. The first rollouts of an object are
+the same in all candidates. Arrays that are there are not made again.
+
+`objects` infers the four FEM reference objects from four recorded rollouts each (envs/whip/data, and
+`experiments.reference_objects --seeds 1 2 3`), by `jaxlfi infer` and the settings of `experiments.real2sim`; finished
+runs are not repeated. Both write a table and its arrays.
+"""
+
+import argparse
+import csv
+import io
+import os
+import sys
+from pathlib import Path
+
+from jaxlfi.io import compile_cache
+
+if __name__ == "__main__":  # before jax starts
+    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={os.cpu_count() or 1}")
+    compile_cache.enable()
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+import jaxlfi
+from experiments.sim2sim import HEURISTICS, SETTINGS
+from experiments.widths import Cases, final_states, save
+from jaxlfi.bayessim.batch import posterior_after
+from jaxlfi.cli import parser as cli
+from jaxlfi.distributions.support import Support
+from jaxlfi.envs.whip.exploration import exploratory_actions
+from jaxlfi.envs.whip.parameters import INITIAL
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.real2sim import NUISANCES, whip_task
+from jaxlfi.envs.whip.reference_objects.objects import TABLE
+from jaxlfi.envs.whip.reference_objects.objects import load as reference_object
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS
+from jaxlfi.io import files as atomic
+from jaxlfi.runs import folder as run_store
+from jaxlfi.studies.calibration.repeat import described
+from jaxlfi.tasks.simulation import trajectory_and_outcome
+from jaxlfi.tasks.task import Task
+
+CANDIDATES = {
+    "1": ((0,), "all"),
+    "2 all": ((0, 1), "all"),
+    "2 mean": ((0, 1), "mean"),
+    "4 all": ((0, 1, 2, 3), "all"),
+    "4 mean": ((0, 1, 2, 3), "mean"),
+    "4 same, mean": ((0, 0, 0, 0), "mean"),
+}
+"""Seeds of the rollouts' exploratory actions, and the pooling of their summaries."""
+DRAWS = 500
+WIDTH = np.array([110.0, np.log(50.0)])
+"""Of Theta_0 in length (mm) and ln E."""
+RECORDED = Path(__file__).parent / "results" / "real2sim" / "rollouts"
+"""Folder of the reference objects' further rollouts."""
+
+
+def problem(seeds: tuple[int, ...], pooling: str) -> Task:
+    """The whip under the actions of these seeds, through the side camera."""
+    actions = np.stack([exploratory_actions(seed) for seed in seeds])
+    parts = pick("native"), DETECTORS["mask"], NUISANCES["fixed"]
+    return whip_task(*parts, actions[0] if len(seeds) == 1 else actions, pooling=pooling)
+
+
+def truths(first: int, count: int) -> np.ndarray:
+    """Lengths (mm) and moduli (Pa): uniform over Theta_0 in length and log-modulus, shape [count, 2]."""
+    low, high = (np.array([1e3 * float(end[0]), np.log(float(end[1]))]) for end in (INITIAL.low, INITIAL.high))
+    drawn = low + (high - low) * np.random.default_rng(first).uniform(size=(count, 2))
+    return np.stack([drawn[:, 0], np.exp(drawn[:, 1])], axis=-1)
+
+
+def cases(task: Task, first: int, count: int, most: tuple[int, ...], rollouts: int) -> Cases:
+    """So many of the rollouts that all candidates share, of every truth."""
+    theta = task.space.to_inference(jnp.asarray(truths(first, count), jnp.float32))
+    everything = problem(most, "all")
+    observe = jax.jit(jax.vmap(lambda key, theta: trajectory_and_outcome(everything, key, theta)))
+    seeds = first + np.arange(count)
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(1), jnp.asarray(seeds))
+    observed, failure = observe(keys, theta)
+    if np.any(failure):
+        raise SystemExit(f"{int(np.sum(failure != 0))} of the observed simulations failed")
+    observed = np.asarray(observed)[:, : observed.shape[1] // len(most) * rollouts]
+    return Cases(seeds, np.asarray(theta), observed, np.asarray(jax.vmap(task.summary)(jnp.asarray(observed))))
+
+
+def known(arguments: argparse.Namespace, console: Console) -> None:
+    """All candidates on truths that are known; arrays that are there are kept."""
+    for name in arguments.candidates:
+        path = arguments.out / f"{name.replace(', ', ' ').replace(' ', '-')}.npz"
+        if path.exists():
+            continue
+        seeds, pooling = CANDIDATES[name]
+        task, most = problem(seeds, pooling), (0, 0, 0, 0) if len(set(seeds)) < len(seeds) else (0, 1, 2, 3)
+        own = cases(task, arguments.first_seed, arguments.truths, most, len(seeds))
+        console.print(f"{name} rollouts", highlight=False)
+
+        @jax.jit
+        @jax.vmap
+        def one(key, truth, x, state):
+            return described(key, truth, posterior_after(state.belief, state.network, x), DRAWS)
+
+        runs = final_states(task, SETTINGS, "initial", HEURISTICS["edge"], own, arguments.truths, console)
+        [(_, state, seconds)] = list(runs)
+        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(77), jnp.asarray(own.seeds))
+        found = jax.device_get(one(keys, own.theta, own.x, state))
+        box = {"low": state.belief.support.low, "high": state.belief.support.high}
+        arrays = found | jax.device_get(box) | {"theta": own.theta, "seconds": np.asarray(seconds)}
+        save(path, arrays, SETTINGS, actions=str(seeds), pooling=pooling)
+    lines = [line(name, atomic.read_arrays(path)) for name, path in _kept(arguments.out)]
+    write(arguments.out / "known.csv", lines)
+    for row in lines:
+        console.print(" | ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))
+
+
+def _kept(folder: Path) -> list[tuple[str, Path]]:
+    """Candidates whose arrays are there, in their order."""
+    paths = {name: folder / f"{name.replace(', ', ' ').replace(' ', '-')}.npz" for name in CANDIDATES}
+    return [(name, path) for name, path in paths.items() if path.exists()]
+
+
+def line(name: str, arrays: dict[str, np.ndarray]) -> dict[str, object]:
+    """A candidate's line of the table: means over truths, of length in mm and of ln E."""
+    draws, theta = arrays["draws"], arrays["theta"]
+    low, high = np.quantile(draws, [0.05, 0.95], axis=1)
+    error, deviation = np.abs(draws.mean(axis=1) - theta), draws.std(axis=1)
+    held = (low <= theta) & (theta <= high)
+    columns = {"error": error.mean(axis=0), "median error": np.median(error, axis=0), "sd": deviation.mean(axis=0)}
+    both = {f"{what} of {d}": float(values[i]) for what, values in columns.items() for i, d in enumerate(("mm", "ln E"))}
+    inside = {f"{d} in 90 %": int(held[:, i].sum()) for i, d in enumerate(("length", "ln E"))}
+    return {"rollouts": name, "truths": len(theta), **both, **inside, "seconds": float(arrays["seconds"]) / len(theta)}
+
+
+def objects(arguments: argparse.Namespace, console: Console) -> None:
+    """The reference objects from four rollouts each."""
+    lines = []
+    for dlo in arguments.objects:
+        for pooling in arguments.poolings:
+            folder = arguments.runs / f"{dlo}-{pooling}"
+            words = ["infer", f"whip,pooling={pooling}", "--object", dlo]
+            words += [str(RECORDED / f"{dlo}-{seed}.npz") for seed in (1, 2, 3)]
+            words += ["--seeds", str(arguments.seeds), "--heuristic", "edge", "--no-figures", "--out", str(folder)]
+            if not (folder / "config.json").exists():
+                if status := cli.main(words):
+                    raise SystemExit(status)
+            elif run_store.read_config(folder).get("status") != "finished":
+                cli.main(["resume", str(folder)])
+            lines += [found(dlo, pooling, one) for one in sorted(folder.glob("**/posterior.npz"))]
+    write(arguments.out / "objects.csv", lines)
+    for row in lines:
+        console.print(" | ".join(map(str, row.values())))
+
+
+def found(dlo: str, pooling: str, path: Path) -> dict[str, object]:
+    """A run's line of the table: medians and 90 % intervals in natural units, and the support it ended with."""
+    run = jaxlfi.load(path.parent)
+    low, middle, high = np.quantile(run.posterior.sample(jax.random.key(1), 4000), [0.05, 0.5, 0.95], axis=0)
+    support: Support = run.space.box_to_natural(run.belief.support)
+    truth = reference_object(dlo)
+    return {
+        "object": dlo,
+        "pooling": pooling,
+        "run": path.parent.name,
+        "length at rest [mm]": round(1e3 * truth.length),
+        "E by sag [kPa]": round(truth.light_young / 1e3, 1),
+        "length [mm]": f"{middle[0]:.0f} [{low[0]:.0f}, {high[0]:.0f}]",
+        "E [kPa]": f"{middle[1] / 1e3:.3g} [{low[1] / 1e3:.3g}, {high[1] / 1e3:.3g}]",
+        "holds E by sag": bool(low[1] <= truth.light_young <= high[1]),
+        "support E [kPa]": f"[{support.low[1] / 1e3:.2g}, {support.high[1] / 1e3:.2g}]",
+    }
+
+
+def write(path: Path, lines: list[dict[str, object]]) -> None:
+    """A table as .csv, and how it was made."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, lines[0])
+    writer.writeheader()
+    writer.writerows({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in lines)
+    atomic.write_bytes(path, stream.getvalue().encode())
+    command = run_store.command_line(["python", "-m", "experiments.rollouts", *sys.argv[1:]])
+    atomic.write_json(path.with_suffix(".json"), run_store.environment() | {"command_line": command})
+
+
+def main() -> None:
+    """Run what is missing, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("known", "objects"))
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--candidates", nargs="+", choices=list(CANDIDATES), default=list(CANDIDATES))
+    parser.add_argument("--truths", type=int, default=8)
+    parser.add_argument("--first-seed", type=int, default=1000, help="0 to report, from 1000 to choose")
+    parser.add_argument("--runs", type=Path, default=Path("runs/rollouts"), help="folder of the runs of objects")
+    parser.add_argument("--objects", nargs="+", default=[dlo.name for dlo in TABLE])
+    parser.add_argument("--poolings", nargs="+", default=["all"])
+    parser.add_argument("--seeds", type=int, default=1, help="runs of each object")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    {"known": known, "objects": objects}[arguments.what](arguments, Console(width=160))
+
+
+if __name__ == "__main__":
+    main()
