@@ -1,7 +1,7 @@
 """The whip: several rollouts of one object, each under its own actions, believed together.
 
     python -m experiments.rollouts known --first-seed 0 --out experiments/results/rollouts
-    python -m experiments.rollouts objects --runs runs/rollouts --out experiments/results/rollouts
+    python -m experiments.rollouts objects --first-seed 0 --out experiments/results/rollouts
 
 `known` observes simulated DLOs inside Theta_0 once, twice and four times, and infers each by the settings of
 `experiments.sim2sim`, EDGE and the detector `mask`, with two ways of making one summary of several rollouts' (the
@@ -9,8 +9,9 @@ whip's option `pooling`) and, for comparison, four rollouts under the same actio
 the same in all candidates. Arrays that are there are not made again.
 
 `objects` infers the four FEM reference objects from four recorded rollouts each (envs/whip/data, and
-`experiments.reference_objects --seeds 1 2 3`), by `jaxlfi infer` and the settings of `experiments.real2sim`; finished
-runs are not repeated. Both write a table and its arrays.
+`experiments.reference_objects --seeds 1 2 3`), by the settings of `experiments.real2sim`, those of `jaxlfi infer whip
+--object dlo-2 dlo-2-1.npz dlo-2-2.npz dlo-2-3.npz`; as all objects were whipped alike, one batch serves them. Both
+write a table and its arrays.
 """
 
 import argparse
@@ -31,16 +32,17 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-import jaxlfi
 from experiments.sim2sim import HEURISTICS, SETTINGS
 from experiments.widths import Cases, final_states, save
 from jaxlfi.bayessim.batch import posterior_after
-from jaxlfi.cli import parser as cli
-from jaxlfi.distributions.support import Support
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.cli.commands import with_settings
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.parameters import INITIAL
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.real2sim import NUISANCES, whip_task
+from jaxlfi.envs.whip.real2sim import task as load_task
 from jaxlfi.envs.whip.reference_objects.objects import TABLE
 from jaxlfi.envs.whip.reference_objects.objects import load as reference_object
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
@@ -94,39 +96,38 @@ def cases(task: Task, first: int, count: int, most: tuple[int, ...], rollouts: i
     return Cases(seeds, np.asarray(theta), observed, np.asarray(jax.vmap(task.summary)(jnp.asarray(observed))))
 
 
+def inferred(task: Task, settings: Settings, own: Cases, console: Console) -> dict[str, np.ndarray]:
+    """Draws from the posteriors of all cases with EDGE from Theta_0, in one batch, and where their supports ended."""
+
+    @jax.jit
+    @jax.vmap
+    def one(key, truth, x, state):
+        return described(key, truth, posterior_after(state.belief, state.network, x), DRAWS)
+
+    [(_, state, seconds)] = final_states(task, settings, "initial", HEURISTICS["edge"], own, len(own.seeds), console)
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(77), jnp.asarray(own.seeds))
+    found = one(keys, own.theta, own.x, state) | {"low": state.belief.support.low, "high": state.belief.support.high}
+    return jax.device_get(found) | {"seeds": own.seeds, "theta": own.theta, "seconds": np.asarray(seconds)}
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """Where a candidate's arrays are."""
+    return folder / f"{name.replace(', ', ' ').replace(' ', '-')}.npz"
+
+
 def known(arguments: argparse.Namespace, console: Console) -> None:
-    """All candidates on truths that are known; arrays that are there are kept."""
+    """All candidates on truths that are known."""
     for name in arguments.candidates:
-        path = arguments.out / f"{name.replace(', ', ' ').replace(' ', '-')}.npz"
+        path = file_of(arguments.out, name)
         if path.exists():
             continue
         seeds, pooling = CANDIDATES[name]
         task, most = problem(seeds, pooling), (0, 0, 0, 0) if len(set(seeds)) < len(seeds) else (0, 1, 2, 3)
         own = cases(task, arguments.first_seed, arguments.truths, most, len(seeds))
-        console.print(f"{name} rollouts", highlight=False)
-
-        @jax.jit
-        @jax.vmap
-        def one(key, truth, x, state):
-            return described(key, truth, posterior_after(state.belief, state.network, x), DRAWS)
-
-        runs = final_states(task, SETTINGS, "initial", HEURISTICS["edge"], own, arguments.truths, console)
-        [(_, state, seconds)] = list(runs)
-        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(77), jnp.asarray(own.seeds))
-        found = jax.device_get(one(keys, own.theta, own.x, state))
-        box = {"low": state.belief.support.low, "high": state.belief.support.high}
-        arrays = found | jax.device_get(box) | {"theta": own.theta, "seconds": np.asarray(seconds)}
-        save(path, arrays, SETTINGS, actions=str(seeds), pooling=pooling)
-    lines = [line(name, atomic.read_arrays(path)) for name, path in _kept(arguments.out)]
-    write(arguments.out / "known.csv", lines)
-    for row in lines:
-        console.print(" | ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))
-
-
-def _kept(folder: Path) -> list[tuple[str, Path]]:
-    """Candidates whose arrays are there, in their order."""
-    paths = {name: folder / f"{name.replace(', ', ' ').replace(' ', '-')}.npz" for name in CANDIDATES}
-    return [(name, path) for name, path in paths.items() if path.exists()]
+        console.print(f"{name}, {arguments.truths} truths", highlight=False)
+        save(path, inferred(task, SETTINGS, own, console), SETTINGS, actions=str(seeds), pooling=pooling)
+    kept = [(name, file_of(arguments.out, name)) for name in CANDIDATES]
+    write(arguments.out / "known.csv", [line(name, atomic.read_arrays(path)) for name, path in kept if path.exists()])
 
 
 def line(name: str, arrays: dict[str, np.ndarray]) -> dict[str, object]:
@@ -136,52 +137,69 @@ def line(name: str, arrays: dict[str, np.ndarray]) -> dict[str, object]:
     error, deviation = np.abs(draws.mean(axis=1) - theta), draws.std(axis=1)
     held = (low <= theta) & (theta <= high)
     columns = {"error": error.mean(axis=0), "median error": np.median(error, axis=0), "sd": deviation.mean(axis=0)}
-    both = {f"{what} of {d}": float(values[i]) for what, values in columns.items() for i, d in enumerate(("mm", "ln E"))}
+    both = {
+        f"{what} of {d}": float(values[i]) for what, values in columns.items() for i, d in enumerate(("mm", "ln E"))
+    }
     inside = {f"{d} in 90 %": int(held[:, i].sum()) for i, d in enumerate(("length", "ln E"))}
     return {"rollouts": name, "truths": len(theta), **both, **inside, "seconds": float(arrays["seconds"]) / len(theta)}
 
 
 def objects(arguments: argparse.Namespace, console: Console) -> None:
     """The reference objects from four rollouts each."""
-    lines = []
-    for dlo in arguments.objects:
-        for pooling in arguments.poolings:
-            folder = arguments.runs / f"{dlo}-{pooling}"
-            words = ["infer", f"whip,pooling={pooling}", "--object", dlo]
-            words += [str(RECORDED / f"{dlo}-{seed}.npz") for seed in (1, 2, 3)]
-            words += ["--seeds", str(arguments.seeds), "--heuristic", "edge", "--no-figures", "--out", str(folder)]
-            if not (folder / "config.json").exists():
-                if status := cli.main(words):
-                    raise SystemExit(status)
-            elif run_store.read_config(folder).get("status") != "finished":
-                cli.main(["resume", str(folder)])
-            lines += [found(dlo, pooling, one) for one in sorted(folder.glob("**/posterior.npz"))]
+    names = [dlo.name for dlo in TABLE]
+    for pooling in arguments.poolings:
+        path = arguments.out / f"objects-4-{pooling}.npz"
+        if path.exists():
+            continue
+        tasks = [load_task((name, *further(name)), engine="native", pooling=pooling) for name in names]
+        task = tasks[0]  # all were whipped alike, and seen from the same place
+        sag = [[1e3 * reference_object(name).length, reference_object(name).light_young] for name in names]
+        count = arguments.seeds
+        observed = np.repeat(np.stack([one.observation for one in tasks]), count, axis=0)
+        own = Cases(
+            np.tile(arguments.first_seed + np.arange(count), len(names)),
+            np.asarray(task.space.to_inference(jnp.repeat(jnp.asarray(sag, jnp.float32), count, axis=0))),
+            observed,
+            np.asarray(jax.vmap(task.summary)(jnp.asarray(observed))),
+        )
+        settings = with_settings(QUICK, task.settings, partly=True).replace(predictive=False)
+        console.print(f"{pooling}, {len(own.seeds)} runs", highlight=False)
+        save(path, inferred(task, settings, own, console), settings, pooling=pooling)
+    kept = {pooling: arguments.out / f"objects-4-{pooling}.npz" for pooling in ("all", "mean")}
+    lines = [row for pooling, path in kept.items() if path.exists() for row in found(pooling, atomic.read_arrays(path))]
     write(arguments.out / "objects.csv", lines)
-    for row in lines:
-        console.print(" | ".join(map(str, row.values())))
 
 
-def found(dlo: str, pooling: str, path: Path) -> dict[str, object]:
-    """A run's line of the table: medians and 90 % intervals in natural units, and the support it ended with."""
-    run = jaxlfi.load(path.parent)
-    low, middle, high = np.quantile(run.posterior.sample(jax.random.key(1), 4000), [0.05, 0.5, 0.95], axis=0)
-    support: Support = run.space.box_to_natural(run.belief.support)
-    truth = reference_object(dlo)
-    return {
-        "object": dlo,
-        "pooling": pooling,
-        "run": path.parent.name,
-        "length at rest [mm]": round(1e3 * truth.length),
-        "E by sag [kPa]": round(truth.light_young / 1e3, 1),
-        "length [mm]": f"{middle[0]:.0f} [{low[0]:.0f}, {high[0]:.0f}]",
-        "E [kPa]": f"{middle[1] / 1e3:.3g} [{low[1] / 1e3:.3g}, {high[1] / 1e3:.3g}]",
-        "holds E by sag": bool(low[1] <= truth.light_young <= high[1]),
-        "support E [kPa]": f"[{support.low[1] / 1e3:.2g}, {support.high[1] / 1e3:.2g}]",
-    }
+def further(name: str) -> list[str]:
+    """The recordings of a reference object beside the one that it is known by."""
+    return [str(RECORDED / f"{name}-{seed}.npz") for seed in (1, 2, 3)]
+
+
+def found(pooling: str, arrays: dict[str, np.ndarray]) -> list[dict[str, object]]:
+    """A line of the table for each run: medians and 90 % intervals, and the support it ended with."""
+    length, logs = np.moveaxis(np.quantile(arrays["draws"], [0.05, 0.5, 0.95], axis=1), -1, 0)
+    stiffness = np.exp(logs) / 1e3
+    each = len(arrays["theta"]) // len(TABLE)
+    return [
+        {
+            "object": TABLE[i // each].name,
+            "pooling": pooling,
+            "seed": int(arrays["seeds"][i]),
+            "length at rest [mm]": round(float(theta[0])),
+            "E by sag [kPa]": round(float(np.exp(theta[1])) / 1e3, 1),
+            "length [mm]": f"{length[1, i]:.0f} [{length[0, i]:.0f}, {length[2, i]:.0f}]",
+            "E [kPa]": f"{stiffness[1, i]:.1f} [{stiffness[0, i]:.1f}, {stiffness[2, i]:.1f}]",
+            "holds E by sag": bool(logs[0, i] <= theta[1] <= logs[2, i]),
+            "support E [kPa]": "[{:.2g}, {:.2g}]".format(*(np.exp(arrays[end][i, 1]) / 1e3 for end in ("low", "high"))),
+        }
+        for i, theta in enumerate(arrays["theta"])
+    ]
 
 
 def write(path: Path, lines: list[dict[str, object]]) -> None:
     """A table as .csv, and how it was made."""
+    for row in lines:
+        print(" | ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))
     stream = io.StringIO()
     writer = csv.DictWriter(stream, lines[0])
     writer.writeheader()
@@ -199,9 +217,7 @@ def main() -> None:
     parser.add_argument("--candidates", nargs="+", choices=list(CANDIDATES), default=list(CANDIDATES))
     parser.add_argument("--truths", type=int, default=8)
     parser.add_argument("--first-seed", type=int, default=1000, help="0 to report, from 1000 to choose")
-    parser.add_argument("--runs", type=Path, default=Path("runs/rollouts"), help="folder of the runs of objects")
-    parser.add_argument("--objects", nargs="+", default=[dlo.name for dlo in TABLE])
-    parser.add_argument("--poolings", nargs="+", default=["all"])
+    parser.add_argument("--poolings", nargs="+", choices=("all", "mean"), default=("all", "mean"))
     parser.add_argument("--seeds", type=int, default=1, help="runs of each object")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)

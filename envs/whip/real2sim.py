@@ -161,8 +161,10 @@ def whip_task(
         first = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[0], leaf.shape), scenes)
         scenes = first.replace(stack=scenes.stack)
         views = jax.vmap(side_camera)(scenes) if camera is None else camera
-        look = jax.vmap(trajectory, in_axes=(0, None, None, 0, 0, 0))
-        rows, valid = look(keys[:, 1], engine, detector, views, scenes, actions)
+        look = lambda key, view, scene, actions: trajectory(key, engine, detector, view, scene, actions)
+        # Not by vmap: JAX copies the arguments of a callback from 100 kB on in a thread of its pool, and where every
+        # device's callback holds one of these threads, all wait for ever. So batches stay as small as of one rollout.
+        rows, valid = jax.lax.map(lambda given: look(*given), (keys[:, 1], views, scenes, actions))
         return rows.reshape(-1, rows.shape[-1]), jnp.all(valid)
 
     made = Task(

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from importlib.metadata import EntryPoint
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from jaxlfi.runs import folder as run_store
 from jaxlfi.studies import grid
 from jaxlfi.tasks import observation
 from jaxlfi.tasks import registry as tasks
+from jaxlfi.tasks.trials import repeated
 from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
 
@@ -428,6 +430,29 @@ def test_tasks_take_options():
 def test_an_object_is_an_option_of_the_task(tmp_path, capsys):
     message = error_line(capsys, "infer", TASK, "--object", "dlo-0", *FLAGS, "--out", tmp_path / "out")
     assert "expected options among none" in message and "object=dlo-0" in message
+
+
+def several(object: tuple[str, ...] | str | None = None, pooling: Literal["all", "mean"] = "all"):
+    """A task that knows objects, and an option that all tasks have besides."""
+    return dataclasses.replace(gaussian(), name=f"{object} {pooling}")
+
+
+def test_several_objects_are_an_option_of_the_task(tmp_path, capsys):
+    words = "--object", "a b.npz", "c", "--object", "d", *FLAGS, "--out", tmp_path / "out"
+    assert "object=a b.npz;c;d" in error_line(capsys, "infer", TASK, *words)  # which has no objects
+    reference = "tests.cli.test_cli:several"
+    assert tasks.load(f"{reference},object=a b.npz;c;d").name == "('a b.npz', 'c', 'd') all"
+    assert tasks.load(f"{reference},object=a").name == "('a',) all"
+    message = error_line(capsys, "infer", reference, "--object", "a,b", *FLAGS, "--out", tmp_path / "out")
+    assert "expected options as NAME,key=value" in message
+
+
+def test_a_pooling_is_the_tasks_own_unless_there_are_trials():
+    reference = "tests.cli.test_cli:several,object=a"
+    assert tasks.load(f"{reference},pooling=mean").name == "('a',) mean"
+    assert tasks.load(f"{reference},pooling=mean,trials=2") == repeated(tasks.load(reference), 2, "mean")
+    with pytest.raises(ValueError, match=r"pooling: expected one of \['all', 'mean'\], got 'moments'"):
+        tasks.load(f"{reference},pooling=moments")
 
 
 def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line(tmp_path):

@@ -119,6 +119,10 @@ def test_a_task_itself_can_be_named(here):
         ("x", int | str, "x"),
         ("7", int | str, 7),
         ("[1]", list[int], "[1]"),
+        ("a;b c", tuple[str, ...], ("a", "b c")),
+        ("a", tuple[str, ...] | str | None, ("a",)),
+        ("1;2", tuple[int, ...], (1, 2)),
+        ("1;2", tuple[int, int], "1;2"),
     ],
 )
 def test_texts_become_values(text, kind, value):
