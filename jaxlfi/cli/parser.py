@@ -406,8 +406,9 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         nargs="+",
         action="extend",
         metavar="NAME",
-        help="what is observed, where the task knows several objects (short for TASK,object=NAME). Several, as names or "
-        "files, are recordings of one object, each under its own actions, and believed together (TASK,object=NAME;NAME)",
+        help="what is observed, where the task knows several objects (short for TASK,object=NAME); several names or "
+        "files: recordings of one object, each under its own actions, believed together (short for "
+        "TASK,object=NAME;NAME)",
     )
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results")
     command.add_argument(
