@@ -128,8 +128,9 @@ def whip_task(
 ) -> Task:
     """The task made of its parts, for studies that choose them.
 
-    A simulation of several rollouts is so many simulations of one, each with a key of its own, of the same length,
-    modulus and nuisances but for where the stack of cubes stands, which is built up anew. It fails where one fails.
+    A simulation of several rollouts is so many simulations of one, the i-th with the key `fold_in(key, i)`, of the same
+    length, modulus and nuisances but for where the stack of cubes stands, which is built up anew. It fails where one
+    fails.
 
     Args:
         engine: the physics.
@@ -156,15 +157,20 @@ def whip_task(
         return trajectory(key_keypoints, engine, detector, view, scene, actions)
 
     def several(key: jax.Array, theta: Float[Array, "2"]):
-        keys = jax.vmap(jax.random.split)(jax.random.split(key, len(actions)))
-        scenes = jax.vmap(lambda key: nuisances(key, *(theta / MILLIMETRES)))(keys[:, 0])
-        first = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[0], leaf.shape), scenes)
-        scenes = first.replace(stack=scenes.stack)
-        views = jax.vmap(side_camera)(scenes) if camera is None else camera
-        look = lambda key, view, scene, actions: trajectory(key, engine, detector, view, scene, actions)
+        def scene_of(key):
+            return nuisances(key, *(theta / MILLIMETRES))
+
+        first = scene_of(jax.random.split(jax.random.fold_in(key, 0))[0])
+
+        def rollout(i):
+            key_scene, key_keypoints = jax.random.split(jax.random.fold_in(key, i))
+            scene = first.replace(stack=scene_of(key_scene).stack)
+            view = side_camera(scene) if camera is None else jax.tree.map(lambda leaf: leaf[i], camera)
+            return trajectory(key_keypoints, engine, detector, view, scene, actions[i])
+
         # Not by vmap: JAX copies the arguments of a callback from 100 kB on in a thread of its pool, and where every
         # device's callback holds one of these threads, all wait for ever. So batches stay as small as of one rollout.
-        rows, valid = jax.lax.map(lambda given: look(*given), (keys[:, 1], views, scenes, actions))
+        rows, valid = jax.lax.map(rollout, jnp.arange(len(actions)))
         return rows.reshape(-1, rows.shape[-1]), jnp.all(valid)
 
     made = Task(
