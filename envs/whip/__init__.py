@@ -11,7 +11,7 @@ def task(
     detector: Literal["clean", "mask", "noisy", "transporter"] = "mask",
     nuisances: Literal["fixed", "random"] = "fixed",
     engine: Literal["auto", "native", "mjx", "warp"] = "auto",
-    pooling: Literal["all", "mean", "moments"] = "all",
+    pooling: Literal["mean", "all", "moments"] = "mean",
 ):
     """The Real2Sim task; its options are those of `jaxlfi.envs.whip.real2sim.task`.
 

@@ -43,7 +43,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pair(folder):
-    return task(object=("dlo-2", str(folder / "a.npz")), engine="native")
+    return task(object=("dlo-2", str(folder / "a.npz")), engine="native", pooling="all")
 
 
 def test_a_simulation_is_those_of_the_single_rollouts_with_keys_of_their_own(pair, folder, key):
@@ -85,7 +85,7 @@ def test_the_observation_and_its_summary_are_those_of_the_rollouts(pair, folder)
     assert pair.record_label == "control step of 2 rollouts, one after another"
     single = task(object="dlo-2", engine="native")
     apart = np.stack([single.summary(jnp.asarray(one)) for one in each])
-    mean = task(object=names, engine="native", pooling="mean")
+    mean = task(object=names, engine="native")
     moments = task(object=names, engine="native", pooling="moments")
     for made, expected in (
         (pair, apart.ravel()),
@@ -100,7 +100,7 @@ def test_the_observation_and_its_summary_are_those_of_the_rollouts(pair, folder)
 
 
 def test_one_recording_is_what_it_was():
-    several, one = task(object=("dlo-2",), engine="native", pooling="mean"), task(object="dlo-2", engine="native")
+    several, one = task(object=("dlo-2",), engine="native", pooling="all"), task(object="dlo-2", engine="native")
     assert several.name == one.name == "whip" and several.record_label == one.record_label
     np.testing.assert_array_equal(several.observation, one.observation)
     assert several.summary_names == one.summary_names and several.summary.func is one.summary.func
@@ -193,7 +193,7 @@ def test_a_run_of_two_recordings_is_loaded_again_by_its_reference(folder, tmp_pa
     reference = json.loads((out / "config.json").read_text())["task"]
     assert reference == f"whip,engine=native,object=dlo-2;{a}"
     run = jaxlfi.load(out)
-    assert run.task.name == "whip x 2" and run.observed.shape == (32, 30) and run.x.shape == (224,)
+    assert run.task.name == "whip x 2" and run.observed.shape == (32, 30) and run.x.shape == (112,)
     np.testing.assert_array_equal(run.task.observation, registry.load(reference).observation)
     assert (out / "report.html").exists() and list((out / "figures").glob("*.png"))
     assert command("resume", out) == 0
