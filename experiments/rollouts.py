@@ -8,10 +8,10 @@
 whip's option `pooling`) and, for comparison, four rollouts under the same actions. The first rollouts of an object are
 the same in all candidates. Arrays that are there are not made again.
 
-`objects` infers the four FEM reference objects from four recorded rollouts each (envs/whip/data, and
-`experiments.reference_objects --seeds 1 2 3`), by the settings of `experiments.real2sim`, those of `jaxlfi infer whip
---object dlo-2 dlo-2-1.npz dlo-2-2.npz dlo-2-3.npz`; as all objects were whipped alike, one batch serves them. Both
-write a table and its arrays.
+`objects` infers the four FEM reference objects by the same settings from one and from four recorded rollouts each
+(envs/whip/data, and `experiments.reference_objects --seeds 1 2 3`), as `jaxlfi infer whip --object dlo-2 dlo-2-1.npz
+dlo-2-2.npz dlo-2-3.npz` does one object; as all were whipped alike, one batch serves them. Both write a table and its
+arrays.
 """
 
 import argparse
@@ -35,9 +35,7 @@ from rich.console import Console
 from experiments.sim2sim import HEURISTICS, SETTINGS
 from experiments.widths import Cases, final_states, save
 from jaxlfi.bayessim.batch import posterior_after
-from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.cli.commands import with_settings
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.parameters import INITIAL
 from jaxlfi.envs.whip.physics.engines import pick
@@ -145,13 +143,14 @@ def line(name: str, arrays: dict[str, np.ndarray]) -> dict[str, object]:
 
 
 def objects(arguments: argparse.Namespace, console: Console) -> None:
-    """The reference objects from four rollouts each."""
+    """The reference objects from one rollout and from four."""
     names = [dlo.name for dlo in TABLE]
-    for pooling in arguments.poolings:
-        path = arguments.out / f"objects-4-{pooling}.npz"
+    for candidate in arguments.candidates:
+        path = file_of(arguments.out, f"objects {candidate}")
         if path.exists():
             continue
-        tasks = [load_task((name, *further(name)), engine="native", pooling=pooling) for name in names]
+        seeds, pooling = CANDIDATES[candidate]
+        tasks = [load_task((name, *further(name, seeds)), engine="native", pooling=pooling) for name in names]
         task = tasks[0]  # all were whipped alike, and seen from the same place
         sag = [[1e3 * reference_object(name).length, reference_object(name).light_young] for name in names]
         count = arguments.seeds
@@ -162,20 +161,19 @@ def objects(arguments: argparse.Namespace, console: Console) -> None:
             observed,
             np.asarray(jax.vmap(task.summary)(jnp.asarray(observed))),
         )
-        settings = with_settings(QUICK, task.settings, partly=True).replace(predictive=False)
-        console.print(f"{pooling}, {len(own.seeds)} runs", highlight=False)
-        save(path, inferred(task, settings, own, console), settings, pooling=pooling)
-    kept = {pooling: arguments.out / f"objects-4-{pooling}.npz" for pooling in ("all", "mean")}
-    lines = [row for pooling, path in kept.items() if path.exists() for row in found(pooling, atomic.read_arrays(path))]
+        console.print(f"{candidate}, {len(own.seeds)} runs of reference objects", highlight=False)
+        save(path, inferred(task, SETTINGS, own, console), SETTINGS, actions=str(seeds), pooling=pooling)
+    kept = {name: file_of(arguments.out, f"objects {name}") for name in CANDIDATES}
+    lines = [row for name, path in kept.items() if path.exists() for row in found(name, atomic.read_arrays(path))]
     write(arguments.out / "objects.csv", lines)
 
 
-def further(name: str) -> list[str]:
-    """The recordings of a reference object beside the one that it is known by."""
-    return [str(RECORDED / f"{name}-{seed}.npz") for seed in (1, 2, 3)]
+def further(name: str, seeds: tuple[int, ...]) -> list[str]:
+    """The recordings of a reference object under the actions of these seeds, but for 0: that one has its name."""
+    return [str(RECORDED / f"{name}-{seed}.npz") for seed in seeds if seed]
 
 
-def found(pooling: str, arrays: dict[str, np.ndarray]) -> list[dict[str, object]]:
+def found(candidate: str, arrays: dict[str, np.ndarray]) -> list[dict[str, object]]:
     """A line of the table for each run: medians and 90 % intervals, and the support it ended with."""
     length, logs = np.moveaxis(np.quantile(arrays["draws"], [0.05, 0.5, 0.95], axis=1), -1, 0)
     stiffness = np.exp(logs) / 1e3
@@ -183,7 +181,7 @@ def found(pooling: str, arrays: dict[str, np.ndarray]) -> list[dict[str, object]
     return [
         {
             "object": TABLE[i // each].name,
-            "pooling": pooling,
+            "rollouts": candidate,
             "seed": int(arrays["seeds"][i]),
             "length at rest [mm]": round(float(theta[0])),
             "E by sag [kPa]": round(float(np.exp(theta[1])) / 1e3, 1),
@@ -217,7 +215,6 @@ def main() -> None:
     parser.add_argument("--candidates", nargs="+", choices=list(CANDIDATES), default=list(CANDIDATES))
     parser.add_argument("--truths", type=int, default=8)
     parser.add_argument("--first-seed", type=int, default=1000, help="0 to report, from 1000 to choose")
-    parser.add_argument("--poolings", nargs="+", choices=("all", "mean"), default=("all", "mean"))
     parser.add_argument("--seeds", type=int, default=1, help="runs of each object")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
