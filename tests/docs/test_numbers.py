@@ -292,6 +292,22 @@ def test_real2sim(dlo, configuration):
     np.testing.assert_allclose([float(value) for value in numbers(cells[4])], support, rtol=0.05)
 
 
+@pytest.mark.parametrize("name", ["1", "tuning/4-mean", "tuning/4-all"])
+def test_several_rollouts(name):
+    kept = arrays(f"rollouts/{name}")
+    draws, theta = kept["draws"], kept["theta"]
+    low, high = np.quantile(draws, [0.05, 0.95], axis=1)
+    error, deviation = np.abs(draws.mean(axis=1) - theta).mean(axis=0), draws.std(axis=1).mean(axis=0)
+    held = ((low <= theta) & (theta <= high)).sum(axis=0)
+    label = {"1": "| 1 | 0", "tuning/4-mean": "| 4, `mean` | 1000", "tuning/4-all": "| 4, `all` | 1000"}[name]
+    assert_printed(
+        [
+            f"{label} | {error[0]:.1f} | {error[1]:.2f} | {deviation[0]:.1f}, {deviation[1]:.2f} "
+            f"| {held[0]}, {held[1]} of {len(theta)} |"
+        ]
+    )
+
+
 def test_engines_of_the_whip():
     measured = json.loads((RESULTS / "whip-engines/speed.json").read_text())["measured"]
     for printed, name in (
