@@ -10,14 +10,13 @@ and figure are drawn from the saved arrays. `--seeds 2 --rounds 2 --steps 20` is
 import argparse
 import dataclasses
 import json
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from jaxlfi.io import compile_cache
+from jaxlfi.io import compile_cache, host_devices
 
 if __name__ == "__main__":  # before jax starts
-    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={os.cpu_count() or 1}")
+    host_devices.divide()
     compile_cache.enable()
 
 import jax

@@ -17,14 +17,13 @@ arrays.
 import argparse
 import csv
 import io
-import os
 import sys
 from pathlib import Path
 
-from jaxlfi.io import compile_cache
+from jaxlfi.io import compile_cache, host_devices
 
 if __name__ == "__main__":  # before jax starts
-    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={os.cpu_count() or 1}")
+    host_devices.divide()
     compile_cache.enable()
 
 import jax

@@ -14,13 +14,12 @@ known: the table has the median standard deviation relative to it.
 
 import argparse
 import operator
-import os
 from pathlib import Path
 
-from jaxlfi.io import compile_cache
+from jaxlfi.io import compile_cache, host_devices
 
 if __name__ == "__main__":  # before jax starts
-    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={os.cpu_count() or 1}")
+    host_devices.divide()
     compile_cache.enable()
 
 import jax

@@ -16,14 +16,13 @@ import argparse
 import dataclasses
 import json
 import operator
-import os
 import time
 from pathlib import Path
 
-from jaxlfi.io import compile_cache
+from jaxlfi.io import compile_cache, host_devices
 
 if __name__ == "__main__":  # before jax starts
-    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={os.cpu_count() or 1}")
+    host_devices.divide()
     compile_cache.enable()
 
 import jax

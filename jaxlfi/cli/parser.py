@@ -12,7 +12,6 @@ import dataclasses
 import itertools
 import json
 import math
-import os
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -461,13 +460,12 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
     On CPU jax sees one device, and runs of small networks do not fill it: with as many devices as cores, each takes
     its part of a batch. A single run stays on one device, whose matrix products then use all cores.
     """
+    from jaxlfi.io import host_devices
+
     runs = _runs(arguments)
-    flags = os.environ.get("XLA_FLAGS", "")
-    if runs > 1 and "xla_force_host_platform_device_count" not in flags:
-        devices = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, runs)
-        if recorded := _recorded(arguments).get("devices"):
-            devices = recorded  # the same batch on the same number of devices repeats bit for bit
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={devices}".strip()
+    if runs > 1:
+        # The same batch on the same number of devices repeats bit for bit.
+        host_devices.divide(_recorded(arguments).get("devices") or min(host_devices.processors(), runs))
     if not getattr(arguments, "no_cache", True):
         from jaxlfi.io import compile_cache
 

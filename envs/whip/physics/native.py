@@ -7,7 +7,6 @@ the gripper or the DLO comes near them in an interval, that interval is simulate
 import contextlib
 import dataclasses
 import functools
-import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -24,16 +23,12 @@ from jaxlfi.envs.whip.physics.edits import dlo_edits, edited, edited_model
 from jaxlfi.envs.whip.physics.engine import State, ramp, settled
 from jaxlfi.envs.whip.physics.scene import CUBES, HAND, Scene, bare_model, base_model
 from jaxlfi.envs.whip.rig import SECTION
+from jaxlfi.io.host_devices import processors
 
 CACHED_MODELS = 4096
 """Models that are cached, 65 kB each: more than the scenes of most batches, which are stepped many times."""
 CHUNK = 256
 """Maximum number of scenes that are rolled out in one call, which bounds the memory of the substeps' states."""
-
-
-def processors() -> int:
-    """Number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class NativeEngine:
