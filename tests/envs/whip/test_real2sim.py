@@ -43,7 +43,7 @@ def test_the_declaration_is_the_papers(problem):
     np.testing.assert_allclose(problem.feasible.high, [350, 5e5], rtol=1e-5)
     for box in problem.supports.values():
         check_within(box, problem.feasible)
-    assert problem.settings == {"rounds": 15, "batch_size": 10}
+    assert problem.settings == {"rounds": 15, "min_rounds": 15, "batch_size": 10}
     assert problem.hyperparameters["edge"]["mass_threshold"] == (0.003, 0.005)
     assert len(problem.channels) == 30 and len(problem.named_summaries(112)) == 112
 
