@@ -63,7 +63,7 @@ lost.
 
 def all_rounds(settings: Settings) -> Settings:
     """Every run makes as many rounds as the shortest would: equal budgets, whether posteriors have settled or not."""
-    return settings.replace(rounds=settings.min_rounds or settings.rounds, min_rounds=0)
+    return settings.replace(rounds=min(settings.min_rounds or settings.rounds, settings.rounds), min_rounds=0)
 
 
 def apt(settings: Settings) -> Settings:

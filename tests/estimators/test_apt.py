@@ -204,6 +204,7 @@ def test_methods_keep_the_budget():
         assert isinstance(settings.check().estimator, FlowEstimator)
         assert (settings.inflation, settings.min_rounds) == (1.0, 0)
     assert METHODS["bayessim"](QUICK) is QUICK
+    assert METHODS["npe"](QUICK.replace(rounds=3)).simulations_per_round == 300
 
 
 def test_a_run_can_be_sampled(folder, tmp_path):
