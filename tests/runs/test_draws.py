@@ -96,12 +96,14 @@ def test_all_draws_are_of_one_distribution(ways):
             assert stats.ks_2samp(other[:, d], expected[:, d]).pvalue > 1e-4, (name, d)
 
 
-def test_no_draw_lies_on_a_bound(ways):
+def test_no_draws_lie_on_a_bound(ways):
+    """Clipped ones would by the hundred; one of a density that is not zero there may come as near by chance."""
     _, draws = ways
     low, high = np.array([0.5, -1.0]), np.array([3.0, 1.0])
     gap = 1e-6 * (high - low)
     for name, theta in draws.items():
-        assert ((theta > low + gap) & (theta < high - gap)).all(), name
+        assert np.sum((theta <= low + gap) | (theta >= high - gap)) <= 2, name
+        assert np.all((theta > low - gap) & (theta < high + gap)), name
 
 
 @pytest.mark.parametrize("space", ["natural", "inference"])

@@ -90,6 +90,8 @@ def test_arrays_have_the_documented_shapes(folder):
             "effective_size": (ROUNDS,),
             "not_positive_definite": (ROUNDS,),
             "mass_inside": (ROUNDS,),
+            "moved": (ROUNDS,),
+            "settled": (ROUNDS,),
             "predictive_simulations": (ROUNDS,),
             "names": (DIM,),
             "final_trajectory": (SAMPLES, 2),

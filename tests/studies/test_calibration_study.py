@@ -285,7 +285,11 @@ def test_chunks_are_picked_up_to_the_same_arrays(repeated, folder, tmp_path):
     for name in whole:
         np.testing.assert_array_equal(whole[name], again[name], err_msg=name)
     left = {name: check for name, check in results(repeated).items() if "reference" not in name}
-    assert results(out) == left
+    found = results(out)
+    # The classifier is trained anew, which amplifies the last bits of a program that was compiled again.
+    trained = "classifier, draws or truths"
+    assert found.pop(trained)["verdict"] == left.pop(trained)["verdict"]
+    assert found == left
 
 
 def refused(capsys, *arguments) -> str:
