@@ -83,9 +83,9 @@ class Variant:
 def variants(quick: Settings = QUICK, clipped: Settings = CLIPPED) -> dict[str, Variant]:
     """The rows of the table, by name.
 
-    All but the first two change one thing of `single`, which is `clipped` with one network instead of four: a quarter
-    of the work, and nothing that an ensemble averages away. EDGE's own readings move nothing else, so that the other
-    configurations are left out there.
+    `single` is `clipped` with one network instead of four, and every later row changes one setting of `single`. One
+    network takes a quarter of the time, and shows effects that an ensemble would average away. EDGE's own readings
+    change nothing in the other configurations, which are left out there.
     """
     base = clipped.replace(estimator=clipped.estimator.replace(ensemble_size=1))
 

@@ -1,8 +1,9 @@
 """NPE of BayesFlow 2 (Radev et al. 2023), on its JAX backend, by the defaults of its `BasicWorkflow`.
 
-Those are a coupling flow, 100 epochs of batches of 32, and a learning rate that is warmed up and decays. Two things are
-not its defaults, both as its guides advise: the summaries are standardised, not only the parameters, and parameters
-with a uniform prior are constrained to their box, so that no draw lies outside. Failed simulations are dropped.
+The defaults are a coupling flow, 100 epochs, batches of 32, and a learning rate with warm-up and decay. Two settings
+differ from the defaults, both as BayesFlow's guides advise: summaries are standardised as the parameters are, and
+parameters with a uniform prior are constrained to their box, so that no draw lies outside. Failed simulations are
+dropped.
 """
 
 import logging

@@ -13,11 +13,12 @@ def processors() -> int:
 def divide(devices: int | None = None) -> None:
     """Let JAX see so many devices, by default one a core; call it before jax starts. A number already set is kept.
 
-    XLA's threads become one more than devices. Each device takes one; the large arguments of a callback are copied by
-    another, and where all were taken by callbacks, they would wait for the copies for ever.
+    By the environment variable NPROC, XLA's pool gets at least one thread more than there are devices. Each device
+    occupies one, and a callback's large arguments are copied by another of the same pool: with all threads in
+    callbacks, the program would deadlock.
     """
     devices = devices or processors()
     flags = os.environ.get("XLA_FLAGS", "")
     if FLAG not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --{FLAG}={devices}".strip()
-        os.environ.setdefault("NPROC", str(max(processors(), devices + 1)))  # how XLA is told the number of threads
+        os.environ.setdefault("NPROC", str(max(processors(), devices + 1)))
