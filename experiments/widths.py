@@ -156,6 +156,8 @@ def final_states(
                 states |= {row: jax.tree.map(operator.itemgetter(place), state) for place, row in enumerate(rows)}
             active = np.array([row for row in active if not states[row].progress.settled], int)
             progress.advance()
+            if not len(active):
+                break
     return stack([states[row] for row in range(len(states))]), seconds
 
 
