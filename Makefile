@@ -3,17 +3,18 @@ PYTHON ?= python3.11
 VENV ?= .venv
 BIN = $(VENV)/bin
 OUT ?= runs/demo
-# Worker processes of the tests; two suit a small machine.
-WORKERS ?= 2
+# Worker processes of the tests: one more than two cores, as some tests wait for processes that they start.
+WORKERS ?= 3
 
 .PHONY: demo test lint docs bench clean help
 
 help:  ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
+# Python compiles what it imports; all that is installed would take longer than the installation.
 $(VENV)/.installed: pyproject.toml setup.py constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,dev,whip]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[test,dev,whip]'
 	@touch $@
 
 demo: $(VENV)/.installed  ## the main job: supports and heuristics compared on Lotka-Volterra

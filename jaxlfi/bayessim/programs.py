@@ -4,6 +4,7 @@ import functools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
@@ -25,13 +26,33 @@ def program(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...],
 
 @functools.lru_cache(maxsize=KEPT)
 def _program(function, bound: tuple, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...]):
-    many = jax.vmap(functools.partial(function, *bound), in_axes=in_axes)
+    one = functools.partial(function, *bound)
+    mapped = jax.vmap(one, in_axes=in_axes)
+
+    def many(*arguments):
+        return _alone(one, in_axes, arguments) if _runs(in_axes, arguments) == 1 else mapped(*arguments)
+
+    many.__name__ = function.__name__  # in profiles
     if mesh.size > 1:
         # Runs are divided by shard_map, as while-loops must not get predicates that cross devices.
         split = PartitionSpec(mesh.axis_names[0])
         specs = tuple(PartitionSpec() if axis is None else split for axis in in_axes)
         many = jax.shard_map(many, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
     return jax.jit(many, donate_argnums=donate)
+
+
+def _runs(in_axes: tuple[int | None, ...], arguments: tuple) -> int:
+    """Number of runs of a batch (on one device)."""
+    return next(len(jax.tree.leaves(value)[0]) for axis, value in zip(in_axes, arguments, strict=True) if axis == 0)
+
+
+def _alone(one: functools.partial, in_axes: tuple[int | None, ...], arguments: tuple) -> Any:
+    """A batch of one run without `vmap`, whose loops and scatters would take a tenth longer, to compile and to run."""
+    own = [
+        value if axis is None else jax.tree.map(lambda leaf: leaf[0], value)
+        for axis, value in zip(in_axes, arguments, strict=True)
+    ]
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], one(*own))
 
 
 _EXECUTABLES: dict[Any, Any] = {}

@@ -67,6 +67,7 @@ def compilations():
 
 
 def test_an_equal_task_made_anew_compiles_nothing(compilations):
+    programs.forget()
     infer(0, gaussian_linear.task())
     before, kept = len(compilations()), dict(programs._EXECUTABLES)
     assert before > 0  # so that compilations are seen at all
