@@ -14,7 +14,7 @@ help:  ## what there is to make
 # Python compiles what it imports; all that is installed would take longer than the installation.
 $(VENV)/.installed: pyproject.toml setup.py constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[test,dev,whip]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[test,dev,whip,policy]'
 	@touch $@
 
 demo: $(VENV)/.installed  ## the main job: supports and heuristics compared on Lotka-Volterra

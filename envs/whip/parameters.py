@@ -40,6 +40,9 @@ INITIAL = Support([0.195, 1e3], [0.305, 5e4])
 FEASIBLE = Support([0.050, 0.5e3], [0.350, 5e5])
 """Phi of (length, young)."""
 
+MILLIMETRES = np.array([1000.0, 1.0])
+"""Factors from (length, young) in m and Pa to the units they are inferred in, mm and Pa."""
+
 MEDIAN = WhipParameters(
     length=0.250,
     young=2.5e4,
@@ -57,6 +60,11 @@ LOWEST = WhipParameters(0.050, 0.5e3, 50.0, 0.3, 0.020, 80.0, (-0.02, -0.005), (
 
 HIGHEST = WhipParameters(0.350, 5e5, 100.0, 0.5, 0.030, 120.0, (0.02, 0.005), (0.025, 0.025, 0.025))
 """Upper bounds, likewise."""
+
+
+def in_task_units(box: Support) -> Support:
+    """A box of (length, young) in mm and Pa, the units they are inferred in."""
+    return Support(np.asarray(box.low) * MILLIMETRES, np.asarray(box.high) * MILLIMETRES)
 
 
 def median(length: Float[Array, "*batch"] | float = MEDIAN.length, young=MEDIAN.young) -> WhipParameters:

@@ -10,12 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlfi.distributions.support import Support
 from jaxlfi.envs.whip import parameters as ranges
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.frames import COLOURS
-from jaxlfi.envs.whip.parameters import WhipParameters, median, randomised
+from jaxlfi.envs.whip.parameters import MILLIMETRES, WhipParameters, in_task_units, median, randomised
 from jaxlfi.envs.whip.physics.engine import Engine
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.trajectory import trajectory
@@ -29,8 +28,6 @@ TRUTH = (0.23, 8e3)
 """Length (m) and Young's modulus (Pa) of the simulated DLO that is observed where no object is named."""
 DATA = Path(__file__).parent / "data"
 """Folder of the recorded rollouts of the FEM reference objects."""
-MILLIMETRES = np.array([1e3, 1.0])
-"""Factors from (m, Pa) to the units of the task's parameters, (mm, Pa)."""
 NUISANCES: dict[str, Callable[..., WhipParameters]] = {
     "fixed": lambda key, length, young: median(length, young),
     "random": randomised,
@@ -180,8 +177,8 @@ def whip_task(
         names=("length", "young"),
         units=("mm", "Pa"),
         log=("young",),
-        supports={"initial": _in_task_units(ranges.INITIAL), "feasible": _in_task_units(ranges.FEASIBLE)},
-        feasible=_in_task_units(ranges.FEASIBLE),
+        supports={"initial": in_task_units(ranges.INITIAL), "feasible": in_task_units(ranges.FEASIBLE)},
+        feasible=in_task_units(ranges.FEASIBLE),
         summary=functools.partial(cross_correlation, actions=2),
         truth=None if truth is None else np.asarray(truth) * MILLIMETRES,
         observation=observation,
@@ -204,7 +201,3 @@ def _check_together(names: Sequence[str], observed: Sequence[recordings.Recordin
     intervals = [one.control_interval for one in observed]
     if len(set(intervals)) > 1:
         raise ValueError(f"object: expected recordings of one control interval, got {', '.join(map(str, intervals))} s")
-
-
-def _in_task_units(box: Support) -> Support:
-    return Support(np.asarray(box.low) * MILLIMETRES, np.asarray(box.high) * MILLIMETRES)

@@ -21,6 +21,7 @@ from jaxlfi.bayessim.convergence import LAG
 from jaxlfi.bayessim.presets import METHODS, PRESETS, all_rounds
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.widths import expected_widths
+from jaxlfi.cli import train
 from jaxlfi.diagnostics.bounds import bound_summary
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import TRIES
@@ -178,6 +179,9 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     folder = arguments.folder
     if grid.is_grid(folder):
         return _resume_grid(folder, console)
+    if train.is_training(folder):
+        train.resume(folder, console, not arguments.no_figures)
+        return None
     config = run_store.read_config(folder)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
         executing.clean(folder)

@@ -1,4 +1,4 @@
-"""Progress of the rounds: a bar on a terminal, plain lines elsewhere."""
+"""Progress of rounds, or of other steps: a bar on a terminal, plain lines elsewhere."""
 
 import time
 from types import TracebackType
@@ -22,7 +22,7 @@ class RoundProgress:
         ...     progress.advance()
     """
 
-    def __init__(self, console: Console, rounds: int, done: int, label: str):
+    def __init__(self, console: Console, rounds: int, done: int, label: str, unit: str = "round"):
         """Nothing is shown before the context is entered.
 
         Args:
@@ -30,15 +30,16 @@ class RoundProgress:
             rounds: how many there are.
             done: how many were done before, by a run that is resumed.
             label: what is going on.
+            unit: what a round is called.
         """
         self._console, self._rounds, self._first, self._done = console, rounds, done, done
-        self._label = label
+        self._label, self._unit = label, unit
         self._began = time.monotonic()
         columns = (
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("rounds,"),
+            TextColumn(f"{unit}s,"),
             TimeElapsedColumn(),
             TextColumn("elapsed,"),
             TimeRemainingColumn(),
@@ -53,7 +54,7 @@ class RoundProgress:
             self._bar.start()
         else:
             self._console.print(
-                f"{self._label}: {self._rounds - self._done} of {self._rounds} rounds to do", markup=False
+                f"{self._label}: {self._rounds - self._done} of {self._rounds} {self._unit}s to do", markup=False
             )
         return self
 
@@ -69,12 +70,14 @@ class RoundProgress:
         self._console.print(f"compiled in {seconds:.1f} s")
         self._began = time.monotonic()
 
-    def advance(self) -> None:
-        """One more round is done."""
-        self._done += 1
+    def advance(self, rounds: int = 1, more: str = "") -> None:
+        """So many more rounds are done; `more` is said with it."""
+        self._done += rounds
         if self._bar:
-            self._bar.advance(self._task)
+            self._bar.update(self._task, advance=rounds, description=f"{self._label}{more}")
             return
         elapsed = time.monotonic() - self._began
         left = elapsed / (self._done - self._first) * (self._rounds - self._done)
-        self._console.print(f"round {self._done} of {self._rounds}, {elapsed:.0f} s elapsed, about {left:.0f} s left")
+        self._console.print(
+            f"{self._unit} {self._done} of {self._rounds}, {elapsed:.0f} s elapsed, about {left:.0f} s left{more}"
+        )

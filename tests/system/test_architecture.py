@@ -29,11 +29,11 @@ LAYERS = (
     ("heuristics", "estimators", "diagnostics"),
     ("bayessim",),
     ("runs",),
-    ("studies",),
+    ("studies", "rl"),
     ("cli",),
 )
 """Packages of jaxlfi, from the ground up: each imports those below it, and none beside or above it."""
-LEAVES = ("io", "fields", "plugins", "source_fields", "flags")
+LEAVES = ("io", "factories", "fields", "plugins", "source_fields", "flags")
 """Modules that every layer may import, and that import no layer."""
 BESIDE = {"figures": {"figures"}, "plot": {"figures"}, "__main__": {"cli"}}
 """Modules that are no part of the layers, and all of jaxlfi that they import."""

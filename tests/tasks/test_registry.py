@@ -8,8 +8,9 @@ from typing import Literal
 import pytest
 
 from jaxlfi.envs import gaussian_linear
+from jaxlfi.factories import convert, parse
 from jaxlfi.tasks import registry
-from jaxlfi.tasks.registry import convert, load, parse
+from jaxlfi.tasks.registry import load
 
 
 @pytest.fixture

@@ -1,0 +1,135 @@
+"""The whipping task as policies are trained on it: sections VI-E to VI-H behind `jaxlfi.rl.environment`."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.episode import Episode, Whip
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.parameters import (
+    FEASIBLE,
+    INITIAL,
+    MEDIAN,
+    MILLIMETRES,
+    WhipParameters,
+    in_task_units,
+    randomised,
+)
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS, ON_DLO
+from jaxlfi.rl.environment import EnvState, Signals
+
+_POINTS = (*(f"DLO {i + 1}" for i in range(ON_DLO)), *COLOURS)
+OBSERVATIONS = Signals(
+    names=(
+        "gripper x",
+        "gripper z",
+        *(f"{point} {axis}" for point in _POINTS for axis in "uv"),
+        *(f"{colour} hit" for colour in COLOURS),
+    ),
+    units=("m", "m", *["image"] * 20, *[""] * 6),
+    centre=(*rules.WORKSPACE.mean(axis=0).tolist(), *[0.5] * 20, *[0.0] * 6),
+    scale=(0.1, 0.1, *[0.25] * 20, *[1.0] * 6),
+)
+"""The gripper within its workspace; keypoints in normalised pixels, which span the image from 0 to 1; flags."""
+ACTIONS = Signals(("dx", "dz"), ("m", "m"), (0.0, 0.0), (rules.ACTION_LIMIT, rules.ACTION_LIMIT))
+"""Displacements of the gripper's set-point."""
+
+
+@struct.dataclass
+class Scene:
+    """An episode, the scene it is in, and the key of what comes.
+
+    Attributes:
+        episode: of the whipping task.
+        parameters: of its scene.
+        key: of the steps to come.
+    """
+
+    episode: Episode
+    parameters: WhipParameters
+    key: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class WhipEnvironment:
+    """Episodes in scenes of a given length (mm) and modulus (Pa), whose nuisances, stack and camera are drawn anew.
+
+    Attributes:
+        whip: physics and detector.
+    """
+
+    whip: Whip
+    name: str = "whip"
+    space: Space = Space(("length", "young"), log=(False, True))
+    units: tuple[str, ...] = ("mm", "Pa")
+    nominal: tuple[float, ...] = (MEDIAN.length * MILLIMETRES[0], MEDIAN.young * MILLIMETRES[1])
+    observations: Signals = OBSERVATIONS
+    actions: Signals = ACTIONS
+    steps: int = rules.STEPS
+
+    @property
+    def supports(self) -> Mapping[str, Support]:
+        """Theta_0 of section VI-B, and Phi."""
+        return {"initial": in_task_units(INITIAL), "feasible": self.feasible}
+
+    @property
+    def feasible(self) -> Support:
+        """Phi."""
+        return in_task_units(FEASIBLE)
+
+    def reset(self, key: jax.Array, theta: Float[Array, "2"]) -> EnvState:
+        """The DLO at rest in a scene of this length (mm) and modulus (Pa)."""
+        key_scene, key_reset, key = jax.random.split(key, 3)
+        parameters = randomised(key_scene, *(theta / MILLIMETRES))
+        episode, observation = self.whip.reset(key_reset, parameters)
+        no = jnp.asarray(False)
+        return EnvState(
+            inner=Scene(episode, parameters, key),
+            observation=observation,
+            reward=jnp.asarray(0.0),
+            terminated=no,
+            truncated=no,
+            facts=_facts(episode.hit, no, no),
+        )
+
+    def step(self, state: EnvState, action: Float[Array, "2"]) -> EnvState:
+        """Apply an action (dx, dz), in m."""
+        scene = state.inner
+        key, key_step = jax.random.split(scene.key)
+        episode, step = self.whip.step(key_step, scene.parameters, scene.episode, action)
+        return EnvState(
+            inner=Scene(episode, scene.parameters, key),
+            observation=step.observation,
+            reward=step.reward,
+            terminated=step.terminated,
+            truncated=step.failed,
+            facts=_facts(step.hit, step.outside, step.failed),
+        )
+
+
+def make(detector: str = "mask", engine: str = "auto") -> WhipEnvironment:
+    """The whipping task.
+
+    Args:
+        detector: of keypoints: "clean", "mask", "noisy" or "transporter".
+        engine: the physics: "auto", "native", "mjx" or "warp".
+
+    Raises:
+        ValueError: for unknown names.
+    """
+    if detector not in DETECTORS:
+        raise ValueError(f"detector: expected one of {', '.join(DETECTORS)}, got {detector!r}")
+    return WhipEnvironment(Whip(pick(engine), DETECTORS[detector]))
+
+
+def _facts(hit: Array, outside: Array, failed: Array) -> dict[str, Array]:
+    top = hit[rules.TOP]
+    return {"hit": top, "clean_hit": top & ~jnp.any(hit[: rules.TOP]), "outside": outside, "failed": failed}

@@ -1,0 +1,215 @@
+"""The command `jaxlfi train`: policies on domains, by PPO.
+
+This module imports neither jax nor numpy before it has to, so that `--help` answers at once.
+"""
+
+import argparse
+import json
+import shutil
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxlfi import flags, source_fields
+from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from jaxlfi.rl.environment import Environment
+
+PRESETS = ("quick", "paper")
+SETTINGS = "jaxlfi.rl.settings:PPO"
+"""The class whose fields are the settings of a training."""
+
+EXAMPLES = """\
+domains:
+  RUN             the posterior of a finished run (jaxlfi infer): low-variance draws of its mixture, clipped to Phi, or
+                  to the run's support where that was fixed
+  uniform         uniform over the environment's first support, Theta_0 (PPO-U); uniform:NAME over another
+  median          the environment's nominal point (PPO-mu)
+  point:X,Y,...   a point of your own, in natural units
+Each environment draws a point of the domain and keeps it, as in the paper; --redrawn draws one for every episode.
+All domains and seeds are trained side by side, and evaluated without noise on 128 other points of their domain.
+
+examples:
+  jaxlfi train whip --domain uniform --seeds 4 --out runs/uniform
+  jaxlfi train whip --domain runs/dlo-0 uniform median --seeds 4 --out runs/policies
+  jaxlfi train whip,detector=clean --domain point:200,1e5 --total-steps 30000 --out runs/point
+  jaxlfi resume runs/policies                    go on after a crash, to the same policies bit for bit
+
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    top = OneLineParser(
+        prog="jaxlfi train",
+        description="Train policies by PPO on environments whose parameters are drawn from a domain.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    top.add_argument(
+        "environment",
+        metavar="ENVIRONMENT",
+        help="an environment's name, such as whip, or module:factory; NAME,key=value sets options",
+    )
+    top.add_argument("--domain", nargs="+", required=True, metavar="DOMAIN", help="what to train on; several: each")
+    top.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results")
+    top.add_argument("--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)")
+    top.add_argument("--seeds", type=int, default=1, metavar="N", help="trainings of each domain (default: 1)")
+    top.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first one's seed (default: 0)")
+    top.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
+    top.add_argument("--debug", action="store_true", help="show where an error came from")
+    group = top.add_argument_group("PPO (default: the preset's)")
+    flags.add(group, {"PPO": source_fields.of_class(SETTINGS).fields}, into="settings", defaults=False)
+    top.set_defaults(settings={})
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: the words after `jaxlfi train`; by default those of the process.
+
+    Returns:
+        0; 2 for bad input; 130 where it was interrupted.
+    """
+    arguments = parser().parse_args(argv)
+    begun = False
+    try:
+        from rich.console import Console
+
+        console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
+        plan = _plan(arguments)
+        from jaxlfi.rl import training
+
+        training.begin(plan, arguments.out)
+        begun = True
+        run(arguments.out, plan.environment, console, not arguments.no_figures)
+    except (ValueError, OSError, ImportError) as error:
+        if arguments.debug:
+            traceback.print_exception(error)
+        print(f"jaxlfi train: error: {' '.join(str(error).split())}", file=sys.stderr)
+        if begun and not (arguments.out / "checkpoint.npz").exists() and not (arguments.out / "table.csv").exists():
+            shutil.rmtree(arguments.out)  # made by this very command, and there is nothing in it to go on from
+        return 2
+    except KeyboardInterrupt:
+        advice = f"; continue with: jaxlfi resume {arguments.out}" if begun else ""
+        print(f"jaxlfi train: interrupted{advice}", file=sys.stderr)
+        return 130
+    return 0
+
+
+def run(out: Path, environment: "Environment", console: "Console", figures: bool) -> None:
+    """Train what a folder asks for, print how the policies fare, and draw the learning curves."""
+    import numpy as np
+    from rich.table import Table
+
+    from jaxlfi.io.progress import RoundProgress
+    from jaxlfi.rl import training
+
+    config = training.read_config(out)
+    settings = training.settings_of(config)
+    count = len(config["trainings"])
+    label = f"{environment.name}: {count} {'policy' if count == 1 else 'policies side by side'}"
+    with RoundProgress(console, settings.updates, training.updates_done(out), label, unit="update") as progress:
+
+        def on_chunk(updates: int, curves: Mapping[str, Any]) -> None:
+            progress.advance(updates, f", return {np.nanmean(curves['value'][-updates:]):.2f}")
+
+        result = training.resumed(out, environment, on_chunk)
+    facts = [name for name in result.outcomes if name not in training.NO_FACTS]
+    table = Table("domain", "seed", "return", *facts, title=f"on {training.HELD_OUT} other points of each domain")
+    for place, (domain, seed) in enumerate(result.names):
+        means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]
+        table.add_row(domain, str(seed), *(f"{mean:.2f}" for mean in means))
+    console.print(table)
+    console.print(f"policies: {out}/DOMAIN/seed_NNN/policy.npz", markup=False)
+    if figures:
+        from jaxlfi.figures import learning
+
+        learning.save_curves(out / "curves.png", result.names, result.curves["value"], settings.steps_per_update)
+        console.print(f"learning curves: {out / 'curves.png'}", markup=False)
+
+
+def is_training(out: Path) -> bool:
+    """Whether a folder is that of trainings; it may be damaged."""
+    try:
+        config = json.loads((out / "config.json").read_text())
+    except (OSError, ValueError):
+        return False
+    return isinstance(config, dict) and config.get("format") == "jaxlfi-training"
+
+
+def resume(out: Path, console: "Console", figures: bool) -> None:
+    """Go on with a training that was stopped."""
+    from jaxlfi.rl import registry, training
+
+    config = training.read_config(out)
+    if training.finished(out):
+        console.print(f"{out} is complete: nothing to resume", markup=False)
+        return
+    if config["environment"] is None:
+        raise ValueError(f"{out}: expected an environment that can be found by name; resume it in Python")
+    run(out, registry.load(config["environment"]), console, figures)
+
+
+def _plan(arguments: argparse.Namespace) -> Any:
+    if arguments.seeds < 1:
+        raise ValueError(f"seeds: expected at least 1, got {arguments.seeds}")
+    from jaxlfi.rl import registry
+    from jaxlfi.rl.settings import PRESETS as SETTINGS_OF
+    from jaxlfi.rl.training import Plan
+
+    environment = registry.load(arguments.environment)
+    domains: dict[str, Callable] = {}
+    for word in arguments.domain:
+        name, draw = _domain(environment, word)
+        if name in domains:
+            raise ValueError(f"domain: expected different ones, got {name!r} twice")
+        domains[name] = draw
+    return Plan(
+        reference=arguments.environment,
+        environment=environment,
+        settings=SETTINGS_OF[arguments.preset].replace(**arguments.settings),
+        preset=arguments.preset,
+        domains=domains,
+        seeds=tuple(range(arguments.first_seed, arguments.first_seed + arguments.seeds)),
+    )
+
+
+def _domain(environment: "Environment", word: str) -> tuple[str, Callable]:
+    """The name of a domain, and how to draw it."""
+    from jaxlfi.rl import domains
+
+    kind, _, rest = word.partition(":")
+    if kind == "uniform":
+        supports = environment.supports
+        if rest and rest not in supports:
+            raise ValueError(f"domain: expected uniform:NAME of {', '.join(supports)}, got {word!r}")
+        box = supports[rest or next(iter(supports))]
+        return f"uniform-{rest}" if rest else "uniform", lambda key, n: domains.uniform(key, box, n)
+    if kind == "median" and not rest:
+        return "median", lambda key, n: domains.point(environment.nominal, n)
+    if kind == "point":
+        try:
+            numbers = [float(number) for number in rest.split(",")]
+        except ValueError:
+            raise ValueError(f"domain: expected point:X,Y,... of numbers, got {word!r}") from None
+        theta = domains.check_point(environment, numbers)
+        return f"point-{'-'.join(f'{number:g}' for number in numbers)}", lambda key, n: domains.point(theta, n)
+    folder = Path(word)
+    if not folder.is_dir():
+        raise ValueError(
+            f"domain: expected the folder of a run, uniform, uniform:NAME, median or point:X,Y,..., got {word!r}"
+        )
+    from jaxlfi.runs.load import load
+
+    run = load(folder)
+    domains.check_belief(environment, run.space, run.space.box_to_natural(run.feasible))
+    limits = run.space.box_to_natural(run.feasible if run.heuristic.grows else run.support)
+    return folder.resolve().name, lambda key, n: domains.of_belief(key, run.belief, run.space, limits, n)

@@ -1,0 +1,4 @@
+"""Policies for the domains that inference found: PPO on a belief, its evaluation, and policies as files.
+
+Needs the extra `policy` (Brax), but for `policy`, which runs trained policies with NumPy alone.
+"""

@@ -1,0 +1,84 @@
+"""Domains: the parameters of the environments that a policy is trained on (section VI-H)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support, check_within
+from jaxlfi.rl.environment import Environment
+
+POOL = 4096
+"""Points of a domain that is redrawn in every episode."""
+
+
+@struct.dataclass
+class Domain:
+    """Points theta in natural units, one for each environment of a training or evaluation.
+
+    Attributes:
+        theta: shape [N, D].
+    """
+
+    theta: Float[Array, "*batch n dim"]
+
+
+def of_belief(key: jax.Array, belief: Belief, space: Space, limits: Support, n: int) -> Domain:
+    """Low-variance draws of a posterior's mixture, clipped to a box (section VI-H).
+
+    Args:
+        key: consumed.
+        belief: in inference space.
+        space: from there to natural units.
+        limits: Phi; or Theta_0, for a posterior on a fixed support. In natural units.
+        n: how many.
+    """
+    draws = belief.mixture.low_variance_sample(key, n)
+    return Domain(limits.clip(space.to_natural(draws)))
+
+
+def uniform(key: jax.Array, support: Support, n: int) -> Domain:
+    """Uniform draws over a box in natural units: PPO-U."""
+    return Domain(support.sample(key, n))
+
+
+def point(theta: Float[Array | np.ndarray, " dim"], n: int) -> Domain:
+    """The same point for all environments, in natural units: PPO-mu."""
+    return Domain(jnp.broadcast_to(jnp.asarray(theta, jnp.float32), (n, len(theta))))
+
+
+def check_belief(environment: Environment, space: Space, feasible: Support) -> None:
+    """Refuse the posterior of other parameters than an environment's.
+
+    Raises:
+        ValueError: for other names, or another Phi.
+    """
+    if space.names != environment.space.names:
+        raise ValueError(
+            f"domain: expected a posterior of {', '.join(environment.space.names)}, the parameters of "
+            f"{environment.name}, got one of {', '.join(space.names)}"
+        )
+    check_within(feasible, environment.feasible, "domain")
+
+
+def check_point(environment: Environment, theta: Float[np.ndarray, " dim"]) -> np.ndarray:
+    """Refuse a point that is not in Phi.
+
+    Raises:
+        ValueError: which names the parameter and its range.
+    """
+    theta = np.asarray(theta, np.float32)
+    if theta.shape != (environment.space.dim,):
+        raise ValueError(
+            f"domain: expected {environment.space.dim} numbers ({', '.join(environment.space.names)}), "
+            f"got {theta.tolist()}"
+        )
+    for name, value, low, high in zip(
+        environment.space.names, theta, environment.feasible.low, environment.feasible.high, strict=True
+    ):
+        if not low <= value <= high:
+            raise ValueError(f"domain: expected {name} between {float(low):g} and {float(high):g} (Phi), got {value:g}")
+    return theta

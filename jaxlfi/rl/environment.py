@@ -1,0 +1,112 @@
+"""What can be trained on: environments of unknown parameters theta, and the signals that they exchange."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+
+
+@dataclasses.dataclass(frozen=True)
+class Signals:
+    """Names, units and scaling of the numbers that an environment and a policy exchange.
+
+    A policy works with `(value - centre) / scale`. The scaling is part of the environment and not learnt: by running
+    statistics, a flag that has never been raised would weigh a million when it is raised for the first time.
+
+    Attributes:
+        names: one a number.
+        units: one a number; "" without one.
+        centre: in these units, one a number.
+        scale: likewise; positive.
+
+    Raises:
+        ValueError: for unequal lengths, and scales that are not positive.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    centre: tuple[float, ...]
+    scale: tuple[float, ...]
+
+    def __post_init__(self):
+        lengths = {name: len(getattr(self, name)) for name in ("names", "units", "centre", "scale")}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"signals: expected as many of each, got {lengths}")
+        if not all(math.isfinite(scale) and scale > 0 for scale in self.scale):
+            raise ValueError(f"signals: expected positive scales, got {list(self.scale)}")
+
+    @property
+    def size(self) -> int:
+        """How many numbers."""
+        return len(self.names)
+
+    def to_unit(self, values: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
+        """From units to what a policy works with."""
+        return (values - np.float32(self.centre)) / np.float32(self.scale)
+
+    def from_unit(self, values: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
+        """The way back."""
+        return values * np.float32(self.scale) + np.float32(self.centre)
+
+
+@struct.dataclass
+class EnvState:
+    """An episode between two steps.
+
+    Attributes:
+        inner: what the environment needs for its next step: its physics, its key, its theta.
+        observation: in its units, shape [O].
+        reward: of the step that led here.
+        terminated: whether the episode has ended, by its rules or because its time is up.
+        truncated: whether it has ended in a state that says nothing of the rewards to come, as where the simulation has
+            become unstable. What a step into such a state is worth is not learnt.
+        facts: of the episode so far, by name, such as whether a target has been hit; recorded at the episode's end.
+    """
+
+    inner: Any
+    observation: Float[Array, "*batch obs"]
+    reward: Float[Array, "*batch"]
+    terminated: Bool[Array, "*batch"]
+    truncated: Bool[Array, "*batch"]
+    facts: Mapping[str, Array]
+
+
+@runtime_checkable
+class Environment(Protocol):
+    """An environment of unknown parameters: pure, for one episode, batched by `vmap`.
+
+    Attributes:
+        name: of the environment.
+        space: names of the parameters theta [D], and which are inferred as logarithms.
+        units: of the parameters, one each.
+        feasible: Phi, in natural units.
+        supports: boxes of theta by name, in natural units; the first is Theta_0.
+        nominal: the point theta that is trained on where no distribution is, in natural units.
+        observations: of a state.
+        actions: of a policy; an action is limited to `centre` +- `scale`.
+        steps: maximum length of an episode.
+    """
+
+    name: str
+    space: Space
+    units: tuple[str, ...]
+    feasible: Support
+    supports: Mapping[str, Support]
+    nominal: tuple[float, ...]
+    observations: Signals
+    actions: Signals
+    steps: int
+
+    def reset(self, key: jax.Array, theta: Float[Array, " dim"]) -> EnvState:
+        """The start of an episode with these parameters, in natural units; nuisances are drawn anew."""
+
+    def step(self, state: EnvState, action: Float[Array, " act"]) -> EnvState:
+        """One step, by an action in its units."""

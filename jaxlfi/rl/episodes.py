@@ -1,0 +1,125 @@
+"""Episodes one after another, in many environments side by side, as Brax's `acting` steps them."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlfi.rl.domains import Domain
+from jaxlfi.rl.environment import Environment, EnvState
+
+
+@struct.dataclass
+class Episodes:
+    """N environments between two steps; its fields `obs`, `reward`, `done` and `info` are those of Brax's states.
+
+    Attributes:
+        env: the episodes that go on, or have just begun.
+        key: of each environment; its next episode is drawn with it, shape [N].
+        steps: of each episode so far, shape [N].
+        sums: of the rewards of each episode so far, shape [N].
+        domain: theta of the environments.
+        obs: as a policy sees them, shape [N, O].
+        reward: of the last step, shape [N].
+        done: whether the last step ended an episode, 0 or 1, shape [N].
+        info: what Brax's loss asks for (`truncation`), and the episodes that ended (`ended`).
+    """
+
+    env: EnvState
+    key: jax.Array
+    steps: Int[Array, "*batch"]
+    sums: Float[Array, "*batch"]
+    domain: Domain
+    obs: Float[Array, "*batch obs"]
+    reward: Float[Array, "*batch"]
+    done: Float[Array, "*batch"]
+    info: dict[str, Any]
+
+
+@struct.dataclass
+class Ended:
+    """Episodes that ended in a step.
+
+    Attributes:
+        done: whether one did; the other fields are of episodes still under way where it is false.
+        value: its return, the sum of its rewards.
+        steps: its length.
+        facts: what its environment says of it.
+    """
+
+    done: Bool[Array, "*batch"]
+    value: Float[Array, "*batch"]
+    steps: Int[Array, "*batch"]
+    facts: dict[str, Array]
+
+
+class Batch:
+    """N environments, each at its point of a domain; an episode that ends is followed by a new one in the same step.
+
+    Every episode begins with keys of its own: nuisances and first states are drawn anew, and nothing of the last
+    episode is left. Where domains are `redrawn`, so is theta, from all points of the domain; otherwise environment i
+    stays with the domain's i-th point.
+
+    The end of an episode by its time limit is a termination: no reward follows it. Brax would leave the last step out
+    of what is learnt if it were a truncation. What is truncated is a failed simulation, of which nothing can be learnt.
+    """
+
+    def __init__(self, environment: Environment, n: int, redrawn: bool = False):
+        """N environments.
+
+        Args:
+            environment: for one episode.
+            n: how many.
+            redrawn: whether theta is drawn anew for every episode.
+        """
+        self.environment, self.n, self.redrawn = environment, n, redrawn
+
+    def reset(self, key: jax.Array, domain: Domain) -> Episodes:
+        """The first episodes."""
+        keys, env = self._begin(jax.random.split(key, self.n), domain)
+        zeros = jnp.zeros(self.n)
+        info = {"truncation": zeros, "ended": _ended(env, jnp.zeros(self.n, bool), zeros, jnp.zeros(self.n, int))}
+        observed = self.environment.observations.to_unit(env.observation)
+        return Episodes(env, keys, jnp.zeros(self.n, int), zeros, domain, observed, zeros, zeros, info)
+
+    def step(self, state: Episodes, action: Float[Array, "n act"]) -> Episodes:
+        """One step of all, by actions as a policy gives them; they are limited to [-1, 1]."""
+        scaled = self.environment.actions.from_unit(jnp.clip(action, -1.0, 1.0))
+        env = jax.vmap(self.environment.step)(state.env, scaled)
+        steps, sums = state.steps + 1, state.sums + env.reward
+        truncated = env.truncated
+        terminated = (env.terminated | (steps >= self.environment.steps)) & ~truncated
+        done = terminated | truncated
+        info = {"truncation": truncated.astype(jnp.float32), "ended": _ended(env, done, sums, steps)}
+
+        # Keys move on with every step, so that none is used twice.
+        next_keys, fresh = self._begin(state.key, state.domain)
+        choose = lambda new, old: jax.vmap(jnp.where)(done, new, old)
+        return Episodes(
+            env=jax.tree.map(choose, fresh, env),
+            key=next_keys,
+            steps=jnp.where(done, 0, steps),
+            sums=jnp.where(done, 0.0, sums),
+            domain=state.domain,
+            obs=self.environment.observations.to_unit(choose(fresh.observation, env.observation)),
+            reward=env.reward,
+            done=done.astype(jnp.float32),
+            info=info,
+        )
+
+    def _begin(self, keys: jax.Array, domain: Domain) -> tuple[jax.Array, EnvState]:
+        """The environments' next keys, and an episode of each."""
+
+        def one(key, index):
+            following, key_theta, key_reset = jax.random.split(key, 3)
+            if self.redrawn:
+                index = jax.random.randint(key_theta, (), 0, len(domain.theta))
+            return following, self.environment.reset(key_reset, domain.theta[index])
+
+        return jax.vmap(one)(keys, jnp.arange(self.n))
+
+
+def _ended(env: EnvState, done: Array, sums: Array, steps: Array) -> Ended:
+    return Ended(done, sums, steps, dict(env.facts))

@@ -1,0 +1,132 @@
+"""Policy: what a training leaves behind, as one file that NumPy alone can run.
+
+This module imports neither jax nor Brax, so that a robot's computer needs neither.
+"""
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxlfi.io import files
+
+FORMAT, VERSION = "jaxlfi-policy", 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """A deterministic policy: from an observation to an action, both in their units.
+
+    Scaled observations go through layers with tanh between them; the result is limited to [-1, 1] and scaled to the
+    limits of the actions.
+
+    Attributes:
+        weights: of the layers, shapes [in, out].
+        biases: likewise, shapes [out].
+        schema: what the numbers are: `environment`, and `observations` and `actions` with their `names`, `units`,
+            `centre` and `scale` (`jaxlfi.rl.environment.Signals`); whatever else was recorded with the policy.
+
+    Raises:
+        ValueError: for layers that do not fit together or to the schema.
+
+    Example:
+        >>> signals = {"names": ["x"], "units": ["m"], "centre": [1.0], "scale": [0.5]}
+        >>> schema = {"environment": "line", "observations": signals, "actions": signals}
+        >>> policy = Policy((np.array([[-1.0]]),), (np.array([0.5]),), schema)
+        >>> policy([1.5]).tolist()
+        [0.75]
+    """
+
+    weights: tuple[np.ndarray, ...]
+    biases: tuple[np.ndarray, ...]
+    schema: Mapping[str, Any]
+
+    def __post_init__(self):
+        sizes = [len(self.observed["names"]), *(np.shape(bias)[0] for bias in self.biases)]
+        shapes = [np.shape(weight) for weight in self.weights]
+        if shapes != list(itertools.pairwise(sizes)) or sizes[-1] != len(self.acted["names"]):
+            raise ValueError(
+                f"policy: expected layers from {sizes[0]} observations to {len(self.acted['names'])} actions, "
+                f"got weights of shapes {shapes} and biases of sizes {sizes[1:]}"
+            )
+
+    @property
+    def observed(self) -> Mapping[str, Any]:
+        """The schema of observations."""
+        return self.schema["observations"]
+
+    @property
+    def acted(self) -> Mapping[str, Any]:
+        """The schema of actions."""
+        return self.schema["actions"]
+
+    def __call__(self, observation: Sequence[float] | np.ndarray) -> np.ndarray:
+        """The action, float32 [..., A], for an observation [..., O]."""
+        layer = (np.asarray(observation, np.float32) - self._numbers("observations", "centre")) / self._numbers(
+            "observations", "scale"
+        )
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            layer = np.tanh(layer @ weight + bias)
+        action = np.clip(layer @ self.weights[-1] + self.biases[-1], -1.0, 1.0)
+        return action * self._numbers("actions", "scale") + self._numbers("actions", "centre")
+
+    def require(self, environment: str, observations: Sequence[str], actions: Sequence[str]) -> "Policy":
+        """Refuse a policy of another environment.
+
+        Args:
+            environment: its name.
+            observations: names of its observations.
+            actions: names of its actions.
+
+        Raises:
+            ValueError: which says what differs.
+        """
+        pairs = {
+            "environment": (environment, self.schema["environment"]),
+            "observations": (list(observations), list(self.observed["names"])),
+            "actions": (list(actions), list(self.acted["names"])),
+        }
+        for what, (expected, got) in pairs.items():
+            if expected != got:
+                raise ValueError(f"policy: expected {what} {expected!r}, got one of {got!r}")
+        return self
+
+    def save(self, path: str | Path) -> Path:
+        """Write an .npz: `weight_0`, `bias_0`, ... and the schema as JSON."""
+        schema = {"format": FORMAT, "version": VERSION, **self.schema}
+        arrays = {"schema": np.asarray(json.dumps(schema))}
+        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            arrays |= {f"weight_{index}": weight, f"bias_{index}": bias}
+        files.write_arrays(Path(path), arrays, compress=False, durable=True)
+        return Path(path)
+
+    def _numbers(self, signals: str, name: str) -> np.ndarray:
+        return np.asarray(self.schema[signals][name], np.float32)
+
+
+def load(path: str | Path) -> Policy:
+    """A policy from its file.
+
+    Raises:
+        ValueError: for a file that is missing, damaged, of another format or a newer version.
+    """
+    path = Path(path)
+    arrays = files.read_arrays(path)
+    try:
+        schema = json.loads(str(arrays["schema"]))
+        kind, version = schema.pop("format"), schema.pop("version")
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected a policy that jaxlfi saved, got an .npz without its schema") from error
+    if kind != FORMAT or version != VERSION:
+        raise ValueError(f"{path}: expected {FORMAT} of version {VERSION}, got {kind} of version {version}")
+    count = sum(name.startswith("weight_") for name in arrays)
+    try:
+        layers = [(arrays[f"weight_{index}"], arrays[f"bias_{index}"]) for index in range(count)]
+        weights, biases = zip(*layers, strict=True)
+        return Policy(weights, biases, schema)
+    except (KeyError, ValueError, IndexError) as error:
+        raise ValueError(f"{path}: expected a whole policy, got: {error}") from error

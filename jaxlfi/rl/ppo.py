@@ -1,0 +1,262 @@
+"""PPO (Schulman et al., 2017) by Brax's parts, as init / update / train.
+
+The losses, networks and acting are Brax's own; the loop around them is ours, because all that the next update needs is
+in one pytree here: a training that was stopped goes on to the same bits, and trainings with other seeds, domains and
+hyperparameters run side by side under `vmap`. With the same keys it makes the updates of
+`brax.training.agents.ppo.train`.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import io
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen, struct
+from jaxtyping import Array, Float, Int
+
+from jaxlfi.rl.domains import Domain
+from jaxlfi.rl.environment import Environment
+from jaxlfi.rl.episodes import Batch, Ended, Episodes
+from jaxlfi.rl.policy import Policy
+from jaxlfi.rl.settings import PPO
+
+try:
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX says there that Warp is not installed
+        from brax.training import acting
+        from brax.training.agents.ppo import losses, networks
+except ImportError as error:
+    raise ImportError("jaxlfi.rl needs Brax: pip install 'jaxlfi[policy]'") from error
+
+
+@struct.dataclass
+class Training:
+    """What the next update needs.
+
+    Attributes:
+        params: of the policy's and the value function's networks.
+        optimiser: Adam's state.
+        episodes: the environments.
+        key: of the updates to come.
+        updates: made so far.
+    """
+
+    params: losses.PPONetworkParams
+    optimiser: Any
+    episodes: Episodes
+    key: jax.Array
+    updates: Int[Array, ""]
+
+
+@struct.dataclass
+class Update:
+    """What an update did.
+
+    Attributes:
+        episodes: number that ended.
+        value: mean return of these episodes; NaN without any.
+        length: their mean number of steps.
+        facts: means of what the environment says of them.
+        losses: means over minibatches, by Brax's names.
+    """
+
+    episodes: Int[Array, ""]
+    value: Float[Array, ""]
+    length: Float[Array, ""]
+    facts: dict[str, Array]
+    losses: dict[str, Array]
+
+
+def policy_networks(environment: Environment, settings: PPO) -> networks.PPONetworks:
+    """A Gaussian policy whose deviation does not depend on the state, and a value function: tanh networks.
+
+    Observations come to them scaled by the environment's schema.
+    """
+    orthogonal = lambda gain: functools.partial(jax.nn.initializers.orthogonal, gain)
+    return networks.make_ppo_networks(
+        environment.observations.size,
+        environment.actions.size,
+        policy_hidden_layer_sizes=settings.hidden,
+        value_hidden_layer_sizes=settings.hidden,
+        activation=linen.tanh,
+        distribution_type="normal",
+        noise_std_type="log",
+        init_noise_std=settings.initial_deviation,
+        policy_network_kernel_init_fn=orthogonal(2**0.5),
+        value_network_kernel_init_fn=orthogonal(2**0.5),
+        mean_kernel_init_fn=orthogonal(0.01),
+    )
+
+
+def init(key: jax.Array, environment: Environment, settings: PPO, domain: Domain) -> Training:
+    """The state before the first update: new networks, and the first episodes.
+
+    Args:
+        key: consumed.
+        environment: what is trained on.
+        settings: of the training.
+        domain: theta of the environments; as many points as there are environments, unless they are redrawn.
+    """
+    key_policy, key_value, key_episodes, key_updates = jax.random.split(key, 4)
+    networks = policy_networks(environment, settings)
+    params = losses.PPONetworkParams(
+        policy=networks.policy_network.init(key_policy), value=networks.value_network.init(key_value)
+    )
+    return Training(
+        params=params,
+        optimiser=_optimiser(settings).init(params),
+        episodes=_batch(environment, settings).reset(key_episodes, domain),
+        key=key_updates,
+        updates=jnp.asarray(0),
+    )
+
+
+def update(environment: Environment, settings: PPO, training: Training) -> tuple[Training, Update]:
+    """One update: episodes by the current policy, then `passes` over their transitions.
+
+    Args:
+        environment: what is trained on.
+        settings: of the training.
+        training: what the updates before left.
+
+    Returns:
+        The next state, and what the update did.
+    """
+    key_passes, key_episodes, key_next = jax.random.split(training.key, 3)
+    networks = policy_networks(environment, settings)
+    batch = _batch(environment, settings)
+    act = _acting(networks, training.params)
+
+    def unroll(carry, _):
+        episodes, key = carry
+        key, following = jax.random.split(key)
+        episodes, data = acting.generate_unroll(
+            batch, episodes, act, key, settings.unroll, extra_fields=("truncation", "ended")
+        )
+        return (episodes, following), data
+
+    pieces = settings.minibatches * settings.segments // settings.environments
+    (episodes, _), data = jax.lax.scan(unroll, (training.episodes, key_episodes), length=pieces)
+    ended = data.extras["state_extras"].pop("ended")
+    # [pieces, unroll, environments, ...] -> [all pieces, unroll, ...]
+    data = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 1, 2), data)
+    data = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), data)
+
+    loss = functools.partial(
+        losses.compute_ppo_loss,
+        ppo_network=networks,
+        entropy_cost=settings.entropy,
+        discounting=settings.discount,
+        gae_lambda=settings.trace,
+        clipping_epsilon=settings.clipping,
+        vf_coefficient=settings.value_weight,
+    )
+    optimiser = _optimiser(settings)
+
+    def minibatch(carry, data):
+        state, params, key = carry
+        key, key_loss = jax.random.split(key)
+        (_, metrics), gradients = jax.value_and_grad(loss, has_aux=True)(params, None, data, key_loss)
+        change, state = optimiser.update(gradients, state)
+        return (state, optax.apply_updates(params, change), key), metrics
+
+    def one_pass(carry, _):
+        state, params, key = carry
+        key, key_order, key_minibatches = jax.random.split(key, 3)
+        order = jax.random.permutation(key_order, settings.minibatches * settings.segments)
+        shuffled = jax.tree.map(lambda leaf: leaf[order].reshape(settings.minibatches, -1, *leaf.shape[1:]), data)
+        (state, params, _), metrics = jax.lax.scan(minibatch, (state, params, key_minibatches), shuffled)
+        return (state, params, key), metrics
+
+    first = training.optimiser, training.params, key_passes
+    (state, params, _), metrics = jax.lax.scan(one_pass, first, length=settings.passes)
+    after = Training(params, state, episodes, key_next, training.updates + 1)
+    return after, _summary(ended, jax.tree.map(jnp.mean, metrics))
+
+
+def train(
+    environment: Environment,
+    settings: PPO,
+    training: Training,
+    updates: int,
+    count: Int[Array, ""] | int | None = None,
+) -> tuple[Training, Update]:
+    """Several updates as one scan.
+
+    Args:
+        environment: what is trained on.
+        settings: of the training.
+        training: what the updates before left.
+        updates: how many.
+        count: only the first so many of them, so that one program serves any number.
+
+    Returns:
+        The state after them, and what each did, stacked along a leading axis; zeros for those that were not made.
+    """
+    one = functools.partial(update, environment, settings)
+    if count is None:
+        return jax.lax.scan(lambda state, _: one(state), training, length=updates)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, training)[1])
+    body = lambda state, index: jax.lax.cond(index < count, one, lambda state: (state, nothing), state)
+    return jax.lax.scan(body, training, jnp.arange(updates))
+
+
+def _optimiser(settings: PPO) -> optax.GradientTransformation:
+    return optax.chain(
+        optax.clip_by_global_norm(settings.max_gradient_norm),
+        optax.adam(settings.learning_rate, eps=settings.adam_epsilon),
+    )
+
+
+def _batch(environment: Environment, settings: PPO) -> Batch:
+    return Batch(environment, settings.environments, settings.redrawn)
+
+
+def _acting(ppo_networks: networks.PPONetworks, params: losses.PPONetworkParams):
+    return networks.make_inference_fn(ppo_networks)((None, params.policy, params.value))
+
+
+def _summary(ended: Ended, metrics: dict[str, Array]) -> Update:
+    """Means over the episodes that ended in an update."""
+    done = ended.done.astype(jnp.float32)
+    number = jnp.sum(done)
+    mean = lambda values: jnp.where(number > 0, jnp.sum(done * values) / jnp.maximum(number, 1.0), jnp.nan)
+    facts = {name: mean(values.astype(jnp.float32)) for name, values in ended.facts.items()}
+    return Update(number.astype(int), mean(ended.value), mean(ended.steps.astype(jnp.float32)), facts, metrics)
+
+
+def deterministic(environment: Environment, settings: PPO, params: losses.PPONetworkParams):
+    """The policy without its noise: from an observation to an action, both in their units."""
+    policy = networks.make_inference_fn(policy_networks(environment, settings))(
+        (None, params.policy, params.value), deterministic=True
+    )
+
+    def act(observation: Float[Array, " obs"]) -> Float[Array, " act"]:
+        # The key is not used.
+        action, _ = policy(environment.observations.to_unit(observation), jax.random.key(0))
+        return environment.actions.from_unit(jnp.clip(action, -1.0, 1.0))
+
+    return act
+
+
+def as_file(environment: Environment, params: losses.PPONetworkParams, **recorded: Any) -> Policy:
+    """The policy as a file that needs neither JAX nor Brax.
+
+    Args:
+        environment: that it was trained on.
+        params: of its training.
+        recorded: what else its schema is to say.
+    """
+    layers = params.policy["params"]
+    hidden = [layers["MLP_0"][f"hidden_{index}"] for index in range(len(layers["MLP_0"]))]
+    every = jax.device_get([*hidden, layers["Dense_0"]])
+    schema = {
+        "environment": environment.name,
+        "observations": dataclasses.asdict(environment.observations),
+        "actions": dataclasses.asdict(environment.actions),
+        **recorded,
+    }
+    return Policy(tuple(layer["kernel"] for layer in every), tuple(layer["bias"] for layer in every), schema)

@@ -1,0 +1,264 @@
+"""Trainings side by side: domains times seeds as one compiled program, in a folder that can be resumed.
+
+config.json domains.npz                what was asked for, and the points that are trained and evaluated on
+checkpoint.npz                         while it runs: all trainings, and their learning curves so far
+curves.npz table.csv                   learning curves; how each policy fares on its own domain
+DOMAIN/seed_000/policy.npz ...         the policies (`jaxlfi.rl.policy`)
+"""
+
+import csv
+import dataclasses
+import functools
+import io
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlfi.io import files, serialise
+from jaxlfi.rl import ppo
+from jaxlfi.rl.domains import POOL, Domain
+from jaxlfi.rl.environment import Environment
+from jaxlfi.rl.evaluation import evaluate
+from jaxlfi.rl.ppo import Training, Update
+from jaxlfi.rl.settings import PPO
+from jaxlfi.runs import folder as run_folders
+from jaxlfi.runs.folder import StoreError
+
+FORMAT, VERSION = "jaxlfi-training", 1
+HELD_OUT = 128
+"""Points of each domain that its policies are evaluated on, other than those that they were trained on."""
+MAX_CHUNK = 16
+"""Updates between two checkpoints, at most."""
+NO_FACTS = ("value", "steps", "theta")
+"""Arrays of outcomes that are no facts that the environment tells of an episode."""
+
+Draw = Callable[[jax.Array, int], Domain]
+"""Draws a domain of so many points with a key."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What is to be trained.
+
+    Attributes:
+        reference: by which the environment can be found (`jaxlfi.rl.registry.load`); None for one made in Python.
+        environment: what is trained on.
+        settings: of PPO.
+        preset: that the settings were made from, or None.
+        domains: how to draw the points of each domain, by its name.
+        seeds: of every domain's trainings.
+    """
+
+    reference: str | None
+    environment: Environment
+    settings: PPO
+    preset: str | None
+    domains: Mapping[str, Draw]
+    seeds: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What trainings came to; trainings are ordered by domain, and by seed within a domain.
+
+    Attributes:
+        names: domain and seed of each of the R trainings.
+        curves: what each update did, by the names of `ppo.Update`, shape [updates, R].
+        outcomes: returns and facts of the deterministic policies on held-out points of their domains, shape [R, M].
+        training: the last states, stacked.
+    """
+
+    names: tuple[tuple[str, int], ...]
+    curves: Mapping[str, np.ndarray]
+    outcomes: Mapping[str, np.ndarray]
+    training: Training
+
+
+def begin(plan: Plan, out: Path) -> None:
+    """Make the folder of a training: all that a resume needs.
+
+    Raises:
+        StoreError: if something is there already.
+    """
+    names = [(domain, seed) for domain in plan.domains for seed in plan.seeds]
+    points = POOL if plan.settings.redrawn else plan.settings.environments
+    drawn = []
+    for name, seed in names:
+        key_trained, key_held_out, *_ = _keys(seed)
+        drawn.append((plan.domains[name](key_trained, points), plan.domains[name](key_held_out, HELD_OUT)))
+    arrays = {
+        "trained": np.stack([np.asarray(domain.theta) for domain, _ in drawn]),
+        "held_out": np.stack([np.asarray(domain.theta) for _, domain in drawn]),
+        "parameters": np.asarray(plan.environment.space.names),
+        "units": np.asarray(plan.environment.units),
+    }
+    config = {
+        "format": FORMAT,
+        "version": VERSION,
+        "environment": plan.reference,
+        "environment_name": plan.environment.name,
+        "preset": plan.preset,
+        "settings": serialise.fields_to_json(plan.settings, serialise.class_name),
+        "trainings": [{"domain": domain, "seed": seed} for domain, seed in names],
+        **run_folders.environment(),
+    }
+    run_folders.create(out, config, lambda staging: files.write_arrays(staging / "domains.npz", arrays))
+
+
+def resumed(out: Path, environment: Environment, on_chunk: Callable[[int, Mapping[str, np.ndarray]], Any]) -> Result:
+    """Train, from the beginning or from the last checkpoint, to the end.
+
+    Args:
+        out: a folder that `begin` made.
+        environment: that of the folder.
+        on_chunk: called after each checkpoint with the updates since the last one, and the curves so far.
+
+    Returns:
+        What the trainings came to; it is in the folder as well.
+
+    Raises:
+        StoreError: for a folder that is none, is damaged, or is of another environment.
+    """
+    config = read_config(out)
+    settings = settings_of(config)
+    names = tuple((one["domain"], one["seed"]) for one in config["trainings"])
+    if config["environment_name"] != environment.name:
+        raise StoreError(f"{out}: expected a training of {environment.name}, got one of {config['environment_name']}")
+    domains = _read(out / "domains.npz")
+    keys = jnp.stack([_keys(seed)[2] for _, seed in names])
+    start = jax.jit(jax.vmap(lambda key, domain: ppo.init(key, environment, settings, domain)))
+    state = start(keys, Domain(jnp.asarray(domains["trained"])))
+
+    done, curves = 0, {}
+    checkpoint = out / "checkpoint.npz"
+    if checkpoint.exists():
+        done, curves, state = _read_checkpoint(checkpoint, state)
+    chunk = min(MAX_CHUNK, settings.updates)
+    some = lambda state, count: ppo.train(environment, settings, state, chunk, count)
+    advance = jax.jit(jax.vmap(some, in_axes=(0, None), out_axes=(0, 1)), donate_argnums=0)
+    while done < settings.updates:
+        began, count = time.monotonic(), min(chunk, settings.updates - done)
+        state, made = advance(state, count)
+        rows = _rows(made) | {"seconds": np.full((chunk, len(names)), (time.monotonic() - began) / count)}
+        curves = {
+            name: np.concatenate([curves[name], row[:count]]) if done else row[:count] for name, row in rows.items()
+        }
+        done += count
+        _write_checkpoint(checkpoint, done, curves, state)
+        on_chunk(count, curves)
+
+    fares = jax.jit(jax.vmap(functools.partial(_fares, environment, settings)))
+    outcomes = fares(jnp.stack([_keys(seed)[3] for _, seed in names]), state.params, jnp.asarray(domains["held_out"]))
+    outcomes = {name: np.asarray(value) for name, value in outcomes.items()}
+    result = Result(names, curves, outcomes, state)
+    _write_result(out, environment, config, result)
+    checkpoint.unlink()
+    return result
+
+
+def read_config(out: Path) -> dict[str, Any]:
+    """The config.json of a training.
+
+    Raises:
+        StoreError: for folders that are none.
+    """
+    try:
+        config = json.loads((out / "config.json").read_text())
+    except (OSError, ValueError) as error:
+        raise StoreError(
+            f"expected the folder of a training, got {str(out)!r} without a readable config.json"
+        ) from error
+    if not isinstance(config, dict) or (config.get("format"), config.get("version")) != (FORMAT, VERSION):
+        raise StoreError(f"expected the folder of a training of this version, got {str(out)!r}")
+    return config
+
+
+def settings_of(config: Mapping[str, Any]) -> PPO:
+    """The settings of a training by its config.json."""
+    return serialise.made_of(PPO, "settings", config["settings"], serialise.dataclass_of)
+
+
+def updates_done(out: Path) -> int:
+    """Updates that the checkpoint of a training has behind it."""
+    return int(_read(out / "checkpoint.npz")["done"]) if (out / "checkpoint.npz").exists() else 0
+
+
+def finished(out: Path) -> bool:
+    """Whether the trainings of a folder have come to their end."""
+    return (out / "table.csv").exists()
+
+
+def _keys(seed: int) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Keys of a seed: of the points trained on, of those held out, of the training, of the evaluation."""
+    return tuple(jax.random.split(jax.random.key(seed), 4))
+
+
+def _fares(environment: Environment, settings: PPO, key: jax.Array, params: Any, theta: jax.Array) -> dict[str, Any]:
+    act = ppo.deterministic(environment, settings, params)
+    outcomes = evaluate(key, environment, act, Domain(theta))
+    return {"value": outcomes.value, "steps": outcomes.steps, "theta": theta} | outcomes.facts
+
+
+def _rows(made: Update) -> dict[str, np.ndarray]:
+    made = jax.device_get(made)
+    plain = {"value": made.value, "length": made.length, "episodes": made.episodes}
+    return {**plain, **made.facts, **{f"loss/{name}": value for name, value in made.losses.items()}}
+
+
+# ------------------------------------------------------------------------------------------------------------- files
+
+
+def _plain(leaf: Any) -> np.ndarray:
+    keys = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(leaf) if keys else leaf)
+
+
+def _write_checkpoint(path: Path, done: int, curves: Mapping[str, np.ndarray], state: Training) -> None:
+    leaves = {f"state{name}": _plain(leaf) for name, leaf in run_folders.named_leaves(state).items()}
+    rows = {f"curve/{name}": row for name, row in curves.items()}
+    files.write_arrays(path, {"done": np.asarray(done)} | rows | leaves, compress=False, durable=True)
+
+
+def _read_checkpoint(path: Path, like: Training) -> tuple[int, dict[str, np.ndarray], Training]:
+    arrays = _read(path)
+    leaves = []
+    for name, leaf in run_folders.named_leaves(like).items():
+        array, expected = arrays.get(f"state{name}"), _plain(leaf)
+        if array is None or array.shape != expected.shape or array.dtype != expected.dtype:
+            raise StoreError(f"{path}: expected {name} of shape {expected.shape}, got another or none")
+        keys = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        leaves.append(jax.random.wrap_key_data(jnp.asarray(array)) if keys else jnp.asarray(array))
+    state = jax.tree.unflatten(jax.tree.structure(like), leaves)
+    curves = {name.removeprefix("curve/"): row for name, row in arrays.items() if name.startswith("curve/")}
+    return int(arrays["done"]), curves, state
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    try:
+        return files.read_arrays(path)
+    except ValueError as error:
+        raise StoreError(str(error)) from error
+
+
+def _write_result(out: Path, environment: Environment, config: Mapping[str, Any], result: Result) -> None:
+    files.write_arrays(out / "curves.npz", dict(result.curves))
+    files.write_arrays(out / "outcomes.npz", dict(result.outcomes))
+    facts = [name for name in result.outcomes if name not in NO_FACTS]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["domain", "seed", "return", *facts])
+    for place, (domain, seed) in enumerate(result.names):
+        folder = out / domain / f"seed_{seed:03d}"
+        folder.mkdir(parents=True, exist_ok=True)
+        params = jax.tree.map(lambda leaf, place=place: leaf[place], result.training.params)
+        recorded = {"reference": config["environment"], "domain": domain, "seed": seed, "versions": config["versions"]}
+        ppo.as_file(environment, params, **recorded).save(folder / "policy.npz")
+        means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]
+        writer.writerow([domain, seed, *(f"{mean:.4f}" for mean in means)])
+    files.write_bytes(out / "table.csv", text.getvalue().encode())

@@ -1,0 +1,221 @@
+"""Trainings in folders: what they leave, that they go on to the same bits, and what is refused; the command line."""
+
+import csv
+import json
+
+import jax
+import numpy as np
+import pytest
+
+pytest.importorskip("brax")
+
+import small
+from rl.toy import SETTINGS, Line
+
+from jaxlfi import infer
+from jaxlfi.cli import train as command
+from jaxlfi.io import files
+from jaxlfi.rl import domains, training
+from jaxlfi.rl.policy import load
+from jaxlfi.runs.folder import StoreError
+from jaxlfi.tasks.task import Task
+
+LINE = Line()
+REFERENCE = "rl.toy:Line"
+WORDS = ("--environments 4 --unroll 5 --segments 2 --minibatches 4 --passes 3 --total-steps 160 --hidden 8 8").split()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def keys_of_brax():
+    """Brax uses keys in its own way, which the checker takes for a reuse."""
+    with jax.debug_key_reuse(False):
+        yield
+
+
+@pytest.fixture(autouse=True)
+def two_updates_between_checkpoints(monkeypatch):
+    monkeypatch.setattr(training, "MAX_CHUNK", 3)
+
+
+def plan(**changes):
+    box = LINE.supports["initial"]
+    draws = {
+        "uniform": lambda key, n: domains.uniform(key, box, n),
+        "median": lambda key, n: domains.point(LINE.nominal, n),
+    }
+    return training.Plan(REFERENCE, LINE, SETTINGS.replace(**changes), None, draws, (0, 5))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    out = tmp_path_factory.mktemp("training") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "MAX_CHUNK", 3)
+        training.begin(plan(), out)
+        return out, training.resumed(out, LINE, lambda updates, curves: None)
+
+
+def test_what_it_leaves(finished):
+    out, result = finished
+    assert result.names == (("uniform", 0), ("uniform", 5), ("median", 0), ("median", 5))
+    assert {path.relative_to(out).as_posix() for path in out.rglob("*.*")} == {
+        *("config.json", "domains.npz", "curves.npz", "outcomes.npz", "table.csv"),
+        *(f"{domain}/seed_{seed:03d}/policy.npz" for domain, seed in result.names),
+    }
+    points = files.read_arrays(out / "domains.npz")
+    assert points["trained"].shape == (4, 4, 2) and points["held_out"].shape == (4, 128, 2)
+    np.testing.assert_array_equal(points["trained"][2:], np.broadcast_to(np.float32(LINE.nominal), (2, 4, 2)))
+    assert not np.array_equal(points["trained"][0], points["trained"][1])  # each seed has points of its own
+    curves = files.read_arrays(out / "curves.npz")
+    assert curves["value"].shape == (4, 4) and curves["episodes"].min() >= 1
+    with (out / "table.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    returns = files.read_arrays(out / "outcomes.npz")["value"].mean(axis=1)
+    np.testing.assert_allclose([float(row["return"]) for row in rows], returns, atol=1e-4)
+    assert training.finished(out)
+
+
+def test_the_table_is_that_of_the_saved_policies(finished):
+    """The policies' files, in a plain loop over NumPy's numbers, earn what the table says."""
+    out, result = finished
+    theta, start = np.asarray(result.outcomes["theta"][1]), jax.random.split(training._keys(5)[3], 128)
+    policy = load(out / "uniform/seed_005/policy.npz").require("line", LINE.observations.names, LINE.actions.names)
+    for i in range(0, 128, 16):
+        gain, target = theta[i]
+        position, value = 0.1 * float(jax.random.normal(start[i])), 0.0
+        for _ in range(LINE.steps):
+            position += gain * policy([position, target])[0]
+            value -= 0.0 if abs(position) > 3 else abs(position - target)
+            if abs(position) > 3 or abs(position - target) < 0.05:
+                break
+        assert value == pytest.approx(float(result.outcomes["value"][1, i]), abs=1e-3)
+
+
+def test_a_training_that_was_stopped_goes_on_to_the_same_bits(finished, tmp_path):
+    out, _ = finished
+    again = tmp_path / "again"
+    training.begin(plan(), again)
+
+    def stop(updates, curves):
+        raise KeyboardInterrupt
+
+    for done in (0, 3):
+        assert training.updates_done(again) == done
+        with pytest.raises(KeyboardInterrupt):
+            training.resumed(again, LINE, stop)
+    assert not training.finished(again)
+    training.resumed(again, LINE, stop if training.updates_done(again) < 4 else lambda updates, curves: None)
+    for path in out.rglob("*.npz"):
+        first, second = files.read_arrays(path), files.read_arrays(again / path.relative_to(out))
+        for name in first.keys() - {"seconds", "schema"}:
+            np.testing.assert_array_equal(first[name], second[name], err_msg=f"{path} {name}")
+    assert (out / "table.csv").read_text() == (again / "table.csv").read_text()
+
+
+def test_what_cannot_be_gone_on_with_is_refused(finished, tmp_path):
+    out, _ = finished
+    with pytest.raises(ValueError, match="expected a new"):
+        training.begin(plan(), out)
+    with pytest.raises(StoreError, match="without a readable"):
+        training.read_config(tmp_path)
+    config = json.loads((out / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config | {"version": 0}))
+    with pytest.raises(StoreError, match=r"of this version"):
+        training.read_config(tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps(config | {"environment_name": "whip"}))
+    with pytest.raises(StoreError, match="expected a training of line, got one of whip"):
+        training.resumed(tmp_path, LINE, print)
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(StoreError, match=r"domains\.npz: expected a whole"):
+        training.resumed(tmp_path, LINE, print)
+    files.write_arrays(tmp_path / "domains.npz", files.read_arrays(out / "domains.npz"))
+    files.write_arrays(tmp_path / "checkpoint.npz", {"done": np.asarray(3)})
+    with pytest.raises(StoreError, match=r"checkpoint\.npz: expected .*params.*got another or none"):
+        training.resumed(tmp_path, LINE, print)
+
+
+# --------------------------------------------------------------------------------------------------- command line
+
+
+def run(*words):
+    return command.main([REFERENCE, *WORDS, *map(str, words)])
+
+
+def test_the_command_trains_what_the_library_does(finished, tmp_path, capsys):
+    out, _ = finished
+    assert run("--domain", "uniform", "median", "--seeds", "1", "--out", tmp_path / "run", "--learning-rate", "3e-3",
+               "--entropy", "0", "--initial-deviation", "1") == 0  # fmt: skip
+    printed = capsys.readouterr().out
+    assert "update 4 of 4" in printed and "uniform" in printed
+    for path in ("uniform/seed_000/policy.npz", "median/seed_000/policy.npz"):
+        ours, theirs = load(tmp_path / "run" / path), load(out / path)
+        for a, b in zip(ours.weights, theirs.weights, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-4)
+    picture = (tmp_path / "run" / "curves.png").read_bytes()
+    assert picture.startswith(b"\x89PNG") and len(picture) > 5000
+
+
+def test_the_command_is_resumed(tmp_path, capsys, monkeypatch):
+    from jaxlfi.cli import parser
+
+    out = tmp_path / "run"
+    original = training._write_checkpoint
+
+    def killed(*arguments):
+        original(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training, "_write_checkpoint", killed)
+    assert run("--domain", "median", "--out", out) == 130
+    assert f"continue with: jaxlfi resume {out}" in capsys.readouterr().err
+    monkeypatch.setattr(training, "_write_checkpoint", original)
+    assert parser.main(["resume", str(out), "--no-figures", "--no-cache"]) == 0
+    assert training.finished(out)
+    assert parser.main(["resume", str(out)]) == 0
+    assert "complete: nothing to resume" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--domain", "nowhere"], "domain: expected the folder of a run, uniform"),
+        (["--domain", "uniform:mars"], "domain: expected uniform:NAME of initial, wide, got 'uniform:mars'"),
+        (["--domain", "point:1"], "domain: expected 2 numbers (gain, target)"),
+        (["--domain", "point:1,x"], "domain: expected point:X,Y,... of numbers"),
+        (["--domain", "point:1,2.5"], "domain: expected target between -2 and 2 (Phi), got 2.5"),
+        (["--domain", "median", "median"], "domain: expected different ones, got 'median' twice"),
+        (["--domain", "median", "--seeds", "0"], "seeds: expected at least 1, got 0"),
+        (["--domain", "median", "--minibatches", "3"], "minibatches: expected minibatches x segments"),
+        (["--domain", "median", "--discount", "2"], "discount: expected a number in [0, 1], got 2"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(words, expected, tmp_path, capsys):
+    assert run(*words, "--out", tmp_path / "run") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("jaxlfi train: error: ") and error.count("\n") == 1
+    assert expected in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_posterior_of_a_run_is_a_domain(tmp_path, capsys):
+    """A run's mixture, clipped to Phi; the posterior of other parameters is refused."""
+
+    def simulate(key, theta):
+        return theta + 0.1 * jax.random.normal(key, (2,))
+
+    task = Task(
+        simulate, names=LINE.space.names, log=("gain",), supports={"initial": LINE.supports["initial"]},
+        feasible=LINE.feasible, truth=(0.8, 0.6),
+    )  # fmt: skip
+    found = infer(jax.random.key(0), task, settings=small.settings(rounds=1))
+    found.save(tmp_path / "found")
+    name, draw = command._domain(LINE, str(tmp_path / "found"))
+    theta = np.asarray(draw(jax.random.key(1), 500).theta)
+    assert name == "found" and theta.shape == (500, 2)
+    np.testing.assert_allclose(np.log(theta[:, 0]).mean(), found.mixture.mean[0], atol=0.1)
+    np.testing.assert_allclose(theta[:, 1].mean(), found.mixture.mean[1], atol=0.1)
+    assert bool(LINE.feasible.contains(theta).all())
+    other = infer(jax.random.key(0), small.gaussian(), settings=small.settings(rounds=1))
+    other.save(tmp_path / "other")
+    assert run("--domain", tmp_path / "other", "--out", tmp_path / "run") == 2
+    assert "domain: expected a posterior of gain, target, the parameters of line" in capsys.readouterr().err
