@@ -63,8 +63,10 @@ def fields_table(reference: str) -> str:
 def help_text(command: str) -> str:
     """What a command prints about itself."""
     os.environ["COLUMNS"] = "100"
-    from jaxlfi.cli.parser import Families, parser
+    from jaxlfi.cli.parser import Families, foreign_commands, parser
 
+    if point := foreign_commands().get(command):
+        return f"```text\n{importlib.import_module(point.module).parser().format_help().strip()}\n```"
     words = [command] if command != "jaxlfi" else []
     top = parser(Families.of(words))
     (commands,) = [action for action in top._actions if getattr(action, "choices", None) and action.dest == "command"]

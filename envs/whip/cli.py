@@ -1,4 +1,4 @@
-"""The command line of the whipping task: `jaxlfi whip render | plan`.
+"""The command line of the whipping task: `jaxlfi whip render | plan | deploy`.
 
 This module imports neither jax nor numpy, so that `--help` answers at once.
 """
@@ -17,6 +17,7 @@ examples:
   jaxlfi whip render --length 250 --young 2.5e4 --policy plan --detector transporter --out runs/whip
   jaxlfi whip plan --length 250 --young 2.5e4 --out runs/plan.npz
   jaxlfi whip render --length 200 --young 2.5e4 --policy runs/plan.npz --out runs/shorter
+  jaxlfi whip deploy runs/policies/uniform/seed_000/policy.npz constant:0.03,-0.03 --object dlo-0 --out runs/deployed
 
 """
 
@@ -26,7 +27,7 @@ def parser() -> argparse.ArgumentParser:
     formatter = argparse.RawDescriptionHelpFormatter
     top = OneLineParser(
         prog="jaxlfi whip",
-        description="Render rollouts of the DLO whipping task, and plan whips.",
+        description="Render rollouts of the DLO whipping task, plan whips, and let policies whip.",
         epilog=EXAMPLES,
         formatter_class=formatter,
     )
@@ -58,6 +59,25 @@ def parser() -> argparse.ArgumentParser:
     )
     _add_scene(plan)
     plan.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .npz: actions, value, history")
+
+    deploy = commands.add_parser(
+        "deploy",
+        help="let policies act on the FEM reference objects",
+        description="Let policies act on the FEM reference objects, in a closed loop through noisy images. All see the "
+        "same places of stack and camera, displaced as in training. Writes table.csv and episodes.csv.",
+    )
+    deploy.add_argument(
+        "policies",
+        nargs="+",
+        metavar="POLICY",
+        help="a policy.npz (jaxlfi train), a plan or another .npz with actions [16, 2] in m, or constant:DX,DZ in m",
+    )
+    deploy.add_argument(
+        "--object", nargs="+", required=True, metavar="NAME", help="what to act on: dlo-0, dlo-1, dlo-2, dlo-3"
+    )
+    deploy.add_argument("--repetitions", type=int, default=16, metavar="N", help="places (default: 16)")
+    deploy.add_argument("--seed", type=int, default=0, metavar="N", help="seed of places and noise (default: 0)")
+    deploy.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
     return top
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import functools
+import sys
 from pathlib import Path
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from rich.console import Console
 from rich.progress import Progress
+from rich.table import Table
 
 from jaxlfi.envs.whip import planner, rules
 from jaxlfi.envs.whip import recording as recordings
@@ -21,6 +23,7 @@ from jaxlfi.envs.whip.parameters import WhipParameters, check, median
 from jaxlfi.envs.whip.physics.engine import Engine
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.physics.scene import Scene
+from jaxlfi.envs.whip.reference_objects import objects, repetitions
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
@@ -80,6 +83,33 @@ def plan(arguments: argparse.Namespace) -> None:
     scene = {f"parameters/{name}": value for name, value in vars(parameters).items()}
     atomic.write_arrays(out, {**vars(found), **scene})
     print(f"mean return {found.value:.2f} after {found.history.size} tries, wrote {out}")
+
+
+def deploy(arguments: argparse.Namespace) -> None:
+    """`jaxlfi whip deploy`.
+
+    Raises:
+        ValueError: for bad input.
+    """
+    out, n = arguments.out, arguments.repetitions
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ValueError(f"out: expected a new or empty folder, got {out}")
+    if n < 1:
+        raise ValueError(f"repetitions: expected at least 1, got {n}")
+    named = [objects.load(name) for name in dict.fromkeys(arguments.object)]
+    begins = {word: repetitions.acting(word) for word in arguments.policies}
+    with Progress(console=Console(stderr=True)) as progress:
+        bar = progress.add_task("episodes", total=len(begins) * len(named) * n)
+        rows = repetitions.repeat(jax.random.key(arguments.seed), begins, named, n, lambda: progress.advance(bar))
+    out.mkdir(parents=True, exist_ok=True)
+    repetitions.write(out / "episodes.csv", rows)
+    lines = repetitions.summary(rows)
+    repetitions.write(out / "table.csv", lines)
+    table = Table(*lines[0], title=f"{n} places: the first nominal, the others displaced as in training")
+    for line in lines:
+        table.add_row(*(value if isinstance(value, str) else f"{value:.2f}" for value in line.values()))
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    print(f"wrote {out / 'table.csv'} and {out / 'episodes.csv'}")
 
 
 def _parameters(arguments: argparse.Namespace) -> WhipParameters:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxlfi import flags, source_fields
+from jaxlfi.cli.domains import DOMAINS, domain
 from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
 
 if TYPE_CHECKING:
@@ -24,15 +25,11 @@ PRESETS = ("quick", "paper")
 SETTINGS = "jaxlfi.rl.settings:PPO"
 """The class whose fields are the settings of a training."""
 
-EXAMPLES = """\
-domains:
-  RUN             the posterior of a finished run (jaxlfi infer): low-variance draws of its mixture, clipped to Phi, or
-                  to the run's support where that was fixed
-  uniform         uniform over the environment's first support, Theta_0 (PPO-U); uniform:NAME over another
-  median          the environment's nominal point (PPO-mu)
-  point:X,Y,...   a point of your own, in natural units
-Each environment draws a point of the domain and keeps it, as in the paper; --redrawn draws one for every episode.
-All domains and seeds are trained side by side, and evaluated without noise on 128 other points of their domain.
+EXAMPLES = f"""\
+{DOMAINS}
+Each environment draws a point of its domain and keeps it, as in the paper; --redrawn draws one for every
+episode. All domains and seeds are trained side by side, and evaluated without noise on 128 other points of
+their domain.
 
 examples:
   jaxlfi train whip --domain uniform --seeds 4 --out runs/uniform
@@ -124,9 +121,9 @@ def run(out: Path, environment: "Environment", console: "Console", figures: bool
         result = training.resumed(out, environment, on_chunk)
     facts = [name for name in result.outcomes if name not in training.NO_FACTS]
     table = Table("domain", "seed", "return", *facts, title=f"on {training.HELD_OUT} other points of each domain")
-    for place, (domain, seed) in enumerate(result.names):
+    for place, (trained_on, seed) in enumerate(result.names):
         means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]
-        table.add_row(domain, str(seed), *(f"{mean:.2f}" for mean in means))
+        table.add_row(trained_on, str(seed), *(f"{mean:.2f}" for mean in means))
     console.print(table)
     console.print(f"policies: {out}/DOMAIN/seed_NNN/policy.npz", markup=False)
     if figures:
@@ -168,7 +165,7 @@ def _plan(arguments: argparse.Namespace) -> Any:
     environment = registry.load(arguments.environment)
     domains: dict[str, Callable] = {}
     for word in arguments.domain:
-        name, draw = _domain(environment, word)
+        name, draw = domain(environment, word)
         if name in domains:
             raise ValueError(f"domain: expected different ones, got {name!r} twice")
         domains[name] = draw
@@ -180,36 +177,3 @@ def _plan(arguments: argparse.Namespace) -> Any:
         domains=domains,
         seeds=tuple(range(arguments.first_seed, arguments.first_seed + arguments.seeds)),
     )
-
-
-def _domain(environment: "Environment", word: str) -> tuple[str, Callable]:
-    """The name of a domain, and how to draw it."""
-    from jaxlfi.rl import domains
-
-    kind, _, rest = word.partition(":")
-    if kind == "uniform":
-        supports = environment.supports
-        if rest and rest not in supports:
-            raise ValueError(f"domain: expected uniform:NAME of {', '.join(supports)}, got {word!r}")
-        box = supports[rest or next(iter(supports))]
-        return f"uniform-{rest}" if rest else "uniform", lambda key, n: domains.uniform(key, box, n)
-    if kind == "median" and not rest:
-        return "median", lambda key, n: domains.point(environment.nominal, n)
-    if kind == "point":
-        try:
-            numbers = [float(number) for number in rest.split(",")]
-        except ValueError:
-            raise ValueError(f"domain: expected point:X,Y,... of numbers, got {word!r}") from None
-        theta = domains.check_point(environment, numbers)
-        return f"point-{'-'.join(f'{number:g}' for number in numbers)}", lambda key, n: domains.point(theta, n)
-    folder = Path(word)
-    if not folder.is_dir():
-        raise ValueError(
-            f"domain: expected the folder of a run, uniform, uniform:NAME, median or point:X,Y,..., got {word!r}"
-        )
-    from jaxlfi.runs.load import load
-
-    run = load(folder)
-    domains.check_belief(environment, run.space, run.space.box_to_natural(run.feasible))
-    limits = run.space.box_to_natural(run.feasible if run.heuristic.grows else run.support)
-    return folder.resolve().name, lambda key, n: domains.of_belief(key, run.belief, run.space, limits, n)

@@ -1,5 +1,7 @@
 """Domains: the parameters of the environments that a policy is trained on (section VI-H)."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +26,10 @@ class Domain:
     """
 
     theta: Float[Array, "*batch n dim"]
+
+
+Draw = Callable[[jax.Array, int], Domain]
+"""Draws a domain of so many points with a key."""
 
 
 def of_belief(key: jax.Array, belief: Belief, space: Space, limits: Support, n: int) -> Domain:

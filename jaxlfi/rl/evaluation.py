@@ -1,12 +1,17 @@
 """Evaluation: how a policy fares on the points of a domain."""
 
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlfi.rl.domains import Domain
+from jaxlfi.rl.domains import Domain, Draw
 from jaxlfi.rl.environment import Environment
+from jaxlfi.rl.policy import Policy
 
 
 @struct.dataclass
@@ -26,7 +31,21 @@ class Outcomes:
     facts: dict[str, Array]
 
 
-def evaluate(key: jax.Array, environment: Environment, act, domain: Domain) -> Outcomes:
+def acting(weights: Sequence[Array], biases: Sequence[Array], schema: Mapping[str, Any]) -> Callable[[Array], Array]:
+    """A saved policy (`jaxlfi.rl.policy.Policy`) in JAX: from an observation [O] to an action [A], in their units."""
+    numbers = lambda signals: (jnp.asarray(schema[signals][name], jnp.float32) for name in ("centre", "scale"))
+    (seen_centre, seen_scale), (centre, scale) = numbers("observations"), numbers("actions")
+
+    def act(observation: Float[Array, " obs"]) -> Float[Array, " act"]:
+        layer = (observation - seen_centre) / seen_scale
+        for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+            layer = jnp.tanh(layer @ weight + bias)
+        return centre + scale * jnp.clip(layer @ weights[-1] + biases[-1], -1.0, 1.0)
+
+    return act
+
+
+def evaluate(key: jax.Array, environment: Environment, act: Callable[[Array], Array], domain: Domain) -> Outcomes:
     """One episode at each point, by one policy.
 
     Args:
@@ -53,3 +72,47 @@ def evaluate(key: jax.Array, environment: Environment, act, domain: Domain) -> O
         return outcome
 
     return jax.vmap(episode)(jax.random.split(key, len(domain.theta)), domain.theta)
+
+
+def cross_evaluate(
+    environment: Environment, policies: Mapping[str, Policy], draws: Mapping[str, Draw], episodes: int, seed: int = 0
+) -> list[dict[str, Any]]:
+    """Every policy on every domain; all policies meet the same episodes.
+
+    Args:
+        environment: to act in.
+        policies: by name, all of the same widths.
+        draws: how to draw the points of each domain, by its name.
+        episodes: on each domain.
+        seed: of points and episodes.
+
+    Returns:
+        A row for each policy and domain: mean return, its standard error, and means of the environment's facts.
+
+    Raises:
+        ValueError: for policies of another environment or of several widths, and less than one episode.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes: expected at least 1, got {episodes}")
+    for policy in policies.values():
+        policy.require(environment.name, environment.observations.names, environment.actions.names)
+    shapes = [[weight.shape for weight in policy.weights] for policy in policies.values()]
+    if any(own != shapes[0] for own in shapes):
+        raise ValueError("policies: expected networks of the same widths; evaluate others by themselves")
+    layers = jax.tree.map(lambda *leaves: np.stack(leaves), *((one.weights, one.biases) for one in policies.values()))
+    schema = next(iter(policies.values())).schema
+
+    @jax.jit
+    def fares(key: jax.Array, domain: Domain) -> Outcomes:
+        return jax.vmap(lambda layers: evaluate(key, environment, acting(*layers, schema), domain))(layers)
+
+    rows = []
+    for name, draw in draws.items():
+        key_points, key_episodes = jax.random.split(jax.random.key(seed))
+        outcomes = jax.device_get(fares(key_episodes, draw(key_points, episodes)))
+        for place, policy in enumerate(policies):
+            value = outcomes.value[place]
+            error = float(value.std(ddof=1) / episodes**0.5) if episodes > 1 else float("nan")
+            facts = {fact: float(np.mean(values[place])) for fact, values in outcomes.facts.items()}
+            rows.append({"policy": policy, "domain": name, "return": float(value.mean()), "error": error, **facts})
+    return rows

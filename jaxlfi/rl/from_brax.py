@@ -109,13 +109,14 @@ def from_brax(
             do not fit.
 
     Example:
+        >>> from jaxlfi.rl import ppo
         >>> from brax import envs
         >>> def heavier(sys, theta):
         ...     inertia = sys.link.inertia
         ...     return sys.replace(link=sys.link.replace(inertia=inertia.replace(mass=theta[0] * inertia.mass)))
         >>> env = envs.get_environment("inverted_pendulum", backend="generalized")
-        >>> from_brax(env, heavier, Support([0.5], [2.0]), names=("mass",)).actions.size
-        1
+        >>> pendulum = from_brax(env, heavier, Support([0.5], [2.0]), names=("mass",))
+        >>> networks = ppo.policy_networks(pendulum, ppo.PPO())
     """
     if getattr(env, "unwrapped", env) is not env:
         raise ValueError(f"env: expected an environment that is not wrapped, got {type(env).__name__}")

@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxlfi.io import files, serialise
 from jaxlfi.rl import ppo
-from jaxlfi.rl.domains import POOL, Domain
+from jaxlfi.rl.domains import POOL, Domain, Draw
 from jaxlfi.rl.environment import Environment
 from jaxlfi.rl.evaluation import evaluate
 from jaxlfi.rl.ppo import Training, Update
@@ -37,9 +37,6 @@ MAX_CHUNK = 16
 """Updates between two checkpoints, at most."""
 NO_FACTS = ("value", "steps", "theta")
 """Arrays of outcomes that are no facts that the environment tells of an episode."""
-
-Draw = Callable[[jax.Array, int], Domain]
-"""Draws a domain of so many points with a key."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import plugins
+from jaxlfi import factories, plugins
 from jaxlfi.bayessim import memory
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
@@ -377,7 +377,7 @@ def registered(monkeypatch):
         EntryPoint("linear", "jaxlfi.envs.gaussian_linear:task", tasks.GROUP),
         EntryPoint("broken", "no.such.module:task", tasks.GROUP),
     ]
-    monkeypatch.setattr(tasks, "entry_points", lambda group: points)
+    monkeypatch.setattr(factories, "entry_points", lambda group: points)
 
 
 def test_tasks_are_listed_also_beside_a_broken_package(registered, capsys):

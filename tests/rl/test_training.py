@@ -13,6 +13,8 @@ import small
 from rl.toy import SETTINGS, Line
 
 from jaxlfi import infer
+from jaxlfi.cli import domains as words_of
+from jaxlfi.cli import evaluate as evaluating
 from jaxlfi.cli import train as command
 from jaxlfi.io import files
 from jaxlfi.rl import domains, training
@@ -209,7 +211,7 @@ def test_the_posterior_of_a_run_is_a_domain(tmp_path, capsys):
     )  # fmt: skip
     found = infer(jax.random.key(0), task, settings=small.settings(rounds=1))
     found.save(tmp_path / "found")
-    name, draw = command._domain(LINE, str(tmp_path / "found"))
+    name, draw = words_of.domain(LINE, str(tmp_path / "found"))
     theta = np.asarray(draw(jax.random.key(1), 500).theta)
     assert name == "found" and theta.shape == (500, 2)
     np.testing.assert_allclose(np.log(theta[:, 0]).mean(), found.mixture.mean[0], atol=0.1)
@@ -219,3 +221,44 @@ def test_the_posterior_of_a_run_is_a_domain(tmp_path, capsys):
     other.save(tmp_path / "other")
     assert run("--domain", tmp_path / "other", "--out", tmp_path / "run") == 2
     assert "domain: expected a posterior of gain, target, the parameters of line" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------------------------ evaluation
+
+
+def test_saved_policies_are_evaluated_on_any_domain(finished, tmp_path, capsys):
+    """The returns of the training's own table, and a NumPy loop's at a point."""
+    out, _ = finished
+    paths = [str(out / name / "policy.npz") for name in ("uniform/seed_000", "median/seed_005")]
+    file = tmp_path / "cross.csv"
+    words = [REFERENCE, *paths, "--domain", "median", "point:1,-1", "--episodes", "40", "--out", str(file)]
+    assert evaluating.main(words) == 0
+    with file.open() as text:
+        rows = {(row["policy"], row["domain"]): row for row in csv.DictReader(text)}
+    assert list(rows) == [(path, domain) for domain in ("median", "point-1--1") for path in paths]
+    _, key = jax.random.split(jax.random.key(0))
+    starts = 0.1 * np.array([float(jax.random.normal(one)) for one in jax.random.split(key, 40)])
+    policy, position, value = load(paths[1]), starts, np.zeros(40)
+    over = np.zeros(40, bool)
+    for _ in range(LINE.steps):
+        position = position + policy(np.stack([position, np.full(40, -1.0)], axis=1))[:, 0]
+        distance = np.abs(position + 1.0)
+        value -= np.where(over | (np.abs(position) > 3), 0.0, distance)
+        over |= (distance < 0.05) | (np.abs(position) > 3)
+    assert float(rows[paths[1], "point-1--1"]["return"]) == pytest.approx(value.mean(), abs=1e-3)
+    assert evaluating.main(words) == 2
+    assert "out: expected a new .csv file" in capsys.readouterr().err
+
+
+def test_policies_of_other_environments_are_not_evaluated(finished, tmp_path, capsys):
+    out, _ = finished
+    path = out / "median/seed_000/policy.npz"
+    other = load(path)
+    other.schema["environment"] = "whip"
+    other.save(tmp_path / "other.npz")
+    for file, expected in (
+        (tmp_path / "other.npz", "policy: expected environment 'line', got one of 'whip'"),
+        (tmp_path / "none.npz", "expected a whole .npz"),
+    ):
+        assert evaluating.main([REFERENCE, str(file), "--domain", "median"]) == 2
+        assert expected in capsys.readouterr().err

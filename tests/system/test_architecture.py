@@ -261,13 +261,14 @@ def test_the_keys_of_a_run_are_split_in_one_module(path):
 
 @everywhere
 def test_who_may_import_which_library(path):
-    """Plots are drawn by modules called figures, physics is the whip's; experiments may do both."""
+    """Plots are drawn by modules called figures, physics is the whip's, policies are Brax's; experiments may do all."""
     allowed = {
         "matplotlib": ("jaxlfi.figures", f"{ENVS}.whip.figures", "experiments"),
         "mujoco": (f"{ENVS}.whip", "experiments"),
         "gymnasium": (f"{ENVS}.whip",),
+        "brax": ("jaxlfi.rl",),
     }
-    forbidden = dict.fromkeys(("brax", "pickle", "cloudpickle", "dill", "joblib"), ())
+    forbidden = dict.fromkeys(("pickle", "cloudpickle", "dill", "joblib"), ())
     for library, packages in (allowed | forbidden).items():
         if not any(within(name_of(path), package) for package in packages):
             assert not {name for name in imported(path) if within(name, library)}, library

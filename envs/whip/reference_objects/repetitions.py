@@ -1,0 +1,120 @@
+"""Policies on the reference objects, again and again at displaced places: who hits, how cleanly, and where not."""
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS
+from jaxlfi.envs.whip.reference_objects.deployment import Act, Deployed, deploy, places
+from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
+from jaxlfi.io import files
+from jaxlfi.io.host_devices import processors
+from jaxlfi.rl import policy as policies
+
+COLUMNS = ("policy", "object", "place", "return", "hit", "clean_hit", "outside", "failed", "steps")
+
+
+def acting(word: str) -> Callable[[], Act]:
+    """How to act by "constant:DX,DZ" (m), a policy's file, or an .npz with an array "actions" [16, 2], open loop.
+
+    Returns:
+        What begins an episode: a function of no arguments that returns the policy.
+
+    Raises:
+        ValueError: for anything else, and policies of another environment.
+    """
+    if word.startswith("constant:"):
+        try:
+            action = np.array([float(number) for number in word.removeprefix("constant:").split(",")])
+        except ValueError:
+            action = np.zeros(0)
+        if action.shape != (2,) or not (np.abs(action) <= rules.ACTION_LIMIT).all():
+            raise ValueError(f"policy: expected constant:DX,DZ of at most {rules.ACTION_LIMIT} m, got {word!r}")
+        return lambda: lambda observation: action
+    arrays = files.read_arrays(Path(word))
+    if "actions" in arrays and arrays["actions"].shape == (rules.STEPS, 2):
+        plan = np.clip(arrays["actions"], -rules.ACTION_LIMIT, rules.ACTION_LIMIT)
+
+        def begin() -> Act:
+            steps = iter(plan)
+            return lambda observation: next(steps)
+
+        return begin
+    policy = policies.load(word).require("whip", OBSERVATIONS.names, ACTIONS.names)
+    return lambda: policy
+
+
+def repeat(
+    key: jax.Array,
+    begins: Mapping[str, Callable[[], Act]],
+    objects: Sequence[ReferenceObject],
+    n: int,
+    on_episode: Callable[[], Any] = lambda: None,
+) -> list[dict[str, Any]]:
+    """Every policy on every object at the same n places, which are displaced as in training but for the first.
+
+    Args:
+        key: of places and camera noise; the same in all of them.
+        begins: what begins an episode of each policy, by name.
+        objects: to act on.
+        n: how many places.
+        on_episode: called after each episode.
+
+    Returns:
+        A row for each episode, by `COLUMNS`.
+    """
+    key_places, key_noise = jax.random.split(key)
+    scenes, cameras = places(key_places, n)
+    keys = list(jax.random.split(key_noise, n))
+
+    def episode(case: tuple[str, ReferenceObject, int]) -> dict[str, Any]:
+        name, dlo, place = case
+        row = _row(name, dlo.name, place, deploy(keys[place], dlo, begins[name](), scenes[place], cameras[place]))
+        on_episode()
+        return row
+
+    cases = [(name, dlo, place) for name in begins for dlo in objects for place in range(n)]
+    with ThreadPoolExecutor(processors()) as pool:  # MuJoCo steps without Python's lock
+        return list(pool.map(episode, cases))
+
+
+def _row(name: str, dlo: str, place: int, one: Deployed) -> dict[str, Any]:
+    values = (name, dlo, place, one.value, one.hit[rules.TOP], one.clean_hit, one.outside, one.failed, one.steps)
+    return dict(zip(COLUMNS, (value.item() if hasattr(value, "item") else value for value in values), strict=True))
+
+
+def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Of each policy on each object: mean return and its standard error, worst return, rates of hits and exits."""
+    pairs = dict.fromkeys((row["policy"], row["object"]) for row in rows)
+    out = []
+    for policy, dlo in pairs:
+        own = [row for row in rows if (row["policy"], row["object"]) == (policy, dlo)]
+        column = lambda name, own=own: np.array([row[name] for row in own], float)
+        returns = column("return")
+        out.append(
+            {
+                "policy": policy,
+                "object": dlo,
+                "return": returns.mean(),
+                "error": returns.std(ddof=1) / len(own) ** 0.5 if len(own) > 1 else float("nan"),
+                "worst": returns.min(),
+                **{name: column(name).mean() for name in ("hit", "clean_hit", "outside", "failed")},
+            }
+        )
+    return out
+
+
+def write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows as csv."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    files.write_bytes(path, text.getvalue().encode())

@@ -1,0 +1,55 @@
+"""Domains as the command line names them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxlfi.rl.environment import Environment
+
+DOMAINS = """\
+domains:
+  RUN             the posterior of a finished run (jaxlfi infer): low-variance draws of its mixture, clipped to Phi, or
+                  to the run's support where that was fixed
+  uniform         uniform over the environment's first support, Theta_0 (PPO-U); uniform:NAME over another
+  median          the environment's nominal point (PPO-mu)
+  point:X,Y,...   a point of your own, in natural units
+"""
+"""For `--help`."""
+
+
+def domain(environment: "Environment", word: str) -> tuple[str, Callable]:
+    """The name of a domain, and how to draw n points of it with a key.
+
+    Raises:
+        ValueError: for what names none, a point outside of Phi, and the posterior of other parameters.
+    """
+    from jaxlfi.rl import domains
+
+    kind, _, rest = word.partition(":")
+    if kind == "uniform":
+        supports = environment.supports
+        if rest and rest not in supports:
+            raise ValueError(f"domain: expected uniform:NAME of {', '.join(supports)}, got {word!r}")
+        box = supports[rest or next(iter(supports))]
+        return f"uniform-{rest}" if rest else "uniform", lambda key, n: domains.uniform(key, box, n)
+    if kind == "median" and not rest:
+        return "median", lambda key, n: domains.point(environment.nominal, n)
+    if kind == "point":
+        try:
+            numbers = [float(number) for number in rest.split(",")]
+        except ValueError:
+            raise ValueError(f"domain: expected point:X,Y,... of numbers, got {word!r}") from None
+        theta = domains.check_point(environment, numbers)
+        return f"point-{'-'.join(f'{number:g}' for number in numbers)}", lambda key, n: domains.point(theta, n)
+    folder = Path(word)
+    if not folder.is_dir():
+        raise ValueError(
+            f"domain: expected the folder of a run, uniform, uniform:NAME, median or point:X,Y,..., got {word!r}"
+        )
+    from jaxlfi.runs.load import load
+
+    run = load(folder)
+    domains.check_belief(environment, run.space, run.space.box_to_natural(run.feasible))
+    limits = run.space.box_to_natural(run.feasible if run.heuristic.grows else run.support)
+    return folder.resolve().name, lambda key, n: domains.of_belief(key, run.belief, run.space, limits, n)

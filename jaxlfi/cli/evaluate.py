@@ -1,0 +1,87 @@
+"""The command `jaxlfi evaluate`: how saved policies fare on domains, theirs and others.
+
+This module imports neither jax nor numpy before it has to, so that `--help` answers at once.
+"""
+
+import argparse
+import csv
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxlfi.cli.domains import DOMAINS, domain
+from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
+
+EXAMPLES = f"""\
+{DOMAINS}
+examples:
+  jaxlfi evaluate whip runs/policies/*/*/policy.npz --domain runs/dlo-0 uniform median --out runs/cross.csv
+
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    top = OneLineParser(
+        prog="jaxlfi evaluate",
+        description="Evaluate saved policies, without noise, on points of domains; all meet the same episodes.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    top.add_argument("environment", metavar="ENVIRONMENT", help="an environment's name, as of jaxlfi train")
+    top.add_argument("policies", nargs="+", type=Path, metavar="FILE", help="policy.npz files that jaxlfi train wrote")
+    top.add_argument("--domain", nargs="+", required=True, metavar="DOMAIN", help="what to evaluate on; several: each")
+    top.add_argument("--episodes", type=int, default=128, metavar="N", help="on each domain (default: 128)")
+    top.add_argument("--seed", type=int, default=0, metavar="N", help="of the points and episodes (default: 0)")
+    top.add_argument("--out", type=Path, metavar="FILE", help="a new .csv, a row for each policy and domain")
+    top.add_argument("--debug", action="store_true", help="show where an error came from")
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: the words after `jaxlfi evaluate`; by default those of the process.
+
+    Returns:
+        0; 2 for bad input; 130 where it was interrupted.
+    """
+    arguments = parser().parse_args(argv)
+    try:
+        _run(arguments)
+    except (ValueError, OSError, ImportError) as error:
+        if arguments.debug:
+            traceback.print_exception(error)
+        print(f"jaxlfi evaluate: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("jaxlfi evaluate: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from jaxlfi.rl import registry
+    from jaxlfi.rl.evaluation import cross_evaluate
+    from jaxlfi.rl.policy import load
+
+    if arguments.out is not None and (arguments.out.exists() or arguments.out.suffix != ".csv"):
+        raise ValueError(f"out: expected a new .csv file, got {arguments.out}")
+    environment = registry.load(arguments.environment)
+    policies = {str(path): load(path) for path in arguments.policies}
+    draws = dict(domain(environment, word) for word in arguments.domain)
+    rows = cross_evaluate(environment, policies, draws, arguments.episodes, arguments.seed)
+    table = Table(*rows[0], title=f"{arguments.episodes} episodes on each domain")
+    for row in rows:
+        table.add_row(*(value if isinstance(value, str) else f"{value:.2f}" for value in row.values()))
+    (Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)).print(table)
+    if arguments.out is not None:
+        with arguments.out.open("x", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
