@@ -39,17 +39,17 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("jaxlfi")
 
-MEMORY = 1400 * 2**20
+MEMORY = 1600 * 2**20
 """Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory."""
 
-MAX_MEMORY = 1600 * 2**20
+MAX_MEMORY = 1700 * 2**20
 """Bytes beyond which it does so between two tests of one file, which would mostly have used the same programs."""
 
 
 LONG = (
     "test_examples", "test_cli", "test_outside_package", "test_draws", "test_infer", "test_grid", "test_apt",
     "test_resume", "test_readme", "test_calibration_study", "test_lynx_hare", "test_load", "test_real2sim",
-    "test_algorithm", "test_engines",
+    "test_algorithm", "test_engines", "test_estimators", "test_training", "test_from_brax",
 )  # fmt: skip
 """Files of half a minute and more."""
 

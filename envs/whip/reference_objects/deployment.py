@@ -16,7 +16,7 @@ from jaxlfi.envs.whip.recording import Recording
 from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
 from jaxlfi.envs.whip.reference_objects.observation import HEX, IMAGE_SIZE, found
 from jaxlfi.envs.whip.reference_objects.scene import PLACE, SIMULATOR
-from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig, UnstableError
+from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig, UnstableError, stacked
 from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.envs.whip.vision.camera import Camera, side_camera
 from jaxlfi.envs.whip.vision.keypoints import ON_DLO
@@ -40,7 +40,8 @@ class Deployed:
         steps: its number of control steps.
         observations: before each action and after the last one, shape [T + 1, 28].
         actions: shape [T, 2].
-        recording: of all 16 steps, where the policy was asked to go on after the end.
+        recording: of all 16 steps, where these were asked for.
+        frames: likewise, all true frames, ten to a step, shape [161].
     """
 
     value: float
@@ -51,6 +52,7 @@ class Deployed:
     observations: Float[np.ndarray, "times 28"]
     actions: Float[np.ndarray, "steps 2"]
     recording: Recording | None = None
+    frames: Frames | None = None
 
     @property
     def clean_hit(self) -> bool:
@@ -124,7 +126,7 @@ def deploy(
         act: the policy.
         place: the scene.
         camera: that sees it; by default the side camera of the scene.
-        whole: go on for all 16 steps, and record them; the outcome is that at the episode's end.
+        whole: record 16 steps: after the episode's end, whose outcome is returned, the gripper is held still.
 
     Raises:
         ValueError: for actions that are too large or not finite.
@@ -136,14 +138,15 @@ def deploy(
     keypoints, seen = eye.see(frame)
     start, hit, value = keypoints[ON_DLO:], np.zeros(6, bool), 0.0
     seen_so_far, grippers, points, hits = [seen], [frame.gripper], [keypoints], [hit]
-    observations, actions, outcome = [_observed(frame, keypoints, hit)], [], None
+    observations, actions, outcome, film = [_observed(frame, keypoints, hit)], [], None, [stacked([frame])]
     for step in range(1, rules.STEPS + 1):
-        actions.append(np.asarray(act(observations[-1]), float))
+        actions.append(np.zeros(2) if outcome is not None else np.asarray(act(observations[-1]), float))
         try:
-            frame = jax.tree.map(lambda leaf: leaf[-1], rig.step(actions[-1]))
+            film.append(rig.step(actions[-1]))
         except UnstableError:
             outcome = outcome or (value, hit, False, True, step)
             break
+        frame = jax.tree.map(lambda leaf: leaf[-1], film[-1])
         keypoints, seen = eye.see(frame)
         hit, outside = np.asarray(rules.hits(hit, start, keypoints[ON_DLO:])), bool(rules.outside(frame.gripper))
         value += float(rules.reward(hit, outside))
@@ -171,7 +174,8 @@ def deploy(
             colours=HEX,
             provenance={"simulator": SIMULATOR},
         )
-    return Deployed(*outcome, np.stack(observations), np.stack(actions), recording)
+    frames = jax.tree.map(lambda *parts: np.concatenate(parts), *film) if recording else None
+    return Deployed(*outcome, np.stack(observations), np.stack(actions), recording, frames)
 
 
 def _observed(frame: Frames, keypoints: np.ndarray, hit: np.ndarray) -> np.ndarray:

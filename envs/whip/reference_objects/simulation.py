@@ -85,7 +85,7 @@ class ReferenceRig:
             self._advance()
             if i % round(FRAME_INTERVAL / TIMESTEP) == 0:
                 seen.append(self._look())
-        return _stacked(seen)
+        return stacked(seen)
 
     def rollout(self, actions: Float[np.ndarray, "time 2"]) -> tuple[Float[np.ndarray, " frames"], Frames]:
         """One episode.
@@ -100,7 +100,7 @@ class ReferenceRig:
             ValueError: for actions that are too large.
             UnstableError: if the simulation becomes unstable.
         """
-        frames = [_stacked([self.reset()]), *(self.step(action) for action in np.asarray(actions, float))]
+        frames = [stacked([self.reset()]), *(self.step(action) for action in np.asarray(actions, float))]
         together = jax.tree.map(lambda *parts: np.concatenate(parts), *frames)
         return np.arange(len(together.gripper)) * FRAME_INTERVAL, together
 
@@ -131,5 +131,6 @@ class ReferenceRig:
             raise UnstableError(f"{self.dlo.name}: became unstable at {self._data.time:.3f} s: {broken}")
 
 
-def _stacked(frames: list[Frames]) -> Frames:
+def stacked(frames: list[Frames]) -> Frames:
+    """Frames one after another."""
     return jax.tree.map(lambda *parts: np.stack(parts), *frames)

@@ -10,8 +10,9 @@ import pytest
 
 pytest.importorskip("mujoco")
 
+from envs_whip import a_policy
+
 from jaxlfi.envs.whip import cli, rules
-from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS
 from jaxlfi.envs.whip.parameters import HIGHEST, LOWEST
 from jaxlfi.envs.whip.recording import trajectory
 from jaxlfi.envs.whip.reference_objects import deployment, objects, repetitions
@@ -20,7 +21,6 @@ from jaxlfi.envs.whip.rig import START
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import along
 from jaxlfi.io import files
-from jaxlfi.rl.policy import Policy
 
 KEY = jax.random.key(0)
 TOWARDS = np.array([0.03, -0.03])
@@ -65,6 +65,10 @@ def test_a_whole_episode_is_a_recording_to_infer_from(whole):
     assert seen.shape == (16, 30)
     np.testing.assert_allclose(seen[:, :2], whole.observations[:-1, :2], atol=1e-6)
     np.testing.assert_allclose(seen[:, 28:], whole.actions, atol=1e-7)
+    np.testing.assert_array_equal(whole.actions[: whole.steps], np.tile(TOWARDS, (whole.steps, 1)))
+    np.testing.assert_array_equal(whole.actions[whole.steps :], 0)  # then it is held still
+    assert whole.frames.dlo.shape[0] == 161
+    np.testing.assert_allclose(whole.frames.gripper[::10], whole.recording.gripper, atol=1e-7)
 
 
 def test_an_episode_ends_at_its_end_and_repeats(whole):
@@ -97,13 +101,6 @@ def test_places_are_displaced_as_in_training(key):
         np.testing.assert_allclose(values[0], 0, atol=1e-7)
         assert (values >= np.array(low) - 1e-6).all() and (values <= np.array(high) + 1e-6).all()
         np.testing.assert_allclose(values.std(axis=0), (np.array(high) - low) / 12**0.5, rtol=0.15)
-
-
-def a_policy(path, environment="whip"):
-    signals = lambda one: {name: list(getattr(one, name)) for name in ("names", "units", "centre", "scale")}
-    schema = {"environment": environment, "observations": signals(OBSERVATIONS), "actions": signals(ACTIONS)}
-    bias = np.float32([0.5, -0.5])
-    return Policy((np.zeros((28, 2), np.float32),), (bias,), schema).save(path)
 
 
 def test_words_for_policies(tmp_path):

@@ -1,0 +1,220 @@
+"""The command `jaxlfi r2s2r`: from a real object to a policy for it, and back (Algorithm 1 with lines 3, 4 and 19-22).
+
+policy_0/                  the first policy, on the uniform distribution over Theta_0 (jaxlfi train)
+iteration_1/rollout.npz    that policy on the object, as its camera sees it: x^r
+iteration_1/posterior/     what the object may be (jaxlfi infer)
+iteration_1/policy/        a policy on that posterior (jaxlfi train)
+iteration_2/ ...           likewise, with the new policy's rollout besides
+deployed/                  all these policies on the object, at displaced places (jaxlfi whip deploy)
+page.html film.gif sheet.png
+
+Every stage is a command of its own in a folder of its own. The same command again goes on where it was stopped. This
+module imports neither jax nor numpy before it has to, so that `--help` answers at once.
+"""
+
+import argparse
+import json
+import shutil
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxlfi.cli import parser as command_line
+from jaxlfi.cli import train
+from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.envs.whip import cli as whip
+from jaxlfi.envs.whip import require_mujoco
+
+EXAMPLES = """\
+examples:
+  jaxlfi r2s2r --object dlo-0 --heuristic edge --out runs/r2s2r
+  jaxlfi r2s2r --object dlo-3 --policy runs/uniform/uniform/seed_000/policy.npz --iterations 2 --out runs/twice
+  jaxlfi r2s2r --object dlo-0 --recording my-rollout.npz --out runs/recorded
+
+"""
+REPETITIONS = 16
+"""Places at which policies are compared in the end."""
+
+
+class StageError(Exception):
+    """A stage that ended with this exit status."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    top = OneLineParser(
+        prog="jaxlfi r2s2r",
+        description="From a reference object to a policy for it: a first policy on the uniform distribution, its "
+        "rollout on the object, inference of the object's parameters, a policy on that posterior, and both on the "
+        "object. The same command again goes on where it was stopped.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    top.add_argument("--object", required=True, metavar="NAME", help="dlo-0, dlo-1, dlo-2 or dlo-3")
+    top.add_argument("--out", type=Path, required=True, metavar="DIR", help="a folder, new or of the same command")
+    top.add_argument("--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)")
+    top.add_argument("--preset", choices=("quick", "paper"), default="quick", help="of all stages (default: quick)")
+    top.add_argument("--seed", type=int, default=0, metavar="N", help="of all stages (default: 0)")
+    top.add_argument("--iterations", type=int, default=1, metavar="N", help="times to go round (default: 1)")
+    top.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")
+    top.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz in place of the first training")
+    top.add_argument("--recording", type=Path, metavar="FILE", help="a recorded rollout in place of the first one")
+    top.add_argument("--posterior", type=Path, metavar="RUN", help="a finished run in place of the first inference")
+    top.add_argument("--debug", action="store_true", help="show where an error came from")
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: the words after `jaxlfi r2s2r`; by default those of the process.
+
+    Returns:
+        0; 2 for bad input; 130 where it was interrupted.
+    """
+    arguments = parser().parse_args(argv)
+    try:
+        require_mujoco()
+        _begin(arguments)
+        policies = _round_and_round(arguments)
+        _deploy(arguments, policies)
+        from jaxlfi.envs.whip.r2s2r_page import write
+
+        write(arguments, policies)
+    except StageError as stage:
+        if stage.args[0] == 130:
+            print("jaxlfi r2s2r: interrupted; the same command goes on from here", file=sys.stderr)
+        return stage.args[0]
+    except (ValueError, OSError, ImportError) as error:
+        if arguments.debug:
+            traceback.print_exception(error)
+        print(f"jaxlfi r2s2r: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("jaxlfi r2s2r: interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+    print(f"wrote {arguments.out / 'page.html'}")
+    return 0
+
+
+# ------------------------------------------------------------------------------------------------------------ stages
+
+
+def _begin(arguments: argparse.Namespace) -> None:
+    """Check everything at once, and make the folder or recognise it."""
+    from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS
+    from jaxlfi.envs.whip.real2sim import recorded
+    from jaxlfi.envs.whip.reference_objects import objects
+    from jaxlfi.io import files
+    from jaxlfi.rl import policy
+    from jaxlfi.runs.folder import environment
+    from jaxlfi.runs.load import load
+
+    objects.load(arguments.object)
+    if arguments.iterations < 1:
+        raise ValueError(f"iterations: expected at least 1, got {arguments.iterations}")
+    if arguments.policy:
+        policy.load(arguments.policy).require("whip", OBSERVATIONS.names, ACTIONS.names)
+    if arguments.recording:
+        recorded(str(arguments.recording))
+    if arguments.posterior:
+        load(arguments.posterior)
+    asked = {
+        name: None if value is None else str(value)
+        for name, value in vars(arguments).items()
+        if name not in ("out", "debug")
+    }
+    path = arguments.out / "config.json"
+    if path.exists():
+        found = json.loads(path.read_text()).get("asked")
+        if found != asked:
+            raise ValueError(f"out: expected a new folder, or one of the same command, got {arguments.out} of {found}")
+        return
+    if arguments.out.exists() and any(arguments.out.iterdir()):
+        raise ValueError(f"out: expected a new folder, or one of the same command, got {arguments.out}")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    files.write_json(path, {"format": "jaxlfi-r2s2r", "version": 1, "asked": asked, **environment()})
+
+
+def _round_and_round(arguments: argparse.Namespace) -> list[Path]:
+    """All policies, the first one's file first."""
+    out = arguments.out
+    policies = [arguments.policy or _train(arguments, "uniform", out / "policy_0")]
+    rollouts: list[Path] = []
+    for iteration in range(1, arguments.iterations + 1):
+        folder = out / f"iteration_{iteration}"
+        folder.mkdir(exist_ok=True)
+        given = arguments.recording if iteration == 1 else None
+        rollouts.append(given or _rollout(arguments, policies[-1], folder / "rollout.npz", iteration))
+        run = arguments.posterior if iteration == 1 else None
+        run = run or _infer(arguments, rollouts, folder / "posterior")
+        policies.append(_train(arguments, str(run), folder / "policy"))
+    return policies
+
+
+def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
+    if not (out / "table.csv").exists():
+        steps = [] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)]
+        preset = ["--preset", arguments.preset, "--first-seed", str(arguments.seed)]
+        begun = (out / "config.json").exists()
+        _command(
+            command_line.main if begun else train.main,
+            ["resume", str(out)] if begun else ["whip", "--domain", domain, "--out", str(out), *preset, *steps],
+            f"a policy on {domain}",
+        )
+    return next(out.glob("*/seed_*/policy.npz"))
+
+
+def _rollout(arguments: argparse.Namespace, policy: Path, path: Path, iteration: int) -> Path:
+    """What the camera sees of a policy on the object, at the nominal place."""
+    if path.with_suffix(".json").exists():
+        return path
+    import jax
+
+    from jaxlfi.envs.whip import recording
+    from jaxlfi.envs.whip.reference_objects.deployment import deploy
+    from jaxlfi.envs.whip.reference_objects.objects import load
+    from jaxlfi.rl import policy as policies
+
+    _say(f"a rollout of {policy} on {arguments.object}")
+    key = jax.random.fold_in(jax.random.key(arguments.seed), iteration)
+    deployed = deploy(key, load(arguments.object), policies.load(policy), whole=True)
+    if deployed.recording is None:
+        raise ValueError(f"{policy}: expected a rollout that can be recorded, got an unstable simulation")
+    path.unlink(missing_ok=True)  # of a rollout that was not written to its end
+    recording.write(path, deployed.recording)
+    return path
+
+
+def _infer(arguments: argparse.Namespace, rollouts: Sequence[Path], out: Path) -> Path:
+    if not (out / "posterior.npz").exists():
+        words = ["infer", "whip", "--object", *map(str, rollouts), "--heuristic", arguments.heuristic]
+        words += ["--preset", arguments.preset, "--first-seed", str(arguments.seed), "--out", str(out)]
+        begun = (out / "config.json").exists()
+        _command(command_line.main, ["resume", str(out)] if begun else words, f"what {arguments.object} may be")
+    return out
+
+
+def _deploy(arguments: argparse.Namespace, policies: Sequence[Path]) -> None:
+    out = arguments.out / "deployed"
+    if not (out / "table.csv").exists():
+        shutil.rmtree(out, ignore_errors=True)
+        words = ["deploy", *map(str, policies), "--object", arguments.object, "--repetitions", str(REPETITIONS)]
+        words += ["--seed", str(arguments.seed), "--out", str(out)]
+        _command(whip.main, words, f"all policies on {arguments.object}")
+
+
+def _command(run, words: list[str], what: str) -> None:
+    _say(f"{what}: jaxlfi {' '.join(words)}")
+    if status := run(words):
+        raise StageError(status)
+
+
+def _say(text: str) -> None:
+    print(f"\n== {text}", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,94 @@
+"""The page that `jaxlfi r2s2r` ends with: what was believed, what was trained on, how it fared, and a film."""
+
+import argparse
+import csv
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxlfi.envs.whip.r2s2r import REPETITIONS
+from jaxlfi.envs.whip.reference_objects import film
+from jaxlfi.envs.whip.reference_objects.deployment import deploy
+from jaxlfi.envs.whip.reference_objects.objects import load as load_object
+from jaxlfi.envs.whip.reference_objects.scene import PLACE
+from jaxlfi.io import files
+from jaxlfi.rl import policy
+from jaxlfi.runs.load import load
+from jaxlfi.runs.run import Run
+
+STYLE = (
+    "body{font-family:sans-serif;max-width:60em;margin:2em auto}td,th{padding:.2em .8em;text-align:left}"
+    "img{max-width:100%}"
+)
+
+
+def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
+    """Write page.html, and film.gif and sheet.png of the last policy on the object.
+
+    Args:
+        arguments: of `jaxlfi r2s2r`, whose stages are complete.
+        policies: all of them, the first one's file first.
+    """
+    out = arguments.out
+    if not (out / "film.gif").exists():
+        key, act = jax.random.key(arguments.seed), policy.load(policies[-1])
+        last = deploy(key, load_object(arguments.object), act, whole=True)
+        if last.recording is not None:
+            film.save_pictures(out, last, PLACE.cube_side, f"{arguments.object}: return {last.value:.2f}")
+    runs = [arguments.posterior] if arguments.posterior else [out / "iteration_1/posterior"]
+    runs += [out / f"iteration_{iteration}/posterior" for iteration in range(2, arguments.iterations + 1)]
+    with (out / "deployed" / "table.csv").open(newline="") as file:
+        fared = [{name: _short(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    pictures = [path for path in (out / "film.gif", out / "sheet.png") if path.exists()]
+    pictures += [*sorted(out.glob("**/policy*/curves.png")), *sorted(out.glob("iteration_*/posterior/figures/*.png"))]
+    parts = (
+        f"<h1>{html.escape(arguments.object)}: from the object to a policy, and back</h1>",
+        f"<p>Heuristic {html.escape(arguments.heuristic)}, preset {arguments.preset}, seed {arguments.seed}.</p>",
+        "<h2>What was believed</h2>",
+        _table([row for folder in runs for row in believed(folder, load(folder))]),
+        "<h2>What was trained on</h2>",
+        _table([{"policy": str(path), "domain": policy.load(path).schema.get("domain", "")} for path in policies]),
+        f"<h2>How it fared on the object</h2><p>At {REPETITIONS} places; the first is nominal, at the others stack and "
+        "camera are displaced as in training. All policies meet the same places.</p>",
+        _table(fared),
+        *(_figure(path.relative_to(out).as_posix()) for path in pictures),
+    )
+    page = f"<!doctype html><meta charset=utf-8><title>jaxlfi r2s2r</title><style>{STYLE}</style>{''.join(parts)}\n"
+    files.write_bytes(out / "page.html", page.encode())
+    return out / "page.html"
+
+
+def believed(folder: Path, run: Run) -> list[dict[str, str]]:
+    """Median and 90 % interval of each parameter, and the support that the run ended with, in natural units."""
+    quantiles = np.quantile(np.asarray(run.draws()), (0.05, 0.5, 0.95), axis=0)
+    box = run.space.box_to_natural(run.belief.support)
+    return [
+        {
+            "run": str(folder),
+            "parameter": name,
+            "median": f"{middle:.4g}",
+            "90 % interval": f"{low:.4g} to {high:.4g}",
+            "last support": f"{float(box.low[place]):.4g} to {float(box.high[place]):.4g}",
+        }
+        for place, (name, low, middle, high) in enumerate(zip(run.space.names, *quantiles, strict=True))
+    ]
+
+
+def _short(value: str) -> str:
+    try:
+        return f"{float(value):.2f}"
+    except ValueError:
+        return value
+
+
+def _table(rows: Sequence[Mapping[str, str]]) -> str:
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in rows[0])
+    lines = ("".join(f"<td>{html.escape(value)}</td>" for value in row.values()) for row in rows)
+    return f"<table><tr>{head}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+
+
+def _figure(path: str) -> str:
+    return f'<figure><img src="{html.escape(path)}" alt=""><figcaption>{html.escape(path)}</figcaption></figure>'

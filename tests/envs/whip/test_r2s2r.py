@@ -1,0 +1,143 @@
+"""The loop from an object to a policy: its stages, that they are gone on with, replaced, and refused.
+
+The stages are commands with tests of their own; here they leave what they would leave.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+from envs_whip import a_policy
+
+import jaxlfi
+from jaxlfi.distributions.space import Space
+from jaxlfi.envs.whip import r2s2r, r2s2r_page
+from jaxlfi.io import files
+
+
+@pytest.fixture
+def stages(monkeypatch):
+    """All commands that were run, in place of running them; and who is interrupted."""
+    ran, stopped = [], []
+
+    def out_of(words):
+        return Path(words[words.index("--out") + 1] if "--out" in words else words[1])
+
+    def command(kind):
+        def run(words):
+            ran.append([kind, *words])
+            out = out_of(words)
+            out.mkdir(parents=True, exist_ok=True)
+            (out / "config.json").write_text("{}")
+            if kind in stopped:
+                stopped.clear()
+                return 130
+            if "posterior" in out.name:
+                files.write_arrays(out / "posterior.npz", {})
+            elif kind == "deploy":
+                (out / "table.csv").write_text("policy,return\n")
+            else:
+                (out / "domain/seed_000").mkdir(parents=True)
+                a_policy(out / "domain/seed_000/policy.npz")
+                (out / "table.csv").write_text("")
+            return 0
+
+        return run
+
+    def rollout(arguments, policy, path, iteration):
+        if not path.exists():
+            ran.append(["rollout", str(policy), str(path)])
+            path.write_text("")
+        return path
+
+    monkeypatch.setattr(r2s2r.train, "main", command("train"))
+    monkeypatch.setattr(r2s2r.command_line, "main", command("infer or resume"))
+    monkeypatch.setattr(r2s2r.whip, "main", command("deploy"))
+    monkeypatch.setattr(r2s2r, "_rollout", rollout)
+    monkeypatch.setattr(r2s2r_page, "write", lambda arguments, policies: ran.append(["page", *map(str, policies)]))
+    return ran, stopped
+
+
+def test_the_stages_follow_each_other(stages, tmp_path):
+    ran, _ = stages
+    out = tmp_path / "loop"
+    words = ["--object", "dlo-0", "--out", str(out), "--seed", "3", "--iterations", "2", "--total-steps", "960"]
+    assert r2s2r.main(words) == 0
+    assert [words[0] for words in ran] == [
+        "train", "rollout", "infer or resume", "train", "rollout", "infer or resume", "train", "deploy", "page",
+    ]  # fmt: skip
+    first, second = out / "policy_0/domain/seed_000/policy.npz", out / "iteration_1/policy/domain/seed_000/policy.npz"
+    assert ran[0][1:4] == ["whip", "--domain", "uniform"] and "960" in ran[0] and "3" in ran[0]
+    assert ran[1][1:] == [str(first), str(out / "iteration_1/rollout.npz")]
+    assert ran[2][1:6] == ["infer", "whip", "--object", str(out / "iteration_1/rollout.npz"), "--heuristic"]
+    assert ran[3][3] == str(out / "iteration_1/posterior")
+    assert ran[4][1] == str(second)  # the second time round by the policy on the first posterior
+    rollouts = [str(out / f"iteration_{i}/rollout.npz") for i in (1, 2)]
+    assert ran[5][4:6] == rollouts  # all rollouts so far together
+    assert len(ran[-1]) == 4 and ran[-2][2:4] == ran[-1][1:3]
+    ran.clear()
+    assert r2s2r.main(words) == 0
+    assert [words[0] for words in ran] == ["page"]  # all else is there
+
+
+@pytest.mark.parametrize(("kind", "again"), [("train", "resume"), ("infer or resume", "resume"), ("deploy", "deploy")])
+def test_it_goes_on_where_it_was_stopped(stages, tmp_path, kind, again, capsys):
+    ran, stopped = stages
+    words = ["--object", "dlo-1", "--out", str(tmp_path / "loop")]
+    stopped.append(kind)
+    assert r2s2r.main(words) == 130
+    assert "the same command goes on from here" in capsys.readouterr().err
+    before = len(ran)
+    assert r2s2r.main(words) == 0
+    assert ran[before][1] == again and ran[before - 1][0] == kind
+    assert [words[0] for words in ran][-2:] == ["deploy", "page"]
+
+
+def test_stages_are_replaced_by_files(stages, tmp_path, monkeypatch):
+    ran, _ = stages
+    policy = a_policy(tmp_path / "policy.npz")
+    monkeypatch.setattr("jaxlfi.envs.whip.real2sim.recorded", lambda name: None)
+    monkeypatch.setattr("jaxlfi.runs.load.load", lambda folder: None)
+    words = ["--object", "dlo-2", "--policy", str(policy), "--recording", "rollout.npz", "--posterior", "runs/found"]
+    assert r2s2r.main([*words, "--out", str(tmp_path / "loop")]) == 0
+    assert [words[0] for words in ran] == ["train", "deploy", "page"]
+    assert ran[0][3] == "runs/found" and ran[1][2] == str(policy)
+
+
+def test_bad_input_is_one_line_and_leaves_nothing(stages, tmp_path, capsys):
+    other = a_policy(tmp_path / "other.npz", "line")
+    for words, expected in (
+        (["--object", "dlo-9"], "expected one of dlo-0"),
+        (["--object", "dlo-0", "--iterations", "0"], "iterations: expected at least 1"),
+        (["--object", "dlo-0", "--policy", str(other)], "policy: expected environment 'whip', got one of 'line'"),
+        (["--object", "dlo-0", "--recording", "none.npz"], "none.npz"),
+        (["--object", "dlo-0", "--posterior", "none"], "none"),
+    ):
+        assert r2s2r.main([*words, "--out", str(tmp_path / "loop")]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("jaxlfi r2s2r: error: ") and expected in error and error.count("\n") == 1
+        assert not (tmp_path / "loop").exists()
+    assert r2s2r.main(["--object", "dlo-0", "--out", str(tmp_path / "loop")]) == 0
+    assert r2s2r.main(["--object", "dlo-1", "--out", str(tmp_path / "loop")]) == 2
+    assert "out: expected a new folder, or one of the same command" in capsys.readouterr().err
+
+
+def test_what_was_believed(tmp_path):
+    """Quantiles of a run's draws in natural units, beside its last support."""
+
+    class Run:
+        space = Space(("length", "young"), (False, True))
+
+        class belief:
+            support = jaxlfi.Support([100.0, float(np.log(1e3))], [300.0, float(np.log(1e5))])
+
+        def draws(self):
+            return np.stack([np.linspace(150, 250, 101), np.full(101, 2e4)], axis=1)
+
+    rows = r2s2r_page.believed(tmp_path, Run())
+    assert [row["parameter"] for row in rows] == ["length", "young"]
+    assert rows[0]["median"] == "200" and rows[0]["90 % interval"] == "155 to 245"
+    assert rows[0]["last support"] == "100 to 300" and rows[1]["last support"] == "1000 to 1e+05"
