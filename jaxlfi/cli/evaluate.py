@@ -50,6 +50,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = parser().parse_args(argv)
     try:
+        from jaxlfi.io import compile_cache
+
+        compile_cache.enable()
         _run(arguments)
     except (ValueError, OSError, ImportError) as error:
         if arguments.debug:

@@ -81,6 +81,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         from rich.console import Console
 
         console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
+        from jaxlfi.io import compile_cache
+
+        compile_cache.enable()
         plan = _plan(arguments)
         from jaxlfi.rl import training
 

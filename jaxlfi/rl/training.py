@@ -142,7 +142,8 @@ def resumed(out: Path, environment: Environment, on_chunk: Callable[[int, Mappin
     while done < settings.updates:
         began, count = time.monotonic(), min(chunk, settings.updates - done)
         state, made = advance(state, count)
-        rows = _rows(made) | {"seconds": np.full((chunk, len(names)), (time.monotonic() - began) / count)}
+        rows = _rows(made)
+        rows["seconds"] = np.full((chunk, len(names)), (time.monotonic() - began) / count)
         curves = {
             name: np.concatenate([curves[name], row[:count]]) if done else row[:count] for name, row in rows.items()
         }
