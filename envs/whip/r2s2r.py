@@ -17,7 +17,7 @@ import json
 import shutil
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jaxlfi.cli import parser as command_line
@@ -206,8 +206,9 @@ def _deploy(arguments: argparse.Namespace, policies: Sequence[Path]) -> None:
         _command(whip.main, words, f"all policies on {arguments.object}")
 
 
-def _command(run, words: list[str], what: str) -> None:
-    _say(f"{what}: jaxlfi {' '.join(words)}")
+def _command(run: Callable[[list[str]], int], words: list[str], what: str) -> None:
+    prefix = {train.main: "train ", whip.main: "whip "}.get(run, "")
+    _say(f"{what}: jaxlfi {prefix}{' '.join(words)}")
     if status := run(words):
         raise StageError(status)
 

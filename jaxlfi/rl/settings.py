@@ -65,8 +65,8 @@ These are the defaults of Stable-Baselines3: 2,048 steps of each environment to 
 and so three updates (73,728 steps). Its minibatches are 16 shuffled transitions; here they are the 16 of one piece.
 """
 
-QUICK = PPO(learning_rate=5e-4, entropy=0.01, initial_deviation=0.6, minibatches=12)
-"""An update on every 192 steps: an episode of each environment."""
+QUICK = PPO(learning_rate=5e-4, entropy=0.01, minibatches=12)
+"""An update on every 192 steps: an episode of each environment. Chosen by `experiments.policy_settings`."""
 
 PRESETS: dict[str, PPO] = {"quick": QUICK, "paper": PAPER}
 """Presets by name."""

@@ -360,3 +360,54 @@ def test_bound_warnings():
     (row,) = re.findall(r"\| \*\*now: more than [^|]+\|[^|]+\|[^|]+\|[^|]+\|", README)
     for count, of in ((hits, wrong), (alarms, right), (warned, runs)):
         assert f"({count} of {of})" in row
+
+
+# ------------------------------------------------------------------------------------------------------------ policies
+
+
+def policy_rows(name: str) -> list[dict[str, str]]:
+    with (RESULTS / "policies" / name).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+SETTINGS_OF_PPO = list(dict.fromkeys(row["settings"] for row in policy_rows("settings-dlo-0/table.csv")))
+
+
+@pytest.mark.parametrize("settings", SETTINGS_OF_PPO)
+def test_settings_of_ppo(settings):
+    own = [float(row["return"]) for row in policy_rows("settings-dlo-0/table.csv") if row["settings"] == settings]
+    assert f"| {settings} | {np.mean(own):.2f} | {', '.join(f'{value:.2f}' for value in own)} |" in README
+
+
+POLICIES = ("dlo-0", "uniform")
+
+
+def of_policies(name: str, domain: str, measure: str, **where: str) -> list[float]:
+    """A measure of the four policies that were trained on a domain."""
+    chosen = [row for row in policy_rows(name) if all(row[key] == value for key, value in where.items())]
+    return [float(row[measure]) for row in chosen if row["policy"].startswith(f"{domain}/")]
+
+
+def mean_and_each(values: list[float]) -> str:
+    return f"{np.mean(values):.2f} ({', '.join(f'{value:.2f}' for value in values)})"
+
+
+@pytest.mark.parametrize("trained", POLICIES)
+def test_policies_in_simulation(trained):
+    cells = [
+        mean_and_each(of_policies("cross.csv", trained, measure, domain=domain))
+        for domain, measure in (("dlo-0", "return"), ("dlo-0", "clean_hit"), ("uniform", "return"), ("uniform", "clean_hit"))
+    ]  # fmt: skip
+    assert f"| {trained} | {' | '.join(cells)} |" in README
+
+
+@pytest.mark.parametrize("dlo", ["dlo-0", "dlo-3"])
+@pytest.mark.parametrize("trained", [*POLICIES, "constant:0.03,-0.03"])
+def test_policies_on_the_objects(trained, dlo):
+    measures = ("return", "hit", "clean_hit", "worst")
+    if trained in POLICIES:
+        cells = [mean_and_each(of_policies("deployed.csv", trained, name, object=dlo)) for name in measures]
+    else:
+        (row,) = (row for row in policy_rows("deployed.csv") if (row["policy"], row["object"]) == (trained, dlo))
+        cells = [f"{float(row[name]):.2f}" for name in measures]
+    assert f"| {dlo} | {trained} | {' | '.join(cells)} |" in README
