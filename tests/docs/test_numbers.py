@@ -382,10 +382,10 @@ def test_settings_of_ppo(settings):
 POLICIES = ("dlo-0", "uniform")
 
 
-def of_policies(name: str, domain: str, measure: str, **where: str) -> list[float]:
+def of_policies(name: str, trained: str, measure: str, **where: str) -> list[float]:
     """A measure of the four policies that were trained on a domain."""
     chosen = [row for row in policy_rows(name) if all(row[key] == value for key, value in where.items())]
-    return [float(row[measure]) for row in chosen if row["policy"].startswith(f"{domain}/")]
+    return [float(row[measure]) for row in chosen if row["policy"].startswith(f"{trained}/")]
 
 
 def mean_and_each(values: list[float]) -> str:
