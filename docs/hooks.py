@@ -13,7 +13,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 RESULTS = "experiments/results"
-SYMBOLS = {"delta": "δ", "tau": "τ", "eta": "η", "nu_TH": "ν_TH", "rho": "ρ"}
+SYMBOLS = {
+    **{"delta": "δ", "tau": "τ", "eta": "η", "nu_TH": "ν_TH", "rho": "ρ"},
+    **{"gamma": "γ", "lambda": "λ", "epsilon": "ε"},
+}
 DIRECTIVE = re.compile(r"^<!-- (fields|help|examples)(?:: (\S+))? -->$", re.MULTILINE)
 
 

@@ -394,10 +394,8 @@ def mean_and_each(values: list[float]) -> str:
 
 @pytest.mark.parametrize("trained", POLICIES)
 def test_policies_in_simulation(trained):
-    cells = [
-        mean_and_each(of_policies("cross.csv", trained, measure, domain=domain))
-        for domain, measure in (("dlo-0", "return"), ("dlo-0", "clean_hit"), ("uniform", "return"), ("uniform", "clean_hit"))
-    ]  # fmt: skip
+    measures = [(domain, measure) for domain in POLICIES for measure in ("return", "clean_hit")]
+    cells = [mean_and_each(of_policies("cross.csv", trained, name, domain=domain)) for domain, name in measures]
     assert f"| {trained} | {' | '.join(cells)} |" in README
 
 

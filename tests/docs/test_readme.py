@@ -1,5 +1,6 @@
 """README's blocks run, in their order, from a fresh folder; what takes long is parsed by the real parsers."""
 
+import importlib
 import re
 import shlex
 import tomllib
@@ -53,11 +54,8 @@ def fresh(tmp_path_factory):
 
 def parse(words: list[str]) -> None:
     """By the parser that the command itself uses."""
-    if words[0] == "whip":
-        pytest.importorskip("mujoco")
-        from jaxlfi.envs.whip import cli as whip
-
-        whip.parser().parse_args(words[1:])
+    if point := cli.foreign_commands().get(words[0]):
+        importlib.import_module(point.module).parser().parse_args(words[1:])
     else:
         cli.parse(words)
 
