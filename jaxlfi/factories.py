@@ -1,4 +1,4 @@
-"""Things made by name: factories of entry-point groups or `module:factory`, with options as text.
+"""Objects made by name: by registered factories (entry points) or `module:factory`, with options given as text.
 
 A reference is a name, and options for its factory, as in "whip,object=dlo-0,detector=clean". Options are converted to
 the types that the factory's signature declares: int, float, bool, str, Path, Literal, unions of them, and tuples of any
@@ -48,7 +48,7 @@ def parse(reference: str, word: str = "task") -> tuple[str, dict[str, str]]:
 
 
 def find(group: str, word: str, reference: str) -> Any:
-    """What a name or "module:factory" points to: a factory, or the thing itself.
+    """The factory, or the ready-made object, that a registered name or "module:factory" refers to.
 
     Raises:
         ValueError: for unknown names, and modules that cannot be imported.
@@ -86,13 +86,13 @@ def _signature(factory) -> inspect.Signature | None:
 
 
 def parameters(factory: Any) -> tuple[str, ...]:
-    """Names of a factory's options; none of what is no function."""
+    """Names of a factory's options; empty for an object that is not callable."""
     signature = _signature(factory)
     return () if signature is None else tuple(signature.parameters)
 
 
 def made(word: str, reference: str, factory: Any, options: dict[str, str], kind: type) -> Any:
-    """What a factory makes with these options; or the thing itself, where it is of that kind.
+    """The object that a factory makes with these options; or the object itself, if it was given ready-made.
 
     Raises:
         ValueError: for options that the factory does not have or of another type, and for whatever it raises.

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import OneLineParser
 from jaxlfi.envs.whip import require_mujoco
 
@@ -106,7 +107,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         0; 2 for bad input; 130 where it was interrupted.
     """
     arguments = parser().parse_args(argv)
-    try:
+
+    def work() -> None:
         require_mujoco()
         from jaxlfi.io import compile_cache
 
@@ -114,13 +116,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         from jaxlfi.envs.whip import commands
 
         getattr(commands, arguments.command)(arguments)
-    except (ValueError, OSError, ImportError) as error:
-        print(f"jaxlfi whip: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("jaxlfi whip: interrupted", file=sys.stderr)
-        return 130
-    return 0
+
+    return exit_status("jaxlfi whip", work)
 
 
 if __name__ == "__main__":

@@ -16,12 +16,12 @@ import argparse
 import json
 import shutil
 import sys
-import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jaxlfi.cli import parser as command_line
 from jaxlfi.cli import train
+from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import OneLineParser
 from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip import require_mujoco
@@ -38,7 +38,11 @@ REPETITIONS = 16
 
 
 class StageError(Exception):
-    """A stage that ended with this exit status."""
+    """A stage that ended with an exit status other than 0."""
+
+    def __init__(self, status: int):
+        super().__init__(status)
+        self.status = status
 
 
 def parser() -> argparse.ArgumentParser:
@@ -75,28 +79,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         0; 2 for bad input; 130 where it was interrupted.
     """
     arguments = parser().parse_args(argv)
+    go_on = "; the same command goes on from here"
     try:
-        require_mujoco()
-        _begin(arguments)
-        policies = _round_and_round(arguments)
-        _deploy(arguments, policies)
-        from jaxlfi.envs.whip.r2s2r_page import write
+        return exit_status("jaxlfi r2s2r", lambda: _loop(arguments), arguments.debug, lambda: go_on)
+    except StageError as stage:  # which has said why
+        if stage.status == 130:
+            print(f"jaxlfi r2s2r: interrupted{go_on}", file=sys.stderr)
+        return stage.status
 
-        write(arguments, policies)
-    except StageError as stage:
-        if stage.args[0] == 130:
-            print("jaxlfi r2s2r: interrupted; the same command goes on from here", file=sys.stderr)
-        return stage.args[0]
-    except (ValueError, OSError, ImportError) as error:
-        if arguments.debug:
-            traceback.print_exception(error)
-        print(f"jaxlfi r2s2r: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("jaxlfi r2s2r: interrupted; the same command goes on from here", file=sys.stderr)
-        return 130
-    print(f"wrote {arguments.out / 'page.html'}")
-    return 0
+
+def _loop(arguments: argparse.Namespace) -> None:
+    require_mujoco()
+    _begin(arguments)
+    policies = _round_and_round(arguments)
+    _deploy(arguments, policies)
+    from jaxlfi.envs.whip.r2s2r_page import write
+
+    print(f"wrote {write(arguments, policies)}")
 
 
 # ------------------------------------------------------------------------------------------------------------ stages

@@ -6,11 +6,11 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 import argparse
 import csv
 import sys
-import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
 from jaxlfi.cli.domains import DOMAINS, domain
+from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
 
 EXAMPLES = f"""\
@@ -49,23 +49,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         0; 2 for bad input; 130 where it was interrupted.
     """
     arguments = parser().parse_args(argv)
-    try:
-        from jaxlfi.io import compile_cache
-
-        compile_cache.enable()
-        _run(arguments)
-    except (ValueError, OSError, ImportError) as error:
-        if arguments.debug:
-            traceback.print_exception(error)
-        print(f"jaxlfi evaluate: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("jaxlfi evaluate: interrupted", file=sys.stderr)
-        return 130
-    return 0
+    return exit_status("jaxlfi evaluate", lambda: _run(arguments), arguments.debug)
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    from jaxlfi.io import compile_cache
+
+    compile_cache.enable()
     from rich.console import Console
     from rich.table import Table
 

@@ -7,13 +7,13 @@ import argparse
 import json
 import shutil
 import sys
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxlfi import flags, source_fields
 from jaxlfi.cli.domains import DOMAINS, domain
+from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
 
 if TYPE_CHECKING:
@@ -76,32 +76,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         0; 2 for bad input; 130 where it was interrupted.
     """
     arguments = parser().parse_args(argv)
-    begun = False
+    begun = lambda: f"; continue with: jaxlfi resume {arguments.out}" if is_training(arguments.out) else ""
+    return exit_status("jaxlfi train", lambda: _train(arguments), arguments.debug, begun)
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    from rich.console import Console
+
+    from jaxlfi.io import compile_cache
+
+    compile_cache.enable()
+    plan = _plan(arguments)
+    from jaxlfi.rl import training
+
+    training.begin(plan, arguments.out)
     try:
-        from rich.console import Console
-
         console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
-        from jaxlfi.io import compile_cache
-
-        compile_cache.enable()
-        plan = _plan(arguments)
-        from jaxlfi.rl import training
-
-        training.begin(plan, arguments.out)
-        begun = True
         run(arguments.out, plan.environment, console, not arguments.no_figures)
-    except (ValueError, OSError, ImportError) as error:
-        if arguments.debug:
-            traceback.print_exception(error)
-        print(f"jaxlfi train: error: {' '.join(str(error).split())}", file=sys.stderr)
-        if begun and not (arguments.out / "checkpoint.npz").exists() and not (arguments.out / "table.csv").exists():
+    except Exception:
+        if not (training.updates_done(arguments.out) or training.finished(arguments.out)):
             shutil.rmtree(arguments.out)  # made by this very command, and there is nothing in it to go on from
-        return 2
-    except KeyboardInterrupt:
-        advice = f"; continue with: jaxlfi resume {arguments.out}" if begun else ""
-        print(f"jaxlfi train: interrupted{advice}", file=sys.stderr)
-        return 130
-    return 0
+        raise
 
 
 def run(out: Path, environment: "Environment", console: "Console", figures: bool) -> None:
@@ -122,7 +117,7 @@ def run(out: Path, environment: "Environment", console: "Console", figures: bool
             progress.advance(updates, f", return {np.nanmean(curves['value'][-updates:]):.2f}")
 
         result = training.resumed(out, environment, on_chunk)
-    facts = [name for name in result.outcomes if name not in training.NO_FACTS]
+    facts = [name for name in result.outcomes if name not in training.NOT_FACTS]
     table = Table("domain", "seed", "return", *facts, title=f"on {training.HELD_OUT} other points of each domain")
     for place, (trained_on, seed) in enumerate(result.names):
         means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]

@@ -115,7 +115,7 @@ def init(key: jax.Array, environment: Environment, settings: PPO, domain: Domain
 
 
 def update(environment: Environment, settings: PPO, training: Training) -> tuple[Training, Update]:
-    """One update: episodes by the current policy, then `passes` over their transitions.
+    """One update: episodes by the current policy, then `epochs` over their transitions.
 
     Args:
         environment: what is trained on.
@@ -125,7 +125,7 @@ def update(environment: Environment, settings: PPO, training: Training) -> tuple
     Returns:
         The next state, and what the update did.
     """
-    key_passes, key_episodes, key_next = jax.random.split(training.key, 3)
+    key_epochs, key_episodes, key_next = jax.random.split(training.key, 3)
     networks = policy_networks(environment, settings)
     batch = _batch(environment, settings)
     act = _acting(networks, training.params)
@@ -138,10 +138,10 @@ def update(environment: Environment, settings: PPO, training: Training) -> tuple
         )
         return (episodes, following), data
 
-    pieces = settings.minibatches * settings.segments // settings.environments
-    (episodes, _), data = jax.lax.scan(unroll, (training.episodes, key_episodes), length=pieces)
+    unrolls = settings.minibatches * settings.segments // settings.environments
+    (episodes, _), data = jax.lax.scan(unroll, (training.episodes, key_episodes), length=unrolls)
     ended = data.extras["state_extras"].pop("ended")
-    # [pieces, unroll, environments, ...] -> [all pieces, unroll, ...]
+    # [unrolls, steps, environments, ...] -> [segments, steps, ...]
     data = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 1, 2), data)
     data = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), data)
 
@@ -150,7 +150,7 @@ def update(environment: Environment, settings: PPO, training: Training) -> tuple
         ppo_network=networks,
         entropy_cost=settings.entropy,
         discounting=settings.discount,
-        gae_lambda=settings.trace,
+        gae_lambda=settings.gae_lambda,
         clipping_epsilon=settings.clipping,
         vf_coefficient=settings.value_weight,
     )
@@ -163,7 +163,7 @@ def update(environment: Environment, settings: PPO, training: Training) -> tuple
         change, state = optimiser.update(gradients, state)
         return (state, optax.apply_updates(params, change), key), metrics
 
-    def one_pass(carry, _):
+    def one_epoch(carry, _):
         state, params, key = carry
         key, key_order, key_minibatches = jax.random.split(key, 3)
         order = jax.random.permutation(key_order, settings.minibatches * settings.segments)
@@ -171,8 +171,8 @@ def update(environment: Environment, settings: PPO, training: Training) -> tuple
         (state, params, _), metrics = jax.lax.scan(minibatch, (state, params, key_minibatches), shuffled)
         return (state, params, key), metrics
 
-    first = training.optimiser, training.params, key_passes
-    (state, params, _), metrics = jax.lax.scan(one_pass, first, length=settings.passes)
+    first = training.optimiser, training.params, key_epochs
+    (state, params, _), metrics = jax.lax.scan(one_epoch, first, length=settings.epochs)
     after = Training(params, state, episodes, key_next, training.updates + 1)
     return after, _summary(ended, jax.tree.map(jnp.mean, metrics))
 

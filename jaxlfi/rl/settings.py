@@ -10,16 +10,18 @@ Number = Float[Array, "*batch"] | float
 class PPO(Checked):
     """Settings of a training.
 
-    An update is made on `minibatches` times `segments` pieces of `unroll` steps of one environment. A minibatch is
-    whole pieces, as in Brax, where other implementations shuffle single transitions.
+    An update is made on `minibatches` times `segments` trajectory segments of `unroll` steps of one environment. A
+    minibatch is whole segments, as in Brax, where other implementations shuffle single transitions.
 
     Raises:
-        ValueError: for values out of range, and pieces that cannot be divided among the environments.
+        ValueError: for values out of range, and segments that cannot be divided among the environments.
     """
 
     learning_rate: Number = hyperparameter(3e-4, help="of Adam", low=0)
     discount: Number = hyperparameter(0.99, help="of a reward one step later", symbol="gamma", low=0, high=1)
-    trace: Number = hyperparameter(0.95, help="of the generalised advantage estimate", symbol="lambda", low=0, high=1)
+    gae_lambda: Number = hyperparameter(
+        0.95, help="of the generalised advantage estimate", symbol="lambda", low=0, high=1
+    )
     entropy: Number = hyperparameter(0.0, help="weight of the policy's entropy in the loss", low=0)
     clipping: Number = hyperparameter(0.2, help="of the ratio of probabilities", symbol="epsilon", above=0)
     value_weight: Number = hyperparameter(0.5, help="weight of the value function's loss", low=0)
@@ -29,10 +31,10 @@ class PPO(Checked):
         1.0, help="standard deviation of the first policy's actions, as a fraction of their limit", above=0
     )
     environments: int = option(12, help="environments side by side, each with its own theta", low=1)
-    unroll: int = option(16, help="steps of a piece", low=1)
-    segments: int = option(1, help="pieces in a minibatch", low=1)
+    unroll: int = option(16, help="steps of a trajectory segment", low=1)
+    segments: int = option(1, help="trajectory segments in a minibatch", low=1)
     minibatches: int = option(1536, help="minibatches of an update's transitions", low=1)
-    passes: int = option(10, help="passes over an update's transitions", low=1)
+    epochs: int = option(10, help="epochs over an update's transitions", low=1)
     total_steps: int = option(60_000, help="steps of all environments together, rounded up to whole updates", low=1)
     hidden: tuple[int, ...] = option((64, 64), help="widths of the hidden layers of both networks", low=1)
     redrawn: bool = option(
@@ -61,8 +63,8 @@ class PPO(Checked):
 PAPER = PPO()
 """Section VI-H: 12 environments, 60,000 steps, minibatches of 16 transitions, otherwise PPO's defaults.
 
-These are the defaults of Stable-Baselines3: 2,048 steps of each environment to an update, which are 1,536 pieces of 16,
-and so three updates (73,728 steps). Its minibatches are 16 shuffled transitions; here they are the 16 of one piece.
+These are the defaults of Stable-Baselines3: 2,048 steps of each environment to an update, which are 1,536 segments of 16,
+and so three updates (73,728 steps). Its minibatches are 16 shuffled transitions; here they are the 16 of one segment.
 """
 
 QUICK = PPO(learning_rate=5e-4, entropy=0.01, minibatches=12)

@@ -35,8 +35,8 @@ HELD_OUT = 128
 """Points of each domain that its policies are evaluated on, other than those that they were trained on."""
 MAX_CHUNK = 16
 """Updates between two checkpoints, at most."""
-NO_FACTS = ("value", "steps", "theta")
-"""Arrays of outcomes that are no facts that the environment tells of an episode."""
+NOT_FACTS = ("value", "steps", "theta")
+"""Arrays of `outcomes` other than the facts that an environment reports of an episode."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,7 +247,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 def _write_result(out: Path, environment: Environment, config: Mapping[str, Any], result: Result) -> None:
     files.write_arrays(out / "curves.npz", dict(result.curves))
     files.write_arrays(out / "outcomes.npz", dict(result.outcomes))
-    facts = [name for name in result.outcomes if name not in NO_FACTS]
+    facts = [name for name in result.outcomes if name not in NOT_FACTS]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["domain", "seed", "return", *facts])

@@ -24,7 +24,7 @@ from jaxlfi.rl.from_brax import from_brax
 from jaxlfi.rl.settings import PPO
 
 OPTIMISED = True
-SETTINGS = PPO(environments=2, unroll=4, minibatches=2, passes=1, hidden=(8,), total_steps=16)
+SETTINGS = PPO(environments=2, unroll=4, minibatches=2, epochs=1, hidden=(8,), total_steps=16)
 MASSES = Support([0.5], [4.0])
 
 

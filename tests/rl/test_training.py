@@ -24,7 +24,7 @@ from jaxlfi.tasks.task import Task
 
 LINE = Line()
 REFERENCE = "rl.toy:Line"
-WORDS = ("--environments 4 --unroll 5 --segments 2 --minibatches 4 --passes 3 --total-steps 160 --hidden 8 8").split()
+WORDS = ("--environments 4 --unroll 5 --segments 2 --minibatches 4 --epochs 3 --total-steps 160 --hidden 8 8").split()
 
 
 @pytest.fixture(autouse=True, scope="module")

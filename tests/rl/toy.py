@@ -12,9 +12,9 @@ from jaxlfi.rl.environment import EnvState, Signals
 from jaxlfi.rl.settings import PPO
 
 SETTINGS = PPO(
-    learning_rate=3e-3, environments=4, unroll=5, segments=2, minibatches=4, passes=3, total_steps=160, hidden=(8, 8)
+    learning_rate=3e-3, environments=4, unroll=5, segments=2, minibatches=4, epochs=3, total_steps=160, hidden=(8, 8)
 )
-"""Two segments of five steps in each of four minibatches: two pieces of each environment to an update, four updates."""
+"""Two segments of five steps in each of four minibatches: two segments of each environment to an update, four updates."""
 
 
 @struct.dataclass
