@@ -63,8 +63,8 @@ class PPO(Checked):
 PAPER = PPO()
 """Section VI-H: 12 environments, 60,000 steps, minibatches of 16 transitions, otherwise PPO's defaults.
 
-These are the defaults of Stable-Baselines3: 2,048 steps of each environment to an update, which are 1,536 segments of 16,
-and so three updates (73,728 steps). Its minibatches are 16 shuffled transitions; here they are the 16 of one segment.
+These are the defaults of Stable-Baselines3: 2,048 steps of each environment to an update, which are 1,536 segments of
+16, and so three updates (73,728 steps). Its minibatches are 16 shuffled transitions; here, the 16 of one segment.
 """
 
 QUICK = PPO(learning_rate=5e-4, entropy=0.01, minibatches=12)

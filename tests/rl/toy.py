@@ -14,7 +14,7 @@ from jaxlfi.rl.settings import PPO
 SETTINGS = PPO(
     learning_rate=3e-3, environments=4, unroll=5, segments=2, minibatches=4, epochs=3, total_steps=160, hidden=(8, 8)
 )
-"""Two segments of five steps in each of four minibatches: two segments of each environment to an update, four updates."""
+"""Two segments of five steps in each of four minibatches, which are two of each environment; four updates."""
 
 
 @struct.dataclass
