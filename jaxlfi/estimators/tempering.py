@@ -78,8 +78,8 @@ def tempered(
     """
     require_blackjax()
     from blackjax.mcmc import random_walk
-    from blackjax.smc import adaptive_tempered, resampling
-    from blackjax.smc import tempered as fixed
+    from blackjax.smc import ess, resampling, solver
+    from blackjax.smc import tempered as smc
 
     n, dim = start.shape
     additive = random_walk.build_additive_step()
@@ -95,28 +95,28 @@ def tempered(
         return additive(key, state, log_density, lambda key, position: move(key, others, scale))
 
     bounded = lambda theta: jnp.maximum(jnp.nan_to_num(log_likelihood(theta), nan=LEAST), LEAST)
-    parts = log_prior, bounded, step, random_walk.init, resampling.systematic
-    adaptive = adaptive_tempered.build_kernel(*parts, target_ess=TARGET_ESS)
-    last = fixed.build_kernel(*parts)
+    kernel = smc.build_kernel(log_prior, bounded, step, random_walk.init, resampling.systematic)
 
     def shared(theta: Float[Array, "n dim"]) -> dict[str, Array]:
         return {"others": theta[None], "scale": jnp.std(theta, axis=0)[None]}
 
     def running(carry) -> Array:
-        stage, state, _ = carry
-        return (stage < STAGES) & (state.tempering_param < 1)
+        stage, temperature, *_ = carry
+        return (stage <= STAGES) & (temperature < 1)
 
     def one_stage(carry):
-        stage, state, log_evidence = carry
-        state, info = adaptive(jax.random.fold_in(key_stages, stage), state, MOVES, shared(state.particles))
-        return stage + 1, state, log_evidence + info.log_likelihood_increment
+        """Particles move before they are weighted: one stage more, from the temperature 1 to itself, moves the last."""
+        stage, _, state, log_evidence = carry
+        before = state.tempering_param
+        rise = ess.ess_solver(jax.vmap(bounded), state.particles, TARGET_ESS, 1 - before, solver.dichotomy)
+        after = jnp.where(stage < STAGES, before + jnp.clip(rise, 0.0, 1 - before), 1.0)
+        state, info = kernel(jax.random.fold_in(key_stages, stage), state, MOVES, after, shared(state.particles))
+        return stage + 1, before, state, log_evidence + info.log_likelihood_increment
 
     # As plain numbers: the checker of keys that are used twice takes BlackJAX's scans under vmap for such (JAX 0.9).
-    key_stages, key_last, key_pick = jax.random.key_data(jax.random.split(key, 3))
-    state = fixed.init(start)._replace(tempering_param=jnp.zeros(()))
-    stages, state, log_evidence = jax.lax.while_loop(running, one_stage, (jnp.asarray(0), state, jnp.zeros(())))
-    temperature = state.tempering_param
-    # Particles move before they are weighted: those of the last stage are still to be resampled, and moved.
-    state, info = last(key_last, state, MOVES, 1.0, shared(state.particles))
+    key_stages, key_pick = jax.random.key_data(jax.random.split(key))
+    state = smc.init(start)._replace(tempering_param=jnp.zeros(()))
+    initial = jnp.asarray(0), jnp.zeros(()), state, jnp.zeros(())
+    stages, temperature, state, log_evidence = jax.lax.while_loop(running, one_stage, initial)
     theta = state.particles[resampling.systematic(key_pick, state.weights, n)]
-    return Tempered(theta, log_evidence + info.log_likelihood_increment, stages, temperature)
+    return Tempered(theta, log_evidence, stages - 1, temperature)

@@ -56,8 +56,8 @@ def test_a_gaussian_beyond_a_bound_is_truncated():
         law = stats.truncnorm(*((np.array([BOX.low[d], BOX.high[d]]) - mean[d]) / scale[d]), mean[d], scale[d])
         assert theta[:, d].mean() == pytest.approx(law.mean(), abs=0.1 * law.std())
         assert theta[:, d].std() == pytest.approx(law.std(), rel=0.1)
-        # Particles have common ancestors: a quarter of them is compared.
-        assert stats.kstest(theta[::4, d], law.cdf).pvalue > 1e-3
+        # Particles have common ancestors: no p-value of independent draws (largest of 60 seeds by fours: 0.065).
+        assert stats.kstest(theta[:, d], law.cdf).statistic < 0.1
     evidence = np.mean([float(each.log_evidence) for each in found])
     assert evidence == pytest.approx(masses([mean], [scale])[0] - LOG_VOLUME, abs=0.15)
 

@@ -115,13 +115,14 @@ def test_theta_reaches_the_model_and_the_original_is_left_alone(slider):
 
 def test_the_unchanged_model_is_the_environment_itself(pendulum):
     key, action = jax.random.key(2), jnp.array([0.3])
-    state = pendulum.reset(key, jnp.ones(1))
-    own = pendulum.env.reset(jax.random.key_data(key))
+    reset, step = jax.jit(pendulum.reset), jax.jit(pendulum.step)
+    state = reset(key, jnp.ones(1))
+    own = jax.jit(pendulum.env.reset)(jax.random.key_data(key))
     np.testing.assert_allclose(state.observation, own.obs, atol=1e-6)
-    after, own = jax.jit(pendulum.step)(state, action), jax.jit(pendulum.env.step)(own, action)
+    after, own = step(state, action), jax.jit(pendulum.env.step)(own, action)
     np.testing.assert_allclose(after.observation, own.obs, atol=1e-5)
     np.testing.assert_allclose(after.reward, own.reward, atol=1e-6)
-    heavy = jax.jit(pendulum.step)(pendulum.reset(key, jnp.array([4.0])), action)
+    heavy = step(reset(key, jnp.array([4.0])), action)
     assert np.abs(heavy.observation - after.observation).max() > 1e-3
 
 
@@ -129,7 +130,9 @@ def test_the_unchanged_model_is_the_environment_itself(pendulum):
 def test_they_are_trained_on(name, request):
     environment = request.getfixturevalue(name)
     domain = domains.uniform(jax.random.key(1), environment.supports["initial"], SETTINGS.environments)
-    start = ppo.init(jax.random.key(0), environment, SETTINGS, domain)
+    start = jax.jit(functools.partial(ppo.init, environment=environment, settings=SETTINGS))(
+        jax.random.key(0), domain=domain
+    )
     train = jax.jit(functools.partial(ppo.train, environment, SETTINGS), static_argnums=1)
     trained, made = train(start, SETTINGS.updates)
     assert np.isfinite(made.losses["total_loss"]).all()
@@ -141,8 +144,8 @@ def test_they_are_trained_on(name, request):
 
 
 def test_a_step_out_of_the_real_numbers_ends_the_episode(slider):
-    state = slider.reset(jax.random.key(0), jnp.ones(1))
-    after = slider.step(state, jnp.array([jnp.nan]))
+    state = jax.jit(slider.reset)(jax.random.key(0), jnp.ones(1))
+    after = jax.jit(slider.step)(state, jnp.array([jnp.nan]))
     assert bool(after.truncated) and not bool(after.terminated) and float(after.reward) == 0.0
     np.testing.assert_array_equal(after.observation, state.observation)
     assert bool(after.facts["failed"])
