@@ -71,7 +71,7 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory):
     """A cache of compiled programs, shared by the workers and the processes that tests start: they mostly compile."""
     base = tmp_path_factory.getbasetemp()
     folder = str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "xla")
-    for name, value in (("jax_compilation_cache_dir", folder), ("jax_persistent_cache_min_compile_time_secs", 0.2)):
+    for name, value in (("jax_compilation_cache_dir", folder), ("jax_persistent_cache_min_compile_time_secs", 0)):
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
     os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # processes say nothing of programs that they find compiled
