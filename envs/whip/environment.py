@@ -23,7 +23,9 @@ from jaxlfi.envs.whip.parameters import (
     randomised,
 )
 from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS, ON_DLO
+from jaxlfi.rl.deployment import Deployment, Limits
 from jaxlfi.rl.environment import EnvState, Signals
 
 _POINTS = (*(f"DLO {i + 1}" for i in range(ON_DLO)), *COLOURS)
@@ -41,6 +43,13 @@ OBSERVATIONS = Signals(
 """The gripper within its workspace; keypoints in normalised pixels, which span the image from 0 to 1; flags."""
 ACTIONS = Signals(("dx", "dz"), ("m", "m"), (0.0, 0.0), (rules.ACTION_LIMIT, rules.ACTION_LIMIT))
 """Displacements of the gripper's set-point."""
+LIMITS = Limits(
+    step=(rules.ACTION_LIMIT, rules.ACTION_LIMIT),
+    speed=2**0.5 * rules.ACTION_LIMIT / CONTROL_INTERVAL,
+    low=rules.WORKSPACE[0].astype(float).round(6),
+    high=rules.WORKSPACE[1].astype(float).round(6),
+)
+"""Of the set-point: the actions' own limits, the speed that these come to, and the workspace."""
 
 
 @struct.dataclass
@@ -79,6 +88,19 @@ class WhipEnvironment:
     def supports(self) -> Mapping[str, Support]:
         """Theta_0 of section VI-B, and Phi."""
         return {"initial": in_task_units(INITIAL), "feasible": self.feasible}
+
+    @property
+    def deployment(self) -> Deployment:
+        """What a robot must know to be controlled by a policy that was trained here."""
+        detector = self.whip.detector
+        name = next((name for name, known in DETECTORS.items() if known == detector), "own")
+        return Deployment(
+            control_interval=CONTROL_INTERVAL,
+            steps=rules.STEPS,
+            moved=("gripper x", "gripper z"),
+            limits=LIMITS,
+            detector={"name": name, **{key: float(value) for key, value in vars(detector).items()}},
+        )
 
     @property
     def feasible(self) -> Support:

@@ -83,6 +83,9 @@ class EnvState:
 class Environment(Protocol):
     """An environment of unknown parameters: pure, for one episode, batched by `vmap`.
 
+    One whose actions displace the set-points of a robot may have an attribute `deployment` besides
+    (`jaxlfi.rl.deployment.Deployment`), which its policies then carry.
+
     Attributes:
         name: of the environment.
         space: names of the parameters theta [D], and which are inferred as logarithms.

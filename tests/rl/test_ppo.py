@@ -15,8 +15,10 @@ from brax.training.agents.ppo import train as brax_ppo
 from rl.toy import SETTINGS, Line
 
 from jaxlfi.rl import domains, ppo
+from jaxlfi.rl.deployment import Deployment, Limits, of_schema
 from jaxlfi.rl.episodes import Batch
 from jaxlfi.rl.evaluation import evaluate
+from jaxlfi.rl.policy import load
 
 LINE = Line()
 SEED = 3
@@ -179,6 +181,16 @@ def test_the_file_of_a_policy_acts_like_its_networks(domain):
     expected = jax.vmap(ppo.deterministic(LINE, SETTINGS, params))(seen)
     np.testing.assert_allclose(policy(seen), expected, atol=1e-5)
     assert policy.schema["observations"] == dataclasses.asdict(LINE.observations) and policy.schema["seed"] == 0
+    assert "deployment" not in policy.schema
+
+
+def test_the_file_of_a_policy_says_what_its_environment_declares_of_robots(domain, tmp_path):
+    class Robotic(Line):
+        deployment = Deployment(0.5, 7, ("position",), Limits((0.4,), 0.8, (-3.0,), (3.0,)), {"name": "exact"})
+
+    params = ppo.init(jax.random.key(0), LINE, SETTINGS, domain).params
+    saved = load(ppo.as_file(Robotic(), params).save(tmp_path / "policy.npz"))
+    assert of_schema(saved.schema) == Robotic.deployment
 
 
 @pytest.mark.parametrize(

@@ -267,6 +267,7 @@ def test_who_may_import_which_library(path):
         "mujoco": (f"{ENVS}.whip", "experiments"),
         "gymnasium": (f"{ENVS}.whip",),
         "brax": ("jaxlfi.rl",),
+        "onnx": ("jaxlfi.rl",),
     }
     forbidden = dict.fromkeys(("pickle", "cloudpickle", "dill", "joblib"), ())
     for library, packages in (allowed | forbidden).items():

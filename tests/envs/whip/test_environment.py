@@ -48,6 +48,16 @@ def test_boxes_are_the_papers_in_mm_and_pa(whip):
     np.testing.assert_allclose(whip.nominal, [250, 2.5e4])
 
 
+def test_its_policies_will_say_what_a_robot_must_keep_to(whip):
+    """Of the set-point: 6 cm in 0.16 s along each axis, in the workspace."""
+    facts = whip.deployment
+    assert (facts.control_interval, facts.steps, facts.moved) == (0.16, 16, ("gripper x", "gripper z"))
+    assert facts.limits.step == (0.06, 0.06) and facts.limits.speed == pytest.approx(0.06 * 2**0.5 / 0.16)
+    assert (facts.limits.low, facts.limits.high) == ((0.275, 0.1), (0.6, 0.5))
+    assert facts.detector["name"] == "clean" and facts.detector["spacing"] == 0.25
+    assert make(detector="mask", engine="native").deployment.detector["name"] == "mask"
+
+
 def test_an_episode_begins_in_a_scene_of_theta_with_nuisances_of_its_own(whip, started):
     scene = started.inner.parameters
     np.testing.assert_allclose(scene.length, [0.2, 0.3], rtol=1e-6)

@@ -1,0 +1,90 @@
+"""The command `jaxlfi export`: a trained policy as one file, for a robot's computer.
+
+This module imports neither jax nor numpy before it has to, and jax for StableHLO only.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxlfi.cli.exit_status import exit_status
+from jaxlfi.cli.parser import OneLineParser
+
+SUFFIXES = {"numpy": ".npz", "stablehlo": ".npz", "onnx": ".onnx"}
+"""Formats, and how the names of their files end."""
+EXAMPLES = """\
+formats, each with the policy's schema (names, units, scaling, limits, control interval, detector, versions):
+  numpy      an .npz that jaxlfi.rl.policy.load runs with NumPy alone
+  stablehlo  an .npz that jaxlfi.rl.stablehlo.load runs with JAX on cpu, cuda or tpu, for batches of any size
+  onnx       for onnxruntime and others; needs the extra onnx
+
+examples:
+  jaxlfi export runs/policies/uniform/seed_000/policy.npz --format onnx --out policy.onnx
+  jaxlfi export runs/uniform --format numpy --out policy.npz      the folder of a training of one policy
+
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    top = OneLineParser(
+        prog="jaxlfi export",
+        description="Write a trained policy as one file that runs elsewhere.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    top.add_argument("policy", type=Path, metavar="POLICY", help="a policy.npz, or the folder of its training")
+    top.add_argument("--format", choices=SUFFIXES, default="numpy", help="of the file (default: numpy)")
+    top.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new file")
+    top.add_argument("--debug", action="store_true", help="show where an error came from")
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: the words after `jaxlfi export`; by default those of the process.
+
+    Returns:
+        0; 2 for bad input; 130 where it was interrupted.
+    """
+    arguments = parser().parse_args(argv)
+    return exit_status("jaxlfi export", lambda: _export(arguments), arguments.debug)
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from jaxlfi.rl import deployment, policy
+
+    out, suffix = arguments.out, SUFFIXES[arguments.format]
+    if out.exists() or out.suffix != suffix:
+        raise ValueError(f"out: expected a new {suffix} file, got {out}")
+    path = _policy_of(arguments.policy)
+    trained = policy.load(path)
+    if deployment.KEY in trained.schema:
+        deployment.of_schema(trained.schema)
+    if arguments.format == "numpy":
+        save = lambda policy, path: policy.save(path)
+    elif arguments.format == "stablehlo":
+        from jaxlfi.rl.stablehlo import save
+    else:
+        from jaxlfi.rl.onnx_graph import save
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save(trained, out)
+    print(f"wrote {out}, the policy {path}")
+
+
+def _policy_of(path: Path) -> Path:
+    """The file of a policy, or the only one in the folder of a training."""
+    if not path.is_dir():
+        return path
+    found = sorted(path.glob("policy.npz")) + sorted(path.glob("*/policy.npz")) + sorted(path.glob("*/*/policy.npz"))
+    if len(found) != 1:
+        some = ", ".join(str(one.relative_to(path)) for one in found[:4]) + ", ..." * (len(found) > 4)
+        raise ValueError(f"policy: expected a folder with one policy.npz, got {path} with {some or 'none'}: name one")
+    return found[0]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

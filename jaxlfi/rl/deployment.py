@@ -1,0 +1,168 @@
+"""Deployment: what a robot must know of the environment that a policy was trained in, beside its signals.
+
+An environment whose actions displace set-points declares it as an attribute `deployment`, and the training writes it
+into the policy's schema. Like `jaxlfi.rl.policy`, this module needs NumPy only.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+KEY = "deployment"
+"""Where it lies in a policy's schema."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """What a robot may be commanded; of A set-points, in their units.
+
+    Attributes:
+        step: largest displacement of each set-point by one command, either way.
+        speed: largest speed of all set-points together, as the Euclidean norm of a displacement per second.
+        low: lower limit of each set-point.
+        high: upper limit.
+
+    Raises:
+        ValueError: for unequal lengths, steps and speeds that are not positive, and an empty box.
+    """
+
+    step: tuple[float, ...]
+    speed: float
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    def __post_init__(self):
+        for name in ("step", "low", "high"):
+            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+        if not len(self.step) == len(self.low) == len(self.high):
+            raise ValueError(f"limits: expected one number a set-point in step, low and high, got {self}")
+        if not (all(step > 0 for step in self.step) and self.speed > 0):  # also refuses NaN
+            raise ValueError(f"limits: expected a positive step and speed, got {self.step} and {self.speed}")
+        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"limits: expected low below high, got {self.low} and {self.high}")
+
+    @staticmethod
+    def none(size: int) -> "Limits":
+        """No limits of so many set-points, for simulations that judge for themselves."""
+        return Limits((math.inf,) * size, math.inf, (-math.inf,) * size, (math.inf,) * size)
+
+    def tightened(
+        self,
+        step: float | None = None,
+        speed: float | None = None,
+        low: Sequence[float] | None = None,
+        high: Sequence[float] | None = None,
+    ) -> "Limits":
+        """The same with some limits tightened.
+
+        Args:
+            step: of every set-point.
+            speed: of all together.
+            low: of each.
+            high: of each.
+
+        Raises:
+            ValueError: for what would loosen a limit.
+        """
+        for name, value in (("step", step), ("speed", speed)):
+            bound = getattr(self, name)
+            if value is not None and not 0 < value <= (bound if name == "speed" else max(bound)):
+                raise ValueError(f"{name}: expected more than 0 and at most the policy's {bound}, got {value}")
+        for name, values, sign in (("low", low, 1), ("high", high, -1)):
+            bounds = getattr(self, name)
+            if values is None:
+                continue
+            if len(values) != len(bounds) or not all(
+                sign * value >= sign * bound for value, bound in zip(values, bounds, strict=True)
+            ):
+                raise ValueError(f"{name}: expected limits within the policy's {list(bounds)}, got {list(values)}")
+        return Limits(
+            self.step if step is None else tuple(min(step, bound) for bound in self.step),
+            self.speed if speed is None else speed,
+            self.low if low is None else tuple(low),
+            self.high if high is None else tuple(high),
+        )
+
+    def applied(self, target: np.ndarray, displacement: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """A displacement of the set-points that keeps to all limits.
+
+        Each part is clipped to its step, the whole is shortened to the speed, and the set-points are clipped to
+        their box.
+
+        Args:
+            target: the set-points before, within the box, shape [A].
+            displacement: what is asked for, shape [A].
+            seconds: since the command before.
+
+        Returns:
+            The displacement and the set-points after it, each of shape [A].
+
+        Example:
+            >>> limits = Limits(step=(0.06, 0.06), speed=0.5, low=(0.3, 0.1), high=(0.6, 0.5))
+            >>> limits.applied(np.array([0.58, 0.3]), np.array([0.09, 0.0]), 0.16)[1].round(3).tolist()
+            [0.6, 0.3]
+        """
+        moved = np.clip(displacement, -np.asarray(self.step), self.step)
+        length = float(np.linalg.norm(moved))
+        if length > self.speed * seconds:
+            moved = moved * (self.speed * seconds / length)
+        after = target + moved
+        inside = np.clip(after, self.low, self.high)
+        return np.where(inside == after, moved, inside - target), inside
+
+
+@dataclasses.dataclass(frozen=True)
+class Deployment:
+    """The conditions that a policy was trained under.
+
+    Attributes:
+        control_interval: between two actions, in s.
+        steps: of an episode, at most.
+        moved: names of the observations whose set-points the actions displace, one an action, in their order.
+        limits: that the set-points kept to.
+        detector: of the observations: its `name`, and what else is known of it.
+
+    Raises:
+        ValueError: for intervals and numbers of steps that are not positive, and limits of another size.
+    """
+
+    control_interval: float
+    steps: int
+    moved: tuple[str, ...]
+    limits: Limits
+    detector: Mapping[str, Any]
+
+    def __post_init__(self):
+        object.__setattr__(self, "moved", tuple(self.moved))
+        if not (self.control_interval > 0 and math.isfinite(self.control_interval) and self.steps >= 1):
+            raise ValueError(
+                f"deployment: expected a positive interval and number of steps, got {self.control_interval} s, "
+                f"{self.steps} steps"
+            )
+        if len(self.limits.step) != len(self.moved):
+            raise ValueError(f"deployment: expected limits of {list(self.moved)}, got {len(self.limits.step)}")
+
+
+def of_schema(schema: Mapping[str, Any]) -> Deployment:
+    """What a policy's schema says of its deployment.
+
+    Raises:
+        ValueError: for a policy that says nothing of it, as those of earlier versions, or of other signals.
+    """
+    found = schema.get(KEY)
+    if found is None:
+        raise ValueError("policy: expected a deployment (limits, control interval) in its schema, got none: train anew")
+    try:
+        deployment = Deployment(**{**found, "limits": Limits(**found["limits"])})
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"policy: expected a deployment in its schema, got one that is not whole: {error}") from error
+    unknown = set(deployment.moved) - set(schema["observations"]["names"])
+    if unknown or len(deployment.moved) != len(schema["actions"]["names"]):
+        raise ValueError(
+            f"policy: expected a deployment whose actions {list(schema['actions']['names'])} each move an "
+            f"observation, got {list(deployment.moved)}"
+        )
+    return deployment

@@ -1,0 +1,66 @@
+"""Policies as ONNX: a graph of eight kinds of operations, for the runtimes that robots have."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from jaxlfi.io import files
+from jaxlfi.rl.policy import Policy
+
+try:
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+except ImportError as error:
+    raise ImportError("an ONNX file needs the package onnx: pip install 'jaxlfi[onnx]'") from error
+
+OPSET, IR_VERSION = 17, 8
+"""Of 2022, so that older runtimes read the file, too."""
+
+
+def graph(policy: Policy) -> onnx.ModelProto:
+    """A policy from `observation` float32 [batch, O] to `action` float32 [batch, A], both in their units.
+
+    The policy's schema is the JSON text under "schema" in `metadata_props`.
+    """
+    nodes, constants, last = [], [], "observation"
+
+    def apply(operation: str, **inputs: np.ndarray) -> None:
+        """Append an operation on the last result and on these constants."""
+        nonlocal last
+        constants.extend(numpy_helper.from_array(np.asarray(value, np.float32), name) for name, value in inputs.items())
+        before, last = last, f"{operation.lower()}_{len(nodes)}"
+        nodes.append(helper.make_node(operation, [before, *inputs], [last], name=last))
+
+    apply("Sub", observation_centre=policy.observed["centre"])
+    apply("Div", observation_scale=policy.observed["scale"])
+    for index, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        if index:
+            apply("Tanh")
+        apply("Gemm", **{f"weight_{index}": weight, f"bias_{index}": bias})
+    apply("Clip", action_low=np.float32(-1), action_high=np.float32(1))
+    apply("Mul", action_scale=policy.acted["scale"])
+    apply("Add", action_centre=policy.acted["centre"])
+    nodes[-1].output[0] = "action"
+
+    signal = lambda name, size: helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
+    made = helper.make_model(
+        helper.make_graph(
+            nodes,
+            "policy",
+            [signal("observation", len(policy.observed["names"]))],
+            [signal("action", len(policy.acted["names"]))],
+            constants,
+        ),
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        producer_name="jaxlfi",
+    )
+    helper.set_model_props(made, {"schema": json.dumps(dict(policy.schema))})
+    onnx.checker.check_model(made, full_check=True)
+    return made
+
+
+def save(policy: Policy, path: str | Path) -> None:
+    """Write a policy as an .onnx file."""
+    files.write_bytes(Path(path), graph(policy).SerializeToString(), durable=True)
