@@ -1,4 +1,4 @@
-"""The command line of the whipping task: `jaxlfi whip render | plan | deploy`.
+"""The command line of the whipping task: `jaxlfi whip render | plan | deploy | control`.
 
 This module imports neither jax nor numpy, so that `--help` answers at once.
 """
@@ -19,6 +19,7 @@ examples:
   jaxlfi whip plan --length 250 --young 2.5e4 --out runs/plan.npz
   jaxlfi whip render --length 200 --young 2.5e4 --policy runs/plan.npz --out runs/shorter
   jaxlfi whip deploy runs/policies/uniform/seed_000/policy.npz constant:0.03,-0.03 --object dlo-0 --out runs/deployed
+  jaxlfi whip control policy.npz --robot socket://127.0.0.1:5005 --max-speed 0.2 --out rollout.npz
 
 """
 
@@ -28,7 +29,7 @@ def parser() -> argparse.ArgumentParser:
     formatter = argparse.RawDescriptionHelpFormatter
     top = OneLineParser(
         prog="jaxlfi whip",
-        description="Render rollouts of the DLO whipping task, plan whips, and let policies whip.",
+        description="Render rollouts of the DLO whipping task, plan whips, let policies whip, and control robots.",
         epilog=EXAMPLES,
         formatter_class=formatter,
     )
@@ -79,6 +80,43 @@ def parser() -> argparse.ArgumentParser:
     deploy.add_argument("--repetitions", type=int, default=16, metavar="N", help="places (default: 16)")
     deploy.add_argument("--seed", type=int, default=0, metavar="N", help="seed of places and noise (default: 0)")
     deploy.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+
+    control = commands.add_parser(
+        "control",
+        help="let a policy control a robot",
+        description="Let a policy control a robot for an episode of 16 steps, within limits, and stop it whatever "
+        "happens. Writes what was seen and done as a recording that `jaxlfi infer whip --object` accepts.",
+    )
+    control.add_argument("policy", metavar="POLICY", help="as of deploy")
+    control.add_argument(
+        "--robot",
+        required=True,
+        metavar="ROBOT",
+        help="socket://HOST:PORT of a driver; dlo-0 to dlo-3, the FEM reference objects; or module:Factory of your "
+        "own, whose options follow after commas: module:Factory,key=value",
+    )
+    control.add_argument("--rate", type=float, metavar="HZ", help="of commands (default: as the policy was trained)")
+    control.add_argument(
+        "--holds",
+        type=int,
+        default=3,
+        metavar="N",
+        help="control periods in a row without a usable observation in which the set-point is held, before the robot "
+        "is stopped (default: 3)",
+    )
+    control.add_argument("--max-age", type=float, metavar="S", help="of an observation (default: a control period)")
+    control.add_argument("--max-step", type=float, metavar="M", help="of a command, along x and along z")
+    control.add_argument("--max-speed", type=float, metavar="M/S", help="of the set-point")
+    control.add_argument(
+        "--workspace",
+        type=float,
+        nargs=4,
+        metavar=("X1", "X2", "Z1", "Z2"),
+        help="limits of the set-point's x and z, in m. Limits can be tightened, not loosened (default: the policy's)",
+    )
+    control.add_argument("--remote", action="store_true", help="let the driver be on another host")
+    control.add_argument("--seed", type=int, default=0, metavar="N", help="of a reference object's camera (default: 0)")
+    control.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .npz, beside it a new .json")
     return top
 
 

@@ -1,6 +1,7 @@
 """The commands of the whipping task, whose arguments `jaxlfi.envs.whip.cli` parses."""
 
 import argparse
+import dataclasses
 import functools
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from jaxlfi.envs.whip import control as controlling
 from jaxlfi.envs.whip import planner, rules
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip import render as drawing
@@ -27,6 +29,7 @@ from jaxlfi.envs.whip.reference_objects import objects, repetitions
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
+from jaxlfi.robots.robot import RobotError
 
 POLICIES = ("explore", "random", "plan")
 
@@ -110,6 +113,32 @@ def deploy(arguments: argparse.Namespace) -> None:
         table.add_row(*(value if isinstance(value, str) else f"{value:.2f}" for value in line.values()))
     Console(width=None if sys.stdout.isatty() else 120).print(table)
     print(f"wrote {out / 'table.csv'} and {out / 'episodes.csv'}")
+
+
+def control(arguments: argparse.Namespace) -> None:
+    """`jaxlfi whip control`.
+
+    Raises:
+        ValueError: for bad input.
+        RobotError: for a robot that failed, or had to be stopped.
+    """
+    out = arguments.out
+    if out.suffix != ".npz" or out.exists() or out.with_suffix(".json").exists():
+        raise ValueError(f"out: expected a new .npz file beside which there is no .json, got {out}")
+    act = repetitions.acting(arguments.policy)()
+    loop = controlling.loop_of(act, arguments)
+    robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote)
+    log = dataclasses.replace(loop, clock=getattr(robot, "clock", loop.clock)).run(robot, act)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    others = controlling.arrays(log)
+    try:
+        recordings.write(out, controlling.recording_of(log, about), others)
+    except ValueError as error:
+        atomic.write_arrays(out, others)
+        print(f"{out} cannot be inferred from, as it is no recording of an object: {error}")
+    print(f"{controlling.summary(log)}, wrote {out}")
+    if log.stopped:
+        raise RobotError(f"robot: stopped after {len(log.actions)} of {loop.steps} steps: {log.stopped}")
 
 
 def _parameters(arguments: argparse.Namespace) -> WhipParameters:

@@ -10,6 +10,8 @@ STACK = 0.60
 """Where the stack of cubes stands, x in m."""
 CONTROL_INTERVAL = 0.16
 """Between two actions, in s."""
+HIT_DISTANCE = 0.06
+"""Displacement of a cube's keypoint from its start above which the cube counts as hit, in normalised pixels."""
 RGBA = {
     "red": (0.85, 0.15, 0.15, 1),
     "green": (0.15, 0.65, 0.2, 1),

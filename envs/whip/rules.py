@@ -5,14 +5,14 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
+from jaxlfi.envs.whip.rig import HIT_DISTANCE
+
 STEPS = 16
 """Number of control steps in an episode."""
 ACTION_LIMIT = 0.06
 """Maximum displacement of the set-point by an action, along x and along z, in m."""
 WORKSPACE = np.array([[0.275, 0.1], [0.6, 0.5]], np.float32)
 """Lower and upper limits of the gripper's x and z, in m."""
-HIT_DISTANCE = 0.06
-"""Displacement of a cube's keypoint from its start above which the cube counts as hit, in normalised pixels."""
 TOP = 5
 """Index of the target, the yellow cube."""
 PENALTIES = np.array([0.05 * 2 ** (4 - i) for i in range(TOP)], np.float32)

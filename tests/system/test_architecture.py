@@ -30,6 +30,7 @@ LAYERS = (
     ("bayessim",),
     ("runs",),
     ("studies", "rl"),
+    ("robots",),
     ("cli",),
 )
 """Packages of jaxlfi, from the ground up: each imports those below it, and none beside or above it."""
@@ -193,6 +194,18 @@ def test_figures_know_no_task(path):
     own = {name for name in imported(path) if within(name, "jaxlfi")} - {"jaxlfi"}
     assert not {name for name in own if not within(name, "jaxlfi.figures")}
     assert not {name for name in imported(path) for library in ("jax", "flax", ENVS) if within(name, library)}
+
+
+ON_ROBOTS = {"jaxlfi.rl.policy", "jaxlfi.rl.deployment", "jaxlfi.io.files", "jaxlfi.io", "jaxlfi.rl", "numpy"}
+"""Modules of ours and others that a robot's computer needs, besides Python's own."""
+
+
+@pytest.mark.parametrize("path", files("jaxlfi/robots"), ids=identify)
+def test_robots_need_numpy_and_no_jax(path):
+    """What they import imports no more at run time: tests/robots run where there is no JAX."""
+    modules = {name for node in at_import(tree_of(path)) for name in imported_by(node, path)}
+    others = {name for name in modules if name.split(".")[0] not in sys.stdlib_module_names}
+    assert not {name for name in others if not any(within(name, known) for known in (*ON_ROBOTS, "jaxlfi.robots"))}
 
 
 ASKED = {

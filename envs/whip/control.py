@@ -1,0 +1,158 @@
+"""Policies that control robots in the whipping task: the loop's settings, and its log as a recording."""
+
+import argparse
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlfi import factories
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.environment import ACTIONS, LIMITS, OBSERVATIONS
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.parameters import median
+from jaxlfi.envs.whip.recording import Recording
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
+from jaxlfi.envs.whip.vision.camera import Camera, side_camera
+from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS
+from jaxlfi.rl import deployment
+from jaxlfi.rl.policy import Policy
+from jaxlfi.robots.client import SocketRobot
+from jaxlfi.robots.loop import Act, Log, Loop
+from jaxlfi.robots.robot import Robot
+
+FLAGS = 2 + 2 * KEYPOINTS
+"""Place of the first flag in an observation; before it come the gripper's x and z, and the keypoints."""
+ABOUT = ("camera", "source", "description", "image_size", "colours", "facts", "provenance")
+"""What a robot may say of itself: fields of `Recording`."""
+
+
+def is_over(observation: np.ndarray) -> bool:
+    """Whether an episode ends: the top cube is hit, or the gripper has been measured outside of its workspace."""
+    gripper = np.asarray(observation[:2], np.float32)
+    outside = (gripper < rules.WORKSPACE[0]) | (gripper > rules.WORKSPACE[1])
+    return bool(observation[FLAGS + rules.TOP] > 0.5 or outside.any())
+
+
+LOOP = Loop(LIMITS, moved=(0, 1), size=OBSERVATIONS.size, rate=1 / CONTROL_INTERVAL, steps=rules.STEPS, over=is_over)
+"""As in training: 16 steps, 6.25 a second."""
+
+
+def recording_of(log: Log, about: Mapping[str, Any]) -> Recording:
+    """The log of a whole episode as a recording, which inference can use.
+
+    Keypoints outside of the image are put at its edge.
+
+    Args:
+        log: of the loop.
+        about: fields of `Recording` (`described`).
+
+    Raises:
+        ValueError: for a log that is no recording, such as one of a robot that was stopped before the end.
+    """
+    steps, observations = len(log.actions), np.asarray(log.observations)
+    if log.stopped or steps != rules.STEPS:
+        raise ValueError(f"expected {rules.STEPS} control steps, got {steps}{log.stopped and ': '}{log.stopped}")
+    if abs(log.period / CONTROL_INTERVAL - 1) > 0.01:
+        raise ValueError(f"expected control steps of {CONTROL_INTERVAL} s, as simulations have, got {log.period:g} s")
+    seen = log.extras.get("seen", np.ones((len(log.times), KEYPOINTS), bool))
+    return Recording(
+        times=log.times,
+        gripper=observations[:, :2],
+        keypoints=np.clip(observations[:, 2:FLAGS].reshape(-1, KEYPOINTS, 2), 0.0, 1.0),
+        seen=np.asarray(seen, bool),
+        actions=log.actions,
+        frame_rate=round(float(1 / np.median(np.diff(log.times))), 6),
+        control_interval=log.period,
+        hits=observations[:, FLAGS:] > 0.5,
+        **about,
+    )
+
+
+def arrays(log: Log) -> dict[str, np.ndarray]:
+    """What a log has besides a recording, by names of its own."""
+    kept = ("times", "observations", "asked", "actions", "targets", "held", "lateness")
+    return {f"log/{name}": getattr(log, name) for name in kept}
+
+
+def summary(log: Log) -> str:
+    """What happened, in a line."""
+    hit = [name for name, flag in zip(COLOURS, log.observations[-1][FLAGS:], strict=True) if flag > 0.5]
+    over = "" if log.over is None else f", over after {log.over}"
+    return (
+        f"{len(log.actions)} steps at {1 / log.period:g} Hz{over}, {int(log.held.sum())} without a usable observation, "
+        f"{log.missed} deadlines missed, hit {', '.join(hit) or 'nothing'}"
+    )
+
+
+def loop_of(act: Act, arguments: argparse.Namespace) -> Loop:
+    """The loop that a policy was trained for, with what the arguments of `jaxlfi whip control` change.
+
+    Raises:
+        ValueError: for what would loosen limits, and numbers that are not positive.
+    """
+    says = isinstance(act, Policy) and deployment.KEY in act.schema
+    loop = Loop.of(act, over=is_over) if says else LOOP
+    low, high = (None, None) if arguments.workspace is None else np.reshape(arguments.workspace, (2, 2)).T.tolist()
+    limits = loop.limits.tightened(arguments.max_step, arguments.max_speed, low, high)
+    given = {"rate": arguments.rate, "max_age": arguments.max_age}
+    changes = {name: value for name, value in given.items() if value is not None}
+    return dataclasses.replace(loop, limits=limits, holds=arguments.holds, **changes)
+
+
+def robot_of(word: str, seed: int, remote: bool) -> tuple[Robot, dict[str, Any]]:
+    """The robot that a word stands for, and what a recording is to say of it.
+
+    Args:
+        word: "socket://HOST:PORT", the name of a reference object, or "module:Factory" with options after commas.
+        seed: of a reference object's camera.
+        remote: whether other hosts than this one are let.
+
+    Raises:
+        ValueError: for other words, and for what is no robot.
+        RobotError: where no driver answers.
+    """
+    if word.startswith("socket:"):
+        robot = SocketRobot(word, OBSERVATIONS.names, ACTIONS.names, remote)
+    elif ":" in word:
+        name, options = factories.parse(word, "robot")
+        robot = factories.made("robot", word, factories.find("", "robot", name), options, Robot)
+    else:
+        from jaxlfi.envs.whip.reference_objects import objects
+        from jaxlfi.envs.whip.reference_objects.robot import ReferenceRobot
+
+        robot = ReferenceRobot(jax.random.key(seed), objects.load(word))
+    if not isinstance(robot, Robot):
+        raise ValueError(f"robot: expected {word!r} to have observe, act and stop, got {type(robot).__name__}")
+    try:
+        return robot, described(getattr(robot, "about", {}))
+    except ValueError:
+        robot.stop()
+        raise
+
+
+def described(about: Mapping[str, Any]) -> dict[str, Any]:
+    """What a robot says of itself as fields of a recording; the nominal camera where it says none, which is noted.
+
+    Raises:
+        ValueError: for what a recording does not have.
+    """
+    if unknown := set(about) - set(ABOUT):
+        raise ValueError(f"robot: expected it to say {', '.join(ABOUT)} of itself, got {', '.join(sorted(unknown))}")
+    fields = {"source": "real", "description": "a policy on a robot", **about}
+    if "camera" not in about:
+        noted = {**fields.get("provenance", {}), "camera": "nominal: the robot did not say"}
+        return {**fields, "camera": side_camera(median()), "provenance": noted}
+    camera, shapes = about["camera"], {"position": (3,), "orientation": (4,), "field_of_view": ()}
+    if isinstance(camera, Camera):
+        return fields
+    try:
+        parts = {name: jnp.asarray(camera[name], jnp.float32) for name in shapes}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"robot: expected a camera's {', '.join(shapes)}, got {camera!r}") from error
+    if {name: part.shape for name, part in parts.items()} != shapes:
+        raise ValueError(f"robot: expected a camera's {', '.join(shapes)} of shapes [3], [4], [], got {camera!r}")
+    return {**fields, "camera": Camera(**parts)}

@@ -1,0 +1,67 @@
+"""SIGINT and SIGTERM, so that they never interrupt a command that is being sent, nor a robot that is being stopped."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interrupted(KeyboardInterrupt):
+    """The process was asked to end by a signal."""
+
+
+class Interrupts:
+    """While it is entered, signals raise `Interrupted` only where they are let: in `check`, `waiting` and `calling`.
+
+    Outside of the main thread signals stay as they are, as Python does not allow to handle them there.
+    """
+
+    def __init__(self):
+        """Nothing has been received."""
+        self._received: list[int] = []
+        self._patience: int | None = None  # signals that are not raised at once; None: none is
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> "Interrupts":
+        """Handle signals."""
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._handle) for number in SIGNALS}
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        """Leave signals to those who handled them before; raise one that has not been raised yet."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if kind is None:
+            self.check()
+
+    def check(self) -> None:
+        """Raise `Interrupted` if there was a signal."""
+        if self._received:
+            raise Interrupted(signal.Signals(self._received[0]).name)
+
+    def waiting(self) -> contextlib.AbstractContextManager[None]:
+        """Where a signal interrupts at once."""
+        return self._let(0)
+
+    def calling(self) -> contextlib.AbstractContextManager[None]:
+        """Where the second signal interrupts at once, as what is called may never return."""
+        return self._let(1)
+
+    @contextlib.contextmanager
+    def _let(self, patience: int) -> Iterator[None]:
+        self._patience = patience
+        try:
+            if not patience:
+                self.check()
+            yield
+        finally:
+            self._patience = None
+
+    def _handle(self, number: int, frame) -> None:
+        self._received.append(number)
+        if self._patience is not None and len(self._received) > self._patience:
+            self._patience = None  # once only
+            self.check()

@@ -1,0 +1,156 @@
+"""A simple robot in a process of its own, to try a control loop on: its camera loses, delays and spoils frames.
+
+    python -m jaxlfi.robots.simulated POLICY --port 5005 --dropped 0.05 --delayed 0.05 --jitter 0.02
+
+It learns from the policy's schema what it is to measure. It lives in the loop's time, so that the same seed and the
+same commands give the same observations, however fast they come.
+"""
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxlfi.rl import deployment
+from jaxlfi.rl.policy import Policy, load
+from jaxlfi.robots import server
+from jaxlfi.robots.clock import Clock
+from jaxlfi.robots.robot import Command, Observation
+
+LAG = 0.08
+"""Time in which a set-point is approached to 37 % of the distance, in s."""
+PHASE = 0.25
+"""Part of a control period by which frames are taken before a command."""
+LATEST = 2.5
+"""Control periods by which a frame is delayed at most."""
+
+
+class PointRobot:
+    """Measured positions that follow their set-points, and other signals that swing about their centres.
+
+    Its camera takes a frame each control period, and all is measured in its frames.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        clock: Clock,
+        seed: int = 0,
+        dropped: float = 0.0,
+        delayed: float = 0.0,
+        spoiled: float = 0.0,
+        jitter: float = 0.0,
+    ):
+        """It rests in the middle of its limits.
+
+        Args:
+            policy: whose schema says what is measured.
+            clock: by which it lives.
+            seed: of all chances.
+            dropped: part of the frames that never come.
+            delayed: part of those that come up to 2.5 control periods late.
+            spoiled: part of those in which a number is missing.
+            jitter: by which frames are taken early or late, at most, in s.
+
+        Raises:
+            ValueError: for parts outside of [0, 1], and more than a quarter of a period of jitter.
+        """
+        facts = deployment.of_schema(policy.schema)
+        for name, value in (("dropped", dropped), ("delayed", delayed), ("spoiled", spoiled)):
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name}: expected a number in [0, 1], got {value}")
+        if not 0 <= jitter <= PHASE * facts.control_interval:
+            raise ValueError(f"jitter: expected at most {PHASE * facts.control_interval} s, got {jitter}")
+        self.about = {"source": "simulated", "description": "a point that follows its set-point"}
+        self._clock, self._seed, self._period, self._jitter = clock, seed, facts.control_interval, jitter
+        self._chances = np.array([dropped, delayed, spoiled])
+        names, units = list(policy.observed["names"]), policy.observed["units"]
+        self._moved = [names.index(name) for name in facts.moved]
+        self._centre = np.array(policy.observed["centre"], float)
+        # Numbers without a unit are flags.
+        self._swing = 0.1 * np.array(policy.observed["scale"]) * [unit != "" for unit in units]
+        self._position = np.add(facts.limits.low, facts.limits.high) / 2
+        self._target, self._since = self._position, -math.inf
+        self._start: float | None = None
+        self._frames = 0
+        self._coming: list[tuple[float, float, Observation]] = []
+
+    def observe(self) -> Observation | None:
+        """The latest frame that has come."""
+        now = self._advance()
+        here = [frame for frame in self._coming if frame[0] <= now]
+        if not here:
+            return None
+        _, taken, latest = max(here, key=lambda frame: frame[2].number)
+        self._coming = [frame for frame in self._coming if frame[2].number >= latest.number]
+        return Observation(latest.values, latest.number, now - taken, latest.target)
+
+    def act(self, command: Command) -> None:
+        """Approach another set-point from now on."""
+        now = self._advance()
+        self._position, self._target, self._since = self._at(now), np.array(command.target), now
+
+    def stop(self) -> None:
+        """Stay."""
+        self._target = self._position = self._at(self._clock.now())
+
+    def _at(self, moment: float) -> np.ndarray:
+        return self._target + (self._position - self._target) * math.exp(-max(moment - self._since, 0.0) / LAG)
+
+    def _advance(self) -> float:
+        """Take the frames up to now."""
+        now = self._clock.now()
+        self._start = now if self._start is None else self._start
+        while True:
+            rng = np.random.default_rng([self._seed, self._frames])
+            early, wait, *chances = rng.uniform(size=5)
+            taken = self._start + (self._frames - PHASE) * self._period + self._jitter * (2 * early - 1)
+            if taken > now:
+                return now
+            dropped, delayed, spoiled = chances < self._chances
+            if not dropped:
+                values = self._centre + self._swing * np.sin(2 * (taken - self._start) + np.arange(len(self._swing)))
+                values[self._moved] = self._at(taken)
+                if spoiled:
+                    values[rng.integers(len(values))] = np.nan
+                comes = taken + delayed * wait * LATEST * self._period
+                self._coming.append((comes, taken, Observation(values, self._frames, 0.0, self._target)))
+            self._frames += 1
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Serve the robot until the process is ended."""
+    parser = argparse.ArgumentParser(prog="python -m jaxlfi.robots.simulated", description=__doc__.splitlines()[0])
+    parser.add_argument("policy", type=Path, metavar="POLICY", help="a policy.npz, whose schema says what is measured")
+    parser.add_argument("--port", type=int, default=0, metavar="N", help="of this host (default: any that is free)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all chances (default: 0)")
+    parser.add_argument("--dropped", type=float, default=0.0, metavar="P", help="part of the frames that never come")
+    parser.add_argument("--delayed", type=float, default=0.0, metavar="P", help="part of those that come late")
+    parser.add_argument("--spoiled", type=float, default=0.0, metavar="P", help="part of those that miss a number")
+    parser.add_argument("--jitter", type=float, default=0.0, metavar="S", help="of the times of frames, in s")
+    parser.add_argument("--watchdog", type=float, default=server.WATCHDOG, metavar="S", help="without a request, in s")
+    parser.add_argument("--journal", type=Path, metavar="FILE", help="a file for its side of the story: lines of JSON")
+    arguments = parser.parse_args(argv)
+    chances = {name: getattr(arguments, name) for name in ("seed", "dropped", "delayed", "spoiled", "jitter")}
+    try:
+        policy = load(arguments.policy)
+        make = lambda clock: PointRobot(policy, clock, **chances)
+        make(None)
+        listener = server.listen(arguments.port)
+    except (ValueError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    print(f"listening on socket://127.0.0.1:{listener.getsockname()[1]}", flush=True)
+    journal = server.write_to(arguments.journal) if arguments.journal else lambda event: None
+    names = policy.observed["names"], policy.acted["names"]
+    limits = deployment.of_schema(policy.schema).limits
+    try:
+        server.serve(listener, make, *names, limits, arguments.watchdog, journal)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

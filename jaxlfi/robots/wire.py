@@ -1,0 +1,141 @@
+"""The protocol by which a robot in a process of its own is controlled: lines of JSON over TCP, a reply to each request.
+
+| request                                              | reply                                                         |
+|------------------------------------------------------|---------------------------------------------------------------|
+| `hello`: `protocol`, `version`, `observations` and   | `hello`: `protocol`, `version`, `about`, what is to be        |
+| `actions`, their names                               | recorded of the robot                                         |
+| `observe`: `now`                                     | `observation`: `number`, `age`, `values`, and where there are |
+|                                                      | any `target`, `extras`; or `nothing`                          |
+| `act`: `now`, `slot`, `displacement`, `target`       | `done`, as soon as the motion has begun                       |
+| `stop`                                               | `stopped`                                                     |
+
+Every line is an object with a `type`, at most 1 MiB. Numbers are in the units of the policy's schema, `age` and `now`
+in s, and an unknown number is null. `now` is the loop's clock, for simulated robots that live in the loop's time;
+others ignore it. Any request may be answered by `error` with a `message`, after which the robot has stopped; it stops,
+too, when the connection ends.
+"""
+
+import ipaddress
+import json
+import math
+import socket
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxlfi.robots.robot import RobotError
+
+PROTOCOL, VERSION = "jaxlfi-robot", 1
+LONGEST = 2**20
+"""Bytes in a line, at most."""
+
+
+class Lines:
+    """Messages through a socket."""
+
+    def __init__(self, connection: socket.socket):
+        """The socket's timeout is that of each reception."""
+        self._socket, self._rest = connection, b""
+
+    def send(self, kind: str, **contents: Any) -> None:
+        """Send a message; numbers that are not finite become null."""
+        message = {"type": kind, **{name: _plain(value) for name, value in contents.items()}}
+        self._socket.sendall(json.dumps(message, allow_nan=False).encode() + b"\n")
+
+    def receive(self) -> dict[str, Any]:
+        """The next message.
+
+        Raises:
+            OSError: for a connection that has ended, and where nothing comes in time.
+            RobotError: for what is no message.
+        """
+        while b"\n" not in self._rest:
+            if len(self._rest) > LONGEST:
+                raise RobotError(f"expected a line of at most {LONGEST} bytes, got more")
+            if not (more := self._socket.recv(65536)):
+                raise ConnectionError("the connection was closed")
+            self._rest += more
+        line, _, self._rest = self._rest.partition(b"\n")
+        try:
+            message = json.loads(line)
+        except ValueError as error:
+            raise RobotError(f"expected a line of JSON, got {line[:40]!r}") from error
+        if not isinstance(message, dict) or not isinstance(message.get("type"), str):
+            raise RobotError(f"expected an object with a type, got {line[:40]!r}")
+        return message
+
+    def close(self) -> None:
+        """End the connection."""
+        self._socket.close()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(name): _plain(one) for name, one in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def numbers(message: Mapping[str, Any], name: str) -> np.ndarray:
+    """A list of numbers in a message, NaN where it has null.
+
+    Raises:
+        RobotError: where it has none.
+    """
+    values = message.get(name)
+    if not isinstance(values, list) or not all(value is None or _is_number(value) for value in values):
+        raise RobotError(f"expected numbers as {name!r} of {message['type']!r}, got {str(values)[:40]}")
+    return np.array([np.nan if value is None else value for value in values], float)
+
+
+def number(message: Mapping[str, Any], name: str) -> float:
+    """A number in a message.
+
+    Raises:
+        RobotError: where it has none.
+    """
+    if not _is_number(message.get(name)):
+        raise RobotError(f"expected a number as {name!r} of {message['type']!r}, got {str(message.get(name))[:40]}")
+    return message[name]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def check_hello(message: Mapping[str, Any]) -> None:
+    """Refuse whoever speaks another protocol or version.
+
+    Raises:
+        RobotError: which says what was expected.
+    """
+    got = tuple(message.get(name) for name in ("type", "protocol", "version"))
+    if got != ("hello", PROTOCOL, VERSION):
+        raise RobotError(f"expected hello of {PROTOCOL} of version {VERSION}, got {' '.join(map(str, got))}")
+
+
+def address(text: str, remote: bool = False) -> tuple[str, int]:
+    """Host and port of "socket://HOST:PORT".
+
+    Args:
+        text: the address.
+        remote: whether other hosts than this one are let. Nothing is encrypted, nor does anybody have to say who they
+            are.
+
+    Raises:
+        ValueError: for other texts, and for other hosts where they are not let.
+    """
+    host, colon, port = text.removeprefix("socket://").rpartition(":")
+    if not (host and colon and port.isdigit() and 0 <= int(port) < 65536):
+        raise ValueError(f"robot: expected socket://HOST:PORT, got {text!r}")
+    try:
+        found = socket.gethostbyname(host)
+    except OSError as error:
+        raise ValueError(f"robot: expected a host, got {host!r}: {error}") from error
+    if not (remote or ipaddress.ip_address(found).is_loopback):
+        raise ValueError(f"robot: expected this very host, as 127.0.0.1, got {host!r}; --remote lets other hosts")
+    return found, int(port)
