@@ -219,7 +219,10 @@ class _Episode:
             observation, fault = self._look()
             if observation is not None:
                 return observation
-        raise RobotError(f"robot: expected an observation to begin with, got {wait + 1} that were none, or {fault}")
+        raise RobotError(
+            f"robot: expected a usable observation to begin with, got none in {wait + 1} control periods, "
+            f"the last one was {fault}"
+        )
 
     def _target(self, observation: Observation) -> np.ndarray:
         """Where the set-points are before the first command."""

@@ -96,6 +96,13 @@ def test_a_loaded_run_is_the_same_and_arviz_summarises_it():
     assert list(summary.index) == ["first", "second"]
 
 
+def test_a_driver_is_controlled_within_its_limits():
+    log = ran("robot_driver")
+    assert log.stopped == "" and log.over == 7 and log.missed == 0  # 3 cm a step from 0.40 to 0.60 m
+    np.testing.assert_allclose(log.targets[[0, 5, 15], 0], [0.43, 0.58, 0.60])
+    np.testing.assert_allclose(log.observations[1:, 0], log.targets[:, 0], rtol=1e-6)
+
+
 def test_every_example_has_a_test():
     source = Path(__file__).read_text()
     assert EXAMPLES and all(f'ran("{name}")' in source for name in EXAMPLES)

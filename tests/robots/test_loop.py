@@ -108,7 +108,7 @@ def test_a_first_observation_is_waited_for_as_long_as_set_points_would_be_held()
     log = run(robot, holds=2, clock=clock)
     assert len(log.actions) == 16 and log.times[0] == 0 and clock.now() == pytest.approx(18 * PERIOD)
     robot = Robot(given={0: missing, 1: late, 2: spoiled})
-    with pytest.raises(RobotError, match="expected an observation to begin with, got 3 that were none, or non-finite"):
+    with pytest.raises(RobotError, match="to begin with, got none in 3 control periods, the last one was non-finite"):
         run(robot, holds=2)
     assert robot.stops == 1 and not robot.commands
 

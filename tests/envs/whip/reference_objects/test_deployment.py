@@ -10,13 +10,14 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from envs_whip import a_policy
+from envs_whip import Rig, a_policy, found
 
 from jaxlfi.envs.whip import cli, rules
 from jaxlfi.envs.whip.parameters import HIGHEST, LOWEST
 from jaxlfi.envs.whip.recording import trajectory
-from jaxlfi.envs.whip.reference_objects import deployment, objects, repetitions
+from jaxlfi.envs.whip.reference_objects import deployment, objects, repetitions, robot
 from jaxlfi.envs.whip.reference_objects.scene import PLACE
+from jaxlfi.envs.whip.reference_objects.simulation import UnstableError
 from jaxlfi.envs.whip.rig import START
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import along
@@ -36,13 +37,13 @@ def test_a_padded_centreline_is_the_same_line():
     rng = np.random.default_rng(0)
     for n in (17, 23, 24, 29):
         line = np.cumsum(rng.normal(size=(n, 3)), axis=0)
-        padded = deployment.padded(line, 29)
+        padded = robot.padded(line, 29)
         assert padded.shape == (29, 3)
         fractions = jnp.linspace(0, 1, 50)
         np.testing.assert_allclose(along(padded, fractions), along(line, fractions), atol=1e-4)
     for points in (16, 34):
         with pytest.raises(ValueError, match="points: expected 17 to 33"):
-            deployment.padded(np.zeros((17, 3)), points)
+            robot.padded(np.zeros((17, 3)), points)
 
 
 def test_an_episode_is_what_its_own_observations_say(whole):
@@ -79,18 +80,32 @@ def test_an_episode_ends_at_its_end_and_repeats(whole):
     assert away.outside and away.value == -1 and not away.hit.any() and not away.clean_hit
 
 
-def test_keypoints_that_are_not_seen_stay_where_they_were(monkeypatch):
-    frames = iter([np.full((10, 2), 0.2), np.full((10, 2), np.nan), np.full((10, 2), 0.7)])
-    seen = iter([np.ones(10, bool), np.zeros(10, bool), np.arange(10) < 4])
-    monkeypatch.setattr(deployment, "_found", lambda *_: (next(frames), next(seen)))
-    eye = deployment.Eye(KEY, side_camera(PLACE), PLACE.cube_side)
-    frame = deployment.Frames(
-        gripper=np.zeros(2), dlo=np.zeros((20, 3)), cubes=np.zeros((6, 3)), orientations=np.zeros((6, 4))
-    )
-    views = [eye.see(frame)[0] for _ in range(3)]
-    np.testing.assert_array_equal(views[0], 0.2)
-    np.testing.assert_array_equal(views[1], 0.2)
-    np.testing.assert_array_equal(views[2][:, 0], np.where(np.arange(10) < 4, 0.7, 0.2))
+def test_a_simulation_that_becomes_unstable_ends_the_episode_as_far_as_it_came(monkeypatch):
+    """In the fourth step; before or after the episode is over."""
+
+    class Fragile(Rig):
+        def step(self, action):
+            calls.append(action)
+            if len(calls) == 4:
+                raise UnstableError("dlo-1: became unstable")
+            return super().step(action)
+
+    monkeypatch.setattr(robot, "ReferenceRig", Fragile)
+    monkeypatch.setattr(robot, "_found", found)
+    for action, outside, steps in (((0.01, 0.0), False, 4), ((-0.06, 0.06), True, 3)):
+        calls = []
+        ended = deployment.deploy(KEY, objects.load("dlo-1"), lambda observation, a=action: np.array(a), whole=True)
+        assert (ended.failed, ended.outside, ended.steps) == (not outside, outside, steps)
+        assert ended.value == (-1 if outside else 0) and ended.recording is None and ended.frames is None
+        assert len(ended.observations) == 4
+        expected = np.tile(action, (4, 1)) * np.array([[1], [1], [1], [not outside]])  # the last was too much
+        np.testing.assert_array_equal(ended.actions, expected)
+
+
+def test_actions_that_are_too_large_are_refused():
+    """The loop would shorten them; here they are a mistake."""
+    with pytest.raises(ValueError, match=r"action: expected dx, dz of at most 0\.06 m"):
+        deployment.deploy(KEY, objects.load("dlo-1"), lambda observation: np.array([0.07, 0.0]))
 
 
 def test_places_are_displaced_as_in_training(key):
