@@ -51,11 +51,11 @@ class SocketRobot:
         hello = {"protocol": wire.PROTOCOL, "version": wire.VERSION}
         try:
             reply = self._asked("hello", ("hello",), **hello, observations=list(observations), actions=list(actions))
-            wire.check_hello(reply)
+            self._checked(lambda: wire.check_hello(reply))
         except RobotError:
             self._lines.close()
             raise
-        self.about: dict[str, Any] = dict(reply.get("about") or {})
+        self.about: dict[str, Any] = reply.get("about", {})
 
     def observe(self) -> Observation | None:
         """The latest observation, or None."""

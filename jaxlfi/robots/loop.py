@@ -256,6 +256,9 @@ class _Episode:
         if fault:
             self.faults[fault] += 1
             return None, fault
+        shapes = {name: np.shape(value) for name, value in observation.extras.items()}
+        if self.seen and shapes != (first := {name: np.shape(value) for name, value in self.seen[0][2].items()}):
+            raise ValueError(f"robot: expected extras of shapes {first} as before, got {shapes}")
         self.last = observation.number
         return observation, ""
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxlfi.rl.deployment import Limits
 from jaxlfi.robots import wire
 from jaxlfi.robots.clock import Simulated
+from jaxlfi.robots.interrupts import Interrupts
 from jaxlfi.robots.robot import Command, Robot, RobotError
 
 WATCHDOG = 1.0
@@ -32,8 +33,9 @@ def serve(
 ) -> None:
     """Serve one loop after another, until the process is ended.
 
-    A robot is stopped exactly once: when it is asked to, when the connection ends or no request comes for a while, and
-    when a request is damaged or a command beyond the limits.
+    A robot is stopped exactly once: when it is asked to, when the connection ends or no request comes for a while, when
+    a request is damaged or a command beyond the limits, after any exception of its own, and before SIGINT or SIGTERM
+    ends the process.
 
     Args:
         listener: that connections come to (`listen`).
@@ -43,14 +45,19 @@ def serve(
         limits: of the set-points.
         watchdog: seconds that may pass without a request.
         journal: takes note of connections ("begun"), commands ("act") and stops ("stopped").
+
+    Raises:
+        Interrupted: after SIGINT or SIGTERM.
     """
-    while True:
-        connection, _ = listener.accept()
-        with connection:
-            connection.settimeout(watchdog)
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            clock = Simulated()
-            _Session(make(clock), clock, observations, actions, limits, journal).run(wire.Lines(connection))
+    names = {"observations": list(observations), "actions": list(actions)}
+    with Interrupts() as interrupts:
+        while True:
+            with interrupts.waiting():
+                connection, _ = listener.accept()
+            with connection:
+                connection.settimeout(watchdog)
+                clock = Simulated()
+                _Session(make(clock), clock, names, limits, journal, interrupts).run(wire.Lines(connection))
 
 
 def listen(port: int, host: str = "127.0.0.1") -> socket.socket:
@@ -71,9 +78,9 @@ def write_to(path: Path) -> Journal:
 class _Session:
     """A robot while a loop is connected to it."""
 
-    def __init__(self, robot: Robot, clock: Simulated, observations, actions, limits: Limits, journal: Journal):
-        self.robot, self.clock, self.limits, self.journal = robot, clock, limits, journal
-        self.names = {"observations": list(observations), "actions": list(actions)}
+    def __init__(self, robot: Robot, clock: Simulated, names, limits: Limits, journal: Journal, interrupts: Interrupts):
+        self.robot, self.clock, self.names, self.limits = robot, clock, names, limits
+        self.journal, self.interrupts = journal, interrupts
         self.target: np.ndarray | None = None
         self.sent: float | None = None
 
@@ -83,16 +90,16 @@ class _Session:
         why = "the server was ended"
         try:
             self._greet(lines)
-            while (message := lines.receive())["type"] != "stop":
+            while (message := self._next(lines))["type"] != "stop":
                 kind, contents = self._answer(message)
                 lines.send(kind, **contents)
             why = "asked to"
         except TimeoutError:
             why = "no request came in time"
-        except (RobotError, ValueError) as error:
-            why = str(error)
-        except OSError:
+        except ConnectionError:
             why = "the connection ended"
+        except Exception as error:  # a driver may raise anything; the next connection has a new one
+            why = str(error) or type(error).__name__
         finally:
             self.robot.stop()
             self.journal({"event": "stopped", "why": why})
@@ -105,14 +112,18 @@ class _Session:
                 lines.send("stopped")
                 return
             lines.send("error", message=why)
-            while lines.receive()["type"] != "stop":
+            while self._next(lines)["type"] != "stop":
                 pass
             lines.send("stopped")
         except OSError:
             return
 
+    def _next(self, lines: wire.Lines) -> dict[str, Any]:
+        with self.interrupts.waiting():
+            return lines.receive()
+
     def _greet(self, lines: wire.Lines) -> None:
-        message = lines.receive()
+        message = self._next(lines)
         wire.check_hello(message)
         for what, expected in self.names.items():
             if message.get(what) != expected:

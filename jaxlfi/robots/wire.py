@@ -116,6 +116,8 @@ def check_hello(message: Mapping[str, Any]) -> None:
     got = tuple(message.get(name) for name in ("type", "protocol", "version"))
     if got != ("hello", PROTOCOL, VERSION):
         raise RobotError(f"expected hello of {PROTOCOL} of version {VERSION}, got {' '.join(map(str, got))}")
+    if not isinstance(message.get("about", {}), dict):
+        raise RobotError(f"expected an object as 'about' of 'hello', got {str(message['about'])[:40]}")
 
 
 def address(text: str, remote: bool = False) -> tuple[str, int]:

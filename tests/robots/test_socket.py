@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 import pytest
-from robots.fakes import LIMITS, PERIOD, a_policy
+from robots.fakes import LIMITS, PERIOD, Robot, a_policy
 
 from jaxlfi.robots import server, simulated, wire
 from jaxlfi.robots.client import SocketRobot
@@ -279,6 +279,7 @@ def test_numbers_that_a_driver_does_not_know_are_not_finite():
     [
         ({**HELLO, "version": 2}, "expected hello of jaxlfi-robot of version 1, got hello jaxlfi-robot 2"),
         ({**HELLO, "protocol": "ros"}, "got hello ros 1"),
+        ({**HELLO, "about": "a Franka"}, "expected an object as 'about' of 'hello', got a Franka"),
         ({"type": "error", "message": "busy"}, "its driver refused hello: busy"),
     ],
 )
@@ -346,6 +347,38 @@ def test_a_server_stops_its_robot_before_it_does_what_it_should_not(robot_proces
     assert stops(events) == [replies[-2]["message"]]
     assert sum(event["event"] == "act" for event in events) == max(0, len(messages) - 2)
     assert re.search(expected, replies[-2]["message"])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_server_that_is_told_to_end_stops_its_robot(number, tmp_path):
+    process = Server(tmp_path)
+    robot, _ = connected(process)
+    assert robot.observe() is not None
+    process.process.send_signal(number)
+    assert stops(process.last()) == ["the server was ended"]
+    assert process.process.wait(timeout=20) == 130
+    process.end()
+
+
+def test_a_robot_that_raises_is_stopped_and_the_next_one_is_served(tmp_path):
+    """In a thread, where Python lets signals alone."""
+    events, made = [], []
+
+    class Hot(Robot):
+        def __init__(self):
+            super().__init__(on_act=lambda command: 1 / 0)
+            made.append(self)
+
+    listener = server.listen(0)
+    words = (lambda clock: Hot(), *NAMES, LIMITS, 5.0, events.append)
+    threading.Thread(target=server.serve, args=(listener, *words), daemon=True).start()
+    address = f"socket://127.0.0.1:{listener.getsockname()[1]}"
+    for count in (1, 2):
+        clock = Simulated()
+        with pytest.raises(RobotError, match="its driver refused act: division by zero"):
+            Loop.of(a_policy(), clock=clock).run(SocketRobot(address, *NAMES, timeout=20.0, clock=clock), a_policy())
+        assert [robot.stops for robot in made] == [1] * count
+    assert stops(events) == ["division by zero"] * 2
 
 
 def test_a_robot_is_stopped_when_nobody_asks_for_anything(tmp_path):
