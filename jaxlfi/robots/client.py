@@ -52,10 +52,10 @@ class SocketRobot:
         try:
             reply = self._asked("hello", ("hello",), **hello, observations=list(observations), actions=list(actions))
             self._checked(lambda: wire.check_hello(reply))
+            self.about: dict[str, Any] = self._checked(lambda: wire.mapping(reply, "about"))
         except RobotError:
             self._lines.close()
             raise
-        self.about: dict[str, Any] = reply.get("about", {})
 
     def observe(self) -> Observation | None:
         """The latest observation, or None."""
@@ -68,7 +68,7 @@ class SocketRobot:
                 number=int(wire.number(reply, "number")),
                 age=wire.number(reply, "age"),
                 target=None if reply.get("target") is None else wire.numbers(reply, "target"),
-                extras=reply.get("extras") or {},
+                extras=wire.mapping(reply, "extras"),
             )
         )
 

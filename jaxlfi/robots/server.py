@@ -138,7 +138,11 @@ class _Session:
         self.clock.sleep_until(now)
         if message["type"] == "observe":
             seen = self.robot.observe()
-            return ("nothing", {}) if seen is None else ("observation", vars(seen))
+            if seen is None:
+                return "nothing", {}
+            if self.sent is None and seen.target is not None:
+                self.target = np.asarray(seen.target, float)  # from which the first command has to begin
+            return "observation", vars(seen)
         slot, displacement, target = (
             int(wire.number(message, "slot")),
             wire.numbers(message, "displacement"),

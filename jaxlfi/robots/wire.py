@@ -103,6 +103,18 @@ def number(message: Mapping[str, Any], name: str) -> float:
     return message[name]
 
 
+def mapping(message: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """An object in a message; empty where there is none.
+
+    Raises:
+        RobotError: where there is something else.
+    """
+    found = message.get(name, {})
+    if not isinstance(found, dict):
+        raise RobotError(f"expected an object as {name!r} of {message['type']!r}, got {str(found)[:40]}")
+    return found
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
@@ -116,8 +128,6 @@ def check_hello(message: Mapping[str, Any]) -> None:
     got = tuple(message.get(name) for name in ("type", "protocol", "version"))
     if got != ("hello", PROTOCOL, VERSION):
         raise RobotError(f"expected hello of {PROTOCOL} of version {VERSION}, got {' '.join(map(str, got))}")
-    if not isinstance(message.get("about", {}), dict):
-        raise RobotError(f"expected an object as 'about' of 'hello', got {str(message['about'])[:40]}")
 
 
 def address(text: str, remote: bool = False) -> tuple[str, int]:

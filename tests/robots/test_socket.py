@@ -244,6 +244,7 @@ def line(**changes):
         (line(values=[0.5, "x", 0, 0, 0]), "expected numbers as 'values'"),
         (line(number=None), "expected a number as 'number' of 'observation', got None"),
         (line(age=True), "expected a number as 'age'"),
+        (line(extras=[1]), "expected an object as 'extras' of 'observation', got .1."),
         (line(values=[0.5] * 4), r"expected observations of 5 numbers, got shape \[4\]"),
         (line(type="error", message="a joint is hot"), "its driver refused observe: a joint is hot"),
         (b"x" * (wire.LONGEST + 10), f"expected a line of at most {wire.LONGEST} bytes"),
@@ -334,6 +335,7 @@ ACT = {"type": "act", "now": 0.0, "slot": 0, "displacement": [0.01, 0.02], "targ
         ([NAMED, {**ACT, "displacement": [0.07, 0.0]}], "expected a command within Limits"),
         ([NAMED, {**ACT, "displacement": [0.05, 0.05]}], "expected a command within Limits"),
         ([NAMED, {**ACT, "target": [0.4, 0.51]}], "expected a command within Limits"),
+        ([NAMED, {"type": "observe", "now": 0.0}, {"type": "observe", "now": 0.5}, ACT], "expected a command within"),
         ([NAMED, {**ACT, "target": [0.4]}], "expected 2 set-points"),
         ([NAMED, {**ACT, "target": [0.4, None]}], "expected a command within Limits"),
         ([NAMED, ACT, {**ACT, "now": 0.16, "target": [0.42, 0.32]}], "expected a command within Limits"),  # 1 cm more
@@ -345,7 +347,7 @@ def test_a_server_stops_its_robot_before_it_does_what_it_should_not(robot_proces
     assert [reply["type"] for reply in replies[-2:]] == ["error", "stopped"]
     events = robot_process.last()
     assert stops(events) == [replies[-2]["message"]]
-    assert sum(event["event"] == "act" for event in events) == max(0, len(messages) - 2)
+    assert sum(event["event"] == "act" for event in events) == messages[:-1].count(ACT)
     assert re.search(expected, replies[-2]["message"])
 
 
