@@ -26,6 +26,7 @@ from jaxlfi.envs.whip.physics.engine import Engine
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.reference_objects import objects, repetitions
+from jaxlfi.envs.whip.reference_objects.simulation import UnstableError
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
@@ -128,7 +129,10 @@ def control(arguments: argparse.Namespace) -> None:
     act = repetitions.acting(arguments.policy)()
     loop = controlling.loop_of(act, arguments)
     robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote)
-    log = dataclasses.replace(loop, clock=getattr(robot, "clock", loop.clock)).run(robot, act)
+    try:
+        log = dataclasses.replace(loop, clock=getattr(robot, "clock", loop.clock)).run(robot, act)
+    except UnstableError as error:
+        raise RobotError(f"robot: {error}") from error
     out.parent.mkdir(parents=True, exist_ok=True)
     others = controlling.arrays(log)
     try:

@@ -228,3 +228,17 @@ def test_a_reference_object_is_a_robot_whose_observations_are_those_of_its_deplo
     np.testing.assert_allclose(seen.gripper[:3], [[0.4, 0.36], [0.43, 0.33], [0.46, 0.30]], atol=1e-6)
     assert seen.gripper[-1].tolist() == pytest.approx([0.6, 0.1])  # the corner of the workspace, and no further
     assert seen.description.startswith("dlo-2") and seen.source == "simulated"
+
+
+def test_a_simulation_that_becomes_unstable_is_one_line(tmp_path, capsys, monkeypatch):
+    from jaxlfi.envs.whip.reference_objects import robot as reference
+    from jaxlfi.envs.whip.reference_objects.simulation import UnstableError
+
+    class Fragile(Rig):
+        def step(self, action):
+            raise UnstableError("dlo-2: became unstable")
+
+    monkeypatch.setattr(reference, "ReferenceRig", Fragile)
+    monkeypatch.setattr(reference, "_found", found)
+    status, _, error, _ = run(tmp_path, capsys, robot="dlo-2")
+    assert status == 2 and error == "jaxlfi whip: error: robot: dlo-2: became unstable\n"
