@@ -1,4 +1,4 @@
-"""The command line of the whipping task: `jaxlfi whip render | plan | deploy | control`.
+"""The command line of the whipping task: `jaxlfi whip render | plan | deploy | control | convert`.
 
 This module imports neither jax nor numpy, so that `--help` answers at once.
 """
@@ -20,6 +20,9 @@ examples:
   jaxlfi whip render --length 200 --young 2.5e4 --policy runs/plan.npz --out runs/shorter
   jaxlfi whip deploy runs/policies/uniform/seed_000/policy.npz constant:0.03,-0.03 --object dlo-0 --out runs/deployed
   jaxlfi whip control policy.npz --robot socket://127.0.0.1:5005 --max-speed 0.2 --out rollout.npz
+  jaxlfi whip convert rollout.npz rollout.mcap
+  jaxlfi whip convert first.npz second.mcap runs/whips              a LeRobot data set of two episodes
+  jaxlfi whip convert "runs/whips#episode=1" second.npz
 
 """
 
@@ -29,7 +32,8 @@ def parser() -> argparse.ArgumentParser:
     formatter = argparse.RawDescriptionHelpFormatter
     top = OneLineParser(
         prog="jaxlfi whip",
-        description="Render rollouts of the DLO whipping task, plan whips, let policies whip, and control robots.",
+        description="Render rollouts of the DLO whipping task, plan whips, let policies whip, control robots, and "
+        "convert recordings.",
         epilog=EXAMPLES,
         formatter_class=formatter,
     )
@@ -117,11 +121,25 @@ def parser() -> argparse.ArgumentParser:
     control.add_argument("--remote", action="store_true", help="let the driver be on another host")
     control.add_argument("--seed", type=int, default=0, metavar="N", help="of a reference object's camera (default: 0)")
     control.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .npz, beside it a new .json")
+
+    convert = commands.add_parser(
+        "convert",
+        help="recordings in the formats of LeRobot and MCAP",
+        description="Convert recorded rollouts: NAME.npz with NAME.json, NAME.mcap, or the folder of a LeRobot data "
+        "set (extra robotics). Arrays of other names than a recording's are left behind.",
+    )
+    convert.add_argument(
+        "recordings",
+        nargs="+",
+        metavar="IN",
+        help="a recording; FOLDER#episode=N of a data set of several; several, for a data set",
+    )
+    convert.add_argument("out", type=Path, metavar="OUT", help="a new NAME.npz, NAME.mcap, or folder without a suffix")
     return top
 
 
 def _add_scene(command: argparse.ArgumentParser) -> None:
-    """Options of both commands: the DLO and its simulation."""
+    """Options of commands that simulate: the DLO and its simulation."""
     command.add_argument("--length", type=float, default=250.0, metavar="MM", help="length of the DLO in mm, 50 to 350")
     command.add_argument(
         "--young", type=float, default=2.5e4, metavar="PA", help="Young's modulus of the DLO in Pa, 500 to 5e5"

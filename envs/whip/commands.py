@@ -15,7 +15,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from jaxlfi.envs.whip import control as controlling
-from jaxlfi.envs.whip import planner, rules
+from jaxlfi.envs.whip import formats, planner, rules
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip import render as drawing
 from jaxlfi.envs.whip.episode import Whip
@@ -87,6 +87,20 @@ def plan(arguments: argparse.Namespace) -> None:
     scene = {f"parameters/{name}": value for name, value in vars(parameters).items()}
     atomic.write_arrays(out, {**vars(found), **scene})
     print(f"mean return {found.value:.2f} after {found.history.size} tries, wrote {out}")
+
+
+def convert(arguments: argparse.Namespace) -> None:
+    """`jaxlfi whip convert`.
+
+    Raises:
+        ValueError: for bad input.
+    """
+    out = arguments.out
+    several = [formats.read(reference) for reference in arguments.recordings]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    formats.write(out, several)
+    frames = ", ".join(str(one.times.size) for one in several)
+    print(f"wrote {out}: {frames} frames at {several[0].frame_rate:g} Hz")
 
 
 def deploy(arguments: argparse.Namespace) -> None:

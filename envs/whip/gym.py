@@ -6,8 +6,10 @@
 Actions are in metres; `gymnasium.wrappers.RescaleAction` brings them to [-1, 1].
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +73,7 @@ class WhipGym(gymnasium.Env):
         detector: str | Detector = "clean",
         engine: str | Engine = "auto",
         render_mode: str | None = None,
+        nuisances: Literal["fixed", "random"] = "fixed",
     ):
         """Nothing is simulated yet.
 
@@ -80,13 +83,15 @@ class WhipGym(gymnasium.Env):
             detector: of keypoints, or its name: "clean", "mask", "noisy" or "transporter".
             engine: the physics, or its name (`physics.engines.pick`).
             render_mode: "rgb_array" for `render`.
+            nuisances: "fixed": every episode is in the scene that is given; "random": in one of its length and modulus,
+                and all else, stack and camera among it, is drawn anew (section VI-H).
 
         Raises:
             ValueError: for parameters outside of their ranges, and unknown names.
         """
         self.action_space, self.observation_space = ACTIONS, OBSERVATIONS
         self.render_mode = _mode(render_mode)
-        self._parts = _parts(engine, parameters)
+        self._parts = _parts(engine, parameters, nuisances)
         self._detector, self._parameters = _detector(detector), _fixed(parameters, ())
         self._key = self._scene = self._episode = None
 
@@ -110,7 +115,7 @@ class WhipGym(gymnasium.Env):
             raise gymnasium.error.ResetNeeded("step: expected a reset before it, got none")
         action = _action(action, (2,))
         self._key, self._episode, now = _go_on(
-            self._parts[0], self._detector, self._scene, self._key, self._episode, action
+            self._parts.engine, self._detector, self._scene, self._key, self._episode, action
         )
         now = _own(now)
         ends = bool(now.terminated), bool(now.truncated)
@@ -122,14 +127,15 @@ class WhipGym(gymnasium.Env):
             return None
         if self._episode is None:
             raise gymnasium.error.ResetNeeded("render: expected a reset before it, got none")
-        return np.asarray(_picture(self._parts[0], self._scene, self._episode))
+        return np.asarray(_picture(self._parts.engine, self._scene, self._episode))
 
 
 class WhipVector(VectorEnv):
     """Many whipping scenes stepped together; scene i is equivalent to a `WhipGym` with the seed `seed + i`.
 
     A scene whose episode has ended is reset in the next step, whose action it ignores (gymnasium's
-    `AutoresetMode.NEXT_STEP`).
+    `AutoresetMode.NEXT_STEP`); or in the same one, which is `AutoresetMode.SAME_STEP`: then the observation is that of
+    the new episode, and the last one of the old is in the info as `final_obs`, beside `final_info`.
 
     Example:
         >>> environments = WhipVector(3, initial_domain)
@@ -146,6 +152,8 @@ class WhipVector(VectorEnv):
         parameters: WhipParameters | Domain | None = None,
         detector: str | Detector = "clean",
         engine: str | Engine = "auto",
+        nuisances: Literal["fixed", "random"] = "fixed",
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ):
         """Nothing is simulated yet.
 
@@ -154,16 +162,19 @@ class WhipVector(VectorEnv):
             parameters: see `WhipGym`; or those of N scenes, with a leading axis.
             detector: see `WhipGym`.
             engine: see `WhipGym`.
+            nuisances: see `WhipGym`.
+            autoreset_mode: when a new episode begins; see above.
 
         Raises:
-            ValueError: see `WhipGym`.
+            ValueError: see `WhipGym`, and for other modes.
         """
         if num_envs < 1:
             raise ValueError(f"num_envs: expected at least 1, got {num_envs}")
         self.num_envs, self.render_mode = num_envs, None
         self.single_action_space, self.single_observation_space = ACTIONS, OBSERVATIONS
         self.action_space, self.observation_space = (batch_space(space, num_envs) for space in (ACTIONS, OBSERVATIONS))
-        self._parts = _parts(engine, parameters)
+        self.metadata = {"autoreset_mode": _autoreset(autoreset_mode)}
+        self._parts = _parts(engine, parameters, nuisances, self.metadata["autoreset_mode"])
         self._detector, self._parameters = _detector(detector), _fixed(parameters, (num_envs,))
         self._keys = self._scenes = self._episodes = None
         self._over = np.zeros(num_envs, bool)
@@ -204,33 +215,60 @@ class WhipVector(VectorEnv):
         if self._episodes is None:
             raise gymnasium.error.ResetNeeded("step: expected a reset before it, got none")
         actions = _action(actions, (self.num_envs, 2))
-        self._keys, self._scenes, self._episodes, now = _go_on_many(
+        before = self._scenes
+        self._keys, self._scenes, self._episodes, now, last = _go_on_many(
             self._parts,
             self._detector,
             self._parameters,
-            self._scenes,
+            before,
             self._keys,
             self._episodes,
             actions,
             self._over,
         )
-        now = _own(now)
-        self._over = now.terminated | now.truncated
-        return now.observation, now.reward, now.terminated, now.truncated, _many(_info(self._scenes, now))
+        now, last = _own(now), _own(last)
+        info = _many(_info(self._scenes, now))
+        if not self._parts.same_step:
+            self._over = now.terminated | now.truncated
+            return now.observation, now.reward, now.terminated, now.truncated, info
+        over = last.terminated | last.truncated
+        if over.any():
+            final = np.full(self.num_envs, None, object)
+            for place in np.flatnonzero(over):
+                final[place] = last.observation[place]
+            info |= {"final_obs": final, "final_info": _many(_info(before, last), over)}
+            info |= {"_final_obs": over, "_final_info": over}
+        return now.observation, last.reward, last.terminated, last.truncated, info
 
 
 # ---------------------------------------------------------------------------------------------------- one scene
 
-Parts = tuple[Engine, Domain | None]
-"""Static arguments of the compiled programs: the physics, and the distribution of scenes if they are drawn."""
+
+@dataclasses.dataclass(frozen=True)
+class Parts:
+    """Static arguments of the compiled programs.
+
+    Attributes:
+        engine: the physics.
+        draw: the distribution of scenes, if they are drawn.
+        nuisances: whether all but length and modulus of given scenes is drawn.
+        same_step: whether an episode begins in the step in which one ends.
+    """
+
+    engine: Engine
+    draw: Domain | None
+    nuisances: bool
+    same_step: bool
 
 
 def _start(parts: Parts, detector: Detector, parameters: WhipParameters, key: jax.Array):
     """A scene, the start of an episode in it, and its first observation."""
-    engine, draw = parts
     key_scene, key_reset = jax.random.split(key)
-    scene = parameters if draw is None else draw(key_scene)
-    episode, observation = Whip(engine, detector).reset(key_reset, scene)
+    if parts.draw is not None:
+        scene = parts.draw(key_scene)
+    else:
+        scene = randomised(key_scene, parameters.length, parameters.young) if parts.nuisances else parameters
+    episode, observation = Whip(parts.engine, detector).reset(key_reset, scene)
     no = jnp.asarray(False)
     return scene, episode, Step(observation, jnp.asarray(0.0), no, no, episode.hit, no, no, jnp.ones(10, bool))
 
@@ -256,14 +294,20 @@ def _begin_many(parts: Parts, detector: Detector, parameters: WhipParameters, ke
 
 @functools.partial(jax.jit, static_argnums=0)
 def _go_on_many(parts: Parts, detector: Detector, parameters: WhipParameters, scenes, keys, episodes, actions, over):
-    """As `_go_on`, but as `_begin` where the episode was over; also returns the scenes."""
+    """As `_go_on`, but as `_begin` where the episode was over, or is; also returns the scenes, and the steps alone."""
 
     def one(parameters, scene, key, episode, action, over):
         key, key_start, key_step = jax.random.split(key, 3)
         idle = episode.replace(state=episode.state.stopped(over))
-        went_on = (scene, *Whip(parts[0], detector).step(key_step, scene, idle, action))
+        went_on = (scene, *Whip(parts.engine, detector).step(key_step, scene, idle, action))
+        last = went_on[-1]
+        if parts.same_step:  # as a step and a reset of a single scene
+            over = last.terminated | last.truncated
+            later, key_start, _ = jax.random.split(key, 3)
+            chosen = jnp.where(over, jax.random.key_data(later), jax.random.key_data(key))
+            key = jax.random.wrap_key_data(chosen)
         started = _start(parts, detector, parameters, key_start)
-        return key, *jax.tree.map(lambda yes, no: jnp.where(over, yes, no), started, went_on)
+        return key, *jax.tree.map(lambda yes, no: jnp.where(over, yes, no), started, went_on), last
 
     return jax.vmap(one)(parameters, scenes, keys, episodes, actions, over)
 
@@ -277,8 +321,28 @@ def _picture(engine: Engine, scene: WhipParameters, episode: Episode):
 # -------------------------------------------------------------------------------------------------- arguments
 
 
-def _parts(engine: str | Engine, parameters: WhipParameters | Domain | None) -> Parts:
-    return pick(engine) if isinstance(engine, str) else engine, parameters if callable(parameters) else None
+def _parts(
+    engine: str | Engine,
+    parameters: WhipParameters | Domain | None,
+    nuisances: str,
+    mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+) -> Parts:
+    if nuisances not in ("fixed", "random"):
+        raise ValueError(f"nuisances: expected fixed or random, got {nuisances!r}")
+    return Parts(
+        engine=pick(engine) if isinstance(engine, str) else engine,
+        draw=parameters if callable(parameters) else None,
+        nuisances=nuisances == "random",
+        same_step=mode is AutoresetMode.SAME_STEP,
+    )
+
+
+def _autoreset(mode: AutoresetMode | str) -> AutoresetMode:
+    modes = {known: known for known in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
+    modes |= {known.value: known for known in modes}
+    if mode not in modes:
+        raise ValueError(f"autoreset_mode: expected NextStep or SameStep, got {mode!r}")
+    return modes[mode]
 
 
 def _fixed(parameters: WhipParameters | Domain | None, batch: tuple[int, ...]) -> WhipParameters:
@@ -340,9 +404,10 @@ def _one(info: dict[str, np.ndarray]) -> dict:
     return {name: value if value.ndim else value.item() for name, value in info.items()}
 
 
-def _many(info: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The info of many scenes, with masks of those that report it, as in gymnasium."""
-    return {**info, **{f"_{name}": np.ones(len(value), bool) for name, value in info.items()}}
+def _many(info: dict[str, np.ndarray], those: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """The info of many scenes, with masks of those that report it, by default all, as in gymnasium."""
+    masks = {f"_{name}": np.ones(len(value), bool) if those is None else those for name, value in info.items()}
+    return {**info, **masks}
 
 
 gymnasium.register(

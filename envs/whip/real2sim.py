@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlfi.envs.whip import formats
 from jaxlfi.envs.whip import parameters as ranges
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip.exploration import exploratory_actions
@@ -65,10 +66,10 @@ def task(
 
     Args:
         object: the observed object: an FEM reference object by name ("dlo-0" to "dlo-3"), or the path of a recorded
-            rollout's .npz (`recording`), which `jaxlfi whip render` writes, too. Simulations apply its actions and are
-            seen through its camera. Several recorded rollouts of one object, a name or path each, are believed
-            together (`whip_task`). By default, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory
-            actions.
+            rollout (`formats`): .npz, which `jaxlfi whip render` writes, too, .mcap, or the folder of a LeRobot data
+            set, FOLDER#episode=3 where it has several. Simulations apply its actions and are seen through its camera.
+            Several recorded rollouts of one object, a name or path each, are believed together (`whip_task`). By
+            default, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory actions.
         detector: the errors of simulated keypoints (`vision.keypoints.DETECTORS`). They should resemble those of the
             detector that the observation was made with; for the reference objects, that is "mask".
         nuisances: "fixed": density, cubes and placement are as in mu; "random": only their ranges are known.
@@ -106,12 +107,16 @@ def recorded(object: str) -> recordings.Recording:
 
     Raises:
         ValueError: if there is no such object or file.
+        ImportError: where the extra `robotics` is needed and not installed.
     """
     known = {path.stem: path for path in sorted(DATA.glob("dlo-*.npz"))}
-    path = known.get(object, Path(object))
-    if not path.exists():
-        raise ValueError(f"object: expected one of {', '.join(known)} or a recorded rollout's .npz, got {object!r}")
-    return recordings.read(path)
+    if object in known:
+        return recordings.read(known[object])
+    if not formats.located(object)[0].exists():
+        raise ValueError(
+            f"object: expected one of {', '.join(known)}, or a recorded rollout: {formats.FORMATS}, got {object!r}"
+        )
+    return formats.read(object)
 
 
 def whip_task(

@@ -1,7 +1,8 @@
 """Recorded rollouts of one object, real or simulated: a file format, and the trajectory that inference sees.
 
 A recording NAME consists of two files: NAME.npz with the arrays below (others are ignored), and NAME.json, which
-describes them. `jaxlfi whip render` writes such a recording of a simulated DLO, rollout.npz and rollout.json.
+describes them. `jaxlfi whip render` writes such a recording of a simulated DLO, rollout.npz and rollout.json. Other
+formats of the same recordings: `jaxlfi.envs.whip.formats`.
 
 | NAME.npz    | shape      | unit              | what                                                            |
 |-------------|------------|-------------------|-----------------------------------------------------------------|
@@ -164,17 +165,9 @@ def write(path: str | Path, recording: Recording, others: Mapping[str, np.ndarra
     for file in (arrays, description):
         if file.exists():
             raise ValueError(f"path: expected a new recording, got {file}, which exists")
-    named = {name: getattr(recording, name) for name in UNITS if getattr(recording, name) is not None}
-    single = lambda name, value: np.asarray(value, np.float32) if value.dtype == float and name != "times" else value
-    described = {name: getattr(recording, name) for name in _DESCRIBED if name != "camera"}
-    camera = {name: np.asarray(getattr(recording.camera, name), float).tolist() for name in _CAMERA}
-    fixed = {"schema": SCHEMA, "version": VERSION, "units": {name: UNITS[name] for name in named}}
     # A recording is complete once the second file exists.
-    atomic.write_arrays(arrays, {**(others or {}), **{name: single(name, value) for name, value in named.items()}})
-    atomic.write_json(
-        description,
-        {**fixed, "keypoints": ORDER, **described, "camera": {**camera, "image_size": recording.image_size}},
-    )
+    atomic.write_arrays(arrays, {**(others or {}), **arrays_of(recording)})
+    atomic.write_json(description, describe(recording))
 
 
 def read(path: str | Path) -> Recording:
@@ -189,16 +182,49 @@ def read(path: str | Path) -> Recording:
     arrays, description = _files(path)
     values = atomic.read_arrays(arrays)
     try:
-        described = _description(description)
-        if missing := set(described["units"]) - set(values):
-            raise ValueError(f"arrays: expected {sorted(described['units'])}, got no {', '.join(sorted(missing))}")
-        values = {name: values[name] for name in described["units"]}
-        camera = described.pop("camera")
-        view = Camera(**{name: jnp.asarray(_array("camera", camera[name], float), jnp.float32) for name in _CAMERA})
-        rest = {name: described[name] for name in _DESCRIBED if name in described}
-        return Recording(**values, **rest, camera=view, image_size=camera["image_size"])
+        return made_of(values, _description(description), description.name)
     except ValueError as error:
         raise ValueError(f"{arrays.with_suffix('')}: {error}") from error
+
+
+def arrays_of(recording: Recording) -> dict[str, np.ndarray]:
+    """The arrays of a recording as files hold them: times in double precision, other numbers in single."""
+    named = {name: getattr(recording, name) for name in UNITS if getattr(recording, name) is not None}
+    single = lambda name, value: np.asarray(value, np.float32) if value.dtype == float and name != "times" else value
+    return {name: single(name, value) for name, value in named.items()}
+
+
+def describe(recording: Recording) -> dict[str, Any]:
+    """The description of a recording as files hold it."""
+    units = {name: UNITS[name] for name in UNITS if getattr(recording, name) is not None}
+    described = {name: getattr(recording, name) for name in _DESCRIBED if name != "camera"}
+    camera = {name: np.asarray(getattr(recording.camera, name), float).tolist() for name in _CAMERA}
+    return {
+        **{"schema": SCHEMA, "version": VERSION, "units": units, "keypoints": list(ORDER)},
+        **described,
+        "camera": {**camera, "image_size": recording.image_size},
+    }
+
+
+def made_of(arrays: Mapping[str, np.ndarray], described: Any, where: str) -> Recording:
+    """The recording that arrays and a description make.
+
+    Args:
+        arrays: by the names of a file; others are ignored.
+        described: what a description says.
+        where: it stands, for errors.
+
+    Raises:
+        ValueError: for a description of another kind or version, and arrays that do not fit.
+    """
+    described = dict(checked(described, where))
+    if missing := set(described["units"]) - set(arrays):
+        raise ValueError(f"arrays: expected {sorted(described['units'])}, got no {', '.join(sorted(missing))}")
+    values = {name: arrays[name] for name in described["units"]}
+    camera = described.pop("camera")
+    view = Camera(**{name: jnp.asarray(_array("camera", camera[name], float), jnp.float32) for name in _CAMERA})
+    rest = {name: described[name] for name in _DESCRIBED if name in described}
+    return Recording(**values, **rest, camera=view, image_size=camera["image_size"])
 
 
 def _files(path: str | Path) -> tuple[Path, Path]:
@@ -208,21 +234,28 @@ def _files(path: str | Path) -> tuple[Path, Path]:
     return path, path.with_suffix(".json")
 
 
-def _description(path: Path) -> dict[str, Any]:
-    """The description, where it is one of a recording that can be read."""
+def _description(path: Path) -> Any:
     if not path.exists():
         raise ValueError(f"a recording is two files: expected a description in {path.name} beside the .npz, got none")
     try:
-        described = json.loads(path.read_text())
+        return json.loads(path.read_text())
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"expected a description in {path.name}, got {type(error).__name__}") from error
+
+
+def checked(described: Any, where: str) -> dict[str, Any]:
+    """A description, where it is one of a recording that can be read.
+
+    Raises:
+        ValueError: for others, saying `where` they stand.
+    """
     if not isinstance(described, dict) or described.get("schema") != SCHEMA:
-        raise ValueError(f"schema: expected {SCHEMA!r} in {path.name}, got another kind of file")
+        raise ValueError(f"schema: expected {SCHEMA!r} in {where}, got another kind of file")
     if described.get("version") != VERSION:
         raise ValueError(f"version: expected {VERSION}, got {described.get('version')!r}")
     for name, kind in {**_DESCRIBED, "units": dict, "keypoints": list}.items():
         if name not in described:
-            raise ValueError(f"{name}: expected in {path.name}, got none")
+            raise ValueError(f"{name}: expected in {where}, got none")
         if not isinstance(described[name], int | float if kind is float else kind):
             raise ValueError(f"{name}: expected a {kind.__name__}, got {described[name]!r}")
     required = {name: unit for name, unit in UNITS.items() if name != "hits" or name in described["units"]}

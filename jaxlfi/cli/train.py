@@ -4,6 +4,7 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 """
 
 import argparse
+import contextlib
 import json
 import shutil
 import sys
@@ -35,6 +36,7 @@ examples:
   jaxlfi train whip --domain uniform --seeds 4 --out runs/uniform
   jaxlfi train whip --domain runs/dlo-0 uniform median --seeds 4 --out runs/policies
   jaxlfi train whip,detector=clean --domain point:200,1e5 --total-steps 30000 --out runs/point
+  jaxlfi train whip --domain uniform --seeds 2 --tensorboard --out runs/watched
   jaxlfi resume runs/policies                    go on after a crash, to the same policies bit for bit
 
 """
@@ -58,6 +60,9 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)")
     top.add_argument("--seeds", type=int, default=1, metavar="N", help="trainings of each domain (default: 1)")
     top.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first one's seed (default: 0)")
+    top.add_argument(
+        "--tensorboard", action="store_true", help="write learning curves while training: tensorboard --logdir DIR"
+    )
     top.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
     top.add_argument("--debug", action="store_true", help="show where an error came from")
     group = top.add_argument_group("PPO (default: the preset's)")
@@ -105,18 +110,28 @@ def run(out: Path, environment: "Environment", console: "Console", figures: bool
     from rich.table import Table
 
     from jaxlfi.io.progress import RoundProgress
-    from jaxlfi.rl import training
+    from jaxlfi.rl import tensorboard, training
 
     config = training.read_config(out)
     settings = training.settings_of(config)
-    count = len(config["trainings"])
+    names = [(one["domain"], one["seed"]) for one in config["trainings"]]
+    count = len(names)
     label = f"{environment.name}: {count} {'policy' if count == 1 else 'policies side by side'}"
-    with RoundProgress(console, settings.updates, training.updates_done(out), label, unit="update") as progress:
+    with contextlib.ExitStack() as stack:
+        progress = RoundProgress(console, settings.updates, training.updates_done(out), label, unit="update")
+        stack.enter_context(progress)
+        scalars = None
+        if config.get("tensorboard"):
+            scalars = stack.enter_context(tensorboard.Scalars(out, names, settings.steps_per_update))
 
         def on_chunk(updates: int, curves: Mapping[str, Any]) -> None:
             progress.advance(updates, f", return {np.nanmean(curves['value'][-updates:]):.2f}")
+            if scalars:
+                scalars.write(curves)
 
         result = training.resumed(out, environment, on_chunk)
+        if scalars:
+            scalars.write(result.curves)  # where nothing was left to train, it was not called
     facts = [name for name in result.outcomes if name not in training.NOT_FACTS]
     table = Table("domain", "seed", "return", *facts, title=f"on {training.HELD_OUT} other points of each domain")
     for place, (trained_on, seed) in enumerate(result.names):
@@ -174,4 +189,5 @@ def _plan(arguments: argparse.Namespace) -> Any:
         preset=arguments.preset,
         domains=domains,
         seeds=tuple(range(arguments.first_seed, arguments.first_seed + arguments.seeds)),
+        tensorboard=arguments.tensorboard,
     )

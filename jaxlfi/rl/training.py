@@ -4,6 +4,7 @@ config.json domains.npz                what was asked for, and the points that a
 checkpoint.npz                         while it runs: all trainings, and their learning curves so far
 curves.npz table.csv                   learning curves; how each policy fares on its own domain
 DOMAIN/seed_000/policy.npz ...         the policies (`jaxlfi.rl.policy`)
+DOMAIN/seed_000/events...              where they were asked for (`jaxlfi.rl.tensorboard`)
 """
 
 import csv
@@ -50,6 +51,7 @@ class Plan:
         preset: that the settings were made from, or None.
         domains: how to draw the points of each domain, by its name.
         seeds: of every domain's trainings.
+        tensorboard: whether the learning curves are written for TensorBoard, too (`jaxlfi.rl.tensorboard`).
     """
 
     reference: str | None
@@ -58,6 +60,7 @@ class Plan:
     preset: str | None
     domains: Mapping[str, Draw]
     seeds: tuple[int, ...]
+    tensorboard: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +106,7 @@ def begin(plan: Plan, out: Path) -> None:
         "preset": plan.preset,
         "settings": serialise.fields_to_json(plan.settings, serialise.class_name),
         "trainings": [{"domain": domain, "seed": seed} for domain, seed in names],
+        "tensorboard": plan.tensorboard,
         **run_folders.environment(),
     }
     run_folders.create(out, config, lambda staging: files.write_arrays(staging / "domains.npz", arrays))

@@ -134,7 +134,10 @@ def test_contributing_names_files_that_exist():
         assert (ROOT / name).exists() or "NAME" in name, name
 
 
-@pytest.mark.parametrize(("page", "start"), [("calibration.md", "import numpy"), ("quickstart.md", "import numpy")])
+@pytest.mark.parametrize(
+    ("page", "start"),
+    [("calibration.md", "import numpy"), ("quickstart.md", "import numpy"), ("recordings.md", "import numpy")],
+)
 def test_short_blocks_of_pages_run(page, start, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"^```python\n(.*?)^```$", text(page), re.MULTILINE | re.DOTALL)

@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("brax")
 
 import small
+from rl import events
 from rl.toy import SETTINGS, Line
 
 from jaxlfi import infer
@@ -168,11 +169,16 @@ def test_the_command_is_resumed(tmp_path, capsys, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(training, "_write_checkpoint", killed)
-    assert run("--domain", "median", "--out", out) == 130
+    assert run("--domain", "median", "--tensorboard", "--out", out) == 130
     assert f"continue with: jaxlfi resume {out}" in capsys.readouterr().err
     monkeypatch.setattr(training, "_write_checkpoint", original)
     assert parser.main(["resume", str(out), "--no-figures", "--no-cache"]) == 0
     assert training.finished(out)
+    returns = files.read_arrays(out / "curves.npz")["value"][:, 0]
+    steps = 40 * np.arange(1, 5)
+    np.testing.assert_allclose(
+        events.scalars(out / "median/seed_000")["episodes/return"], np.stack([steps, returns], 1)
+    )
     assert parser.main(["resume", str(out)]) == 0
     assert "complete: nothing to resume" in capsys.readouterr().out
 

@@ -278,9 +278,13 @@ def test_who_may_import_which_library(path):
     allowed = {
         "matplotlib": ("jaxlfi.figures", f"{ENVS}.whip.figures", "experiments"),
         "mujoco": (f"{ENVS}.whip", "experiments"),
-        "gymnasium": (f"{ENVS}.whip",),
+        "gymnasium": (f"{ENVS}.whip", "experiments"),
+        "stable_baselines3": ("experiments",),
         "brax": ("jaxlfi.rl",),
         "onnx": ("jaxlfi.rl",),
+        "tensorboardX": ("jaxlfi.rl.tensorboard",),
+        "pyarrow": ("jaxlfi.io.lerobot",),
+        "mcap": ("jaxlfi.io.mcap",),
     }
     forbidden = dict.fromkeys(("pickle", "cloudpickle", "dill", "joblib"), ())
     for library, packages in (allowed | forbidden).items():

@@ -139,6 +139,57 @@ def test_a_vector_is_single_ones_which_begin_anew(key):
     assert ended.sum(0).tolist() == [3, 2, 1] and ended[15, 2]
 
 
+def test_a_vector_begins_anew_in_the_same_step_if_asked_to():
+    """As above; the last observation and what it says of the old scene are in the info."""
+    many = WhipVector(3, initial_domain, "transporter", ENGINE, autoreset_mode="SameStep")
+    assert many.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    single = [WhipGym(initial_domain, "transporter", ENGINE) for _ in range(3)]
+    many.reset(seed=7)
+    for i, environment in enumerate(single):
+        environment.reset(seed=7 + i)
+    ended = [0, 0, 0]
+    for t in range(17):
+        actions = np.stack([[0.0, 0.05], [-0.02, 0.0], [0.01 * (-1) ** t, 0.0]]).astype(np.float32)
+        observations, rewards, terminated, truncated, info = many.step(actions)
+        for i, environment in enumerate(single):
+            own, *ends, own_info = environment.step(actions[i])
+            np.testing.assert_allclose([rewards[i], terminated[i], truncated[i]], ends, atol=1e-6)
+            over = ends[1] or ends[2]
+            assert info.get("_final_obs", np.zeros(3, bool))[i] == over
+            if over:
+                ended[i] += 1
+                np.testing.assert_allclose(info["final_obs"][i], own, atol=1e-4)
+                final = info["final_info"]
+                assert final["young"][i] == pytest.approx(own_info["young"]) and final["_young"][i]
+                np.testing.assert_array_equal(final["hit"][i], own_info["hit"])
+                own, own_info = environment.reset()
+            np.testing.assert_allclose(observations[i], own, atol=1e-4)
+            assert info["young"][i] == pytest.approx(own_info["young"])
+    assert ended == [4, 2, 1]
+
+
+def test_nuisances_are_drawn_for_given_lengths_and_moduli():
+    """Every episode of a scene has its length and modulus, and a stack that stands elsewhere."""
+    lengths, moduli = np.array([0.2, 0.3]), np.array([1e4, 4e4])
+    many = WhipVector(2, median(lengths, moduli), engine=ENGINE, nuisances="random", autoreset_mode="SameStep")
+    starts = [many.reset(seed=0)[0]]
+    for _ in range(10):
+        observations, _, terminated, _, info = many.step(np.tile(np.float32([[0.0, 0.06]]), (2, 1)))
+        np.testing.assert_allclose(info["length"], lengths, rtol=1e-6)
+        np.testing.assert_allclose(info["young"], moduli, rtol=1e-6)
+        if terminated.any():
+            assert terminated.all()
+            starts.append(observations)
+    stacks = np.stack(starts)[:, :, 20]  # u of the top cube
+    assert len(stacks) == 4 and len(np.unique(stacks)) == 8
+    single = WhipGym(median(0.2, 1e4), engine=ENGINE, nuisances="random")
+    assert len({float(single.reset(seed=seed)[0][20]) for seed in range(3)}) == 3
+    with pytest.raises(ValueError, match="nuisances: expected fixed or random, got 'some'"):
+        WhipGym(engine=ENGINE, nuisances="some")
+    with pytest.raises(ValueError, match="autoreset_mode: expected NextStep or SameStep, got 'Disabled'"):
+        WhipVector(2, engine=ENGINE, autoreset_mode="Disabled")
+
+
 def test_a_vector_of_scenes_of_their_own():
     lengths = np.array([0.2, 0.3])
     many = WhipVector(2, median(lengths, 1e4), engine=ENGINE)

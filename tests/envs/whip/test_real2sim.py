@@ -110,7 +110,7 @@ def test_objects_may_be_files_and_unknown_ones_are_refused(tmp_path):
     (tmp_path / "mine.json").write_bytes((DATA / "dlo-1.json").read_bytes())
     mine = task(object=str(copied), engine="native").observation
     np.testing.assert_array_equal(mine, task(object="dlo-1", engine="native").observation)
-    with pytest.raises(ValueError, match=r"object: expected one of dlo-0, dlo-1, dlo-2, dlo-3 or .* got 'dlo-9'"):
+    with pytest.raises(ValueError, match=r"object: expected one of dlo-0, dlo-1, dlo-2, dlo-3, or .* got 'dlo-9'"):
         task(object="dlo-9")
     with pytest.raises(ValueError, match=r"detector: expected one of .* got 'blind'"):
         task(detector="blind")

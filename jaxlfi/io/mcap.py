@@ -1,0 +1,185 @@
+"""MCAP files: messages with time stamps, as ROS 2 and Foxglove write and show them.
+
+Each signal is a topic, "observation.state" is /observation/state, with messages encoded as JSON of the schema
+`jaxlfi.Signal`: {"time": 0.16, "values": [0.4, 0.36]}. What the numbers are is in the channel's metadata: `dtype`,
+`names` (a JSON list), `unit`, `duration`. The rollout's metadata are in the record `jaxlfi.rollout`. Topics of other
+schemas may stand beside them and are not read.
+
+Times of the log are ns from the first message on. Those of the rollout, which may begin before zero, are in the
+messages, in full precision.
+
+Needs the extra `robotics` (mcap).
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxlfi.io import files
+from jaxlfi.io.rollout import Rollout, Signal, array, numbers
+
+SCHEMA, RECORD, VERSION = "jaxlfi.Signal", "jaxlfi.rollout", 1
+INSTALL = "MCAP files need the package mcap: pip install 'jaxlfi[robotics]'"
+
+
+def write(path: str | Path, rollout: Rollout) -> None:
+    """Write a rollout.
+
+    Args:
+        path: a new file.
+        rollout: with any signals; numbers that are not finite are written as null, and read as NaN.
+
+    Raises:
+        ValueError: for a path that exists.
+        ImportError: without mcap.
+    """
+    path = Path(path)
+    if path.exists():
+        raise ValueError(f"path: expected a new file, got {path}, which exists")
+    if dotted := [name for name in rollout.signals if name != _name(_topic(name))]:
+        raise ValueError(f"signals: expected words with dots between them, got {dotted[0]!r}")
+    try:
+        from mcap.writer import Writer
+    except ImportError as error:
+        raise ImportError(INSTALL) from error
+    import io
+
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start(library="jaxlfi")
+    messages = []
+    for name, signal in rollout.signals.items():
+        schema = writer.register_schema(SCHEMA, "jsonschema", json.dumps(_schema(signal)).encode())
+        metadata = {"dtype": signal.values.dtype.name, "names": json.dumps(signal.names), "unit": signal.unit}
+        if signal.duration is not None:
+            metadata["duration"] = repr(float(signal.duration))
+        channel = writer.register_channel(_topic(name), "json", schema, metadata)
+        messages += [
+            (time, channel, values) for time, values in zip(signal.times.tolist(), numbers(signal.values), strict=True)
+        ]
+    messages.sort(key=lambda message: message[0])
+    begin = messages[0][0] if messages else 0.0
+    count = {}
+    for time, channel, values in messages:
+        stamp = round((time - begin) * 1e9)
+        count[channel] = count.get(channel, 0) + 1
+        body = json.dumps({"time": time, "values": values}, allow_nan=False).encode()
+        writer.add_message(channel, stamp, body, stamp, count[channel])
+    described = {"version": str(VERSION), "task": rollout.task}
+    writer.add_metadata(RECORD, {**described, "metadata": json.dumps(dict(rollout.metadata), allow_nan=False)})
+    writer.finish()
+    files.write_bytes(path, stream.getvalue())
+
+
+def read(path: str | Path) -> Rollout:
+    """Read a rollout.
+
+    Raises:
+        ValueError: for a file that is missing, truncated, damaged, of another version or without such topics.
+        ImportError: without mcap.
+    """
+    path = Path(path)
+    try:
+        from mcap.reader import make_reader
+    except ImportError as error:
+        raise ImportError(INSTALL) from error
+    try:
+        with path.open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            messages = [(schema, channel, message.data) for schema, channel, message in reader.iter_messages()]
+            records = {record.name: record.metadata for record in reader.iter_metadata()}
+    except OSError as error:
+        raise ValueError(f"{path}: expected an MCAP file, got {error.strerror}") from error
+    except Exception as error:  # mcap and its decompressors each have their own
+        raise ValueError(
+            f"{path}: expected a whole MCAP file, got a truncated or damaged one; `mcap recover` of the MCAP "
+            "command line saves what is left of one"
+        ) from error
+    try:
+        return _rollout(messages, records)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _topic(name: str) -> str:
+    return "/" + name.replace(".", "/")
+
+
+def _name(topic: str) -> str:
+    return topic.strip("/").replace("/", ".")
+
+
+def _schema(signal: Signal) -> dict[str, Any]:
+    """A JSON schema of a signal's messages."""
+    kind = {"b": "boolean", "i": "integer", "u": "integer", "f": ["number", "null"]}[signal.values.dtype.kind]
+    count = len(signal.names)
+    values = {"type": "array", "items": {"type": kind}, "minItems": count, "maxItems": count}
+    properties = {"time": {"type": "number", "description": "in s"}, "values": values}
+    return {"type": "object", "title": SCHEMA, "properties": properties, "required": ["time", "values"]}
+
+
+def _rollout(messages: list[tuple[Any, Any, bytes]], records: Mapping[str, Mapping[str, str]]) -> Rollout:
+    channels, times, values = {}, {}, {}
+    others = set()
+    for schema, channel, data in messages:
+        if schema is None or schema.name != SCHEMA or channel.message_encoding != "json":
+            others.add(f"{channel.topic} ({schema.name if schema else 'no schema'}, {channel.message_encoding})")
+            continue
+        name = _name(channel.topic)
+        channels[name] = channel
+        time, row = _message(channel.topic, data)
+        times.setdefault(name, []).append(time)
+        values.setdefault(name, []).append(row)
+    if not channels:
+        raise ValueError(f"expected topics of JSON messages by the schema {SCHEMA}, got {_some(others)}")
+    signals = {}
+    for name, channel in channels.items():
+        try:
+            signals[name] = _signal(channel.metadata, times[name], values[name])
+        except ValueError as error:
+            raise ValueError(f"{channel.topic}: {error}") from error
+    record = records.get(RECORD, {"version": str(VERSION)})
+    if record.get("version") != str(VERSION):
+        raise ValueError(f"expected a record {RECORD} of version {VERSION}, got {record.get('version')}")
+    try:
+        metadata = json.loads(record.get("metadata", "{}"))
+        return Rollout(signals, dict(metadata), record.get("task", ""))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"expected a JSON object as metadata in the record {RECORD}, got another text") from error
+
+
+def _message(topic: str, data: bytes) -> tuple[float, list]:
+    try:
+        body = json.loads(data)
+        time, row = float(body["time"]), body["values"]
+        if not isinstance(row, list) or not math.isfinite(time):
+            raise TypeError("values are a list, times finite")
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f'{topic}: expected messages {{"time": in s, "values": [...]}}, got {data[:60].decode(errors="replace")!r}'
+        ) from error
+    return time, row
+
+
+def _signal(metadata: Mapping[str, str], times: list[float], rows: list[list]) -> Signal:
+    if len({len(row) for row in rows}) != 1:
+        raise ValueError(f"expected messages of one size, got {sorted({len(row) for row in rows})}")
+    values = array(rows, metadata.get("dtype", "float64"))
+    try:
+        names = json.loads(metadata["names"]) if "names" in metadata else [f"{i}" for i in range(len(rows[0]))]
+        duration = float(metadata["duration"]) if "duration" in metadata else None
+        names = tuple(map(str, names))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"expected names as a JSON list and a duration in s, got {dict(metadata)}") from error
+    # In the order of time: messages of the same instant may stand in any.
+    order = np.argsort(times, kind="stable")
+    return Signal(np.asarray(times)[order], values[order], names, metadata.get("unit", ""), duration)
+
+
+def _some(names: set[str]) -> str:
+    shown = sorted(names)[:4]
+    return ", ".join(shown) + (f" and {len(names) - 4} more" if len(names) > 4 else "") if shown else "no messages"
