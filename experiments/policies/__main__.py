@@ -1,0 +1,61 @@
+"""The study of policies, stage by stage; each keeps what is there, and can be stopped and given again.
+
+python -m experiments.policies posteriors --out experiments/results/policies/study
+python -m experiments.policies train --out experiments/results/policies/study --only dlo-0-edge uniform
+"""
+
+import argparse
+import itertools
+from pathlib import Path
+
+from experiments.policies.study import HEURISTICS, OBJECTS, ORDER, Study, chosen
+
+
+def posteriors(study: Study, arguments: argparse.Namespace) -> None:
+    """What each object may be: posteriors by EDGE and on the fixed support, and a point of least squares."""
+    from experiments.policies import making
+
+    known = [f"{dlo}-{how}" for dlo, how in itertools.product(OBJECTS, (*HEURISTICS, "sysid"))]
+    for name in chosen(arguments.only, known):
+        making.believe(study, name)
+
+
+def train(study: Study, arguments: argparse.Namespace) -> None:
+    """Policies on all domains; with the inference that they need."""
+    from experiments.policies import making
+
+    settings = [] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)]
+    for name in chosen(arguments.only, ORDER):
+        making.learn(study, name, arguments.seeds, settings)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    top = argparse.ArgumentParser(
+        prog="python -m experiments.policies",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    stages = top.add_subparsers(required=True, metavar="STAGE")
+    for stage in (posteriors, train):
+        one = stages.add_parser(stage.__name__, help=stage.__doc__, description=stage.__doc__)
+        one.set_defaults(stage=stage)
+        one.add_argument("--out", type=Path, required=True, metavar="DIR", help="the folder of the study")
+        one.add_argument("--only", nargs="+", default=[], metavar="NAME", help="some of it, in this order")
+        if stage is train:
+            one.add_argument("--seeds", type=int, default=4, metavar="N", help="of each domain (default: 4)")
+            one.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")
+    return top
+
+
+def main() -> None:
+    """Run a stage."""
+    arguments = parser().parse_args()
+    try:
+        arguments.stage(Study(arguments.out), arguments)
+    except ValueError as error:
+        raise SystemExit(f"python -m experiments.policies: error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()
