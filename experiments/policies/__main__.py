@@ -10,6 +10,8 @@ from pathlib import Path
 
 from experiments.policies.study import HEURISTICS, OBJECTS, ORDER, Study, chosen
 
+WHERE = ("simulation", "objects")
+
 
 def posteriors(study: Study, arguments: argparse.Namespace) -> None:
     """What each object may be: posteriors by EDGE and on the fixed support, and a point of least squares."""
@@ -29,6 +31,26 @@ def train(study: Study, arguments: argparse.Namespace) -> None:
         making.learn(study, name, arguments.seeds, settings)
 
 
+def evaluate(study: Study, arguments: argparse.Namespace) -> None:
+    """All policies that are there, and baselines, in simulation and on the FEM objects."""
+    from experiments.policies import actions, evaluation
+    from jaxlfi.envs.whip.environment import make
+    from jaxlfi.io import compile_cache
+
+    compile_cache.enable()
+    environment, trained = make(), study.policies()
+    blind = [name for name in actions.NAMES if name not in actions.OWN or study.has(actions.OWN[name])]
+    names = chosen(arguments.only, [*blind, *trained])
+    for name in names:
+        if name in actions.NAMES:
+            actions.search(study, environment, name)
+    if "simulation" in arguments.where:
+        evaluation.in_simulation(study, names, arguments.episodes)
+    if "objects" in arguments.where:
+        evaluation.on_objects(study, names, arguments.displaced)
+        evaluation.stills(study)
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     top = argparse.ArgumentParser(
@@ -37,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     stages = top.add_subparsers(required=True, metavar="STAGE")
-    for stage in (posteriors, train):
+    for stage in (posteriors, train, evaluate):
         one = stages.add_parser(stage.__name__, help=stage.__doc__, description=stage.__doc__)
         one.set_defaults(stage=stage)
         one.add_argument("--out", type=Path, required=True, metavar="DIR", help="the folder of the study")
@@ -45,6 +67,10 @@ def parser() -> argparse.ArgumentParser:
         if stage is train:
             one.add_argument("--seeds", type=int, default=4, metavar="N", help="of each domain (default: 4)")
             one.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")
+        if stage is evaluate:
+            one.add_argument("--where", nargs="+", choices=WHERE, default=WHERE, help="(default: both)")
+            one.add_argument("--episodes", type=int, default=64, metavar="N", help="on each domain (default: 64)")
+            one.add_argument("--displaced", type=int, default=16, metavar="N", help="places of objects (default: 16)")
     return top
 
 

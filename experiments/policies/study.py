@@ -106,6 +106,15 @@ class Study:
         draws = self.draws(f"{dlo}-edge")
         return np.array([draws[:, 0].mean(), np.exp(np.log(draws[:, 1]).mean())])
 
+    def has(self, name: str) -> bool:
+        """Whether what a domain is made of is there."""
+        dlo, _, kind = name.rpartition("-")
+        if name in BROAD or kind == "true":
+            return True
+        if kind == "sysid":
+            return self.sysid(dlo).exists()
+        return (self.posterior(name if kind in HEURISTICS else f"{dlo}-edge") / "posterior.npz").exists()
+
     def domain(self, name: str) -> str:
         """What `jaxlfi train` calls a domain."""
         if name in BROAD:

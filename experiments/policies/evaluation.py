@@ -1,0 +1,95 @@
+"""Which policy is evaluated on what, in simulation and on the FEM objects; a file for each pair, which is kept.
+
+runs/simulation/POLICY/DOMAIN.npz   `simulation.Performed` of the policies of all seeds, in the same episodes
+runs/objects/POLICY/OBJECT.npz      likewise, at the same places
+runs/stills/POLICY@OBJECT.npz       film strips of a few
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from experiments.policies import actions, deployments
+from experiments.policies.simulation import DOMAINS, Performed, Simulation
+from experiments.policies.study import FEM, PAPER, Study
+from jaxlfi.envs.whip.environment import make
+from jaxlfi.io import files
+from jaxlfi.rl.policy import load
+
+EVERYWHERE = (*PAPER, "feasible", "constant", "plan-median")
+"""Policies and baselines that are no object's own."""
+STILLS = (("dlo-0-none", "dlo-0"), ("dlo-0-edge", "dlo-0"), ("uniform", "dlo-0"), ("dlo-1-edge", "dlo-3"),
+          ("dlo-3-edge", "dlo-3"), ("uniform", "dlo-3"))  # fmt: skip
+"""Policies on objects that are shown: those of the paper's timelapses, and PPO-U beside them."""
+
+
+def domains_of(policy: str) -> Sequence[str]:
+    """Domains in simulation that a policy is evaluated on: all, or its own object's and the uniform one."""
+    if policy in EVERYWHERE:
+        return DOMAINS
+    dlo = own_object(policy)
+    return [name for name in (f"{dlo}-edge", f"{dlo}-true", "uniform") if name in DOMAINS]
+
+
+def objects_of(policy: str) -> Sequence[str]:
+    """FEM objects that a policy is evaluated on: all, or its own."""
+    return FEM if policy in EVERYWHERE else [dlo for dlo in FEM if dlo == own_object(policy)]
+
+
+def own_object(policy: str) -> str:
+    """The object that a policy, or a plan, was made for."""
+    return policy.removeprefix("plan-") if policy.startswith("plan-") else policy.rpartition("-")[0]
+
+
+def in_simulation(study: Study, policies: Iterable[str], episodes: int) -> None:
+    """Evaluate policies in simulation."""
+    simulation = Simulation(study, make(), episodes)
+    for policy in policies:
+        paths = _files(study, policy)
+        for name in domains_of(policy):
+            out = study.out / "runs" / "simulation" / policy / f"{name}.npz"
+            if _is_there(out, (len(paths), episodes)) or not study.has(name):
+                continue
+            print(f"simulation: {policy} on {name}", flush=True)
+            if policy in actions.NAMES:
+                _write(out, simulation.of_actions(files.read_arrays(paths[0])["actions"], name))
+            else:
+                _write(out, simulation.of_policies([load(path) for path in paths], name))
+
+
+def on_objects(study: Study, policies: Iterable[str], displaced: int) -> None:
+    """Evaluate policies on the FEM objects."""
+    where = deployments.scenes(displaced)
+    for policy in policies:
+        paths = _files(study, policy)
+        for dlo in objects_of(policy):
+            out = study.out / "runs" / "objects" / policy / f"{dlo}.npz"
+            if not _is_there(out, (len(paths), len(where))):
+                print(f"objects: {policy} on {dlo}", flush=True)
+                _write(out, deployments.on_object([str(path) for path in paths], dlo, where))
+
+
+def stills(study: Study) -> None:
+    """Film strips of the first seed's policies, all with the same noise."""
+    for policy, dlo in STILLS:
+        out = study.out / "runs" / "stills" / f"{policy}@{dlo}.npz"
+        if policy in study.policies() and not out.exists():
+            print(f"stills: {policy} on {dlo}", flush=True)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            files.write_arrays(out, deployments.stills(_files(study, policy)[0], dlo, jax.random.key(0)))
+
+
+def _files(study: Study, policy: str) -> list[Path]:
+    return [study.actions(policy)] if policy in actions.NAMES else study.policies()[policy]
+
+
+def _is_there(path: Path, shape: tuple[int, int]) -> bool:
+    """Whether a file has as many policies and episodes as are asked for."""
+    return path.exists() and files.read_arrays(path)["value"].shape == shape
+
+
+def _write(path: Path, performed: Performed) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.write_arrays(path, {name: np.asarray(value) for name, value in vars(performed).items()})
