@@ -51,6 +51,20 @@ def evaluate(study: Study, arguments: argparse.Namespace) -> None:
         evaluation.stills(study)
 
 
+def collect(study: Study, arguments: argparse.Namespace) -> None:
+    """Gather what is kept of all that is there, from which reports are made."""
+    from experiments.policies import collection
+
+    collection.collect(study)
+
+
+def report(study: Study, arguments: argparse.Namespace) -> None:
+    """Tables, figures and text from what is kept."""
+    from experiments.policies import report
+
+    report.write(study.out, arguments.readme)
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     top = argparse.ArgumentParser(
@@ -59,11 +73,14 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     stages = top.add_subparsers(required=True, metavar="STAGE")
-    for stage in (posteriors, train, evaluate):
+    for stage in (posteriors, train, evaluate, collect, report):
         one = stages.add_parser(stage.__name__, help=stage.__doc__, description=stage.__doc__)
         one.set_defaults(stage=stage)
         one.add_argument("--out", type=Path, required=True, metavar="DIR", help="the folder of the study")
-        one.add_argument("--only", nargs="+", default=[], metavar="NAME", help="some of it, in this order")
+        if stage in (posteriors, train, evaluate):
+            one.add_argument("--only", nargs="+", default=[], metavar="NAME", help="some of it, in this order")
+        if stage is report:
+            one.add_argument("--readme", type=Path, metavar="FILE", help="also write the text into it")
         if stage is train:
             one.add_argument("--seeds", type=int, default=4, metavar="N", help="of each domain (default: 4)")
             one.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")

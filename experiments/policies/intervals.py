@@ -1,5 +1,7 @@
 """Intervals of returns: training seeds and places are both resampled, as either could have been others."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
@@ -12,22 +14,34 @@ def mean(values: Float[np.ndarray, "seeds places"]) -> tuple[float, float, float
 
     Seeds are resampled, and places, which are the same for all seeds. One policy has no seeds to resample.
     """
-    return _summary(values.mean(), _means(np.random.default_rng(0), values))
+    rng = np.random.default_rng(0)
+    return _summary(values.mean(), _means(rng, values, _shares(rng, values.shape[1])))
 
 
 def difference(
     one: Float[np.ndarray, "seeds places"], other: Float[np.ndarray, "others places"]
 ) -> tuple[float, float, float]:
-    """Mean of one minus mean of the other, at the same places, and its bootstrap interval.
+    """Mean of one minus mean of the other, at the same places, and its bootstrap interval."""
+    return contrast([one], [other])
+
+
+def contrast(plus: Sequence[np.ndarray], minus: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """Mean over some domains' policies minus the mean over others', at the same places, and its bootstrap interval.
+
+    Seeds of different entries are resampled apart; so what the same policies did on several objects is one entry, their
+    mean over the objects.
 
     Raises:
         ValueError: for different numbers of places.
     """
-    if one.shape[1] != other.shape[1]:
-        raise ValueError(f"difference: expected the same places, got {one.shape[1]} and {other.shape[1]}")
+    counts = {values.shape[1] for values in (*plus, *minus)}
+    if len(counts) != 1:
+        raise ValueError(f"places: expected the same everywhere, got {sorted(counts)} of them")
     rng = np.random.default_rng(0)
-    at = rng.integers(one.shape[1], size=(RESAMPLED, one.shape[1]))
-    return _summary(one.mean() - other.mean(), _means(rng, one, at) - _means(rng, other, at))
+    of_places = _shares(rng, counts.pop())
+    resampled = lambda entries: np.mean([_means(rng, values, of_places) for values in entries], axis=0)
+    middle = lambda entries: np.mean([values.mean() for values in entries])
+    return _summary(middle(plus) - middle(minus), resampled(plus) - resampled(minus))
 
 
 def text(found: tuple[float, float, float], places: int = 2) -> str:
@@ -36,13 +50,14 @@ def text(found: tuple[float, float, float], places: int = 2) -> str:
     return f"{middle:.{places}f} [{low:.{places}f}, {high:.{places}f}]"
 
 
-def _means(rng: np.random.Generator, values: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
-    """Means of resampled values, shape [RESAMPLED]."""
-    seeds, places = values.shape
-    at = rng.integers(places, size=(RESAMPLED, places)) if at is None else at
-    counts = lambda index, n: (index[..., None] == np.arange(n)).sum(axis=1) / index.shape[1]
-    of_seeds = counts(rng.integers(seeds, size=(RESAMPLED, seeds)), seeds)
-    return np.einsum("bs,sp,bp->b", of_seeds, values, counts(at, places))
+def _shares(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Of n things that are drawn n times with replacement, how often each is, as a fraction, shape [RESAMPLED, n]."""
+    return rng.multinomial(n, np.full(n, 1 / n), RESAMPLED) / n
+
+
+def _means(rng: np.random.Generator, values: np.ndarray, of_places: np.ndarray) -> np.ndarray:
+    """Means of resampled seeds at resampled places, shape [RESAMPLED]."""
+    return np.einsum("bs,sp,bp->b", _shares(rng, len(values)), values, of_places, optimize=True)
 
 
 def _summary(middle: float, means: np.ndarray) -> tuple[float, float, float]:

@@ -1,0 +1,112 @@
+"""What is kept of a study: a few small files, from which tables and figures are made.
+
+posteriors.csv      what each object may be: medians or points with 90 % intervals
+trainings.npz       NAME/...: returns of training episodes [U, S], the points trained on, returns on held-out points
+simulation.npz      POLICY@DOMAIN/...: of each episode [S, E]: return, hits, exits, length, heights
+objects.npz         POLICY@OBJECT/...: likewise on the FEM objects [S, P]; of the paper's policies also all actions
+actions.npz         actions of the baselines that look at nothing, shape [16, 2] each
+stills.npz          film strips
+provenance.json     command lines and versions of all of it
+"""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+
+from experiments.policies import actions, deployments
+from experiments.policies.evaluation import STILLS, domains_of, objects_of
+from experiments.policies.study import HEURISTICS, OBJECTS, PAPER, Study, truth
+from jaxlfi.io import files
+from jaxlfi.rl import training
+from jaxlfi.runs.folder import environment
+
+PER_EPISODE = ("value", "hit", "clean", "outside", "failed", "steps")
+
+
+def collect(study: Study) -> None:
+    """Write what is kept of all that is there."""
+    _posteriors(study)
+    trained = study.policies()
+    names = [*actions.NAMES, *trained]
+    files.write_arrays(study.out / "trainings.npz", _trainings(study))
+    pairs = {
+        "simulation": [(policy, domain) for policy in names for domain in domains_of(policy)],
+        "objects": [(policy, dlo) for policy in names for dlo in objects_of(policy)],
+    }
+    for where, wanted in pairs.items():
+        kept = {}
+        for policy, on in wanted:
+            path = study.out / "runs" / where / policy / f"{on}.npz"
+            if path.exists():
+                kept |= {f"{policy}@{on}/{name}": row for name, row in _episodes(path, policy, on).items()}
+        files.write_arrays(study.out / f"{where}.npz", kept)
+    found = {name: study.actions(name) for name in actions.NAMES if study.actions(name).exists()}
+    files.write_arrays(
+        study.out / "actions.npz", {name: files.read_arrays(path)["actions"] for name, path in found.items()}
+    )
+    strips = {f"{policy}@{dlo}": study.out / "runs" / "stills" / f"{policy}@{dlo}.npz" for policy, dlo in STILLS}
+    strips = {name: files.read_arrays(path) for name, path in strips.items() if path.exists()}
+    files.write_arrays(
+        study.out / "stills.npz", {f"{name}/{key}": row for name, strip in strips.items() for key, row in strip.items()}
+    )
+    files.write_json(study.out / "provenance.json", _provenance(study))
+
+
+def _episodes(path: Path, policy: str, on: str) -> dict[str, np.ndarray]:
+    arrays = files.read_arrays(path)
+    moved = np.nansum(np.linalg.norm(arrays["actions"], axis=-1), axis=-1)
+    kept = {name: arrays[name] for name in PER_EPISODE}
+    kept |= {"path": moved, **{name: np.nanmean(arrays[name], axis=-1) for name in ("gripper", "lowest")}}
+    kept = {name: row.astype(np.float32) if row.dtype.kind == "f" else row for name, row in kept.items()}
+    if policy in PAPER and path.parent.parent.name == "objects":
+        kept["actions"] = arrays["actions"]
+    if policy in PAPER and on == "median":
+        kept["actions"] = arrays["actions"][:, : deployments.NOMINAL]
+    return kept
+
+
+def _trainings(study: Study) -> dict[str, np.ndarray]:
+    kept = {}
+    for name in study.policies():
+        out = study.training(name)
+        curves, points, outcomes = (
+            files.read_arrays(out / f"{which}.npz") for which in ("curves", "domains", "outcomes")
+        )
+        kept |= {
+            f"{name}/curve": curves["value"].astype(np.float32),
+            f"{name}/trained": points["trained"].astype(np.float32),
+            f"{name}/return": outcomes["value"].mean(axis=1),
+            f"{name}/clean": outcomes["clean_hit"].mean(axis=1),
+            f"{name}/steps_per_update": np.asarray(training.settings_of(training.read_config(out)).steps_per_update),
+        }
+    return kept
+
+
+def _posteriors(study: Study) -> None:
+    rows = []
+    for dlo in OBJECTS:
+        for how in HEURISTICS:
+            if study.has(f"{dlo}-{how}"):
+                low, middle, high = np.quantile(study.draws(f"{dlo}-{how}"), [0.05, 0.5, 0.95], axis=0)
+                rows.append((dlo, how, *np.stack([middle, low, high], axis=1).ravel()))
+        if study.has(f"{dlo}-sysid"):
+            found = json.loads(study.sysid(dlo).read_text())
+            rows.append((dlo, "sysid", *np.stack([found["theta"], *found["interval"]], axis=1).ravel()))
+        rows.append((dlo, "true", *np.stack([truth(dlo), [np.nan] * 2, [np.nan] * 2], axis=1).ravel()))
+    names = ("length", "length_low", "length_high", "young", "young_low", "young_high")
+    with (study.out / "posteriors.csv").open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["object", "how", *names])
+        writer.writerows([dlo, how, *(f"{number:.6g}" for number in numbers)] for dlo, how, *numbers in rows)
+
+
+def _provenance(study: Study) -> dict:
+    """Where it comes from: for each run and training its command line, versions and settings."""
+    found = {}
+    for path in sorted((study.out / "runs").glob("p*/*/config.json")):
+        config = json.loads(path.read_text())
+        wanted = ("command_line", "versions", "started", "preset", "settings")
+        found[f"{path.parts[-3]}/{path.parts[-2]}"] = {name: config[name] for name in wanted if name in config}
+    return {"collected": environment(), "runs": found}

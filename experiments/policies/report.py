@@ -1,0 +1,169 @@
+"""The report of a study: tables as csv and Markdown, figures, and the text of experiments/README.md about it."""
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from experiments.policies import findings, intervals, results, tables
+from experiments.policies.deployments import NOMINAL
+from experiments.policies.results import Results
+from experiments.policies.tables import Row
+from jaxlfi.io import files
+
+TABLES = {
+    "posteriors": tables.posteriors,
+    "trainings": tables.trainings,
+    "question": tables.question,
+    "objects": tables.objects,
+    "nominal": tables.nominal,
+    "simulation": tables.simulation,
+    "difficulty": tables.difficulty,
+    "findings": findings.table,
+}
+BEGIN, END = "<!-- policies: made by `python -m experiments.policies report` -->", "<!-- policies: end -->"
+
+
+def write(out: Path, readme: Path | None = None) -> None:
+    """Write tables and figures, and the text between `BEGIN` and `END` of a file.
+
+    Raises:
+        ValueError: for a file without these two lines.
+    """
+    from experiments.policies import figures  # which takes a while to import
+
+    found = results.load(out)
+    for name, make in TABLES.items():
+        if rows := make(found):
+            _write_csv(out / "tables" / f"{name}.csv", rows)
+            files.write_bytes(out / "tables" / f"{name}.md", f"{tables.markdown(rows)}\n".encode())
+    strips: dict[str, dict[str, np.ndarray]] = {}
+    for key, row in files.read_arrays(out / "stills.npz").items():
+        strips.setdefault(key.rpartition("/")[0], {})[key.rpartition("/")[2]] = row
+    figures.save(out, found, strips)
+    if readme is not None:
+        whole = readme.read_text()
+        if whole.count(BEGIN) != 1 or whole.count(END) != 1:
+            raise ValueError(f"readme: expected the lines {BEGIN!r} and {END!r} in {readme}, each once")
+        before, rest = whole.split(BEGIN)
+        after = rest.split(END)[1]
+        files.write_bytes(readme, f"{before}{BEGIN}\n\n{text(found)}\n\n{END}{after}".encode())
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.write_bytes(path, stream.getvalue().encode())
+
+
+# ------------------------------------------------------------------------------------------------------------- the text
+
+
+def text(found: Results) -> str:
+    """What experiments/README.md says of the study, with the numbers of what is there."""
+    parts = [
+        _counts(found),
+        "**Is a policy trained on an adapted posterior better on the object it came from?**",
+        answer(found),
+        QUESTION,
+        _table(tables.question(found)),
+        OBJECTS,
+        _table(tables.objects(found)),
+        MEASURES.format(*tables.extremes(found, found.displaced)),
+        _table(tables.difficulty(found)),
+        FINDINGS,
+        _table(findings.table(found)),
+        POSTERIORS,
+        _table(tables.posteriors(found)),
+    ]
+    return "\n\n".join(part for part in parts if part)
+
+
+QUESTION = (
+    "Returns of policies on the posteriors by EDGE, where these came from, and by how much they are ahead of others "
+    "there: on the FEM objects at displaced places, in simulation on points of the posterior or at the truth."
+)
+OBJECTS = (
+    "**All policies on the FEM objects**, at displaced places: return with its interval; rate of clean hits; return at "
+    "the worst place, averaged over seeds; rate of exits from the workspace."
+)
+MEASURES = (
+    "**The paper's measures**, of the six agents of a set on each DLO. Consistency is the median of the agents' "
+    "returns, difficulty 1 - (consistency - lowest) / (highest - lowest), where lowest and highest are those of any "
+    "episode, at displaced places {:.2f} and {:.2f}. So one bad episode of one policy moves the difficulty of all DLOs "
+    "towards 0, and where all agents do equally well or badly the extremes coincide and it is not defined."
+)
+FINDINGS = (
+    "**Findings of section VII-C.** Differences at displaced places, positive if it is as the paper finds; whether the "
+    "interval says so."
+)
+POSTERIORS = (
+    "**What the objects may be.** Medians and 90 % intervals of the posteriors, of the one rollout that was recorded; "
+    "points of `mujoco.sysid`'s Gauss-Newton on the same rollout, and its 90 % intervals. The truth of an FEM object "
+    "is the light DLO that sags alike."
+)
+
+
+def _table(rows: Sequence[Row]) -> str:
+    return tables.markdown(rows) if rows else ""
+
+
+def _counts(found: Results) -> str:
+    """How much was done."""
+    shapes = [rows["value"].shape for rows in found.objects.values()] or [(0, NOMINAL)]
+    seeds, places = np.max(shapes, axis=0)
+    return (
+        f"{len(found.trainings)} domains were trained on, {seeds} seeds each; {len(found.policies)} policies and "
+        f"baselines acted on FEM objects, at {places - NOMINAL} displaced places and {NOMINAL} times at the nominal "
+        "one. Intervals are 95 % bootstrap intervals, over training seeds and places at once; with so few seeds they "
+        "are too short rather than too long."
+    )
+
+
+RIVALS = {
+    "uniform": "PPO-U",
+    "fixed": "PPO on the fixed support's posterior",
+    "mean": "PPO at the posterior mean",
+    "sysid": "PPO at the point of least squares",
+    "true": "PPO at the true parameters",
+}
+PLACES = {
+    "FEM object": "FEM objects",
+    "posterior": "their posteriors, simulated",
+    "truth": "simulated objects of known truth",
+}
+
+
+def answer(found: Results) -> str:
+    """The question that matters, in words: a line a rival."""
+    lines = []
+    for kind, name in RIVALS.items():
+        clauses = [_clause(found, word, kind) for word in PLACES]
+        if any(clauses):
+            lines.append(f"- Against {name}: {'; '.join(clause for clause in clauses if clause)}.")
+    return "\n".join(lines)
+
+
+def _clause(found: Results, word: str, kind: str) -> str:
+    """How policies on EDGE's posteriors compare with others, over all places of a kind and at each."""
+    plus, minus, differences = [], [], {}
+    for place in tables.places(found):
+        own = tables.found(place.values, f"{place.dlo}-edge")
+        other = tables.found(place.values, tables.rival(place.dlo, kind))
+        if word in place.what and own is not None and other is not None:
+            plus.append(own)
+            minus.append(other)
+            differences[place.dlo] = intervals.difference(own, other)
+    if not differences:
+        return ""
+    # PPO-U is the same policies everywhere.
+    whole = intervals.contrast(plus, [np.mean(minus, axis=0)] if kind == "uniform" else minus)
+    signs = {"better": lambda low, _: low > 0, "worse": lambda _, high: high < 0}
+    which = {sign: [dlo for dlo, (_, *ends) in differences.items() if holds(*ends)] for sign, holds in signs.items()}
+    verdicts = " and ".join(f"{sign} on {', '.join(names)}" for sign, names in which.items() if names)
+    return f"on {PLACES[word]} ({', '.join(differences)}) {intervals.text(whole)}, {verdicts or 'no difference shown'}"

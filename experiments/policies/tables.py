@@ -1,0 +1,203 @@
+"""Tables of a study: each is rows of text, written as csv and as Markdown."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from experiments.policies import intervals
+from experiments.policies.results import Results, label
+from experiments.policies.study import FEM, PAPER, SIMULATED
+
+Row = dict[str, str]
+NONE = "–"
+RIVALS = {"uniform": "U", "fixed": "fixed support", "mean": "posterior mean", "sysid": "least squares", "true": "truth",
+          "feasible": "Φ", "median": "μ", "constant": "constant", "plan": "plan"}  # fmt: skip
+"""What a policy on EDGE's posterior is compared with, and what columns call it."""
+SETS = {"fixed support": "none", "EDGE": "edge"}
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """Rows as a Markdown table."""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def rival(dlo: str, kind: str) -> str:
+    """The name of the policy, of a kind of `RIVALS`, that an object's is compared with."""
+    own = {"fixed": f"{dlo}-none", "plan": f"plan-{dlo}"}
+    return own.get(kind, kind if kind in ("uniform", "feasible", "median", "constant") else f"{dlo}-{kind}")
+
+
+Values = Callable[[str], np.ndarray]
+"""Returns of a policy, [S, P]; KeyError where it was not evaluated."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where an object's policies are compared.
+
+    Attributes:
+        dlo: the object.
+        what: the FEM object, or a domain in simulation.
+        values: of policies.
+    """
+
+    dlo: str
+    what: str
+    values: Values
+
+
+def places(results: Results) -> list[Place]:
+    """FEM objects, their posteriors in simulation, and simulated objects whose truth is known."""
+    on_object = lambda dlo: lambda policy: results.displaced(policy, dlo)
+    on_domain = lambda name: lambda policy: results.simulated(policy, name)
+    return [
+        *(Place(dlo, f"{dlo}, FEM object", on_object(dlo)) for dlo in FEM),
+        *(Place(dlo, f"{dlo}, its posterior simulated", on_domain(f"{dlo}-edge")) for dlo in FEM),
+        *(Place(dlo, f"{dlo}, its truth simulated", on_domain(f"{dlo}-true")) for dlo in SIMULATED),
+    ]
+
+
+def question(results: Results) -> list[Row]:
+    """A policy on EDGE's posterior, where it came from, and how far it is ahead of others there."""
+    rows = []
+    for place in places(results):
+        own = found(place.values, f"{place.dlo}-edge")
+        if own is None:
+            continue
+        row = {"where": place.what, "on EDGE's posterior": intervals.text(intervals.mean(own))}
+        for kind, name in RIVALS.items():
+            other = found(place.values, rival(place.dlo, kind))
+            row[f"− {name}"] = NONE if other is None else intervals.text(intervals.difference(own, other))
+        rows.append(row)
+    return rows
+
+
+def found(values: Values, policy: str) -> np.ndarray | None:
+    """Returns of a policy, or None where it was not evaluated."""
+    try:
+        return values(policy)
+    except KeyError:
+        return None
+
+
+def objects(results: Results) -> list[Row]:
+    """Every policy on every FEM object: return, rate of clean hits, worst place, rate of exits, at displaced places."""
+    rows = []
+    for policy in results.policies:
+        row = {"policy": label(policy)}
+        for dlo in FEM:
+            row[dlo] = NONE
+            if (policy, dlo) in results.objects:
+                value, clean, outside = (results.displaced(policy, dlo, name) for name in ("value", "clean", "outside"))
+                numbers = (clean.mean(), value.min(axis=1).mean(), outside.mean())
+                cell = "; ".join(f"{number:.2f}" for number in numbers)
+                row[dlo] = f"{intervals.text(intervals.mean(value))}; {cell}"
+        rows.append(row)
+    return rows
+
+
+def nominal(results: Results) -> list[Row]:
+    """Every policy on every FEM object at the nominal place, the paper's four repetitions: return and clean hits."""
+    rows = []
+    for policy in results.policies:
+        row = {"policy": label(policy)}
+        for dlo in FEM:
+            row[dlo] = NONE
+            if (policy, dlo) in results.objects:
+                value, clean = results.nominal(policy, dlo), results.nominal(policy, dlo, "clean")
+                row[dlo] = f"{value.mean():.2f}; {clean.mean():.2f}"
+        rows.append(row)
+    return rows
+
+
+def simulation(results: Results) -> list[Row]:
+    """Every policy on every domain in simulation: return and rate of clean hits."""
+    domains = list(dict.fromkeys(domain for _, domain in results.simulation))
+    rows = []
+    for policy in dict.fromkeys(policy for policy, _ in results.simulation):
+        row = {"policy": label(policy)}
+        for domain in domains:
+            pair = policy, domain
+            row[domain] = NONE
+            if pair in results.simulation:
+                value, clean = results.simulated(*pair), results.simulated(*pair, "clean")
+                row[domain] = f"{intervals.text(intervals.mean(value))}; {clean.mean():.2f}"
+        rows.append(row)
+    return rows
+
+
+def difficulty(results: Results) -> list[Row]:
+    """The paper's measures of each DLO, for both sets of six agents: average, consistency (median), difficulty.
+
+    At the nominal place, as in the paper, and at displaced ones; the median DLO is simulated.
+    """
+    views = {"nominal": results.nominal, "displaced": results.displaced}
+    rows = []
+    for name, how in SETS.items():
+        agents = [*(f"{dlo}-{how}" for dlo in FEM), "uniform", "median"]
+        for dlo in (*FEM, "median"):
+            row = {"policies": name, "DLO": "μ, simulated" if dlo == "median" else dlo}
+            for view, values in views.items():
+                own = [
+                    (results.simulated(agent, dlo) if dlo == "median" else values(agent, dlo)).mean()
+                    for agent in agents
+                    if has(results, agent, dlo)
+                ]
+                numbers = of_agents(own, *extremes(results, values)) if own else (np.nan,) * 3
+                for measure, number in zip(("average", "consistency", "difficulty"), numbers, strict=True):
+                    row[f"{measure}, {view}"] = NONE if np.isnan(number) else f"{number:.2f}"
+            row["agents"] = str(len(own))
+            rows.append(row)
+    return rows
+
+
+def extremes(results: Results, values: Callable[[str, str], np.ndarray]) -> tuple[float, float]:
+    """Lowest and highest return of any episode of the paper's ten policies, on objects and on the simulated median."""
+    of_pair = lambda policy, on: results.simulated(policy, on) if on == "median" else values(policy, on)
+    pairs = [(policy, on) for policy in PAPER for on in (*FEM, "median") if has(results, policy, on)]
+    every = [of_pair(*pair) for pair in pairs] or [np.full(1, np.nan)]
+    return float(min(map(np.min, every))), float(max(map(np.max, every)))
+
+
+def has(results: Results, policy: str, on: str) -> bool:
+    """Whether a policy was evaluated on an object, or in simulation on the median DLO."""
+    return (policy, on) in (results.simulation if on == "median" else results.objects)
+
+
+def of_agents(returns: Sequence[float], low: float, high: float) -> tuple[float, float, float]:
+    """The average over agents, their median (consistency), and 1 - (median - low) / (high - low), the difficulty.
+
+    Args:
+        returns: mean return of each agent on a DLO.
+        low: lowest return of any episode, of all agents on all DLOs.
+        high: highest one.
+    """
+    middle = float(np.median(returns))
+    return float(np.mean(returns)), middle, 1 - (middle - low) / (high - low) if high > low else np.nan
+
+
+def posteriors(results: Results) -> list[Row]:
+    """What each object may be: medians and 90 % intervals of posteriors, points of least squares with theirs."""
+    names = {"edge": "EDGE", "none": "fixed support", "sysid": "least squares (mujoco.sysid)", "true": "true"}
+    rows: dict[str, Row] = {}
+    for one in results.posteriors:
+        row = rows.setdefault(one["object"], {"object": one["object"], **dict.fromkeys(names.values(), NONE)})
+        length, young = (_interval(one, name, scale) for name, scale in (("length", 1.0), ("young", 1e3)))
+        row[names[one["how"]]] = f"{length} mm, {young} kPa"
+    return list(rows.values())
+
+
+def _interval(row: dict[str, str], name: str, scale: float) -> str:
+    middle, low, high = (float(row[key]) / scale for key in (name, f"{name}_low", f"{name}_high"))
+    return f"{middle:.3g}" if np.isnan(low) else f"{middle:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def trainings(results: Results) -> list[Row]:
+    """How policies fare on other points of the domain that they were trained on, by seed."""
+    each = lambda numbers: f"{np.mean(numbers):.2f} ({', '.join(f'{number:.2f}' for number in numbers)})"
+    return [
+        {"domain": name, "policy": label(name), "return": each(own["return"]), "clean hits": each(own["clean"])}
+        for name, own in results.trainings.items()
+    ]
