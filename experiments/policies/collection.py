@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.policies import actions, deployments
+from experiments.policies import actions
 from experiments.policies.evaluation import STILLS, domains_of, objects_of
-from experiments.policies.study import HEURISTICS, OBJECTS, PAPER, Study, truth
+from experiments.policies.study import HEURISTICS, NOMINAL, OBJECTS, PAPER, Study, truth
 from jaxlfi.io import files
 from jaxlfi.rl import training
 from jaxlfi.runs.folder import environment
@@ -63,7 +63,7 @@ def _episodes(path: Path, policy: str, on: str) -> dict[str, np.ndarray]:
     if policy in PAPER and path.parent.parent.name == "objects":
         kept["actions"] = arrays["actions"]
     if policy in PAPER and on == "median":
-        kept["actions"] = arrays["actions"][:, : deployments.NOMINAL]
+        kept["actions"] = arrays["actions"][:, :NOMINAL]
     return kept
 
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from experiments.policies.simulation import Performed, lowest
+from experiments.policies.study import DISPLACED, NOMINAL, STILLS
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.reference_objects.deployment import Deployed, deploy, places
 from jaxlfi.envs.whip.reference_objects.objects import load
@@ -19,13 +20,6 @@ from jaxlfi.envs.whip.render import SIZE
 from jaxlfi.envs.whip.vision.camera import Camera, side_camera
 from jaxlfi.envs.whip.vision.raster import segmentation
 from jaxlfi.io.host_devices import processors
-
-NOMINAL = 4
-"""Episodes at the nominal place, which come first: the paper's repetitions. They differ in the camera's noise."""
-DISPLACED = 16
-"""Other places; stack and camera are displaced as in training."""
-STILLS = (0, 3, 5, 7, 9, 11, 13, 16)
-"""Control steps that are shown of an episode."""
 
 
 def scenes(displaced: int = DISPLACED, nominal: int = NOMINAL, seed: int = 0) -> list[tuple[jax.Array, Any, Camera]]:

@@ -8,9 +8,8 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from experiments.policies.barycentres import barycentre
-from experiments.policies.deployments import NOMINAL, STILLS
 from experiments.policies.results import Results, label
-from experiments.policies.study import FEM
+from experiments.policies.study import FEM, NOMINAL, STILLS
 from experiments.policies.tables import SETS, difficulty
 from jaxlfi.envs.whip.render import PALETTE
 from jaxlfi.figures import style
@@ -40,7 +39,8 @@ def draw_curves(figure: Figure, results: Results) -> None:
             axes.plot(steps, returns, color=look.colour, alpha=0.3, linewidth=0.5)
             axes.plot(steps, returns.mean(axis=1), color=look.colour, linewidth=1.2, label=label(name))
         axes.set(title=title, ylabel="return")
-        axes.legend(frameon=False, ncols=2, fontsize=6)
+        if known:
+            axes.legend(frameon=False, ncols=2, fontsize=6)
     panels[-1].set_xlabel("environment steps")
 
 
@@ -64,11 +64,9 @@ def draw_trajectories(figure: Figure, results: Results, title: str) -> None:
             axes.label_outer()
         _draw_histogram(row[-2], {name: _episodes(results, name, dlo) for name in names}, look)
         row[-1].axis("off")
-        own = measures["μ, simulated" if dlo == "median" else dlo]
-        text = "\n".join(
-            f"{measure} {own[f'{measure}, displaced']}" for measure in ("average", "consistency", "difficulty")
-        )
-        row[-1].text(0.0, 0.5, text, fontsize=6, va="center")
+        own = measures.get("μ, simulated" if dlo == "median" else dlo, {})
+        lines = [f"{name} {own[f'{name}, displaced']}" for name in ("average", "consistency", "difficulty") if own]
+        row[-1].text(0.0, 0.5, "\n".join(lines), fontsize=6, va="center")
         row[0].set_ylabel("μ, simulated" if dlo == "median" else dlo, fontsize=7)
     for axes, name in zip(grid[-1], names, strict=False):
         axes.set_xlabel(label(name), fontsize=7)

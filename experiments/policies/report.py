@@ -2,14 +2,15 @@
 
 import csv
 import io
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from experiments.policies import findings, intervals, results, tables
-from experiments.policies.deployments import NOMINAL
 from experiments.policies.results import Results
+from experiments.policies.study import NOMINAL
 from experiments.policies.tables import Row
 from jaxlfi.io import files
 
@@ -19,10 +20,12 @@ TABLES = {
     "question": tables.question,
     "objects": tables.objects,
     "nominal": tables.nominal,
+    "motion": tables.motion,
     "simulation": tables.simulation,
     "difficulty": tables.difficulty,
     "findings": findings.table,
 }
+WIDTH = 120
 BEGIN, END = "<!-- policies: made by `python -m experiments.policies report` -->", "<!-- policies: end -->"
 
 
@@ -39,10 +42,6 @@ def write(out: Path, readme: Path | None = None) -> None:
         if rows := make(found):
             _write_csv(out / "tables" / f"{name}.csv", rows)
             files.write_bytes(out / "tables" / f"{name}.md", f"{tables.markdown(rows)}\n".encode())
-    strips: dict[str, dict[str, np.ndarray]] = {}
-    for key, row in files.read_arrays(out / "stills.npz").items():
-        strips.setdefault(key.rpartition("/")[0], {})[key.rpartition("/")[2]] = row
-    figures.save(out, found, strips)
     if readme is not None:
         whole = readme.read_text()
         if whole.count(BEGIN) != 1 or whole.count(END) != 1:
@@ -50,6 +49,11 @@ def write(out: Path, readme: Path | None = None) -> None:
         before, rest = whole.split(BEGIN)
         after = rest.split(END)[1]
         files.write_bytes(readme, f"{before}{BEGIN}\n\n{text(found)}\n\n{END}{after}".encode())
+    strips: dict[str, dict[str, np.ndarray]] = {}
+    for key, row in files.read_arrays(out / "stills.npz").items():
+        name, _, what = key.rpartition("/")
+        strips.setdefault(name, {})[what] = row
+    figures.save(out, found, strips)
 
 
 def _write_csv(path: Path, rows: Sequence[Row]) -> None:
@@ -66,22 +70,18 @@ def _write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 def text(found: Results) -> str:
     """What experiments/README.md says of the study, with the numbers of what is there."""
+    measures = MEASURES.format(*tables.extremes(found, found.displaced))
     parts = [
         _counts(found),
         "**Is a policy trained on an adapted posterior better on the object it came from?**",
         answer(found),
-        QUESTION,
-        _table(tables.question(found)),
-        OBJECTS,
-        _table(tables.objects(found)),
-        MEASURES.format(*tables.extremes(found, found.displaced)),
-        _table(tables.difficulty(found)),
-        FINDINGS,
-        _table(findings.table(found)),
-        POSTERIORS,
-        _table(tables.posteriors(found)),
+        *_table(QUESTION, tables.question(found)),
+        *_table(OBJECTS, tables.objects(found)),
+        *_table(measures, tables.difficulty(found)),
+        *_table(FINDINGS, findings.table(found)),
+        *_table(POSTERIORS, tables.posteriors(found)),
     ]
-    return "\n\n".join(part for part in parts if part)
+    return "\n\n".join(_wrapped(part) for part in parts if part)
 
 
 QUESTION = (
@@ -109,14 +109,25 @@ POSTERIORS = (
 )
 
 
-def _table(rows: Sequence[Row]) -> str:
-    return tables.markdown(rows) if rows else ""
+def _wrapped(part: str) -> str:
+    """A paragraph or a list in lines of the usual width; tables stay as they are."""
+    if part.startswith("|"):
+        return part
+    fill = lambda line: textwrap.fill(
+        line, WIDTH, subsequent_indent="  " * line.startswith("- "), break_on_hyphens=False, break_long_words=False
+    )
+    return "\n".join(fill(line) for line in part.splitlines())
+
+
+def _table(heading: str, rows: Sequence[Row]) -> list[str]:
+    """A table below its heading, where there is something in it."""
+    return [heading, tables.markdown(rows)] if rows else []
 
 
 def _counts(found: Results) -> str:
     """How much was done."""
-    shapes = [rows["value"].shape for rows in found.objects.values()] or [(0, NOMINAL)]
-    seeds, places = np.max(shapes, axis=0)
+    seeds = max((len(own["return"]) for own in found.trainings.values()), default=0)
+    places = max((rows["value"].shape[1] for rows in found.objects.values()), default=NOMINAL)
     return (
         f"{len(found.trainings)} domains were trained on, {seeds} seeds each; {len(found.policies)} policies and "
         f"baselines acted on FEM objects, at {places - NOMINAL} displaced places and {NOMINAL} times at the nominal "

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.policies.deployments import NOMINAL
-from experiments.policies.study import PAPER
+from experiments.policies.study import NOMINAL, PAPER
 from jaxlfi.io import files
 
 Pair = tuple[str, str]

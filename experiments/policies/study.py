@@ -15,9 +15,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxlfi.distributions.belief import rejected
 from jaxlfi.envs.whip.parameters import MILLIMETRES
 from jaxlfi.envs.whip.reference_objects.objects import load as load_object
+from jaxlfi.rl.domains import of_belief
 from jaxlfi.runs.load import load as load_run
 
 FEM = ("dlo-0", "dlo-1", "dlo-2", "dlo-3")
@@ -53,7 +53,14 @@ PAPER: Mapping[str, str] = {
     "median": "PPO-μ",
 }
 """The paper's ten policies, and what it calls them."""
+NOMINAL = 4
+"""Episodes at the nominal place, which come first: the paper's repetitions. They differ in the camera's noise."""
+DISPLACED = 16
+"""Other places; stack and camera are displaced as in training."""
+STILLS = (0, 3, 5, 7, 9, 11, 13, 16)
+"""Control steps that are shown of an episode."""
 DRAWS = 4000
+"""Of a posterior, for its quantiles and mean."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,9 +99,10 @@ class Study:
         return {name: paths for name, paths in found.items() if paths and (self.training(name) / "table.csv").exists()}
 
     def draws(self, name: str) -> np.ndarray:
-        """Draws of a posterior inside its support, in natural units, shape [4000, 2]."""
+        """Draws of a posterior as policies are trained on it, clipped, in natural units, shape [4000, 2]."""
         run = load_run(self.posterior(name))
-        return np.asarray(run.space.to_natural(rejected(jax.random.key(1), run.belief, DRAWS)))
+        limits = run.space.box_to_natural(run.feasible if run.heuristic.grows else run.support)
+        return np.asarray(of_belief(jax.random.key(1), run.belief, run.space, limits, DRAWS).theta)
 
     def point(self, name: str) -> np.ndarray:
         """A point, "OBJECT-mean", "OBJECT-true" or "OBJECT-sysid": length (mm) and modulus (Pa), shape [2]."""

@@ -112,6 +112,21 @@ def nominal(results: Results) -> list[Row]:
     return rows
 
 
+def motion(results: Results) -> list[Row]:
+    """How policies move on each FEM object, at displaced places: steps, commanded path, heights, means of all."""
+    columns = {
+        "steps": "steps",
+        "path": "path [m]",
+        "gripper": "gripper's height [m]",
+        "lowest": "distance to table [m]",
+    }
+    return [
+        {"policy": label(policy), "object": dlo}
+        | {text: f"{results.displaced(policy, dlo, name).mean():.3g}" for name, text in columns.items()}
+        for policy, dlo in results.objects
+    ]
+
+
 def simulation(results: Results) -> list[Row]:
     """Every policy on every domain in simulation: return and rate of clean hits."""
     domains = list(dict.fromkeys(domain for _, domain in results.simulation))
@@ -145,11 +160,12 @@ def difficulty(results: Results) -> list[Row]:
                     for agent in agents
                     if has(results, agent, dlo)
                 ]
-                numbers = of_agents(own, *extremes(results, values)) if own else (np.nan,) * 3
-                for measure, number in zip(("average", "consistency", "difficulty"), numbers, strict=True):
-                    row[f"{measure}, {view}"] = NONE if np.isnan(number) else f"{number:.2f}"
-            row["agents"] = str(len(own))
-            rows.append(row)
+                if own:
+                    numbers = of_agents(own, *extremes(results, values))
+                    for measure, number in zip(("average", "consistency", "difficulty"), numbers, strict=True):
+                        row[f"{measure}, {view}"] = NONE if np.isnan(number) else f"{number:.2f}"
+            if own:
+                rows.append(row | {"agents": str(len(own))})
     return rows
 
 

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from experiments import widths
+from experiments.policies import report
+from experiments.policies import results as policies
 from experiments.sota import rows as sota
 from experiments.sota.__main__ import METHODS as SOTA_METHODS
 from experiments.sota.cases import SETTINGS as SOTA_SETTINGS
@@ -379,33 +381,7 @@ def test_settings_of_ppo(settings):
     assert f"| {settings} | {np.mean(own):.2f} | {', '.join(f'{value:.2f}' for value in own)} |" in README
 
 
-POLICIES = ("dlo-0", "uniform")
-
-
-def of_policies(name: str, trained: str, measure: str, **where: str) -> list[float]:
-    """A measure of the four policies that were trained on a domain."""
-    chosen = [row for row in policy_rows(name) if all(row[key] == value for key, value in where.items())]
-    return [float(row[measure]) for row in chosen if row["policy"].startswith(f"{trained}/")]
-
-
-def mean_and_each(values: list[float]) -> str:
-    return f"{np.mean(values):.2f} ({', '.join(f'{value:.2f}' for value in values)})"
-
-
-@pytest.mark.parametrize("trained", POLICIES)
-def test_policies_in_simulation(trained):
-    measures = [(domain, measure) for domain in POLICIES for measure in ("return", "clean_hit")]
-    cells = [mean_and_each(of_policies("cross.csv", trained, name, domain=domain)) for domain, name in measures]
-    assert f"| {trained} | {' | '.join(cells)} |" in README
-
-
-@pytest.mark.parametrize("dlo", ["dlo-0", "dlo-3"])
-@pytest.mark.parametrize("trained", [*POLICIES, "constant:0.03,-0.03"])
-def test_policies_on_the_objects(trained, dlo):
-    measures = ("return", "hit", "clean_hit", "worst")
-    if trained in POLICIES:
-        cells = [mean_and_each(of_policies("deployed.csv", trained, name, object=dlo)) for name in measures]
-    else:
-        (row,) = (row for row in policy_rows("deployed.csv") if (row["policy"], row["object"]) == (trained, dlo))
-        cells = [f"{float(row[name]):.2f}" for name in measures]
-    assert f"| {dlo} | {trained} | {' | '.join(cells)} |" in README
+def test_the_study_of_policies():
+    """Its text is the one that is made of what is kept."""
+    written = (ROOT / "README.md").read_text().split(report.BEGIN)[1].split(report.END)[0]
+    assert written.strip() == report.text(policies.load(RESULTS / "policies" / "study"))
