@@ -2,8 +2,9 @@
 
 posteriors.csv      what each object may be: medians or points with 90 % intervals
 trainings.npz       NAME/...: returns of training episodes [U, S], the points trained on, returns on held-out points
-simulation.npz      POLICY@DOMAIN/...: of each episode [S, E]: return, hits, exits, length, heights
-objects.npz         POLICY@OBJECT/...: likewise on the FEM objects [S, P]; of the paper's policies also all actions
+simulation.npz      POLICY@DOMAIN/...: of each episode [S, E]: return, hits, exits, length
+objects.npz         POLICY@OBJECT/...: likewise on the FEM objects [S, P], with path and heights; of the paper's
+                    policies also all actions
 actions.npz         actions of the baselines that look at nothing, shape [16, 2] each
 stills.npz          film strips
 provenance.json     command lines and versions of all of it
@@ -17,7 +18,7 @@ import numpy as np
 
 from experiments.policies import actions
 from experiments.policies.evaluation import STILLS, domains_of, objects_of
-from experiments.policies.study import HEURISTICS, NOMINAL, OBJECTS, PAPER, Study, truth
+from experiments.policies.study import FEM, HEURISTICS, NOMINAL, OBJECTS, PAPER, Study, truth
 from jaxlfi.io import files
 from jaxlfi.rl import training
 from jaxlfi.runs.folder import environment
@@ -55,15 +56,15 @@ def collect(study: Study) -> None:
 
 
 def _episodes(path: Path, policy: str, on: str) -> dict[str, np.ndarray]:
+    """Of each episode; how policies moved is kept of objects, and actions of what is drawn."""
     arrays = files.read_arrays(path)
-    moved = np.nansum(np.linalg.norm(arrays["actions"], axis=-1), axis=-1)
-    kept = {name: arrays[name] for name in PER_EPISODE}
-    kept |= {"path": moved, **{name: np.nanmean(arrays[name], axis=-1) for name in ("gripper", "lowest")}}
-    kept = {name: row.astype(np.float32) if row.dtype.kind == "f" else row for name, row in kept.items()}
-    if policy in PAPER and path.parent.parent.name == "objects":
-        kept["actions"] = arrays["actions"]
-    if policy in PAPER and on == "median":
-        kept["actions"] = arrays["actions"][:, :NOMINAL]
+    kept = {name: arrays[name] for name in PER_EPISODE} | {"steps": arrays["steps"].astype(np.int8)}
+    on_object = on in FEM
+    if on_object:
+        kept["path"] = np.nansum(np.linalg.norm(arrays["actions"], axis=-1), axis=-1).astype(np.float32)
+        kept |= {name: np.nanmean(arrays[name], axis=-1).astype(np.float32) for name in ("gripper", "lowest")}
+    if policy in PAPER and (on_object or on == "median"):
+        kept["actions"] = arrays["actions"] if on_object else arrays["actions"][:, :NOMINAL]
     return kept
 
 
@@ -103,10 +104,11 @@ def _posteriors(study: Study) -> None:
 
 
 def _provenance(study: Study) -> dict:
-    """Where it comes from: for each run and training its command line, versions and settings."""
-    found = {}
+    """Where it comes from: the command of each run and training, and its versions where they are others than now."""
+    collected, runs = environment(), {}
     for path in sorted((study.out / "runs").glob("p*/*/config.json")):
         config = json.loads(path.read_text())
-        wanted = ("command_line", "versions", "started", "preset", "settings")
-        found[f"{path.parts[-3]}/{path.parts[-2]}"] = {name: config[name] for name in wanted if name in config}
-    return {"collected": environment(), "runs": found}
+        wanted = ["command_line", "started", *(["settings"] if path.parts[-3] == "policies" else [])]
+        wanted += ["versions"] * (config["versions"] != collected["versions"])
+        runs[f"{path.parts[-3]}/{path.parts[-2]}"] = {name: config[name] for name in wanted}
+    return {"collected": collected, "runs": runs}
