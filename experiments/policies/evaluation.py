@@ -5,6 +5,7 @@ runs/objects/POLICY/OBJECT.npz      likewise, at the same places
 runs/stills/POLICY@OBJECT.npz       film strips of a few
 """
 
+import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -60,15 +61,13 @@ def in_simulation(study: Study, policies: Iterable[str], episodes: int) -> None:
 
 
 def on_objects(study: Study, policies: Iterable[str], displaced: int) -> None:
-    """Evaluate policies on the FEM objects."""
-    where = deployments.scenes(displaced)
-    for policy in policies:
-        paths = _files(study, policy)
-        for dlo in objects_of(policy):
-            out = study.out / "runs" / "objects" / policy / f"{dlo}.npz"
-            if not _is_there(out, (len(paths), len(where))):
-                print(f"objects: {policy} on {dlo}", flush=True)
-                _write(out, deployments.on_object([str(path) for path in paths], dlo, where))
+    """Evaluate policies on the FEM objects, one object after another."""
+    where, policies = deployments.scenes(displaced), list(policies)
+    for dlo, policy in itertools.product(FEM, policies):
+        paths, out = _files(study, policy), study.out / "runs" / "objects" / policy / f"{dlo}.npz"
+        if dlo in objects_of(policy) and not _is_there(out, (len(paths), len(where))):
+            print(f"objects: {policy} on {dlo}", flush=True)
+            _write(out, deployments.on_object([str(path) for path in paths], dlo, where))
 
 
 def stills(study: Study) -> None:

@@ -57,7 +57,7 @@ def _shares(rng: np.random.Generator, n: int) -> np.ndarray:
 
 def _means(rng: np.random.Generator, values: np.ndarray, of_places: np.ndarray) -> np.ndarray:
     """Means of resampled seeds at resampled places, shape [RESAMPLED]."""
-    return np.einsum("bs,sp,bp->b", _shares(rng, len(values)), values, of_places, optimize=True)
+    return np.einsum("bp,bp->b", _shares(rng, len(values)) @ values, of_places)
 
 
 def _summary(middle: float, means: np.ndarray) -> tuple[float, float, float]:
