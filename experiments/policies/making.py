@@ -1,5 +1,6 @@
 """What is made by commands of jaxlfi: rollouts of simulated objects, posteriors, policies. What is there is kept."""
 
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -36,6 +37,7 @@ def _record(study: Study, dlo: str) -> Path:
     """A rollout of a simulated object under the exploratory actions, seen as FEM objects are."""
     path = study.recording(dlo)
     if not path.with_suffix(".json").exists():
+        shutil.rmtree(path.parent, ignore_errors=True)  # what was left of one that was stopped
         length, young = SIMULATED[dlo]
         words = ["render", "--length", f"{length:g}", "--young", f"{young:g}", "--detector", "mask"]
         _command(whip.main, [*words, "--out", str(path.parent)], "whip ")
@@ -58,6 +60,7 @@ def learn(study: Study, name: str, seeds: int, settings: Sequence[str]) -> None:
 
 
 def _command(run: Callable[[list[str]], int], words: list[str], prefix: str = "") -> None:
+    """Run a command of jaxlfi; the study ends where it fails."""
     print(f"\n== jaxlfi {prefix}{' '.join(words)}", flush=True)
     if status := run(words):
         raise SystemExit(status)

@@ -1,4 +1,4 @@
-"""A point of least squares for the same rollout: `mujoco.sysid`'s Gauss-Newton, as its users have it.
+"""A point of least squares for the same rollout, by `mujoco.sysid`'s Gauss-Newton.
 
 Residuals are those of the gripper and of the DLO's keypoints in all 16 states, over the standard deviations of the
 detector that inference assumes. The cubes are not touched in an exploratory rollout. The search begins at the centre of
@@ -6,6 +6,7 @@ Theta_0 and is bounded by Phi. Needs the extra `bench` (mujoco[sysid]).
 """
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -26,9 +27,10 @@ ARCS = (0.25, 0.5, 0.75, 1.0)
 STEP = 0.02
 """Of finite differences, in the units of the search: length in 0.1 m, and ln E."""
 CONFIDENCE = 0.9
+"""Of intervals, as those of posteriors in the tables."""
 
 
-def residuals(rollout: recordings.Recording):
+def residuals(rollout: recordings.Recording) -> Callable[[np.ndarray], np.ndarray]:
     """How far simulations are from a rollout.
 
     Returns:
@@ -57,18 +59,18 @@ def fit(path: Path, rollout: recordings.Recording) -> None:
         ValueError: without the extra.
     """
     try:
-        from mujoco import sysid
+        from mujoco.sysid import Parameter, ParameterDict, calculate_intervals, optimize
     except ImportError as error:
         raise ValueError(f"sysid: expected mujoco[sysid] (extra `bench`), got {error}") from error
     far = residuals(rollout)
     low, high = (np.array([10 * bound[0], np.log(bound[1])]) for bound in np.asarray([FEASIBLE.low, FEASIBLE.high]))
     start = np.array([5 * (INITIAL.low[0] + INITIAL.high[0]), 0.5 * np.log(INITIAL.low[1] * INITIAL.high[1])])
-    parameters = sysid.ParameterDict({"theta": sysid.Parameter("theta", start, low, high)})
+    parameters = ParameterDict({"theta": Parameter("theta", start, low, high)})
     residual = lambda x, _: ([far(np.reshape(x, (2, -1)))], None, None)
-    _, found = sysid.optimize(parameters, residual, verbose=False, eps=STEP, max_iters=50, output=io.StringIO())
+    _, found = optimize(parameters, residual, verbose=False, eps=STEP, max_iters=50, output=io.StringIO())
     left = far(found.x[:, None])[:, 0]
     jacobian = (far(found.x[:, None] + STEP * np.eye(2)) - far(found.x[:, None] - STEP * np.eye(2))) / (2 * STEP)
-    _, half = sysid.calculate_intervals([left], jacobian, alpha=1 - CONFIDENCE)
+    _, half = calculate_intervals([left], jacobian, alpha=1 - CONFIDENCE)
     natural = lambda point: [MILLIMETRES[0] * 0.1 * point[0], float(np.exp(point[1]))]
     path.parent.mkdir(parents=True, exist_ok=True)
     files.write_json(

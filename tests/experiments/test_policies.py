@@ -10,14 +10,19 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("brax")
 
-from experiments.policies import findings, intervals, report, results, tables
+from experiments.policies import findings, intervals, report, results, sysid, tables
 from experiments.policies.barycentres import barycentre, soft_dtw
 from experiments.policies.evaluation import domains_of, objects_of
 from experiments.policies.simulation import KNOWN, lowest, perform
 from experiments.policies.study import FEM, ORDER, PAPER, SIMULATED, Study, chosen, truth
+from jaxlfi.envs.whip import recording, trajectory
 from jaxlfi.envs.whip.environment import make
+from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.parameters import median
+from jaxlfi.envs.whip.physics.engines import pick
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.envs.whip.vision.camera import project, side_camera
+from jaxlfi.envs.whip.vision.keypoints import along
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.evaluation import evaluate
 
@@ -149,6 +154,29 @@ def test_episodes_are_those_of_the_evaluation():
         np.testing.assert_array_equal(np.isfinite(rows).sum(axis=1), made.steps)
 
 
+def test_residuals_vanish_at_the_truth():
+    engine, actions = pick("auto"), exploratory_actions()
+    view, failed = jax.jit(lambda: trajectory.seen(engine, median(0.21, 3e4), actions))()
+    points = jax.vmap(lambda line: along(line, jnp.array(sysid.ARCS)))(view.dlo)
+    camera = side_camera(median())
+    rollout = recording.Recording(
+        times=CONTROL_INTERVAL * np.arange(17),
+        gripper=np.asarray(view.gripper),
+        keypoints=np.asarray(project(camera, jnp.concatenate([points, view.cubes], axis=1))),
+        seen=np.ones((17, 10), bool),
+        actions=np.asarray(actions),
+        camera=camera,
+        source="simulated",
+        description="known truth",
+        frame_rate=1 / CONTROL_INTERVAL,
+        image_size=256,
+    )
+    left = sysid.residuals(rollout)(np.array([[2.1, 2.2, 2.1], np.log([3e4, 3e4, 2e4])]))
+    assert not failed and left.shape == (160, 3)
+    right, longer, softer = np.sqrt(np.mean(left**2, axis=0))
+    assert right < 0.01 < 0.5 < min(longer, softer)
+
+
 # -------------------------------------------------------------------------------------------------- tables and the text
 
 
@@ -161,6 +189,7 @@ def made_up(returns, posteriors=()):
         "path": np.full((4, n), 1.0 + value),
         "gripper": np.full((4, n), 0.3),
         "lowest": np.full((4, n), 0.05),
+        "steps": np.full((4, n), 7),
     }
     objects = {pair: rows(value, 20) for pair, value in returns.items() if pair[1] in FEM}
     simulation = {pair: rows(value, 64) for pair, value in returns.items() if pair[1] not in FEM}
