@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.policies import findings, intervals, results, tables
 from experiments.policies.results import Results
-from experiments.policies.study import NOMINAL
+from experiments.policies.study import NOMINAL, ORDER
 from experiments.policies.tables import Row
 from jaxlfi.io import files
 
@@ -129,8 +129,8 @@ def _counts(found: Results) -> str:
     seeds = max((len(own["return"]) for own in found.trainings.values()), default=0)
     places = max((rows["value"].shape[1] for rows in found.objects.values()), default=NOMINAL)
     return (
-        f"{len(found.trainings)} domains were trained on, {seeds} seeds each; {len(found.policies)} policies and "
-        f"baselines acted on FEM objects, at {places - NOMINAL} displaced places and {NOMINAL} times at the nominal "
+        f"{len(found.trainings)} of {len(ORDER)} domains were trained on so far, {seeds} seeds each; "
+        f"{len(found.policies)} kinds of policies and baselines acted on FEM objects, at {places - NOMINAL} displaced places and {NOMINAL} times at the nominal "
         "one. Intervals are 95 % bootstrap intervals, over training seeds and places at once; with so few seeds they "
         "are too short rather than too long."
     )
