@@ -129,10 +129,10 @@ def _counts(found: Results) -> str:
     seeds = max((len(own["return"]) for own in found.trainings.values()), default=0)
     places = max((rows["value"].shape[1] for rows in found.objects.values()), default=NOMINAL)
     return (
-        f"{len(found.trainings)} of {len(ORDER)} domains were trained on so far, {seeds} seeds each; "
-        f"{len(found.policies)} kinds of policies and baselines acted on FEM objects, at {places - NOMINAL} displaced places and {NOMINAL} times at the nominal "
-        "one. Intervals are 95 % bootstrap intervals, over training seeds and places at once; with so few seeds they "
-        "are too short rather than too long."
+        f"{len(found.trainings)} of {len(ORDER)} domains were trained on, {seeds} seeds each. {len(found.policies)} kinds "
+        f"of policies and baselines acted on FEM objects, at {places - NOMINAL} displaced places and {NOMINAL} times at "
+        "the nominal one. Intervals are 95 % bootstrap intervals, over training seeds and places at once; with so few "
+        "seeds they are too short rather than too long."
     )
 
 
