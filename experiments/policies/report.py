@@ -128,11 +128,12 @@ def _counts(found: Results) -> str:
     """How much was done."""
     seeds = max((len(own["return"]) for own in found.trainings.values()), default=0)
     places = max((rows["value"].shape[1] for rows in found.objects.values()), default=NOMINAL)
+    kinds, displaced = len(found.policies), places - NOMINAL
     return (
-        f"{len(found.trainings)} of {len(ORDER)} domains were trained on, {seeds} seeds each. {len(found.policies)} kinds "
-        f"of policies and baselines acted on FEM objects, at {places - NOMINAL} displaced places and {NOMINAL} times at "
-        "the nominal one. Intervals are 95 % bootstrap intervals, over training seeds and places at once; with so few "
-        "seeds they are too short rather than too long."
+        f"{len(found.trainings)} of {len(ORDER)} domains were trained on, {seeds} seeds each. {kinds} kinds of policies "
+        f"and baselines acted on FEM objects, at {displaced} displaced places and {NOMINAL} times at the nominal one. "
+        "Intervals are 95 % bootstrap intervals, over training seeds and places at once; with so few seeds they are too "
+        "short rather than too long."
     )
 
 
