@@ -130,10 +130,10 @@ def _counts(found: Results) -> str:
     places = max((rows["value"].shape[1] for rows in found.objects.values()), default=NOMINAL)
     kinds, displaced = len(found.policies), places - NOMINAL
     return (
-        f"{len(found.trainings)} of {len(ORDER)} domains were trained on, {seeds} seeds each. {kinds} kinds of policies "
-        f"and baselines acted on FEM objects, at {displaced} displaced places and {NOMINAL} times at the nominal one. "
-        "Intervals are 95 % bootstrap intervals, over training seeds and places at once; with so few seeds they are too "
-        "short rather than too long."
+        f"{len(found.trainings)} of {len(ORDER)} domains were trained on, {seeds} seeds each. {kinds} kinds of "
+        f"policies and baselines acted on FEM objects, at {displaced} displaced places and {NOMINAL} times at the "
+        "nominal one. Intervals are 95 % bootstrap intervals, over training seeds and places at once; with so few "
+        "seeds they are too short rather than too long."
     )
 
 
