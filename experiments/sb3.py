@@ -44,9 +44,7 @@ ENVIRONMENTS, BATCH, DETECTOR = 12, 16, "mask"
 BIN = 192
 """Environment steps that returns are averaged over: those of an update of ours."""
 HELD_OUT = 128
-OURS = Path("experiments/results/policies/curves.npz")
-OURS_UNIFORM = slice(4, 8)
-"""Columns of it that were trained on the uniform domain."""
+OURS = Path("experiments/results/policies/study/trainings.npz")
 
 
 class OfGymnasium(VecEnv):
@@ -206,7 +204,7 @@ def draw(figure: Figure, curves: Mapping[str, np.ndarray]) -> None:
         smooth = running_mean(returns, WINDOW)
         steps = BIN * (1 + np.arange(len(returns)))
         axes.plot(steps, smooth, color=look[name].colour, alpha=0.35, linewidth=0.7)
-        axes.plot(steps, smooth.mean(axis=1), **look[name].line)
+        axes.plot(steps, smooth.mean(axis=1), **look[name].line, markevery=len(returns) // 8)
     axes.set(xlabel="environment steps", ylabel="return of training episodes")
     axes.legend(frameon=False)
 
@@ -214,10 +212,10 @@ def draw(figure: Figure, curves: Mapping[str, np.ndarray]) -> None:
 def labelled(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The curves of `draw`: ours, and each of Stable-Baselines3's."""
     with np.load(OURS) as ours:
-        uniform = ours["value"][:, OURS_UNIFORM]
+        uniform = ours["uniform/curve"]
     rollouts = [name.removesuffix("/value") for name in arrays if name.endswith("/value")]
-    theirs = {f"Stable-Baselines3, n_steps {name}": arrays[f"{name}/value"] for name in rollouts}
-    return {"jaxlfi train (quick)": uniform, **theirs}
+    theirs = {f"Stable-Baselines3, updates on {name}": arrays[f"{name}/value"] for name in rollouts}
+    return {"jaxlfi train (quick), updates on 16 steps of each": uniform, **theirs}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -385,3 +385,27 @@ def test_the_study_of_policies():
     """Its text is the one that is made of what is kept."""
     written = (ROOT / "README.md").read_text().split(report.BEGIN)[1].split(report.END)[0]
     assert written.strip() == report.text(policies.load(RESULTS / "policies" / "study"))
+
+
+def mean_and_each(values: list[float]) -> str:
+    return f"{np.mean(values):.2f} ({', '.join(f'{value:.2f}' for value in values)})"
+
+
+@pytest.mark.parametrize(
+    ("learner", "steps", "name", "policies"),
+    [
+        ("`jaxlfi train`, `quick`", "16", "sb3/ours.csv", "uniform/"),
+        ("Stable-Baselines3", "2,048", "sb3/evaluated.csv", "n_steps-2048-"),
+        ("Stable-Baselines3", "16", "sb3/evaluated.csv", "n_steps-16-"),
+    ],
+)
+def test_the_learner_of_the_paper(learner, steps, name, policies):
+    own = [row for row in policy_rows(name) if row["policy"].startswith(policies) and row["domain"] == "uniform"]
+    cells = [mean_and_each([float(row[measure]) for row in own]) for measure in ("return", "hit", "clean_hit")]
+    assert f"| {learner} | {steps} | {' | '.join(cells)} |" in README
+
+
+def test_how_long_the_learner_of_the_paper_took():
+    kept = arrays("policies/sb3/curves")
+    minutes = np.concatenate([kept["16/seconds"], kept["2048/seconds"]]) / 60
+    assert f"A training took {minutes.min():.0f} to {minutes.max():.0f} minutes" in README
