@@ -158,7 +158,12 @@ def test_the_physics_is_not_that_of_inference():
     folder = Path(objects.__file__).parent
     shared = {"frames", "parameters", "recording", "reference_objects", "rig", "rules", "vision"}
     # Policies act on the objects by the task's observations, and films are drawn by its figures.
-    acting = {"deployment": {"episode"}, "repetitions": {"environment"}, "film": {"figures", "render"}}
+    acting = {
+        "robot": {"observer"},
+        "deployment": {"control"},
+        "repetitions": {"environment"},
+        "film": {"figures", "render"},
+    }
     for path in folder.glob("*.py"):
         modules = {node.module for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)}
         own = {module.split(".")[3] for module in modules if module.startswith("jaxlfi.envs.whip.")}
