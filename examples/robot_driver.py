@@ -19,7 +19,7 @@ CAMERA = {"position": [0.45, -0.9, 0.25], "orientation": [0.5**0.5, 0.5**0.5, 0.
 
 
 class PretendedArm:
-    """A Cartesian controller whose set-point goes to where it is told in a straight line, and an arm that follows."""
+    """A Cartesian controller whose set-point moves straight to each target, and an arm that follows."""
 
     def __init__(self, clock):
         self.clock, self.since = clock, clock.now()

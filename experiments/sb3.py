@@ -92,12 +92,12 @@ class OfGymnasium(VecEnv):
         return [getattr(self.environments, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices=None) -> None:
-        """Not possible."""
-        raise NotImplementedError("the environments are one program")
+        """Refused: the base class asks for it, and PPO does not call it; one compiled program has no parts to set."""
+        raise NotImplementedError("set_attr: the environments are one compiled program, which has no parts to set")
 
     def env_method(self, method_name: str, *method_args, indices=None, **method_kwargs) -> list[Any]:
-        """Not possible."""
-        raise NotImplementedError("the environments are one program")
+        """Refused: the base class asks for it, and PPO does not call it; one compiled program has no parts to call."""
+        raise NotImplementedError("env_method: the environments are one compiled program, which has no parts to call")
 
     def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
         """None of them is."""

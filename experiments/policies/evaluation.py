@@ -23,7 +23,7 @@ EVERYWHERE = (*PAPER, "feasible", "constant", "plan-median")
 """Policies and baselines that are no object's own."""
 STILLS = (("dlo-0-none", "dlo-0"), ("dlo-0-edge", "dlo-0"), ("uniform", "dlo-0"), ("dlo-1-edge", "dlo-3"),
           ("dlo-3-edge", "dlo-3"), ("uniform", "dlo-3"))  # fmt: skip
-"""Policies on objects that are shown: those of the paper's timelapses, and PPO-U beside them."""
+"""Pairs of policy and object in the contact sheet: those of the paper's timelapses, and PPO-U on each object."""
 
 
 def domains_of(policy: str) -> Sequence[str]:

@@ -51,7 +51,7 @@ def text(found: tuple[float, float, float], places: int = 2) -> str:
 
 
 def _shares(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Of n things that are drawn n times with replacement, how often each is, as a fraction, shape [RESAMPLED, n]."""
+    """Weights of n values in bootstrap resamples: how often each is drawn, as a fraction, shape [RESAMPLED, n]."""
     return rng.multinomial(n, np.full(n, 1 / n), RESAMPLED) / n
 
 

@@ -84,32 +84,25 @@ def found(values: Values, policy: str) -> np.ndarray | None:
 
 def objects(results: Results) -> list[Row]:
     """Every policy on every FEM object: return, rate of clean hits, worst place, rate of exits, at displaced places."""
-    rows = []
-    for policy in results.policies:
-        row = {"policy": label(policy)}
-        for dlo in FEM:
-            row[dlo] = NONE
-            if (policy, dlo) in results.objects:
-                value, clean, outside = (results.displaced(policy, dlo, name) for name in ("value", "clean", "outside"))
-                numbers = (clean.mean(), value.min(axis=1).mean(), outside.mean())
-                cell = "; ".join(f"{number:.2f}" for number in numbers)
-                row[dlo] = f"{intervals.text(intervals.mean(value))}; {cell}"
-        rows.append(row)
-    return rows
+
+    def cell(policy: str, dlo: str) -> str:
+        value, clean, outside = (results.displaced(policy, dlo, name) for name in ("value", "clean", "outside"))
+        numbers = (clean.mean(), value.min(axis=1).mean(), outside.mean())
+        return "; ".join([intervals.text(intervals.mean(value)), *(f"{number:.2f}" for number in numbers)])
+
+    return _on_objects(results, cell)
 
 
 def nominal(results: Results) -> list[Row]:
     """Every policy on every FEM object at the nominal place, the paper's four repetitions: return and clean hits."""
-    rows = []
-    for policy in results.policies:
-        row = {"policy": label(policy)}
-        for dlo in FEM:
-            row[dlo] = NONE
-            if (policy, dlo) in results.objects:
-                value, clean = results.nominal(policy, dlo), results.nominal(policy, dlo, "clean")
-                row[dlo] = f"{value.mean():.2f}; {clean.mean():.2f}"
-        rows.append(row)
-    return rows
+    numbers = lambda policy, dlo: (results.nominal(policy, dlo, name).mean() for name in ("value", "clean"))
+    return _on_objects(results, lambda *pair: "; ".join(f"{number:.2f}" for number in numbers(*pair)))
+
+
+def _on_objects(results: Results, cell: Callable[[str, str], str]) -> list[Row]:
+    """A row a policy and a column an object, where the one acted on the other."""
+    filled = lambda policy, dlo: cell(policy, dlo) if (policy, dlo) in results.objects else NONE
+    return [{"policy": label(policy)} | {dlo: filled(policy, dlo) for dlo in FEM} for policy in results.policies]
 
 
 def motion(results: Results) -> list[Row]:

@@ -2,8 +2,8 @@
 
 Each signal is a topic, "observation.state" is /observation/state, with messages encoded as JSON of the schema
 `jaxlfi.Signal`: {"time": 0.16, "values": [0.4, 0.36]}. What the numbers are is in the channel's metadata: `dtype`,
-`names` (a JSON list), `unit`, `duration`. The rollout's metadata are in the record `jaxlfi.rollout`. Topics of other
-schemas may stand beside them and are not read.
+`names` (a JSON list), `unit`, `duration`. The rollout's metadata are in the record `jaxlfi.rollout`. A file may have
+topics of other schemas; they are not read.
 
 Times of the log are ns from the first message on. Those of the rollout, which may begin before zero, are in the
 messages, in full precision.

@@ -120,15 +120,7 @@ def load(path: str | Path) -> Policy:
     Raises:
         ValueError: for a file that is missing, damaged, of another format or a newer version.
     """
-    path = Path(path)
-    arrays = files.read_arrays(path)
-    try:
-        schema = json.loads(str(arrays["schema"]))
-        kind, version = schema.pop("format"), schema.pop("version")
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: expected a policy that jaxlfi saved, got an .npz without its schema") from error
-    if kind != FORMAT or version != VERSION:
-        raise ValueError(f"{path}: expected {FORMAT} of version {VERSION}, got {kind} of version {version}")
+    arrays, schema = read(path, FORMAT, VERSION)
     count = sum(name.startswith("weight_") for name in arrays)
     try:
         layers = [(arrays[f"weight_{index}"], arrays[f"bias_{index}"]) for index in range(count)]
@@ -136,3 +128,25 @@ def load(path: str | Path) -> Policy:
         return Policy(weights, biases, schema)
     except (KeyError, ValueError, IndexError) as error:
         raise ValueError(f"{path}: expected a whole policy, got: {error}") from error
+
+
+def read(path: str | Path, kind: str, version: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and schema of a policy's .npz, whichever form the policy has in it.
+
+    Args:
+        path: the file.
+        kind: format that its schema has to name.
+        version: of this format.
+
+    Raises:
+        ValueError: for a file that is missing, damaged, of another format or version.
+    """
+    arrays = files.read_arrays(Path(path))
+    try:
+        schema = json.loads(str(arrays["schema"]))
+        got, its_version = schema.pop("format"), schema.pop("version")
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected a policy that jaxlfi saved, got an .npz without its schema") from error
+    if (got, its_version) != (kind, version):
+        raise ValueError(f"{path}: expected {kind} of version {version}, got {got} of version {its_version}")
+    return arrays, schema

@@ -16,7 +16,7 @@ from jax import export
 from jaxtyping import Array, Float
 
 from jaxlfi.io import files
-from jaxlfi.rl.policy import Policy
+from jaxlfi.rl.policy import Policy, read
 
 try:
     import flatbuffers  # noqa: F401
@@ -62,14 +62,7 @@ def load(path: str | Path) -> Program:
     Raises:
         ValueError: for a file that is missing, damaged, of another format or a newer version.
     """
-    arrays = files.read_arrays(Path(path))
-    try:
-        schema = json.loads(str(arrays["schema"]))
-        kind, version = schema.pop("format"), schema.pop("version")
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: expected a policy's program, got an .npz without its schema") from error
-    if kind != FORMAT or version != VERSION:
-        raise ValueError(f"{path}: expected {FORMAT} of version {VERSION}, got {kind} of version {version}")
+    arrays, schema = read(path, FORMAT, VERSION)
     try:
         return Program(export.deserialize(bytearray(arrays["program"].tobytes())), schema)
     except Exception as error:  # flatbuffers has many for bytes that are none of its own

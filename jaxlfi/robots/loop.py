@@ -158,7 +158,7 @@ def _stop_after(error: BaseException, robot: Robot) -> None:
     try:
         robot.stop()
     except Exception as failed:
-        raise RobotError(f"{error}; and the robot could not be told to stop: {failed}") from error
+        raise RobotError(f"{error}; and stopping the robot failed: {failed}") from error
 
 
 class _Episode:
@@ -227,8 +227,10 @@ class _Episode:
     def _target(self, observation: Observation) -> np.ndarray:
         """Where the set-points are before the first command."""
         limits = self.loop.limits
-        told = observation.target
-        target = np.asarray(np.asarray(observation.values)[list(self.loop.moved)] if told is None else told, float)
+        reported = observation.target
+        target = np.asarray(
+            np.asarray(observation.values)[list(self.loop.moved)] if reported is None else reported, float
+        )
         if target.shape != (len(self.loop.moved),) or not np.isfinite(target).all():
             raise ValueError(f"robot: expected {len(self.loop.moved)} set-points, got {target.tolist()}")
         if (target < limits.low).any() or (target > limits.high).any():

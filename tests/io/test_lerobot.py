@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow
 import pytest
 from pyarrow import parquet
+from same_rollouts import same
 
 from jaxlfi.io import lerobot
 from jaxlfi.io.rollout import Rollout, Signal
@@ -32,16 +33,6 @@ def rollout(frames: int, joints: int = 3, points: int = 5, **metadata) -> Rollou
     commands = RANDOM.normal(size=(9, joints)).astype(np.float32)
     made["action"] = Signal(0.25 * np.arange(9), commands, tuple("abcdefg"[:joints]), "rad", duration=0.25)
     return Rollout(made, metadata, task="turn left" if frames % 2 else "turn right")
-
-
-def same(back: Rollout, one: Rollout) -> None:
-    assert (back.metadata, back.task, set(back.signals)) == (one.metadata, one.task, set(one.signals))
-    for name, signal in one.signals.items():
-        other = back.signals[name]
-        assert (other.names, other.unit, other.duration) == (signal.names, signal.unit, signal.duration)
-        assert other.values.dtype == signal.values.dtype
-        np.testing.assert_array_equal(other.times, signal.times)
-        np.testing.assert_array_equal(other.values, signal.values)
 
 
 @pytest.fixture(scope="module")

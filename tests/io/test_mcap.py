@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from same_rollouts import same
 
 from jaxlfi.io import mcap
 from jaxlfi.io.rollout import Rollout, Signal
@@ -31,16 +32,6 @@ def rollout(joints: int = 3, points: int = 5) -> Rollout:
         for name, (times, values, unit, duration) in made.items()
     }
     return Rollout(signals, {"camera": {"position": [1.5, None]}, "by": "a «test»"}, "turn left")
-
-
-def same(back: Rollout, one: Rollout) -> None:
-    assert (back.metadata, back.task, set(back.signals)) == (one.metadata, one.task, set(one.signals))
-    for name, signal in one.signals.items():
-        other = back.signals[name]
-        assert (other.names, other.unit, other.duration) == (signal.names, signal.unit, signal.duration)
-        assert other.values.dtype == signal.values.dtype
-        np.testing.assert_array_equal(other.times, signal.times)
-        np.testing.assert_array_equal(other.values, signal.values)
 
 
 @pytest.mark.parametrize(("joints", "points"), [(3, 5), (1, 1), (7, 12)])

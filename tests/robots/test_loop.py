@@ -218,7 +218,7 @@ def test_a_robot_that_cannot_be_stopped_is_said_to():
         raise OSError("no answer")
 
     robot.stop = stop
-    with pytest.raises(RobotError, match="the arm is stuck; and the robot could not be told to stop: no answer"):
+    with pytest.raises(RobotError, match="the arm is stuck; and stopping the robot failed: no answer"):
         run(robot)
     assert robot.stops == 1
 

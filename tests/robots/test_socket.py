@@ -156,7 +156,7 @@ def test_a_server_that_dies_is_an_error_and_the_robot_is_told_to_stop(tmp_path):
             process.end()
         return policy(observation)
 
-    with pytest.raises(RobotError, match=r"^robot 127.0.0.1:\d+: .*; and the robot could not be told to stop: "):
+    with pytest.raises(RobotError, match=r"^robot 127.0.0.1:\d+: .*; and stopping the robot failed: "):
         Loop.of(policy, clock=clock).run(robot, act)
     assert len(calls) == 5
     with pytest.raises(RobotError, match=r"expected a driver that listens, got: .*refused"):

@@ -28,7 +28,7 @@ ALL = np.ones(10, bool)
 
 
 class Gripper:
-    """A robot whose gripper is where it is told to be, at whose fourth command the top cube falls.
+    """A robot whose gripper is at its set-point at once; at its fourth command the top cube falls.
 
     Attributes:
         made: all of them.
