@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlfi.envs.whip.parameters import WhipParameters
-from jaxlfi.envs.whip.physics.edits import dlo_edits, edited, edited_model
+from jaxlfi.envs.whip.physics.edits import edited_bare_model, edited_model
 from jaxlfi.envs.whip.physics.engine import State, ramp, settled
 from jaxlfi.envs.whip.physics.scene import CUBES, HAND, Scene, bare_model, base_model
 from jaxlfi.envs.whip.rig import SECTION
@@ -168,7 +168,7 @@ class _ModelCache:
         """The model of a scene; the least recently used one is dropped first."""
         key = tuple(leaf.tobytes() for leaf in jax.tree.leaves(parameters))
         if key not in self._models:
-            self._models[key] = self._make(self._scene, jax.tree.map(np.float64, parameters))
+            self._models[key] = self._make(self._scene, jax.tree.map(np.float64, parameters), self._data[0])
             if len(self._models) > CACHED_MODELS:
                 self._models.popitem(last=False)
         self._models.move_to_end(key)
@@ -188,10 +188,5 @@ class _RolloutPool:
 def _rollout_pool(scene: Scene, threads: int) -> _RolloutPool:
     rollout = mujoco.rollout.Rollout(nthread=threads)
     whole = _ModelCache(scene, base_model(scene), edited_model, rollout, threads)
-    bare = _ModelCache(scene, bare_model(scene), _bare, rollout, threads)
+    bare = _ModelCache(scene, bare_model(scene), edited_bare_model, rollout, threads)
     return _RolloutPool(scene, whole, bare)
-
-
-def _bare(scene: Scene, parameters: WhipParameters) -> mujoco.MjModel:
-    """The model of a scene without its cubes; all other parts have the same indices."""
-    return edited(bare_model(scene), dlo_edits(scene, parameters))
