@@ -1,10 +1,13 @@
-"""Settings of PPO on the whipping task, one changed at a time; all settings and seeds train side by side.
+"""Settings of PPO on the whipping task, one changed at a time; those that differ in numbers only train side by side.
 
-python -m experiments.policy_settings --domain runs/dlo-0 --out experiments/results/policies/settings-dlo-0
+python -m experiments.policy_settings --domain runs/dlo-0 --out OUT
+python -m experiments.policy_settings --around first --domain runs/dlo-0 --out OUT
 """
 
 import argparse
+import collections
 import csv
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -17,20 +20,37 @@ from jaxlfi.cli.domains import domain
 from jaxlfi.io import files
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.rl import ppo, registry
-from jaxlfi.rl.domains import Domain
+from jaxlfi.rl.domains import POOL, Domain
 from jaxlfi.rl.evaluation import evaluate
 from jaxlfi.rl.settings import PPO
 
-BASE = PPO(learning_rate=5e-4, entropy=0.01, initial_deviation=0.6, minibatches=12)
-"""The first guess, from which one setting is changed at a time."""
-CHANGES: dict[str, dict[str, float]] = {
-    "base": {},
-    "discount 0.95": {"discount": 0.95},
-    "discount 0.9": {"discount": 0.9},
-    "deviation 1": {"initial_deviation": 1.0},
-    "learning rate 1.5e-3": {"learning_rate": 1.5e-3},
-    "discount 0.95, deviation 1": {"discount": 0.95, "initial_deviation": 1.0},
+AROUND: dict[str, tuple[PPO, dict[str, dict[str, float]]]] = {
+    "first": (
+        PPO(learning_rate=5e-4, entropy=0.01, initial_deviation=0.6, minibatches=12),
+        {
+            "base": {},
+            "discount 0.95": {"discount": 0.95},
+            "discount 0.9": {"discount": 0.9},
+            "deviation 1": {"initial_deviation": 1.0},
+            "learning rate 1.5e-3": {"learning_rate": 1.5e-3},
+            "discount 0.95, deviation 1": {"discount": 0.95, "initial_deviation": 1.0},
+        },
+    ),
+    "quick": (
+        PPO(learning_rate=5e-4, entropy=0.01, minibatches=12),
+        {
+            "base": {},
+            "entropy 0": {"entropy": 0.0},
+            "learning rate 3e-4": {"learning_rate": 3e-4},
+            "annealed": {"annealing": 1.0},
+            "minibatches of 64": {"minibatches": 3, "segments": 4},
+            "unroll 8": {"segments": 2, "unroll": 8},
+            "24 environments": {"minibatches": 24, "environments": 24},
+            "redrawn": {"redrawn": True},
+        },
+    ),
 }
+"""Where settings were looked for: a first guess and what was changed of it, then what that had led to."""
 FIRST_SEED = 1000
 """Seeds from here on are for choosing settings, and are reported nowhere else."""
 HELD_OUT = 64
@@ -41,65 +61,91 @@ def main() -> None:
     """Train, evaluate, and write the table."""
     arguments = parser().parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
+    base, changes = AROUND[arguments.around]
+    cases = [(label, seed) for label in changes for seed in range(FIRST_SEED, FIRST_SEED + arguments.seeds)]
+    settings = [base.replace(total_steps=arguments.steps, **changes[label]) for label, _ in cases]
+    alike = collections.defaultdict(list)
+    for row, one in enumerate(settings):
+        alike[jax.tree.structure(one)].append(row)
     environment = registry.load("whip")
     name, draw = domain(environment, arguments.domain)
-    cases = [(label, seed) for label in CHANGES for seed in range(FIRST_SEED, FIRST_SEED + arguments.seeds)]
-    settings = [BASE.replace(total_steps=arguments.steps, **CHANGES[label]) for label, _ in cases]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *settings)
-    keys = [jax.random.split(jax.random.key(seed), 4) for _, seed in cases]
-    trained = Domain(jnp.stack([draw(key[0], BASE.environments).theta for key in keys]))
-    held_out = Domain(jnp.stack([draw(key[1], HELD_OUT).theta for key in keys]))
+
+    curves, table = {}, {}
+    chunks = sum(-(-settings[rows[0]].updates // CHUNK) for rows in alike.values())
+    with RoundProgress(Console(), chunks, 0, f"{len(cases)} trainings", unit="chunk") as progress:
+        for rows in alike.values():
+            seeds = [cases[row][1] for row in rows]
+            values, outcomes = side_by_side(environment, draw, [settings[row] for row in rows], seeds, progress)
+            for i, row in enumerate(rows):
+                label, seed = cases[row]
+                curves[f"{label}, {seed}"] = values[:, i]
+                table[cases[row]] = outcomes.value[i].mean(), outcomes.facts["clean_hit"][i].mean()
+            files.write_arrays(arguments.out / "curves.npz", curves)
+            write(arguments.out / "table.csv", table)
+    show(f"{name}, {arguments.steps} steps", list(changes), table)
+
+
+def side_by_side(environment, draw, settings: Sequence[PPO], seeds: Sequence[int], progress: RoundProgress):
+    """Trainings as one program, of settings that differ in numbers only.
+
+    Args:
+        environment: that is trained on.
+        draw: points of the domain, from a key and their number.
+        settings: of each training.
+        seeds: of each training.
+        progress: advanced by a step for every `CHUNK` updates.
+
+    Returns:
+        Mean returns of the updates, shape [updates, trainings], and the outcomes of their policies' episodes on other
+        points of the domain, shape [trainings, HELD_OUT].
+    """
+    first, stacked = (
+        settings[0],
+        jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(one) for one in leaves]), *settings),
+    )
+    keys = jax.vmap(lambda seed: jax.random.split(jax.random.key(seed), 4))(jnp.asarray(seeds))
+    points = POOL if first.redrawn else first.environments
+    domains_of = lambda index, number: Domain(jnp.stack([draw(key[index], number).theta for key in keys]))
 
     start = lambda key, settings, points: ppo.init(key, environment, settings, points)
-    state = jax.jit(jax.vmap(start))(jnp.stack([key[2] for key in keys]), stacked, trained)
+    state = jax.jit(jax.vmap(start))(keys[:, 2], stacked, domains_of(0, points))
     some = lambda settings, state: ppo.train(environment, settings, state, CHUNK)
     advance = jax.jit(jax.vmap(some, out_axes=(0, 1)), donate_argnums=1)
-    returns, chunks = [], -(-settings[0].updates // CHUNK)
-    with RoundProgress(Console(), chunks, 0, f"{len(cases)} trainings", unit="chunk") as progress:
-        for _ in range(chunks):
-            state, made = advance(stacked, state)
-            returns.append(np.asarray(made.value))
-            progress.advance(1, f", return {np.nanmean(returns[-1]):.2f}")
+    values = []
+    for _ in range(-(-first.updates // CHUNK)):
+        state, made = advance(stacked, state)
+        values.append(np.asarray(made.value))
+        progress.advance(1, f", return {np.nanmean(values[-1]):.2f}")
 
     def fares(key, settings, params, points):
         return evaluate(key, environment, ppo.deterministic(environment, settings, params), points)
 
-    outcomes = jax.device_get(
-        jax.jit(jax.vmap(fares))(jnp.stack([key[3] for key in keys]), stacked, state.params, held_out)
-    )
-    files.write_arrays(
-        arguments.out / "curves.npz",
-        {
-            "value": np.concatenate(returns),
-            "returns": outcomes.value,
-            "settings": np.asarray([one for one, _ in cases]),
-        },
-    )
-    write(arguments.out / "table.csv", cases, outcomes.value.mean(axis=1), outcomes.facts["clean_hit"].mean(axis=1))
-    show(name, arguments, cases, outcomes.value.mean(axis=1))
+    outcomes = jax.jit(jax.vmap(fares))(keys[:, 3], stacked, state.params, domains_of(1, HELD_OUT))
+    return np.concatenate(values), jax.device_get(outcomes)
 
 
-def write(path: Path, cases, returns: np.ndarray, clean: np.ndarray) -> None:
+def write(path: Path, table: Mapping[tuple[str, int], tuple[float, float]]) -> None:
     """A row for each training."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["settings", "seed", "return", "clean_hit"])
-        for (label, seed), value, rate in zip(cases, returns, clean, strict=True):
+        for (label, seed), (value, rate) in table.items():
             writer.writerow([label, seed, f"{value:.4f}", f"{rate:.4f}"])
 
 
-def show(name: str, arguments: argparse.Namespace, cases, returns: np.ndarray) -> None:
+def show(title: str, labels: Sequence[str], table: Mapping[tuple[str, int], tuple[float, float]]) -> None:
     """The mean over seeds, and all of them."""
-    table = Table("settings", "mean return", "of each seed", title=f"{name}, {arguments.steps} steps")
-    for label in CHANGES:
-        own = np.array([value for (other, _), value in zip(cases, returns, strict=True) if other == label])
-        table.add_row(label, f"{own.mean():.2f}", "  ".join(f"{value:.2f}" for value in own))
-    Console(width=100).print(table)
+    shown = Table("settings", "mean return", "of each seed", title=title)
+    for label in labels:
+        own = [value for (other, _), (value, _) in table.items() if other == label]
+        shown.add_row(label, f"{np.mean(own):.2f}", "  ".join(f"{value:.2f}" for value in own))
+    Console(width=100).print(shown)
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     top = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    top.add_argument("--around", choices=list(AROUND), default="quick", help="settings to change (default: quick)")
     top.add_argument("--domain", default="uniform", help="as of jaxlfi train (default: uniform)")
     top.add_argument("--seeds", type=int, default=4, help=f"from {FIRST_SEED} on (default: 4)")
     top.add_argument("--steps", type=int, default=36_000, help="of each training (default: 36000)")

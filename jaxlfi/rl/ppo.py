@@ -108,7 +108,7 @@ def init(key: jax.Array, environment: Environment, settings: PPO, domain: Domain
     )
     return Training(
         params=params,
-        optimiser=_optimiser(settings).init(params),
+        optimiser=_optimiser(settings, jnp.asarray(0)).init(params),
         episodes=_batch(environment, settings).reset(key_episodes, domain),
         key=key_updates,
         updates=jnp.asarray(0),
@@ -155,7 +155,7 @@ def update(environment: Environment, settings: PPO, training: Training) -> tuple
         clipping_epsilon=settings.clipping,
         vf_coefficient=settings.value_weight,
     )
-    optimiser = _optimiser(settings)
+    optimiser = _optimiser(settings, training.updates)
 
     def minibatch(carry, data):
         state, params, key = carry
@@ -205,10 +205,12 @@ def train(
     return jax.lax.scan(body, training, jnp.arange(updates))
 
 
-def _optimiser(settings: PPO) -> optax.GradientTransformation:
+def _optimiser(settings: PPO, made: Int[Array, ""]) -> optax.GradientTransformation:
+    """Adam at the learning rate that remains after so many updates."""
+    rate = settings.learning_rate * (1 - settings.annealing * made / settings.updates)
     return optax.chain(
         optax.clip_by_global_norm(settings.max_gradient_norm),
-        optax.adam(settings.learning_rate, eps=settings.adam_epsilon),
+        optax.adam(rate, eps=settings.adam_epsilon),
     )
 
 

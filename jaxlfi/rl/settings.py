@@ -18,6 +18,9 @@ class PPO(Checked):
     """
 
     learning_rate: Number = hyperparameter(3e-4, help="of Adam", low=0)
+    annealing: Number = hyperparameter(
+        0.0, help="fraction of the learning rate that is taken off, evenly, until the last update", low=0, high=1
+    )
     discount: Number = hyperparameter(0.99, help="of a reward one step later", symbol="gamma", low=0, high=1)
     gae_lambda: Number = hyperparameter(
         0.95, help="of the generalised advantage estimate", symbol="lambda", low=0, high=1
