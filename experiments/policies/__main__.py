@@ -27,8 +27,9 @@ def train(study: Study, arguments: argparse.Namespace) -> None:
     from experiments.policies import making
 
     settings = [] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)]
-    for name in chosen(arguments.only, ORDER):
-        making.learn(study, name, arguments.seeds, settings)
+    names, n = chosen(arguments.only, ORDER), arguments.side_by_side
+    for first in range(0, len(names), n):
+        making.learn(study, names[first : first + n], arguments.seeds, settings)
 
 
 def evaluate(study: Study, arguments: argparse.Namespace) -> None:
@@ -83,6 +84,7 @@ def parser() -> argparse.ArgumentParser:
             one.add_argument("--readme", type=Path, metavar="FILE", help="also write the text into it")
         if stage is train:
             one.add_argument("--seeds", type=int, default=4, metavar="N", help="of each domain (default: 4)")
+            one.add_argument("--side-by-side", type=int, default=6, metavar="N", help="domains at a time (default: 6)")
             one.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")
         if stage is evaluate:
             one.add_argument("--where", nargs="+", choices=WHERE, default=WHERE, help="(default: both)")

@@ -12,6 +12,8 @@ from jaxlfi.cli import parser as command_line
 from jaxlfi.cli import train
 from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip.real2sim import recorded
+from jaxlfi.io import files
+from jaxlfi.rl import training
 
 
 def believe(study: Study, name: str) -> None:
@@ -44,19 +46,50 @@ def _record(study: Study, dlo: str) -> Path:
     return path
 
 
-def learn(study: Study, name: str, seeds: int, settings: Sequence[str]) -> None:
-    """Policies on a domain, a seed each, side by side; what the domain needs is made before."""
-    out = study.training(name)
-    if (out / "table.csv").exists():
+def learn(study: Study, names: Sequence[str], seeds: int, settings: Sequence[str]) -> None:
+    """Policies on domains, all seeds of all of them side by side; what the domains need is made before."""
+    names = [name for name in names if not (study.training(name) / "table.csv").exists()]
+    if not names:
         return
-    dlo, _, kind = name.rpartition("-")
-    if name not in BROAD and kind != "true":
-        believe(study, name if kind in (*HEURISTICS, "sysid") else f"{dlo}-edge")
-    if (out / "config.json").exists():
-        _command(command_line.main, ["resume", str(out)])
+    for name in names:
+        dlo, _, kind = name.rpartition("-")
+        if name not in BROAD and kind != "true":
+            believe(study, name if kind in (*HEURISTICS, "sysid") else f"{dlo}-edge")
+    together = study.training("+".join(names))
+    if (together / "config.json").exists():
+        _command(command_line.main, ["resume", str(together)])
     else:
-        words = ["whip", "--domain", study.domain(name), "--seeds", str(seeds), "--preset", "quick", *settings]
-        _command(train.main, [*words, "--out", str(out)], "train ")
+        domains = [study.domain(name) for name in names]
+        words = ["whip", "--domain", *domains, "--seeds", str(seeds), "--preset", "quick", *settings]
+        _command(train.main, [*words, "--out", str(together)], "train ")
+    if len(names) > 1:
+        split(together, [study.training(name) for name in names])
+
+
+def split(together: Path, outs: Sequence[Path]) -> None:
+    """Give each domain of a finished training a folder of its own, as if it had been trained alone.
+
+    Args:
+        together: the training; it is removed.
+        outs: folders for its domains, in their order. One with a table.csv is complete.
+    """
+    config = training.read_config(together)
+    trained = [one["domain"] for one in config["trainings"]]
+    header, *lines = (together / "table.csv").read_text().splitlines(keepends=True)
+    arrays = {name: files.read_arrays(together / f"{name}.npz") for name in ("curves", "outcomes", "domains")}
+    for domain, out in zip(dict.fromkeys(trained), outs, strict=True):
+        if (out / "table.csv").exists():
+            continue
+        rows = [row for row, other in enumerate(trained) if other == domain]
+        out.mkdir(exist_ok=True)
+        shutil.copytree(together / domain, out / domain, dirs_exist_ok=True)
+        points = {name: arrays["domains"][name][rows] for name in ("trained", "held_out")}
+        files.write_arrays(out / "domains.npz", arrays["domains"] | points)
+        files.write_arrays(out / "curves.npz", {name: array[:, rows] for name, array in arrays["curves"].items()})
+        files.write_arrays(out / "outcomes.npz", {name: array[rows] for name, array in arrays["outcomes"].items()})
+        files.write_json(out / "config.json", config | {"trainings": [config["trainings"][row] for row in rows]})
+        files.write_bytes(out / "table.csv", "".join([header, *(lines[row] for row in rows)]).encode())
+    shutil.rmtree(together)
 
 
 def _command(run: Callable[[list[str]], int], words: list[str], prefix: str = "") -> None:

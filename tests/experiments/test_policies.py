@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("brax")
 
-from experiments.policies import findings, intervals, report, results, sysid, tables
+from experiments.policies import findings, intervals, making, report, results, sysid, tables
 from experiments.policies.barycentres import barycentre, soft_dtw
 from experiments.policies.evaluation import domains_of, objects_of
 from experiments.policies.simulation import KNOWN, lowest, perform
@@ -23,6 +23,8 @@ from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.envs.whip.vision.camera import project, side_camera
 from jaxlfi.envs.whip.vision.keypoints import along
+from jaxlfi.io import files
+from jaxlfi.rl import training
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.evaluation import evaluate
 
@@ -132,6 +134,33 @@ def test_domains_are_named_as_the_command_line_does(tmp_path):
     assert study.domain("dlo-1-none") == str(study.posterior("dlo-1-none"))
     length, young = truth("dlo-0")
     assert length == 200 and young == pytest.approx(1e5, rel=0.02)
+
+
+def test_domains_trained_side_by_side_get_folders_of_their_own(tmp_path):
+    together, outs = tmp_path / "a+b", [tmp_path / "first", tmp_path / "second"]
+    trainings = [{"domain": domain, "seed": seed} for domain in ("point-1-2", "b") for seed in (0, 1)]
+    for one in trainings:
+        folder = together / one["domain"] / f"seed_{one['seed']:03d}"
+        folder.mkdir(parents=True)
+        (folder / "policy.npz").write_text(f"{one}")
+    config = {"format": training.FORMAT, "version": training.VERSION, "settings": {}, "trainings": trainings}
+    files.write_json(together / "config.json", config)
+    files.write_arrays(together / "curves.npz", {"value": np.arange(12.0).reshape(3, 4)})
+    files.write_arrays(together / "outcomes.npz", {"value": np.arange(20).reshape(4, 5)})
+    points = {"trained": np.arange(24).reshape(4, 3, 2), "held_out": -np.arange(8).reshape(4, 1, 2)}
+    files.write_arrays(together / "domains.npz", {**points, "parameters": np.array(["length", "young"])})
+    (together / "table.csv").write_text("domain,seed,return\npoint-1-2,0,1\npoint-1-2,1,2\nb,0,3\nb,1,4\n")
+
+    making.split(together, outs)
+    assert not together.exists()
+    assert (outs[1] / "table.csv").read_text() == "domain,seed,return\nb,0,3\nb,1,4\n"
+    assert training.read_config(outs[1])["trainings"] == trainings[2:]
+    assert (outs[0] / "point-1-2" / "seed_001" / "policy.npz").read_text() == f"{trainings[1]}"
+    np.testing.assert_array_equal(files.read_arrays(outs[1] / "curves.npz")["value"], [[2, 3], [6, 7], [10, 11]])
+    np.testing.assert_array_equal(files.read_arrays(outs[0] / "outcomes.npz")["value"], np.arange(10).reshape(2, 5))
+    own = files.read_arrays(outs[1] / "domains.npz")
+    np.testing.assert_array_equal(own["trained"], points["trained"][2:])
+    assert own["parameters"].tolist() == ["length", "young"]
 
 
 def test_the_lowest_keypoint_is_seen_where_it_is():
