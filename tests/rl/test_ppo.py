@@ -110,7 +110,7 @@ def test_it_makes_the_updates_of_brax(domain):
     )
     start = ppo.Training(
         params=params,
-        optimiser=ppo._optimiser(settings).init(params),
+        optimiser=ppo._optimiser(settings, 0).init(params),
         episodes=Batch(LINE, settings.environments).reset(jax.random.split(key_env, settings.environments)[0], domain),
         key=jax.random.split(key_epoch, 1)[0],
         updates=jnp.asarray(0),
@@ -172,6 +172,21 @@ def test_trainings_side_by_side_are_those_by_themselves(train):
     for i in range(3):
         alone = compiled(keys[i], points[i], rates[i])
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-4), together, alone)
+
+
+def test_the_learning_rate_falls_evenly_to_what_is_left_of_it(domain):
+    start = ppo.init(jax.random.key(0), LINE, SETTINGS, domain)
+    later = start.replace(updates=jnp.asarray(3))
+
+    @jax.jit
+    def moved(rate, annealing):
+        settings = SETTINGS.replace(learning_rate=rate, annealing=annealing)
+        return ppo.update(LINE, settings, later)[0].params
+
+    left = 1 - 0.8 * 3 / SETTINGS.updates
+    close = functools.partial(np.testing.assert_allclose, atol=1e-6)
+    jax.tree.map(close, moved(4e-3, 0.8), moved(4e-3 * left, 0.0))
+    assert left < 0.9
 
 
 def test_the_file_of_a_policy_acts_like_its_networks(domain):
