@@ -4,7 +4,9 @@ import argparse
 import dataclasses
 import functools
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +32,7 @@ from jaxlfi.envs.whip.reference_objects.simulation import UnstableError
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
+from jaxlfi.robots.loop import Log
 from jaxlfi.robots.robot import RobotError
 
 POLICIES = ("explore", "random", "plan")
@@ -143,10 +146,19 @@ def control(arguments: argparse.Namespace) -> None:
     act = repetitions.acting(arguments.policy)()
     loop = controlling.loop_of(act, arguments)
     robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote)
+    loop = dataclasses.replace(loop, clock=getattr(robot, "simulated_clock", loop.clock))
     try:
-        log = dataclasses.replace(loop, clock=getattr(robot, "clock", loop.clock)).run(robot, act)
+        log = loop.run(robot, act, on_end=lambda log: _write_log(out, log, about))
     except UnstableError as error:
         raise RobotError(f"robot: {error}") from error
+    if log.stopped:
+        raise RobotError(f"robot: stopped after {len(log.actions)} of {loop.steps} steps: {log.stopped}")
+
+
+def _write_log(out: Path, log: Log, about: Mapping[str, Any]) -> None:
+    """What happened in an episode, as a recording if it is one; nothing if nothing was commanded."""
+    if not len(log.actions):
+        return
     out.parent.mkdir(parents=True, exist_ok=True)
     others = controlling.arrays(log)
     try:
@@ -155,8 +167,6 @@ def control(arguments: argparse.Namespace) -> None:
         atomic.write_arrays(out, others)
         print(f"{out} cannot be inferred from, as it is no recording of an object: {error}")
     print(f"{controlling.summary(log)}, wrote {out}")
-    if log.stopped:
-        raise RobotError(f"robot: stopped after {len(log.actions)} of {loop.steps} steps: {log.stopped}")
 
 
 def _parameters(arguments: argparse.Namespace) -> WhipParameters:

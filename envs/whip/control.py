@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,6 +19,7 @@ from jaxlfi.envs.whip.recording import Recording
 from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.envs.whip.vision.camera import Camera, side_camera
 from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS
+from jaxlfi.io.serialise import json_safe
 from jaxlfi.rl import deployment
 from jaxlfi.rl.policy import Policy
 from jaxlfi.robots.client import SocketRobot
@@ -26,8 +28,16 @@ from jaxlfi.robots.robot import Robot
 
 FLAGS = 2 + 2 * KEYPOINTS
 """Place of the first flag in an observation; before it come the gripper's x and z, and the keypoints."""
-ABOUT = ("camera", "source", "description", "image_size", "colours", "facts", "provenance")
-"""What a robot may say of itself: fields of `Recording`."""
+ABOUT = {
+    "camera": dict,
+    "source": str,
+    "description": str,
+    "image_size": int,
+    "colours": dict,
+    "facts": dict,
+    "provenance": dict,
+}
+"""What a robot may say of itself: fields of `Recording`, and their types."""
 
 
 def is_over(observation: np.ndarray) -> bool:
@@ -80,7 +90,7 @@ def arrays(log: Log) -> dict[str, np.ndarray]:
 
 def summary(log: Log) -> str:
     """What happened, in a line."""
-    hit = [name for name, flag in zip(COLOURS, log.observations[-1][FLAGS:], strict=True) if flag > 0.5]
+    hit = [name for name, flags in zip(COLOURS, log.observations[:, FLAGS:].T, strict=True) if (flags > 0.5).any()]
     over = "" if log.over is None else f", over after {log.over}"
     return (
         f"{len(log.actions)} steps at {1 / log.period:g} Hz{over}, {int(log.held.sum())} without a usable observation, "
@@ -129,7 +139,7 @@ def robot_of(word: str, seed: int, remote: bool) -> tuple[Robot, dict[str, Any]]
         raise ValueError(f"robot: expected {word!r} to have observe, act and stop, got {type(robot).__name__}")
     try:
         return robot, described(getattr(robot, "about", {}))
-    except ValueError:
+    except BaseException:
         robot.stop()
         raise
 
@@ -138,11 +148,18 @@ def described(about: Mapping[str, Any]) -> dict[str, Any]:
     """What a robot says of itself as fields of a recording; the nominal camera where it says none, which is noted.
 
     Raises:
-        ValueError: for what a recording does not have.
+        ValueError: for what a recording does not have, or has of another type.
     """
+    if not isinstance(about, Mapping):
+        raise ValueError(f"robot: expected a mapping as what it says of itself, got {about!r}")
     if unknown := set(about) - set(ABOUT):
         raise ValueError(f"robot: expected it to say {', '.join(ABOUT)} of itself, got {', '.join(sorted(unknown))}")
     fields = {"source": "real", "description": "a policy on a robot", **about}
+    for name, value in fields.items():
+        if name != "camera" and (type(value) is not ABOUT[name] or not _is_json(value)):
+            raise ValueError(
+                f"robot: expected {ABOUT[name].__name__} as its {name}, which JSON can hold, got {value!r}"
+            )
     if "camera" not in about:
         noted = {**fields.get("provenance", {}), "camera": "nominal: the robot did not say"}
         return {**fields, "camera": side_camera(median()), "provenance": noted}
@@ -156,3 +173,11 @@ def described(about: Mapping[str, Any]) -> dict[str, Any]:
     if {name: part.shape for name, part in parts.items()} != shapes:
         raise ValueError(f"robot: expected a camera's {', '.join(shapes)} of shapes [3], [4], [], got {camera!r}")
     return {**fields, "camera": Camera(**parts)}
+
+
+def _is_json(value: Any) -> bool:
+    try:
+        json.dumps(json_safe(value), allow_nan=False)
+    except (TypeError, ValueError):
+        return False
+    return True

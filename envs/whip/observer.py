@@ -4,7 +4,6 @@ Like `jaxlfi.robots`, this module needs NumPy only.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from jaxlfi.envs.whip.rig import HIT_DISTANCE
 
@@ -17,7 +16,7 @@ class Observer:
 
     Attributes:
         keypoints: where each was seen last, in normalised pixels, shape [10, 2].
-        hit: cubes that have been further than 0.06 from where they were first, bottom-up, shape [6].
+        hit: cubes that have been further than 0.06 from where they were first seen, bottom-up, shape [6].
 
     Example:
         >>> observer = Observer()
@@ -34,20 +33,21 @@ class Observer:
         # What was never seen is taken to be in the middle of the image.
         self.keypoints = np.full((10, 2), 0.5, np.float32)
         self.hit = np.zeros(6, bool)
-        self._start: np.ndarray | None = None
+        self._start = np.full((6, 2), np.nan)  # NaN is never far away
 
-    def observe(
-        self, gripper: Float[np.ndarray, "2"], keypoints: Float[np.ndarray, "10 2"], seen: Bool[np.ndarray, "10"]
-    ) -> Float[np.ndarray, "28"]:
-        """The observation of a frame.
+    def observe(self, gripper: np.ndarray, keypoints: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        """The observation of a frame, shape [28].
 
         Args:
-            gripper: its measured x and z, in m.
-            keypoints: four on the DLO and six cubes bottom-up, in normalised pixels; those not seen may be NaN.
-            seen: which of them were found.
+            gripper: its measured x and z, in m, shape [2].
+            keypoints: four on the DLO and six cubes bottom-up, in normalised pixels; those not seen may be NaN. Shape
+                [10, 2].
+            seen: which of them were found, shape [10].
         """
-        self.keypoints = np.where(np.asarray(seen)[:, None], np.asarray(keypoints, np.float32), self.keypoints)
+        seen = np.asarray(seen, bool)
+        self.keypoints = np.where(seen[:, None], np.asarray(keypoints, np.float32), self.keypoints)
         cubes = self.keypoints[CUBES:]
-        self._start = cubes if self._start is None else self._start
+        first = seen[CUBES:] & np.isnan(self._start[:, 0])
+        self._start[first] = cubes[first]
         self.hit = self.hit | (np.linalg.norm(cubes - self._start, axis=-1) > HIT_DISTANCE)
         return np.concatenate([np.asarray(gripper, np.float32), self.keypoints.ravel(), self.hit], dtype=np.float32)

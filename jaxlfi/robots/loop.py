@@ -130,13 +130,14 @@ class Loop:
         """Between two commands, in s."""
         return 1 / self.rate
 
-    def run(self, robot: Robot, act: Act, whole: bool = True) -> Log:
+    def run(self, robot: Robot, act: Act, whole: bool = True, on_end: Callable[[Log], None] = lambda log: None) -> Log:
         """Control a robot for an episode, and stop it.
 
         Args:
             robot: whose `stop` is called exactly once, last, whatever happens.
             act: the policy.
             whole: go on to the last slot after the episode is over, with the set-points held.
+            on_end: called after the stop with what happened so far, also where an error or a signal ended the episode.
 
         Raises:
             ValueError: for an observation or an action of another size, and actions that are not finite.
@@ -150,7 +151,10 @@ class Loop:
             except BaseException as error:
                 _stop_after(error, robot)
                 raise
-            robot.stop()
+            else:
+                robot.stop()
+            finally:
+                on_end(episode.log())
             return episode.log()
 
 
@@ -287,14 +291,16 @@ class _Episode:
         return due
 
     def log(self) -> Log:
-        """What happened so far; there was an observation."""
-        times, observations, extras = zip(*self.seen, strict=True)
+        """What happened so far."""
+        times, observations, extras = zip(*self.seen, strict=True) if self.seen else [()] * 3
         asked, actions, targets, held, lateness = zip(*self.slots, strict=True) if self.slots else [()] * 5
         table = lambda rows: np.reshape(np.array(rows, float), (len(rows), len(self.loop.moved)))
         return Log(
             times=np.array(times),
-            observations=np.stack(observations),
-            extras={name: np.stack([np.asarray(row[name]) for row in extras]) for name in extras[0]},
+            observations=np.reshape(np.array(observations), (len(times), self.loop.size)),
+            extras={
+                name: np.stack([np.asarray(row[name]) for row in extras]) for name in (extras[0] if extras else ())
+            },
             asked=table(asked),
             actions=table(actions),
             targets=table(targets),

@@ -51,7 +51,8 @@ class Robot(Protocol):
     """A robot with its sensors. Methods raise `RobotError`, or whatever they like, upon which the robot is stopped.
 
     None may block for long: while one does, nothing else is commanded. A robot should hold by itself, or stop, when no
-    command comes. It may have an attribute `about`, a mapping of what is to be recorded of it.
+    command comes. It may have an attribute `about`, a mapping of what is to be recorded of it; one that is simulated,
+    and no arm that moves, may have a `simulated_clock`, on which `jaxlfi whip control` then waits.
     """
 
     def observe(self) -> Observation | None:

@@ -1,5 +1,6 @@
 """The other end of the socket: a robot served to a control loop in another process (`jaxlfi.robots.wire`)."""
 
+import contextlib
 import json
 import socket
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +11,7 @@ import numpy as np
 
 from jaxlfi.rl.deployment import Limits
 from jaxlfi.robots import wire
-from jaxlfi.robots.clock import Simulated
+from jaxlfi.robots.clock import Clock, Monotonic, Simulated
 from jaxlfi.robots.interrupts import Interrupts
 from jaxlfi.robots.robot import Command, Robot, RobotError
 
@@ -24,27 +25,32 @@ Journal = Callable[[Mapping[str, Any]], None]
 
 def serve(
     listener: socket.socket,
-    make: Callable[[Simulated], Robot],
+    make: Callable[[Clock], Robot],
     observations: Sequence[str],
     actions: Sequence[str],
+    moved: Sequence[int],
     limits: Limits,
     watchdog: float = WATCHDOG,
     journal: Journal = lambda event: None,
+    clock: Callable[[], Clock] = Monotonic,
 ) -> None:
     """Serve one loop after another, until the process is ended.
 
     A robot is stopped exactly once: when it is asked to, when the connection ends or no request comes for a while, when
-    a request is damaged or a command beyond the limits, after any exception of its own, and before SIGINT or SIGTERM
-    ends the process.
+    a request is damaged or a command beyond the limits, after any exception of its own or of the journal, and before
+    SIGINT or SIGTERM ends the process. Commands are checked by the server's own clock, and none is let before there was
+    an observation.
 
     Args:
         listener: that connections come to (`listen`).
-        make: makes a robot for a connection; a simulated one may live in the loop's time, which the clock shows.
+        make: makes a robot for a connection, by the connection's clock.
         observations: names of the numbers that the robot gives.
         actions: names of the displacements that it takes.
+        moved: places of the measured positions of the set-points in an observation, one an action.
         limits: of the set-points.
         watchdog: seconds that may pass without a request.
         journal: takes note of connections ("begun"), commands ("act") and stops ("stopped").
+        clock: makes a connection's clock. `Simulated` ones follow the loop's time: for robots that live in it.
 
     Raises:
         Interrupted: after SIGINT or SIGTERM.
@@ -56,8 +62,7 @@ def serve(
                 connection, _ = listener.accept()
             with connection:
                 connection.settimeout(watchdog)
-                clock = Simulated()
-                _Session(make(clock), clock, names, limits, journal, interrupts).run(wire.Lines(connection))
+                _Session(make, clock(), names, list(moved), limits, journal, interrupts).run(wire.Lines(connection))
 
 
 def listen(port: int, host: str = "127.0.0.1") -> socket.socket:
@@ -66,29 +71,31 @@ def listen(port: int, host: str = "127.0.0.1") -> socket.socket:
 
 
 def write_to(path: Path) -> Journal:
-    """A journal in a file, a line of JSON an event."""
+    """A journal in a file, a line of JSON an event.
 
-    def journal(event: Mapping[str, Any]) -> None:
-        with path.open("a") as file:
-            file.write(json.dumps(event) + "\n")
-
-    return journal
+    Raises:
+        OSError: for a file that cannot be written.
+    """
+    file = path.open("a", buffering=1)
+    return lambda event: file.write(json.dumps(event) + "\n")
 
 
 class _Session:
     """A robot while a loop is connected to it."""
 
-    def __init__(self, robot: Robot, clock: Simulated, names, limits: Limits, journal: Journal, interrupts: Interrupts):
-        self.robot, self.clock, self.names, self.limits = robot, clock, names, limits
+    def __init__(self, make, clock: Clock, names, moved, limits: Limits, journal: Journal, interrupts: Interrupts):
+        self.make, self.clock, self.names, self.moved, self.limits = make, clock, names, moved, limits
         self.journal, self.interrupts = journal, interrupts
-        self.target: np.ndarray | None = None
+        self.robot: Robot | None = None
+        self.target: np.ndarray | None = None  # where the set-points are, once it is known
         self.sent: float | None = None
 
     def run(self, lines: wire.Lines) -> None:
         """From hello to the stop."""
-        self.journal({"event": "begun"})
         why = "the server was ended"
         try:
+            self.journal({"event": "begun"})
+            self.robot = self.make(self.clock)
             self._greet(lines)
             while (message := self._next(lines))["type"] != "stop":
                 kind, contents = self._answer(message)
@@ -101,9 +108,19 @@ class _Session:
         except Exception as error:  # a driver may raise anything; the next connection has a new one
             why = str(error) or type(error).__name__
         finally:
-            self.robot.stop()
-            self.journal({"event": "stopped", "why": why})
+            why = self._stop(why)
         self._part(lines, why)
+
+    def _stop(self, why: str) -> str:
+        """Stop the robot if there is one, and say why it was stopped."""
+        try:
+            if self.robot is not None:
+                self.robot.stop()
+        except Exception as error:
+            why = f"{why}; and stopping the robot failed: {error}"
+        with contextlib.suppress(Exception):  # the robot has been stopped, and there is nobody to be told
+            self.journal({"event": "stopped", "why": why})
+        return why
 
     def _part(self, lines: wire.Lines, why: str) -> None:
         """The last words, for whoever still listens."""
@@ -134,32 +151,40 @@ class _Session:
     def _answer(self, message: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
         if message["type"] not in ("observe", "act"):
             raise RobotError(f"expected observe, act or stop, got {message['type']!r}")
-        now = wire.number(message, "now")
-        self.clock.sleep_until(now)
+        now = self._now(wire.number(message, "now"))
         if message["type"] == "observe":
             seen = self.robot.observe()
             if seen is None:
                 return "nothing", {}
-            if self.sent is None and seen.target is not None:
-                self.target = np.asarray(seen.target, float)  # from which the first command has to begin
+            if self.sent is None:  # from where the first command has to begin
+                values = np.asarray(seen.values, float)
+                self.target = values[self.moved] if seen.target is None else np.asarray(seen.target, float)
             return "observation", vars(seen)
         slot, displacement, target = (
             int(wire.number(message, "slot")),
             wire.numbers(message, "displacement"),
             wire.numbers(message, "target"),
         )
+        if self.target is None:
+            raise RobotError("expected an observation before the first command, got none")
         self._check(now, displacement, target)
         self.journal({"event": "act", "now": now, "displacement": displacement.tolist(), "target": target.tolist()})
         self.robot.act(Command(slot, displacement, target))
         self.target, self.sent = target, now
         return "done", {}
 
+    def _now(self, of_loop: float) -> float:
+        """The time, which for a simulated robot is that of the loop."""
+        if isinstance(self.clock, Simulated):
+            self.clock.sleep_until(of_loop)
+        return self.clock.now()
+
     def _check(self, now: float, displacement: np.ndarray, target: np.ndarray) -> None:
         """Refuse commands that a loop should not have sent."""
         limits, size = self.limits, len(self.limits.step)
         if displacement.shape != (size,) or target.shape != (size,):
             raise RobotError(f"expected {size} set-points, got {target.tolist()} after {displacement.tolist()}")
-        expected = target if self.target is None else self.target + displacement
+        expected = self.target + displacement
         elapsed = np.inf if self.sent is None else now - self.sent
         safe = (
             (np.abs(displacement) <= np.add(limits.step, ROUNDING)).all()  # also refuses NaN

@@ -17,7 +17,7 @@ import numpy as np
 from jaxlfi.rl import deployment
 from jaxlfi.rl.policy import Policy, load
 from jaxlfi.robots import server
-from jaxlfi.robots.clock import Clock
+from jaxlfi.robots.clock import Clock, Simulated
 from jaxlfi.robots.robot import Command, Observation
 
 LAG = 0.08
@@ -138,16 +138,22 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         policy = load(arguments.policy)
         make = lambda clock: PointRobot(policy, clock, **chances)
-        make(None)
+        make(Simulated())
+        if not 0 <= arguments.port < 65536:
+            raise ValueError(f"port: expected a number from 0 to 65535, got {arguments.port}")
+        if not 0 < arguments.watchdog < math.inf:
+            raise ValueError(f"watchdog: expected a positive number of seconds, got {arguments.watchdog}")
+        journal = server.write_to(arguments.journal) if arguments.journal else lambda event: None
         listener = server.listen(arguments.port)
     except (ValueError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
     print(f"listening on socket://127.0.0.1:{listener.getsockname()[1]}", flush=True)
-    journal = server.write_to(arguments.journal) if arguments.journal else lambda event: None
-    names = policy.observed["names"], policy.acted["names"]
-    limits = deployment.of_schema(policy.schema).limits
+    facts, names = deployment.of_schema(policy.schema), list(policy.observed["names"])
+    moved = [names.index(name) for name in facts.moved]
     try:
-        server.serve(listener, make, *names, limits, arguments.watchdog, journal)
+        server.serve(
+            listener, make, names, policy.acted["names"], moved, facts.limits, arguments.watchdog, journal, Simulated
+        )
     except KeyboardInterrupt:
         sys.exit(130)
 

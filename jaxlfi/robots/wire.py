@@ -11,14 +11,15 @@
 
 Every line is an object with a `type`, at most 1 MiB. Numbers are in the units of the policy's schema, `age` and `now`
 in s, and an unknown number is null. `now` is the loop's clock, for simulated robots that live in the loop's time;
-others ignore it. Any request may be answered by `error` with a `message`, after which the robot has stopped; it stops,
-too, when the connection ends.
+others go by their own. Any request may be answered by `error` with a `message`, after which the robot has stopped; it
+stops, too, when the connection ends.
 """
 
 import ipaddress
 import json
 import math
 import socket
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -35,7 +36,7 @@ class Lines:
     """Messages through a socket."""
 
     def __init__(self, connection: socket.socket):
-        """The socket's timeout is that of each reception."""
+        """The socket's timeout is that of each message."""
         self._socket, self._rest = connection, b""
 
     def send(self, kind: str, **contents: Any) -> None:
@@ -50,12 +51,20 @@ class Lines:
             OSError: for a connection that has ended, and where nothing comes in time.
             RobotError: for what is no message.
         """
-        while b"\n" not in self._rest:
-            if len(self._rest) > LONGEST:
-                raise RobotError(f"expected a line of at most {LONGEST} bytes, got more")
-            if not (more := self._socket.recv(65536)):
-                raise ConnectionError("the connection was closed")
-            self._rest += more
+        timeout = self._socket.gettimeout()
+        ends = time.monotonic() + (timeout or math.inf)
+        try:
+            while b"\n" not in self._rest:
+                if len(self._rest) > LONGEST:
+                    raise RobotError(f"expected a line of at most {LONGEST} bytes, got more")
+                if (left := ends - time.monotonic()) <= 0:  # whoever sends a byte now and then is late all the same
+                    raise TimeoutError("timed out")
+                self._socket.settimeout(None if timeout is None else left)
+                if not (more := self._socket.recv(65536)):
+                    raise ConnectionError("the connection was closed")
+                self._rest += more
+        finally:
+            self._socket.settimeout(timeout)
         line, _, self._rest = self._rest.partition(b"\n")
         try:
             message = json.loads(line)

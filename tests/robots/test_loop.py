@@ -25,6 +25,27 @@ def run(robot, act=lambda observation: TOWARDS, whole=True, **changes):
     return loop(**changes).run(robot, act, whole)
 
 
+def test_what_happened_is_told_after_the_stop_however_it_ended():
+    def cable(command):
+        if command.slot == 8:
+            raise OSError("cable")
+
+    ends = []
+    for robot, expected in (
+        (Robot(on_act=cable), OSError),
+        (Robot(given=dict.fromkeys(range(9), missing)), RobotError),
+    ):
+        with pytest.raises(expected):
+            loop().run(
+                robot, lambda observation: TOWARDS, on_end=lambda log, robot=robot: ends.append((log, robot.stops))
+            )
+    (failed, stops), (nothing, _) = ends
+    assert stops == 1 and failed.targets.shape == (8, 2) and failed.observations.shape == (9, 5)
+    assert nothing.targets.shape == (0, 2) and nothing.observations.shape == (0, 5) and nothing.extras == {}
+    log = loop().run(Robot(), lambda observation: TOWARDS, on_end=lambda log: ends.append(log))
+    np.testing.assert_array_equal(ends[-1].targets, log.targets)
+
+
 def missing(plain):
     return None
 

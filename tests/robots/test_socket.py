@@ -3,6 +3,7 @@
 What was safe is judged by the journal of the robot's own process.
 """
 
+import itertools
 import json
 import re
 import signal
@@ -18,7 +19,7 @@ from robots.fakes import LIMITS, PERIOD, Robot, a_policy
 
 from jaxlfi.robots import server, simulated, wire
 from jaxlfi.robots.client import SocketRobot
-from jaxlfi.robots.clock import Simulated
+from jaxlfi.robots.clock import Monotonic, Simulated
 from jaxlfi.robots.loop import Loop
 from jaxlfi.robots.robot import Command, RobotError
 
@@ -41,7 +42,7 @@ class Server:
         """What happened in each connection, as the robot tells it."""
         events = [json.loads(line) for line in self.journal.read_text().splitlines()] if self.journal.exists() else []
         begins = [place for place, event in enumerate(events) if event["event"] == "begun"]
-        return [events[i:j] for i, j in zip(begins, [*begins[1:], None], strict=True)]
+        return [events[i:j] for i, j in itertools.pairwise([*begins, None])]
 
     def last(self, until=lambda events: events[-1]["event"] == "stopped", patience=20.0):
         """The last connection's events, once there are these."""
@@ -322,7 +323,9 @@ def ask(process, *messages):
 
 
 NAMED = {**HELLO, "observations": list("abcde"), "actions": list("uv")}
-ACT = {"type": "act", "now": 0.0, "slot": 0, "displacement": [0.01, 0.02], "target": [0.4, 0.3]}
+SEE = [{"type": "observe", "now": now} for now in (0.0, 0.5)]  # the first frame comes late
+ACT = {"type": "act", "now": 0.5, "slot": 0, "displacement": [0.01, 0.02], "target": [0.4475, 0.32]}
+"""From the middle of the limits, where the robot begins."""
 
 
 @pytest.mark.parametrize(
@@ -332,14 +335,14 @@ ACT = {"type": "act", "now": 0.0, "slot": 0, "displacement": [0.01, 0.02], "targ
         ([{**NAMED, "observations": list("abcd")}], r"expected observations \['a', 'b', 'c', 'd', 'e'\], got"),
         ([NAMED, b"nothing\n"], "expected a line of JSON"),
         ([NAMED, {"type": "jump"}], "expected observe, act or stop, got 'jump'"),
-        ([NAMED, {**ACT, "displacement": [0.07, 0.0]}], "expected a command within Limits"),
-        ([NAMED, {**ACT, "displacement": [0.05, 0.05]}], "expected a command within Limits"),
-        ([NAMED, {**ACT, "target": [0.4, 0.51]}], "expected a command within Limits"),
-        ([NAMED, {"type": "observe", "now": 0.0}, {"type": "observe", "now": 0.5}, ACT], "expected a command within"),
-        ([NAMED, {**ACT, "target": [0.4]}], "expected 2 set-points"),
-        ([NAMED, {**ACT, "target": [0.4, None]}], "expected a command within Limits"),
-        ([NAMED, ACT, {**ACT, "now": 0.16, "target": [0.42, 0.32]}], "expected a command within Limits"),  # 1 cm more
-        ([NAMED, ACT, {**ACT, "now": 0.01, "target": [0.41, 0.32]}], "expected a command within Limits"),  # too soon
+        ([NAMED, ACT], "expected an observation before the first command, got none"),
+        ([NAMED, *SEE, {**ACT, "displacement": [0.07, 0.0], "target": [0.5075, 0.3]}], "expected a command within"),
+        ([NAMED, *SEE, {**ACT, "displacement": [0.05, 0.05], "target": [0.4875, 0.35]}], "expected a command"),
+        ([NAMED, *SEE, {**ACT, "target": [0.4575, 0.32]}], "expected a command within Limits"),  # 1 cm more
+        ([NAMED, *SEE, {**ACT, "target": [0.4]}], "expected 2 set-points"),
+        ([NAMED, *SEE, {**ACT, "target": [0.4, None]}], "expected a command within Limits"),
+        ([NAMED, *SEE, ACT, {**ACT, "now": 0.66, "target": [0.4675, 0.34]}], "expected a command within Limits"),
+        ([NAMED, *SEE, ACT, {**ACT, "now": 0.51, "target": [0.4575, 0.34]}], "expected a command within Limits"),
     ],
 )  # fmt: skip
 def test_a_server_stops_its_robot_before_it_does_what_it_should_not(robot_process, messages, expected):
@@ -362,8 +365,15 @@ def test_a_server_that_is_told_to_end_stops_its_robot(number, tmp_path):
     process.end()
 
 
-def test_a_robot_that_raises_is_stopped_and_the_next_one_is_served(tmp_path):
-    """In a thread, where Python lets signals alone."""
+def served(make, journal=lambda event: None, clock=Monotonic):
+    """The address of a server in a thread, where Python lets signals alone."""
+    listener = server.listen(0)
+    words = (make, *NAMES, (1, 3), LIMITS, 5.0, journal, clock)
+    threading.Thread(target=server.serve, args=(listener, *words), daemon=True).start()
+    return f"socket://127.0.0.1:{listener.getsockname()[1]}"
+
+
+def test_a_robot_that_raises_is_stopped_and_the_next_one_is_served():
     events, made = [], []
 
     class Hot(Robot):
@@ -371,16 +381,83 @@ def test_a_robot_that_raises_is_stopped_and_the_next_one_is_served(tmp_path):
             super().__init__(on_act=lambda command: 1 / 0)
             made.append(self)
 
-    listener = server.listen(0)
-    words = (lambda clock: Hot(), *NAMES, LIMITS, 5.0, events.append)
-    threading.Thread(target=server.serve, args=(listener, *words), daemon=True).start()
-    address = f"socket://127.0.0.1:{listener.getsockname()[1]}"
+    address = served(lambda clock: Hot(), events.append, Simulated)
     for count in (1, 2):
         clock = Simulated()
         with pytest.raises(RobotError, match="its driver refused act: division by zero"):
             Loop.of(a_policy(), clock=clock).run(SocketRobot(address, *NAMES, timeout=20.0, clock=clock), a_policy())
         assert [robot.stops for robot in made] == [1] * count
     assert stops(events) == ["division by zero"] * 2
+
+
+@pytest.mark.parametrize(
+    ("displacement", "target", "count"),
+    [([0.03, 0.0], [0.46, 0.3], 1), ([0.0, 0.0], [0.6, 0.5], 1), ([0.03, 0.0], [0.43, 0.3], 2)],
+)
+def test_a_server_believes_neither_the_clock_nor_the_place_of_a_loop(displacement, target, count):
+    """What it measures is where the first command begins, and its own clock says how fast set-points move."""
+    robot, clock = Robot(), Simulated()
+    client = SocketRobot(served(lambda clock: robot), *NAMES, timeout=20.0, clock=clock)
+    client.observe()
+    if count == 2:
+        client.act(Command(0, np.array([0.03, 0.0]), np.array([0.43, 0.3])))
+        clock.pass_by(PERIOD)  # of the loop; none has passed
+        target = [0.46, 0.3]
+    with pytest.raises(RobotError, match="its driver refused act: expected a command within Limits"):
+        client.act(Command(1, np.array(displacement), np.array(target)))
+    assert robot.stops == 1 and len(robot.commands) == count - 1
+
+
+def test_a_robot_that_is_not_ready_ends_its_connection_and_not_the_server():
+    ready, events = [False, True], []
+
+    def make(clock):
+        if not ready.pop(0):
+            raise OSError("the arm is not ready")
+        return Robot()
+
+    address = served(make, events.append)
+    with pytest.raises(RobotError, match="its driver refused hello: the arm is not ready"):
+        SocketRobot(address, *NAMES, timeout=20.0)
+    SocketRobot(address, *NAMES, timeout=20.0).stop()
+    assert stops(events) == ["the arm is not ready", "asked to"]
+
+
+def test_a_journal_that_fails_stops_the_robot_and_not_the_server():
+    made = [Robot(), Robot()]
+
+    def journal(event):
+        if event["event"] != "begun":
+            raise OSError("the disk is full")
+
+    left = list(made)
+    address = served(lambda clock: left.pop(0), journal)
+    for robot in made:
+        client = SocketRobot(address, *NAMES, timeout=20.0)
+        client.observe()
+        with pytest.raises(RobotError, match="its driver refused act: the disk is full"):
+            client.act(Command(0, np.array([0.03, 0.0]), np.array([0.43, 0.3])))
+        assert robot.stops == 1 and not robot.commands
+
+
+def test_a_message_that_comes_byte_by_byte_is_late_all_the_same():
+    one, other = socket.socketpair()
+    ended = threading.Event()
+
+    def trickle():
+        while not ended.wait(0.02):
+            other.sendall(b"x")
+
+    thread = threading.Thread(target=trickle, daemon=True)
+    thread.start()
+    one.settimeout(0.2)
+    began = time.monotonic()
+    with pytest.raises(TimeoutError):
+        wire.Lines(one).receive()
+    assert 0.15 < time.monotonic() - began < 5.0 and one.gettimeout() == 0.2
+    ended.set()
+    thread.join()
+    one.close(), other.close()
 
 
 def test_a_robot_is_stopped_when_nobody_asks_for_anything(tmp_path):
@@ -400,6 +477,9 @@ def test_a_simulated_robot_of_nothing_is_refused(tmp_path, capsys):
         ([str(tmp_path / "none.npz")], "expected a whole .npz file"),
         ([str(path), "--dropped", "1.5"], r"dropped: expected a number in [0, 1], got 1.5"),
         ([str(path), "--jitter", "0.1"], "jitter: expected at most 0.04 s"),
+        ([str(path), "--port", "99999"], "port: expected a number from 0 to 65535, got 99999"),
+        ([str(path), "--watchdog", "-1"], "watchdog: expected a positive number of seconds, got -1.0"),
+        ([str(path), "--journal", str(tmp_path / "nowhere" / "j")], "No such file or directory"),
     ):
         with pytest.raises(SystemExit) as end:
             simulated.main(words)

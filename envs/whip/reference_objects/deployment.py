@@ -97,7 +97,7 @@ def deploy(
     robot = ReferenceRobot(key, dlo, place, camera)
     log = None
     with contextlib.suppress(UnstableError):
-        log = dataclasses.replace(UNLIMITED, clock=robot.clock).run(robot, act, whole)
+        log = dataclasses.replace(UNLIMITED, clock=robot.simulated_clock).run(robot, act, whole)
     observations, actions = np.stack(robot.observations), np.stack(robot.actions)
     if not whole or log is None:
         return Deployed(*_outcome(observations), observations, actions)

@@ -24,7 +24,7 @@ class ReferenceRobot:
 
     Attributes:
         about: what is to be recorded of it.
-        clock: of the loop that controls it.
+        simulated_clock: of the loop that controls it.
         camera: that sees it.
         observations: its observations so far, each of shape [28].
         actions: displacements so far, the last of which may have made the simulation unstable, each of shape [2].
@@ -52,7 +52,7 @@ class ReferenceRobot:
             "colours": HEX,
             "provenance": {"simulator": SIMULATOR},
         }
-        self.clock = Simulated()
+        self.simulated_clock = Simulated()
         self.observations: list[np.ndarray] = []
         self.actions: list[np.ndarray] = []
         self._key, self._side, self._observer = key, jnp.float32(place.cube_side), Observer()

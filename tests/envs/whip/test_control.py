@@ -38,7 +38,7 @@ class Gripper:
 
     def __init__(self, about='{"camera": "there"}', lost: int = -1, numbers: int = 28):
         self.about = json.loads(about, object_hook=lambda found: {**found, "camera": CAMERA})
-        self.clock, self.observer, self.stops, self.commands = Simulated(), Observer(), 0, []
+        self.simulated_clock, self.observer, self.stops, self.commands = Simulated(), Observer(), 0, []
         self.position, self.lost, self.numbers = np.array([0.4, 0.36]), lost, numbers
         Gripper.made.append(self)
 
@@ -98,9 +98,18 @@ def test_keypoints_that_are_not_seen_stay_where_they_were_and_cubes_that_moved_s
     assert third.dtype == np.float32 and third.shape == (OBSERVATIONS.size,)
 
 
+def test_a_cube_that_is_found_late_has_not_been_hit():
+    observer, late = Observer(), np.arange(10) != 9
+    assert not observer.observe([0.4, 0.3], np.where(late[:, None], EVERYWHERE, np.nan), late)[22:].any()
+    there = np.where(late[:, None], EVERYWHERE, [0.75, 0.8])
+    assert not observer.observe([0.4, 0.3], there, ALL)[22:].any()
+    there[9] -= 0.05
+    assert observer.observe([0.4, 0.3], there, ALL)[22:].tolist() == [0, 0, 0, 0, 0, 1]
+
+
 def test_an_observer_needs_no_jax():
     program = (
-        "import sys; sys.modules['jax'] = sys.modules['mujoco'] = sys.modules['flax'] = None\n"
+        "import sys; sys.modules['jax'] = sys.modules['mujoco'] = sys.modules['jaxtyping'] = None\n"
         "import numpy as np; from jaxlfi.envs.whip.observer import Observer\n"
         "print(Observer().observe([0.4, 0.3], np.full((10, 2), 0.25), np.ones(10, bool)).sum())"
     )
@@ -182,6 +191,10 @@ def test_a_camera_that_a_robot_does_not_tell_is_the_nominal_one_and_that_is_note
     assert isinstance(fields["camera"], Camera) and fields["source"] == "simulated"
     for about, expected in (
         ({"colour": "red"}, "expected it to say camera, .* of itself, got colour"),
+        (None, "expected a mapping as what it says of itself, got None"),
+        ({"facts": 3}, "expected dict as its facts, which JSON can hold, got 3"),
+        ({"image_size": "256"}, "expected int as its image_size, which JSON can hold, got '256'"),
+        ({"provenance": {"lab": object()}}, "expected dict as its provenance, which JSON can hold"),
         ({"camera": "there"}, "expected a camera's .*field_of_view, got 'there'"),
         ({"camera": {**CAMERA, "position": [1.0]}}, r"expected a camera's .* of shapes \[3\], \[4\], \[\]"),
     ):
@@ -189,6 +202,21 @@ def test_a_camera_that_a_robot_does_not_tell_is_the_nominal_one_and_that_is_note
             control.described(about)
     status, _, error, robot = run(tmp_path, capsys, robot=f'{__name__}:Gripper,about={{"colour": "red"}}')
     assert status == 2 and "got colour" in error and robot.stops == 1 and not robot.commands
+
+
+def test_what_happened_before_a_robot_failed_is_kept(tmp_path, capsys, found_here, monkeypatch):
+    act = Gripper.act
+
+    def failing(self, command):
+        if command.slot == 5:
+            raise OSError("cable")
+        act(self, command)
+
+    monkeypatch.setattr(Gripper, "act", failing)
+    status, out, error, robot = run(tmp_path, capsys)
+    assert status == 2 and "cable" in error and robot.stops == 1
+    assert "expected 16 control steps, got 5" in out and "hit yellow" in out
+    assert files.read_arrays(tmp_path / "rollout.npz")["log/targets"].shape == (5, 2)
 
 
 def test_bad_input_moves_no_robot(tmp_path, capsys, found_here):
