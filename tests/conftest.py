@@ -1,11 +1,23 @@
 """What all tests share: strict JAX, quick compiling, bounded memory, deterministic hypothesis, one key a test."""
 
+import atexit
 import ctypes
 import gc
 import os
+import shutil
 import signal
+import sys
+import tempfile
 import zlib
 from pathlib import Path
+
+# Where Python is told to keep no bytecode, every worker and every process that a test starts would compile the source
+# of all that it imports, for seconds: they share what is compiled, in a folder that goes when the tests end.
+if sys.dont_write_bytecode:
+    sys.dont_write_bytecode, sys.pycache_prefix = False, tempfile.mkdtemp(prefix="jaxlfi-bytecode-")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+    atexit.register(shutil.rmtree, sys.pycache_prefix, ignore_errors=True)
 
 import hypothesis
 import jax
