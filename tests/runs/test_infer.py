@@ -198,36 +198,36 @@ def test_a_run_in_a_folder_goes_on_where_a_callback_stopped_it(tmp_path):
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
-    infer(0, settings=ONE, out=tmp_path / "run")
+    infer(0, out=tmp_path / "run")
     before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     others = {
         "seed": {"seed": 1},
-        "settings": {"settings": settings(rounds=1, simulation_budget=30)},
+        "settings": {"settings": settings(simulation_budget=30)},
         "heuristic": {"heuristic": Edge(expansion=0.1)},
         "task_name": {"task": dataclasses.replace(gaussian(), name="another")},
     }
     for name, changes in others.items():
         with pytest.raises(StoreError, match=f"^out: expected a new folder or one of the same run, got .* {name}$"):
-            infer(out=tmp_path / "run", **({"settings": ONE} | changes))
+            infer(out=tmp_path / "run", **changes)
     (tmp_path / "occupied").mkdir()
     (tmp_path / "occupied" / "notes.txt").write_text("mine")
     with pytest.raises(StoreError, match=r"^out: expected a new or empty folder"):
-        infer(settings=ONE, out=tmp_path / "occupied")
+        infer(out=tmp_path / "occupied")
     assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
 
 
 def test_another_observation_or_support_is_another_run(tmp_path):
     """They do not stand in the settings, but the result of the folder would not be the one that was asked for."""
-    infer(0, settings=ONE, out=tmp_path / "run")
+    infer(0, out=tmp_path / "run")
     for changes in ({"observation": OBSERVED + 1}, {"support": "ok"}):
         with pytest.raises(StoreError, match=r"^out: expected a new folder or one of the same run"):
-            infer(out=tmp_path / "run", settings=ONE, **changes)
+            infer(out=tmp_path / "run", **changes)
 
 
 def test_progress_is_shown_when_asked_for(capsys):
-    infer(settings=ONE)
+    infer()
     assert capsys.readouterr().out == ""
-    infer(settings=ONE, progress=True)
+    infer(progress=True)
     assert "gaussian_linear: 1 run" in capsys.readouterr().out
 
 
@@ -242,7 +242,7 @@ def test_draws_lie_in_the_support():
 
 
 def test_a_network_of_one_round_knows_other_observations(tmp_path):
-    run = infer(settings=ONE, heuristic=Edge())
+    run = infer(task=OWN, heuristic=FIXED, support="own", settings=ONE)
     assert run.amortised
     own, again = run.posterior, run.posterior_of(OBSERVED)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(own), strict=True):
@@ -250,7 +250,7 @@ def test_a_network_of_one_round_knows_other_observations(tmp_path):
     other = run.posterior_of(OBSERVED + 1)
     means = [np.asarray(posterior.sample(jax.random.key(0), 1000)).mean(0) for posterior in (own, other)]
     assert np.abs(means[1] - means[0]).max() > 0.05
-    loaded = load(run.save(tmp_path / "run"), gaussian()).posterior_of(OBSERVED + 1)
+    loaded = load(run.save(tmp_path / "run"), OWN).posterior_of(OBSERVED + 1)
     np.testing.assert_allclose(loaded.mixture.means, other.mixture.means, rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match=r"^observation: expected a trajectory of shape \[2\] .* got \[3\]$"):
         run.posterior_of(np.zeros(3))
