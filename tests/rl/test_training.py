@@ -1,6 +1,7 @@
 """Trainings in folders: what they leave, that they go on to the same bits, and what is refused; the command line."""
 
 import csv
+import dataclasses
 import json
 
 import jax
@@ -223,8 +224,8 @@ def test_the_posterior_of_a_run_is_a_domain(tmp_path, capsys):
     np.testing.assert_allclose(np.log(theta[:, 0]).mean(), found.mixture.mean[0], atol=0.1)
     np.testing.assert_allclose(theta[:, 1].mean(), found.mixture.mean[1], atol=0.1)
     assert bool(LINE.feasible.contains(theta).all())
-    other = infer(jax.random.key(0), small.gaussian(), settings=small.settings(rounds=1))
-    other.save(tmp_path / "other")
+    renamed = dataclasses.replace(task, names=("first", "second"), log=("first",))
+    found.replace(task=renamed).save(tmp_path / "other")
     assert run("--domain", tmp_path / "other", "--out", tmp_path / "run") == 2
     assert "domain: expected a posterior of gain, target, the parameters of line" in capsys.readouterr().err
 
