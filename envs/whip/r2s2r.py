@@ -115,7 +115,7 @@ def _begin(arguments: argparse.Namespace) -> None:
     if arguments.iterations < 1:
         raise ValueError(f"iterations: expected at least 1, got {arguments.iterations}")
     if arguments.policy:
-        policy.load(arguments.policy).require("whip", OBSERVATIONS.names, ACTIONS.names)
+        policy.load(arguments.policy).require("whip", OBSERVATIONS, ACTIONS)
     if arguments.recording:
         recorded(str(arguments.recording))
     if arguments.posterior:

@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float, Int
 from experiments.policies.study import FEM, SIMULATED, Study
 from jaxlfi.cli.domains import domain
 from jaxlfi.envs.whip import rules
-from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS, WhipEnvironment
+from jaxlfi.envs.whip.environment import WhipEnvironment
 from jaxlfi.envs.whip.vision.camera import Camera, side_camera
 from jaxlfi.envs.whip.vision.keypoints import ON_DLO
-from jaxlfi.rl.evaluation import acting
+from jaxlfi.rl.evaluation import acting, stacked
 from jaxlfi.rl.policy import Policy
 
 BROAD = ("uniform", "median")
@@ -101,10 +101,9 @@ class Simulation:
     def __init__(self, study: Study, environment: WhipEnvironment, episodes: int, seed: int = 0):
         """Nothing is done yet."""
         self._study, self._environment, self._episodes, self._seed = study, environment, episodes, seed
-        schema = {"observations": vars(OBSERVATIONS), "actions": vars(ACTIONS)}
 
         def policy(key, theta, layers):
-            act = acting(*layers, schema)
+            act = acting(layers)
             return perform(key, environment, lambda observation, _: act(observation), theta)
 
         self._policies = jax.jit(jax.vmap(policy, in_axes=(None, None, 0)))
@@ -112,8 +111,7 @@ class Simulation:
 
     def of_policies(self, policies: list[Policy], name: str) -> Performed:
         """Policies of the same widths on a domain, shape [S, E]."""
-        layers = jax.tree.map(lambda *leaves: np.stack(leaves), *((one.weights, one.biases) for one in policies))
-        return jax.device_get(self._policies(*self._episodes_of(name), layers))
+        return jax.device_get(self._policies(*self._episodes_of(name), stacked(policies)))
 
     def of_actions(self, actions: Float[np.ndarray, "16 2"], name: str) -> Performed:
         """A sequence of actions on a domain, shape [1, E]."""

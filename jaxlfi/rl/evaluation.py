@@ -31,10 +31,26 @@ class Outcomes:
     facts: dict[str, Array]
 
 
-def acting(weights: Sequence[Array], biases: Sequence[Array], schema: Mapping[str, Any]) -> Callable[[Array], Array]:
-    """A saved policy (`jaxlfi.rl.policy.Policy`) in JAX: from an observation [O] to an action [A], in their units."""
-    numbers = lambda signals: (jnp.asarray(schema[signals][name], jnp.float32) for name in ("centre", "scale"))
-    (seen_centre, seen_scale), (centre, scale) = numbers("observations"), numbers("actions")
+Layers = tuple[Sequence[Array], Sequence[Array], tuple[tuple[Array, Array], tuple[Array, Array]]]
+"""Weights, biases and scaling of a policy (`jaxlfi.rl.policy.Policy`); of several, each with a leading axis."""
+
+
+def stacked(policies: Sequence[Policy]) -> Layers:
+    """Policies of the same widths as one pytree.
+
+    Raises:
+        ValueError: for several widths.
+    """
+    every = [(one.weights, one.biases, one.scaling) for one in policies]
+    shapes = [jax.tree.map(np.shape, one) for one in every]
+    if any(own != shapes[0] for own in shapes):
+        raise ValueError("policies: expected networks of the same widths; evaluate others by themselves")
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *every)
+
+
+def acting(layers: Layers) -> Callable[[Array], Array]:
+    """A policy in JAX: from an observation [O] to an action [A], in their units."""
+    weights, biases, ((seen_centre, seen_scale), (centre, scale)) = layers
 
     def act(observation: Float[Array, " obs"]) -> Float[Array, " act"]:
         layer = (observation - seen_centre) / seen_scale
@@ -90,21 +106,17 @@ def cross_evaluate(
         A row for each policy and domain: mean return, its standard error, and means of the environment's facts.
 
     Raises:
-        ValueError: for policies of another environment or of several widths, and less than one episode.
+        ValueError: for policies of another environment (names, units) or several widths, and less than one episode.
     """
     if episodes < 1:
         raise ValueError(f"episodes: expected at least 1, got {episodes}")
     for policy in policies.values():
-        policy.require(environment.name, environment.observations.names, environment.actions.names)
-    shapes = [[weight.shape for weight in policy.weights] for policy in policies.values()]
-    if any(own != shapes[0] for own in shapes):
-        raise ValueError("policies: expected networks of the same widths; evaluate others by themselves")
-    layers = jax.tree.map(lambda *leaves: np.stack(leaves), *((one.weights, one.biases) for one in policies.values()))
-    schema = next(iter(policies.values())).schema
+        policy.require(environment.name, environment.observations, environment.actions)
+    layers = stacked(list(policies.values()))
 
     @jax.jit
     def fares(key: jax.Array, domain: Domain) -> Outcomes:
-        return jax.vmap(lambda layers: evaluate(key, environment, acting(*layers, schema), domain))(layers)
+        return jax.vmap(lambda layers: evaluate(key, environment, acting(layers), domain))(layers)
 
     rows = []
     for name, draw in draws.items():

@@ -7,9 +7,10 @@ import dataclasses
 import functools
 import itertools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -17,6 +18,15 @@ from jaxlfi.io import files
 
 FORMAT, VERSION = "jaxlfi-policy", 1
 ONE = np.float32(1)
+COLUMNS = ("names", "units", "centre", "scale")
+"""Of the signals in a schema; one entry a number."""
+
+
+class Named(Protocol):
+    """Signals by their names and units."""
+
+    names: Sequence[str]
+    units: Sequence[str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +44,8 @@ class Policy:
             (`jaxlfi.rl.deployment`); whatever else was recorded with the policy, as `versions`.
 
     Raises:
-        ValueError: for layers that do not fit together or to the schema.
+        ValueError: for layers that do not fit together or to the schema, numbers that are not finite, and a schema
+            without the environment or the scaling.
 
     Example:
         >>> signals = {"names": ["x"], "units": ["m"], "centre": [1.0], "scale": [0.5]}
@@ -49,13 +60,18 @@ class Policy:
     schema: Mapping[str, Any]
 
     def __post_init__(self):
-        sizes = [len(self.observed["names"]), *(np.shape(bias)[0] for bias in self.biases)]
+        _check_schema(self.schema)
+        sizes = [len(self.observed["names"]), *(np.size(bias) for bias in self.biases)]
         shapes = [np.shape(weight) for weight in self.weights]
-        if shapes != list(itertools.pairwise(sizes)) or sizes[-1] != len(self.acted["names"]):
+        flat = all(np.ndim(bias) == 1 for bias in self.biases)
+        if shapes != list(itertools.pairwise(sizes)) or sizes[-1] != len(self.acted["names"]) or not flat:
             raise ValueError(
                 f"policy: expected layers from {sizes[0]} observations to {len(self.acted['names'])} actions, "
-                f"got weights of shapes {shapes} and biases of sizes {sizes[1:]}"
+                f"got weights of shapes {shapes} and biases of shapes {[np.shape(bias) for bias in self.biases]}"
             )
+        for array in (*self.weights, *self.biases):
+            if np.asarray(array).dtype.kind not in "fiu" or not np.isfinite(array).all():
+                raise ValueError("policy: expected layers of finite numbers, got others")
 
     @property
     def observed(self) -> Mapping[str, Any]:
@@ -69,7 +85,7 @@ class Policy:
 
     def __call__(self, observation: Sequence[float] | np.ndarray) -> np.ndarray:
         """The action, float32 [..., A], for an observation [..., O]."""
-        inputs, outputs = self._scaling
+        inputs, outputs = self.scaling
         layer = (np.asarray(observation, np.float32) - inputs[0]) / inputs[1]
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             layer = np.tanh(np.dot(layer, weight) + bias)
@@ -77,22 +93,21 @@ class Policy:
         action = np.dot(layer, self.weights[-1]) + self.biases[-1]
         return np.minimum(np.maximum(action, -ONE), ONE) * outputs[1] + outputs[0]
 
-    def require(self, environment: str, observations: Sequence[str], actions: Sequence[str]) -> "Policy":
+    def require(self, environment: str, observations: Named, actions: Named) -> "Policy":
         """Refuse a policy of another environment.
 
         Args:
             environment: its name.
-            observations: names of its observations.
-            actions: names of its actions.
+            observations: names and units of its observations, as `jaxlfi.rl.environment.Signals`.
+            actions: likewise, of its actions.
 
         Raises:
             ValueError: which says what differs.
         """
-        pairs = {
-            "environment": (environment, self.schema["environment"]),
-            "observations": (list(observations), list(self.observed["names"])),
-            "actions": (list(actions), list(self.acted["names"])),
-        }
+        pairs = {"environment": (environment, self.schema["environment"])}
+        for what, signals in (("observations", observations), ("actions", actions)):
+            pairs[what] = list(signals.names), list(self.schema[what]["names"])
+            pairs[f"units of {what}"] = list(signals.units), list(self.schema[what]["units"])
         for what, (expected, got) in pairs.items():
             if expected != got:
                 raise ValueError(f"policy: expected {what} {expected!r}, got one of {got!r}")
@@ -108,8 +123,8 @@ class Policy:
         return Path(path)
 
     @functools.cached_property
-    def _scaling(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """Centre and scale of observations, and of actions."""
+    def scaling(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """Centre and scale of observations, float32 [O] each, and of actions, [A] each."""
         of = lambda signals: tuple(np.asarray(signals[name], np.float32) for name in ("centre", "scale"))
         return of(self.observed), of(self.acted)
 
@@ -150,3 +165,28 @@ def read(path: str | Path, kind: str, version: int) -> tuple[dict[str, np.ndarra
     if (got, its_version) != (kind, version):
         raise ValueError(f"{path}: expected {kind} of version {version}, got {got} of version {its_version}")
     return arrays, schema
+
+
+def _check_schema(schema: Mapping[str, Any]) -> None:
+    """Refuse a schema by which a policy cannot act.
+
+    Raises:
+        ValueError: for one without the environment's name, or signals without as many names, units, finite centres and
+            positive scales.
+    """
+    if not isinstance(schema.get("environment"), str):
+        raise ValueError(f"environment: expected a name in the schema, got {schema.get('environment')!r}")
+    for what in ("observations", "actions"):
+        signals = schema.get(what)
+        columns = [signals.get(name) for name in COLUMNS] if isinstance(signals, Mapping) else [None]
+        if not all(isinstance(column, list | tuple) for column in columns):
+            raise ValueError(f"{what}: expected {', '.join(COLUMNS)} in the schema, got {signals!r}")
+        names, units, centre, scale = columns
+        if not len(names) == len(units) == len(centre) == len(scale):
+            raise ValueError(f"{what}: expected as many of {', '.join(COLUMNS)}, got {[len(one) for one in columns]}")
+        if not all(_is_number(number) for number in (*centre, *scale)) or not all(number > 0 for number in scale):
+            raise ValueError(f"{what}: expected finite centres and positive scales, got {centre} and {scale}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and math.isfinite(value)

@@ -98,7 +98,7 @@ def test_a_policy_is_the_model_that_was_trained(tmp_path):
     model = PPO("MlpPolicy", Space(), seed=3, device="cpu")
     model.policy.action_net.weight.data *= 200  # which begins with hardly any action at all
     policy = load(sb3.as_policy(model, 3).save(tmp_path / "policy.npz"))
-    policy.require("whip", OBSERVATIONS.names, ACTIONS.names)
+    policy.require("whip", OBSERVATIONS, ACTIONS)
     random = np.random.default_rng(0)
     observations = random.normal(0.5, 30.0, (50, OBSERVATIONS.size)).astype(np.float32)
     expected, _ = model.predict(observations, deterministic=True)

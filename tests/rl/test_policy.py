@@ -1,8 +1,11 @@
 """Policies as files: what they compute, what they refuse, and that they need no JAX."""
 
 import itertools
+import json
+import math
 import subprocess
 import sys
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -70,10 +73,58 @@ def test_damaged_files_are_refused(policy, tmp_path):
 
 
 def test_the_policy_of_another_environment_is_refused(policy):
-    assert policy.require("line", ["a", "b"], ["u"]) is policy
-    for other in (("whip", ["a", "b"], ["u"]), ("line", ["a"], ["u"]), ("line", ["a", "b"], ["v"])):
-        with pytest.raises(ValueError, match="policy: expected"):
+    class Named(NamedTuple):
+        names: tuple
+        units: tuple
+
+    seen, acted = Named(("a", "b"), ("m", "")), Named(("u",), ("m",))
+    assert policy.require("line", seen, acted) is policy
+    for other, expected in (
+        (("whip", seen, acted), "environment 'whip', got one of 'line'"),
+        (("line", Named(("a",), ("m",)), acted), r"observations \['a'\]"),
+        (("line", seen, Named(("v",), ("m",))), r"actions \['v'\]"),
+        (("line", seen, Named(("u",), ("mm",))), r"units of actions \['mm'\], got one of \['m'\]"),
+    ):
+        with pytest.raises(ValueError, match=f"policy: expected {expected}"):
             policy.require(*other)
+
+
+def without(schema, *path):
+    """The schema less what lies at a path in it."""
+    first, *rest = path
+    return {
+        name: without(one, *rest) if name == first else one for name, one in schema.items() if rest or name != first
+    }
+
+
+@pytest.mark.parametrize(
+    ("damage", "expected"),
+    [
+        (lambda schema: without(schema, "environment"), "environment: expected a name in the schema, got None"),
+        (lambda schema: schema | {"observations": []}, r"observations: expected names, .* in the schema, got \[\]"),
+        (lambda schema: without(schema, "actions", "centre"), "actions: expected names, .* in the schema, got {"),
+        (lambda schema: with_scale(schema, [0.5, 4.0]), "actions: expected as many of names, .*, got .*2"),
+        (lambda schema: with_scale(schema, [0.0]), r"actions: expected finite .* positive scales, got .* and \[0.0\]"),
+        (lambda schema: with_scale(schema, [math.nan]), "actions: expected finite centres and positive scales"),
+        (lambda schema: with_scale(schema, ["1"]), "actions: expected finite centres and positive scales"),
+    ],
+)
+def test_a_schema_that_a_policy_cannot_act_by_is_refused(policy, tmp_path, damage, expected):
+    path = policy.save(tmp_path / "policy.npz")
+    schema = {"format": "jaxlfi-policy", "version": 1, **damage(policy.schema)}
+    files.write_arrays(path, files.read_arrays(path) | {"schema": np.asarray(json.dumps(schema))})
+    with pytest.raises(ValueError, match=f"policy.npz: expected a whole policy, got: {expected}") as caught:
+        load(path)
+    assert "\n" not in str(caught.value)
+
+
+def with_scale(schema, scale):
+    return schema | {"actions": schema["actions"] | {"scale": scale}}
+
+
+def test_layers_are_finite(policy):
+    with pytest.raises(ValueError, match="policy: expected layers of finite numbers"):
+        Policy(policy.weights, (policy.biases[0], np.float32([np.nan])), policy.schema)
 
 
 def test_it_runs_where_there_is_no_jax(policy, tmp_path):

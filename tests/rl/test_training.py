@@ -20,7 +20,8 @@ from jaxlfi.cli import evaluate as evaluating
 from jaxlfi.cli import train as command
 from jaxlfi.io import files
 from jaxlfi.rl import domains, training
-from jaxlfi.rl.policy import load
+from jaxlfi.rl.evaluation import cross_evaluate
+from jaxlfi.rl.policy import Policy, load
 from jaxlfi.runs.folder import StoreError
 from jaxlfi.tasks.task import Task
 
@@ -83,7 +84,7 @@ def test_the_table_is_that_of_the_saved_policies(finished):
     """The policies' files, in a plain loop over NumPy's numbers, earn what the table says."""
     out, result = finished
     theta, start = np.asarray(result.outcomes["theta"][1]), jax.random.split(training._keys(5)[3], 128)
-    policy = load(out / "uniform/seed_005/policy.npz").require("line", LINE.observations.names, LINE.actions.names)
+    policy = load(out / "uniform/seed_005/policy.npz").require("line", LINE.observations, LINE.actions)
     for i in range(0, 128, 16):
         gain, target = theta[i]
         position, value = 0.1 * float(jax.random.normal(start[i])), 0.0
@@ -255,6 +256,20 @@ def test_saved_policies_are_evaluated_on_any_domain(finished, tmp_path, capsys):
     assert float(rows[paths[1], "point-1--1"]["return"]) == pytest.approx(value.mean(), abs=1e-3)
     assert evaluating.main(words) == 2
     assert "out: expected a new .csv file" in capsys.readouterr().err
+
+
+def test_each_policy_keeps_its_own_scaling():
+    """A policy that is always at its limit, of a small and a large one: both stay outside of the target's 5 cm."""
+
+    def pushing(scale):
+        schema = {"environment": "line", "observations": dataclasses.asdict(LINE.observations)}
+        schema["actions"] = dataclasses.asdict(LINE.actions) | {"centre": [0.0], "scale": [scale]}
+        return Policy((np.zeros((2, 1), np.float32),), (np.float32([5.0]),), schema)
+
+    draws = {"far": lambda key, n: domains.point((1.0, 2.0), n)}
+    rows = cross_evaluate(LINE, {"weak": pushing(0.01), "strong": pushing(0.1)}, draws, 16)
+    sums = [-sum(2.0 - scale * step for step in range(1, 8)) for scale in (0.01, 0.1)]
+    np.testing.assert_allclose([row["return"] for row in rows], sums, atol=0.4)  # starts have a mean of 0 +- 0.025
 
 
 def test_policies_of_other_environments_are_not_evaluated(finished, tmp_path, capsys):

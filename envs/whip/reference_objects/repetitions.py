@@ -47,7 +47,7 @@ def acting(word: str) -> Callable[[], Act]:
             return lambda observation: next(steps)
 
         return begin
-    policy = policies.load(word).require("whip", OBSERVATIONS.names, ACTIONS.names)
+    policy = policies.load(word).require("whip", OBSERVATIONS, ACTIONS)
     return lambda: policy
 
 
