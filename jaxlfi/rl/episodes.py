@@ -77,7 +77,13 @@ class Batch:
         self.environment, self.n, self.redrawn = environment, n, redrawn
 
     def reset(self, key: jax.Array, domain: Domain) -> Episodes:
-        """The first episodes."""
+        """The first episodes.
+
+        Raises:
+            ValueError: for another number of points than environments, unless they are redrawn.
+        """
+        if not self.redrawn and len(domain.theta) != self.n:
+            raise ValueError(f"domain: expected {self.n} points, one an environment, got {len(domain.theta)}")
         keys, env = self._begin(jax.random.split(key, self.n), domain)
         zeros = jnp.zeros(self.n)
         info = {"truncation": zeros, "ended": _ended(env, jnp.zeros(self.n, bool), zeros, jnp.zeros(self.n, int))}

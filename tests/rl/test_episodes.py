@@ -84,6 +84,13 @@ def test_each_environment_keeps_its_theta_unless_they_are_redrawn(key, domain, s
     assert all(len(np.unique(own)) >= 4 for own in every.T)
 
 
+def test_each_environment_needs_a_point(key, domain):
+    """An index beyond the last point would be taken for the last one."""
+    with pytest.raises(ValueError, match="domain: expected 6 points, one an environment, got 5"):
+        Batch(LINE, N + 1).reset(key, domain)
+    Batch(LINE, N + 1, redrawn=True).reset(key, domain)
+
+
 def test_an_episode_does_not_depend_on_the_others(key, domain, states_twice):
     """Environment i alone, with its key, is what it is among others."""
     batch, alone = Batch(LINE, N), Batch(LINE, 1)
