@@ -362,14 +362,13 @@ def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 
 
 def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """In words, where runs whose support cannot grow ended with a bound that looks wrong."""
+    """In words, where runs ended with a bound that looks wrong and that their heuristic cannot move."""
     warnings = []
     for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
         own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
-        if not own[0].heuristic.grows:
-            beliefs = [run.belief for run in own]
-            found = bound_summary(plan.task.space.labels, beliefs, own[0].feasible)
-            warnings += [f"{configuration}: {text}" for text in found]
+        beliefs, grows = [run.belief for run in own], own[0].heuristic.grows
+        found = bound_summary(plan.task.space.labels, beliefs, own[0].feasible, grows=grows)
+        warnings += [f"{configuration}: {text}" for text in found]
     return warnings
 
 

@@ -23,6 +23,9 @@ the mass beyond is near a multiple of 1 / ensemble size: this is enough for one 
 of this number and of others: experiments/README.md.
 """
 
+ROUNDING = 1e-6
+"""Distance from Phi's bound, as a fraction of its width, up to which a bound is Phi's."""
+
 SIDES = ("lower", "upper")
 ADVICE = "The true value may lie beyond it: widen the support there, or adapt it with --heuristic edge."
 PHI_ADVICE = "The bound is that of the feasible domain Phi: widen Phi if it can be."
@@ -69,7 +72,11 @@ _evidence = jax.jit(lambda belief: jnp.stack(bound_evidence(belief)))
 
 
 def bound_warnings(
-    names: Sequence[str], belief: Belief, feasible: Support, threshold: float = MASS_BEYOND
+    names: Sequence[str],
+    belief: Belief,
+    feasible: Support,
+    threshold: float = MASS_BEYOND,
+    grows: bool = False,
 ) -> list[str]:
     """Say in words which bounds of a support the posterior lies beyond, and what to do.
 
@@ -78,6 +85,7 @@ def bound_warnings(
         belief: one belief, concrete.
         feasible: Phi.
         threshold: marginal mass beyond a bound above which the bound is named.
+        grows: whether the support can grow: then only bounds that are Phi's are named, which no heuristic moves.
 
     Example:
         >>> from jaxlfi.distributions.mixture import GaussianMixture
@@ -94,11 +102,16 @@ def bound_warnings(
         f"{names[d]}: {mass[side, d]:.2f} of the posterior mass lies beyond the {SIDES[side]} bound "
         f"{bounds[side, d]:.4g}. {PHI_ADVICE if final[side, d] else ADVICE}"
         for d, side in np.argwhere(mass.T > threshold)
+        if final[side, d] or not grows
     ]
 
 
 def bound_summary(
-    names: Sequence[str], beliefs: Sequence[Belief], feasible: Support, threshold: float = MASS_BEYOND
+    names: Sequence[str],
+    beliefs: Sequence[Belief],
+    feasible: Support,
+    threshold: float = MASS_BEYOND,
+    grows: bool = False,
 ) -> list[str]:
     """The warnings of several runs from one support: which bounds the posterior lies beyond, and in how many runs.
 
@@ -107,17 +120,18 @@ def bound_summary(
         beliefs: one a run; the warnings of a single one are those of `bound_warnings`.
         feasible: Phi.
         threshold: marginal mass beyond a bound above which the bound is named.
+        grows: whether the support can grow; see `bound_warnings`.
 
     Returns:
         At most two texts: one of the bounds that can be moved, and one of the bounds of Phi.
     """
     if len(beliefs) == 1:
-        return bound_warnings(names, beliefs[0], feasible, threshold)
+        return bound_warnings(names, beliefs[0], feasible, threshold, grows)
     mass = np.stack([_evidence(belief) for belief in beliefs])  # [run, side, D]
     bounds = np.stack([np.stack([belief.support.low, belief.support.high]) for belief in beliefs])
     final = np.all(_at_limit(bounds, feasible), axis=0)
     texts = []
-    for limited, advice in ((False, ADVICE), (True, PHI_ADVICE)):
+    for limited, advice in ((False, ADVICE), (True, PHI_ADVICE))[grows:]:
         named = np.argwhere(np.any(mass > threshold, axis=0).T & (final.T == limited))
         places = [
             f"{names[d]} {SIDES[side]} {_value(bounds[:, side, d])} "
@@ -134,7 +148,8 @@ def _at_limit(bounds: np.ndarray, feasible: Support) -> np.ndarray:
     """Whether each bound is that of Phi, or beyond it (a named support may be wider), shape [..., side, D]."""
     limits = np.stack([feasible.low, feasible.high])
     outwards = np.array([[-1.0], [1.0]])
-    return np.isclose(bounds, limits) | (outwards * (bounds - limits) > 0)
+    near = np.abs(bounds - limits) <= ROUNDING * np.asarray(feasible.width)
+    return near | (outwards * (bounds - limits) > 0)
 
 
 def _value(bounds: np.ndarray) -> str:

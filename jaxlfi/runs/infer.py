@@ -20,7 +20,7 @@ from jaxlfi.distributions.arguments import is_concrete, require_key
 from jaxlfi.distributions.space import SpaceName
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset
-from jaxlfi.heuristics import Edge, Heuristic, registry
+from jaxlfi.heuristics import Edge, Heuristic, paired, registry
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import folder as folders
@@ -65,7 +65,8 @@ def infer(
             where the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
             box they fill.
-        heuristic: how the support is adapted.
+        heuristic: how the support is adapted. Components that it compares are matched first (`jaxlfi.Matched`) where
+            networks start anew every round.
         settings: the numbers of the run; `jaxlfi.PAPER` are the paper's.
         space: whether a box is given in "natural" units or in "inference" space.
         simulations: pairs of parameters and simulations that take the place of the first round's: a mapping of arrays,
@@ -93,6 +94,7 @@ def infer(
     if not isinstance(settings, Settings):
         raise ValueError(f"settings: expected jaxlfi.Settings such as jaxlfi.QUICK, got {settings!r}")
     registry.check(heuristic, task.dim)
+    heuristic = paired(heuristic, getattr(settings.estimator, "warm_start", True))  # what it is, is checked later
     learnt = getattr(settings.estimator, "embedding", "none") == "trials"  # what it is, is checked later
     task, observation = trials_of(task, observation, "all" if learnt else "moments")
     if not is_concrete((key, observation, support, heuristic, settings)):
@@ -113,9 +115,8 @@ def infer(
     spec = RunSpec("own", name, box, heuristic, seed_of(key))
     plan = BatchPlan(folders.RUN, None, task, None, settings, (spec,))
     run = _run(plan, observation, first, progress, callback, None if out is None else Path(out))
-    if not heuristic.grows:
-        for warning in run.warnings:
-            python_warnings.warn(warning, SupportWarning, stacklevel=2)
+    for warning in run.warnings:
+        python_warnings.warn(warning, SupportWarning, stacklevel=2)
     return run
 
 

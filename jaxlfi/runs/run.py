@@ -32,7 +32,7 @@ DRAWS = 1000
 
 
 class SupportWarning(UserWarning):
-    """A bound of a support that cannot grow looks wrong."""
+    """A bound looks wrong that the heuristic cannot move: of a support that cannot grow, or of Phi."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,9 +132,13 @@ class Run:
 
     @property
     def warnings(self) -> list[str]:
-        """In words, which bounds of a support that cannot grow look wrong, and what to do."""
+        """In words, which bounds look wrong that the heuristic cannot move, and what to do.
+
+        They are those of a support that cannot grow, and those of Phi.
+        """
         _require_one(self, "warnings")
-        return bound_warnings(self.space.labels, self.belief, self.feasible)
+        found = bound_warnings(self.space.labels, self.belief, self.feasible, grows=self.heuristic.grows)
+        return [warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in found]
 
     @property
     def spec(self) -> RunSpec:

@@ -201,3 +201,22 @@ def test_runs_whose_bounds_differ_are_summarised_by_their_range():
 def test_the_summary_of_one_run_is_its_warnings():
     assert bound_summary(NAMES, [centred(0, 4.3)], PHI) == warnings(centred(0, 4.3))
     assert bound_summary(NAMES, [centred(0, 2.0)] * 3, PHI) == []
+
+
+def test_of_a_support_that_grows_only_the_bounds_of_phi_are_named():
+    """The other bounds move; at Phi nothing does."""
+    both = believed([[4.3, -2.3]], [[0.3, 0.3]])
+    assert len(warnings(both)) == 2
+    (text,) = warnings(both, grows=True)
+    assert text.startswith("drag: ") and text.endswith(WIDEN_PHI)
+    (text,) = bound_summary(NAMES, [both, both], PHI, grows=True)
+    assert "drag lower -2 (2 of 2 runs" in text and text.endswith(WIDEN_PHI) and "mass upper" not in text
+
+
+def test_a_bound_near_phis_is_phis_relative_to_its_width():
+    """Units do not matter: a support from 5e-9 is not at Phi's 0 where Phi is 1e-7 wide."""
+    phi = Support([0.0, -2.0], [1e-7, 10.0])
+    box = Support([5e-9, -2.0], [5e-8, 6.0])
+    belief = believed([[4e-9, 2.0]], [[1e-10, 0.3]], box=box)
+    (text,) = bound_warnings(NAMES, belief, phi)
+    assert text.endswith(ADAPT)

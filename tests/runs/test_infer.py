@@ -271,6 +271,34 @@ def test_a_fixed_support_that_is_wrong_warns():
     with pytest.warns(jaxlfi.SupportWarning, match="second: .* upper bound 0.2"):
         run = infer(task=OWN, support=narrow, heuristic=FIXED, settings=ONE)
     assert any("widen the support" in text for text in run.warnings)
+    assert all("--heuristic" not in text and "heuristic=jaxlfi.Edge()" in text for text in run.warnings)
+
+
+def test_a_support_that_grows_warns_of_the_bounds_of_phi_alone():
+    """Edge cannot move them, and moves all others."""
+    run = infer(settings=ONE, heuristic=Edge())
+    mixture, box = run.belief.mixture, Support([-2.0, -2.0], [2.0, 2.0])
+    outside = run.replace(
+        belief=run.belief.replace(
+            support=box,
+            mixture=mixture.replace(means=jnp.full_like(mixture.means, 2.5), scale_tril=mixture.scale_tril / 1e3),
+        ),
+        feasible=Support([-5.0, -5.0], [5.0, 2.0]),
+    )
+    (text,) = outside.warnings
+    assert text.startswith("second: ") and "of the feasible domain Phi" in text
+    assert len(outside.replace(heuristic=Fixed()).warnings) == 2
+
+
+def test_mode_pairs_components_as_on_the_command_line(tmp_path):
+    """Networks that start anew number their components as they like."""
+    flags = ("--support", "misspecified", "--heuristic", "mode", *FLAGS, "--out", tmp_path / "cli")
+    assert command("infer", TASK, *flags) == 0
+    run = infer(0, observation=None, heuristic=jaxlfi.Mode())
+    other = load(tmp_path / "cli", gaussian())
+    assert run.heuristic == other.heuristic == jaxlfi.Matched(jaxlfi.Mode())
+    np.testing.assert_array_equal(run.history["support_high"], other.history["support_high"])
+    np.testing.assert_array_equal(run.mixture.means, other.mixture.means)
 
 
 def test_without_an_observation_one_is_simulated_at_the_truth():
