@@ -67,9 +67,10 @@ class BatchPlan:
             return parts
         return [f"{spec.configuration}/{part}" for spec, part in zip(self.specs, parts, strict=True)]
 
-    def origin(self, spec: RunSpec) -> Origin:
-        """How one of its runs is described."""
-        return Origin(self.reference, spec.configuration, spec.support_name, self.preset)
+    def origin(self, spec: RunSpec, first: Simulations | None = None) -> Origin:
+        """How one of its runs is described, and the simulations it began with."""
+        given = 0 if first is None else len(first.theta)
+        return Origin(self.reference, spec.configuration, spec.support_name, self.preset, given)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,7 +215,7 @@ def _run(plan, spec, state, observed, index, rows, seconds, final, place) -> Run
         settings=plan.settings,
         space=plan.task.space,
         task=plan.task,
-        origin=plan.origin(spec),
+        origin=plan.origin(spec, observed.first),
     )
 
 
@@ -234,7 +235,9 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed) -> None:
     Raises:
         StoreError: where something is there already.
     """
-    runs = [folders.run_config(plan.task, plan.origin(spec), spec, plan.settings) for spec in plan.specs]
+    runs = [
+        folders.run_config(plan.task, plan.origin(spec, observed.first), spec, plan.settings) for spec in plan.specs
+    ]
     status = {
         "status": "running",
         "devices": min(jax.local_device_count(), len(plan.specs)),

@@ -33,7 +33,7 @@ from jaxlfi.bayessim.widths import expected_widths
 from jaxlfi.io import files as atomic
 from jaxlfi.io.serialise import json_safe
 from jaxlfi.runs import describe
-from jaxlfi.tasks import summaries
+from jaxlfi.tasks import priors, summaries
 from jaxlfi.tasks.task import Task
 
 if TYPE_CHECKING:  # runs know how to save themselves
@@ -133,7 +133,7 @@ def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any])
     Args:
         folder: where; it must not exist or be empty.
         config: written as config.json.
-        fill: called with the folder's temporary path, to write what a resume needs stagings.
+        fill: called with the folder's temporary path, to write what else belongs into it.
     """
     refuse_occupied(folder)
     try:
@@ -284,12 +284,14 @@ def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) 
         "names": list(task.space.labels),
         "units": list(task.units),
         "prior": None if task.prior is None else type(task.prior).__name__,
+        "prior_log_density": priors.described(task.inference.prior, feasible),
         "feasible_low": np.asarray(feasible.low).tolist(),
         "feasible_high": np.asarray(feasible.high).tolist(),
         "configuration": spec.configuration,
         "support": {"name": spec.support_name} | describe.support_to_json(spec.support),
         "heuristic": describe.heuristic_to_json(spec.heuristic),
         "preset": origin.preset,
+        "given_simulations": origin.given_simulations,
         "settings": describe.settings_to_json(settings),
         "seed": spec.seed,
         "widths": expected_widths(settings, spec.heuristic),

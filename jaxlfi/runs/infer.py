@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from jaxlfi.bayessim.batch import RunInputs, RunSpec, run_one
+from jaxlfi.bayessim.correction import gaussian_prior
 from jaxlfi.bayessim.keys import run_keys, seed_of
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.record import FINAL
@@ -29,9 +30,12 @@ from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Origin, Run, SupportWarning
 from jaxlfi.tasks.observation import observe, trials_of
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
+from jaxlfi.tasks.priors import require_mass
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
 
+PRIOR = "prior_log_density"
+"""Name in config.json of the numbers that tell priors apart; folders of earlier versions lack it."""
 Callback = Callable[[int, dict[str, np.ndarray]], Any]
 """Called as a round ends, with its index and its record (the names of history.npz)."""
 
@@ -131,8 +135,9 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
         if config.get("status", "finished") == "finished":
             run = load(out, plan.task)
             _require_observation(out, run.observed, observed.trajectory[0])
-            if observed.first is not None:
-                _require_simulations(out, _first_round(run.dataset), _kept(observed.first))
+            if observed.first is not None or run.origin.given_simulations:
+                began = np.zeros(0) if run.origin.given_simulations == 0 else _first_round(run.dataset)
+                _require_simulations(out, began, _kept(observed.first))
             return run
         _, recorded = executing.reopen(out, plan.task)
         _require_observation(out, recorded.trajectory[0], observed.trajectory[0])
@@ -155,11 +160,16 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
 def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
     """Refuse to go on in the folder of another run."""
     (spec,) = plan.specs
-    wanted = folders.run_config(plan.task, plan.origin(spec), spec, plan.settings)
+    wanted = folders.as_json(folders.run_config(plan.task, plan.origin(spec), spec, plan.settings))
     compared = (
-        "task_name", "names", "units", "feasible_low", "feasible_high", "support", "heuristic", "settings", "seed",
+        "task_name", "names", "units", "feasible_low", "feasible_high", "prior", "support", "heuristic", "settings",
+        "seed",
     )  # fmt: skip
-    if other := [name for name in compared if config.get(name) != folders.as_json(wanted[name])]:
+    other = [name for name in compared if config.get(name) != wanted[name]]
+    priors = [np.asarray(described.get(PRIOR), float) for described in (config, wanted)]
+    if PRIOR in config and "prior" not in other and not np.allclose(*priors, rtol=1e-3, atol=1e-3, equal_nan=True):
+        other.append("prior")
+    if other:
         raise _of_another_run(out, other)
 
 
@@ -199,7 +209,15 @@ def _traced_support(task: Task, support: Any, space: SpaceName) -> Support:
 
 
 def _traced(key, task: Task, observation, support: Support, heuristic, settings: Settings) -> Run:
+    settings.check()
+    prior = task.inference.prior
+    if settings.correction == "paper" and prior is not None:
+        gaussian_prior(prior)
+    if is_concrete(support):
+        with jax.ensure_compile_time_eval():
+            require_mass(prior, support, "own")
     observed, x = observe(run_keys(key).observe, task, observation, concrete=False)
+    settings.estimator.check_for(task.dim, x.shape[-1])
     inputs = RunInputs(key, support, heuristic, observed, x)
     state, records = _scan(task, settings, inputs)
     history = {name: value[-1] if name.startswith(FINAL) else value for name, value in records.items()}

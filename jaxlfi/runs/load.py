@@ -58,7 +58,13 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         if support.dim != space.dim:
             raise ValueError(f"support: expected bounds for {space.dim} parameters, got {support.dim}")
         feasible = Support(config["feasible_low"], config["feasible_high"]).hull(support)
-        origin = Origin(config["task"], config["configuration"], config["support"]["name"], config["preset"])
+        origin = Origin(
+            config["task"],
+            config["configuration"],
+            config["support"]["name"],
+            config["preset"],
+            config.get("given_simulations"),
+        )
         key = key_of(config["seed"])
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise StoreError(f"{folder / 'config.json'}: expected a complete description of the run: {error}") from error

@@ -44,12 +44,14 @@ class Origin:
         configuration: what the run is called in tables.
         support_name: of Theta_0.
         preset: that the settings were made from, or None.
+        given_simulations: how many simulations took the place of the first round's; None where that was not recorded.
     """
 
     reference: str | None = None
     configuration: str = "own"
     support_name: str = "own"
     preset: str | None = None
+    given_simulations: int | None = 0
 
 
 @struct.dataclass
@@ -109,7 +111,7 @@ class Run:
 
         Raises:
             ValueError: for a run of several rounds, whose network has learnt the posterior of its own observation only;
-                one whose network was not kept; or an observation of another shape.
+                one whose network was not kept; or an observation of another shape, or that is not finite.
         """
         if self.settings.rounds != 1:
             raise ValueError(
@@ -169,13 +171,24 @@ class Run:
     def _summary(self, observation: Any) -> jax.Array:
         observation = jnp.asarray(observation, jnp.float32)
         if observation.shape == self.observed.shape and self.task is not None:
-            return self.task.summary(observation)
+            return _finite(self.task.summary(_finite(observation)), "a summary of finite numbers")
         if observation.shape == self.x.shape:
-            return observation
+            return _finite(observation)
+        if self.task is None:
+            raise ValueError(
+                f"observation: expected a summary of shape {list(self.x.shape)}, as the task is not known "
+                f"(jaxlfi.load(folder, task=...) takes one), got shape {list(observation.shape)}"
+            )
         raise ValueError(
             f"observation: expected a trajectory of shape {list(self.observed.shape)} or a summary of shape "
             f"{list(self.x.shape)}, got {list(observation.shape)}"
         )
+
+
+def _finite(values: jax.Array, what: str = "finite numbers") -> jax.Array:
+    if is_concrete(values) and not bool(jnp.isfinite(values).all()):
+        raise ValueError(f"observation: expected {what}, got some that are not")
+    return values
 
 
 @functools.partial(jax.jit, static_argnums=0)

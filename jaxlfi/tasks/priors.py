@@ -7,6 +7,7 @@ from typing import Any
 import distrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlfi.distributions.space import Space
@@ -15,6 +16,8 @@ from jaxlfi.distributions.truncation import MASS_DRAWS, mass_inside, rejection_s
 
 MIN_INSIDE = 0.01
 """Mass of a prior inside the support below which a run is refused: its draws would be those of a uniform prior."""
+PLACES = 8
+"""Places at which a prior is described."""
 LOW_INSIDE = 0.1
 """Mass below which a run warns: 3 % of the draws, or more, are uniform over the support instead."""
 
@@ -76,6 +79,15 @@ def prior_draws(key: jax.Array, prior: Any, support: Support, n: int) -> Float[A
 def prior_mass(prior: Any, support: Support) -> Float[Array, ""]:
     """The prior's mass in the support; 1 for None."""
     return jnp.ones(()) if prior is None else mass_inside(_sampler(prior), support)
+
+
+def described(prior: Any, feasible: Support) -> list[float] | None:
+    """A prior in a few numbers, by which two can be told apart: its log-density at `PLACES` places in a box."""
+    if prior is None:
+        return None
+    unit = np.random.default_rng(0).uniform(size=(PLACES, feasible.dim)).astype(np.float32)
+    low, high = np.asarray(feasible.low), np.asarray(feasible.high)
+    return np.asarray(prior.log_prob(jnp.asarray(low + unit * (high - low))), float).tolist()
 
 
 def require_mass(prior: Any, support: Support, label: str) -> float:

@@ -1,6 +1,7 @@
 """Simulations that were made before: they take the place of the first round's, with weights for how they were drawn."""
 
 import dataclasses
+import json
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ from jaxlfi.envs.gaussian_linear import MIXING, NOISE, posterior
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.folder import StoreError, read_ledger
 from jaxlfi.runs.load import load
+from jaxlfi.studies.calibration import read_run
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from tests.small import FLAGS, SETTINGS, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
@@ -97,6 +99,20 @@ def test_later_rounds_simulate_as_ever(tmp_path):
     resumed = jaxlfi.infer(jax.random.key(2), gaussian(), OBSERVED, out=tmp_path / "stopped", **arguments)
     np.testing.assert_array_equal(resumed.mixture.means, run.mixture.means)
     loaded = load(tmp_path / "run", gaussian())
+    assert loaded.origin.given_simulations == run.origin.given_simulations == 60
+    with pytest.raises(StoreError, match=r"^out: expected a new folder or one of the same run, .*simulations\)$"):
+        jaxlfi.infer(
+            jax.random.key(2), gaussian(), OBSERVED, out=tmp_path / "run", support=loaded.support,
+            **arguments | {"simulations": None},
+        )  # fmt: skip
+    with pytest.raises(StoreError, match=r"that made all of its simulations, got one that began with 60 given ones"):
+        read_run(tmp_path / "run", gaussian())
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    del config["given_simulations"]  # as an earlier version wrote it
+    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
+    assert read_run(tmp_path / "run", gaussian()).origin.given_simulations is None
+    again = jaxlfi.infer(jax.random.key(2), gaussian(), OBSERVED, out=tmp_path / "run", **arguments)
+    np.testing.assert_array_equal(again.mixture.means, run.mixture.means)
     for name in ("theta", "x", "round", "weight"):
         np.testing.assert_array_equal(getattr(loaded.dataset, name)[:73], getattr(run.dataset, name)[:73])
 

@@ -1,7 +1,9 @@
 """infer: the library call, its purity, the folder it can keep its run in, and what it refuses."""
 
 import dataclasses
+import importlib
 
+import distrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,11 +15,12 @@ from jaxlfi.bayessim import programs
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Choice, Edge, Fixed, Truncate
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import StoreError, read_ledger
+from jaxlfi.runs.folder import StoreError, as_json, read_ledger, run_config
 from jaxlfi.runs.load import load
 from jaxlfi.tasks.host import SimulatorError
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
+infer_module = importlib.import_module("jaxlfi.runs.infer")  # the package's name is the function's
 pytestmark = pytest.mark.filterwarnings("ignore::jaxlfi.SupportWarning")
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
@@ -216,6 +219,39 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
     assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
 
 
+def test_another_prior_is_another_run(tmp_path):
+    """Of the same kind, with other numbers; a folder that lacks the numbers is still read."""
+    normal = lambda mean: dataclasses.replace(
+        gaussian(), prior=distrax.MultivariateNormalDiag(jnp.array([mean, 0.3]), jnp.array([2.0, 1.0]))
+    )
+    spec = infer_module.RunSpec("own", "ok", gaussian().support("ok"), Edge(), 0)
+    plan = lambda task: infer_module.BatchPlan("jaxlfi-run", None, task, None, ONE, (spec,))
+    described = lambda task: as_json(run_config(task, plan(task).origin(spec), spec, ONE))
+    config = described(normal(0.5))
+    infer_module._require_same(tmp_path, config, plan(normal(0.5)))
+    for other in (normal(0.9), gaussian()):
+        with pytest.raises(StoreError, match=r"of a run with another prior$"):
+            infer_module._require_same(tmp_path, config, plan(other))
+    with pytest.raises(StoreError, match=r"of a run with another prior$"):
+        infer_module._require_same(tmp_path, described(gaussian()), plan(normal(0.5)))
+    del config["prior_log_density"]
+    infer_module._require_same(tmp_path, config, plan(normal(0.9)))
+
+
+def test_a_traced_run_is_checked_like_another():
+    """Before anything is compiled: shapes alone are asked for."""
+    shape = lambda **arguments: jax.eval_shape(lambda key: jaxlfi.infer(key, **arguments).x, jax.random.key(0))
+    common = {"task": gaussian(), "observation": OBSERVED}
+    with pytest.raises(ValueError, match=r"^simulation_budget: expected at least the 20"):
+        shape(**common, settings=settings(simulation_budget=5))
+    far = distrax.MultivariateNormalDiag(jnp.array([99.0, 99.0]), jnp.ones(2))
+    with pytest.raises(ValueError, match=r"^prior: expected some of its mass inside the support"):
+        shape(**common | {"task": dataclasses.replace(gaussian(), prior=far)}, settings=SETTINGS)
+    tailed = dataclasses.replace(gaussian(), prior=distrax.Independent(distrax.Laplace(jnp.zeros(2), jnp.ones(2)), 1))
+    with pytest.raises(ValueError, match=r"^correction='paper' divides by the prior"):
+        shape(**common | {"task": tailed}, settings=settings(correction="paper"))
+
+
 def test_another_observation_or_support_is_another_run(tmp_path):
     """They do not stand in the settings, but the result of the folder would not be the one that was asked for."""
     infer(0, out=tmp_path / "run")
@@ -254,6 +290,12 @@ def test_a_network_of_one_round_knows_other_observations(tmp_path):
     np.testing.assert_allclose(loaded.mixture.means, other.mixture.means, rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match=r"^observation: expected a trajectory of shape \[2\] .* got \[3\]$"):
         run.posterior_of(np.zeros(3))
+    for observation in (np.array([np.nan, 0.0]), np.array([0.0, np.inf])):
+        with pytest.raises(ValueError, match=r"^observation: expected finite numbers, got some that are not$"):
+            run.posterior_of(observation)
+    unknown = run.replace(task=None, observed=np.zeros((3, 2)))
+    with pytest.raises(ValueError, match=r"^observation: expected a summary of shape \[2\], as the task is not known"):
+        unknown.posterior_of(np.zeros((3, 2)))
     with pytest.raises(ValueError, match=r"^posterior_of: expected a run whose network was kept"):
         run.replace(network=None).posterior_of(OBSERVED)
 

@@ -10,6 +10,7 @@ from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Run
 from jaxlfi.studies import grid
+from jaxlfi.tasks import registry as registry_of_tasks
 from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.task import Task
 
@@ -102,16 +103,30 @@ def read_run(folder: Path, task: Task | None = None) -> Run:
         task: where it was made in Python and cannot be found by name.
 
     Raises:
-        ValueError: for a folder that holds no finished run of one seed, a task that cannot be found or has changed, or
-            a heuristic that is not installed.
+        ValueError: for a folder that holds no finished run of one seed, a run of several rounds that began with given
+            simulations, a task that cannot be found or has changed, or a heuristic that is not installed.
     """
     if grid.is_grid(folder):
         raise StoreError(f"{folder}: expected the folder of one run, got a grid's, which keeps no posteriors")
     run = load(folder, task)
+    if run.task is None and run.origin.reference is not None:
+        try:
+            registry_of_tasks.load(run.origin.reference)
+        except ValueError as error:
+            raise StoreError(
+                f"{folder}: expected its task {run.origin.reference!r}, which cannot be loaded from here (--task names "
+                f"another place): {error}"
+            ) from error
     if run.task is None:
         raise StoreError(
             f"{folder}: expected a run whose task can be found by name, got one made in Python: --task module:factory "
             "names it"
+        )
+    if run.origin.given_simulations and not run.amortised:
+        raise StoreError(
+            f"{folder}: expected a run that made all of its simulations, got one that began with "
+            f"{run.origin.given_simulations} given ones, which other observations cannot repeat (a run of one round "
+            "whose network was kept needs no repeating)"
         )
     if not run.task.on_host and (simulator_shapes(run.task).summary,) != run.x.shape:
         raise StoreError(
