@@ -1,6 +1,7 @@
 """Pictures of rollouts: a sheet of frames and an animation, from segmentation labels and keypoints."""
 
 import dataclasses
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from jaxlfi.figures import style
+from jaxlfi.io import files
 
 COLUMNS = 6
 """Number of columns of a sheet."""
@@ -119,7 +121,9 @@ def save_animation(path: Path, film: Film, title: str, interval: float, freshnes
             frame = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
             frames.append(frame.quantize(64, dither=Image.Dither.NONE))
     path.parent.mkdir(parents=True, exist_ok=True)
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1000 * interval), loop=0)
+    content, duration = io.BytesIO(), round(1000 * interval)
+    frames[0].save(content, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
+    files.write_bytes(path, content.getvalue())  # all of it, or nothing
     return path
 
 

@@ -103,23 +103,29 @@ def _loop(arguments: argparse.Namespace) -> None:
 
 def _begin(arguments: argparse.Namespace) -> None:
     """Check everything at once, and make the folder or recognise it."""
-    from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS
+    from jaxlfi.cli.domains import domain
+    from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS, make
     from jaxlfi.envs.whip.real2sim import recorded
     from jaxlfi.envs.whip.reference_objects import objects
+    from jaxlfi.heuristics import registry as heuristics
     from jaxlfi.io import files
     from jaxlfi.rl import policy
+    from jaxlfi.rl.settings import PRESETS
     from jaxlfi.runs.folder import environment
-    from jaxlfi.runs.load import load
 
     objects.load(arguments.object)
     if arguments.iterations < 1:
         raise ValueError(f"iterations: expected at least 1, got {arguments.iterations}")
+    train.check_seeds(arguments.seed, 1, "seed")
+    heuristics.load(arguments.heuristic)
+    if arguments.total_steps is not None:
+        PRESETS[arguments.preset].replace(total_steps=arguments.total_steps)
     if arguments.policy:
         policy.load(arguments.policy).require("whip", OBSERVATIONS, ACTIONS)
     if arguments.recording:
         recorded(str(arguments.recording))
     if arguments.posterior:
-        load(arguments.posterior)
+        domain(make(), str(arguments.posterior))
     asked = {
         name: None if value is None else str(value)
         for name, value in vars(arguments).items()
@@ -131,7 +137,8 @@ def _begin(arguments: argparse.Namespace) -> None:
         if found != asked:
             raise ValueError(f"out: expected a new folder, or one of the same command, got {arguments.out} of {found}")
         return
-    if arguments.out.exists() and any(arguments.out.iterdir()):
+    # A kill while config.json is written leaves config.json.part.
+    if arguments.out.exists() and any(path.suffix != ".part" for path in arguments.out.iterdir()):
         raise ValueError(f"out: expected a new folder, or one of the same command, got {arguments.out}")
     arguments.out.mkdir(parents=True, exist_ok=True)
     files.write_json(path, {"format": "jaxlfi-r2s2r", "version": 1, "asked": asked, **environment()})

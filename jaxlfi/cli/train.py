@@ -168,9 +168,25 @@ def resume(out: Path, console: "Console", figures: bool) -> None:
     run(out, registry.load(config["environment"]), console, figures)
 
 
+def check_seeds(first: int, count: int, name: str) -> None:
+    """Refuse seeds that make no key.
+
+    Args:
+        first: the first of them.
+        count: how many follow each other.
+        name: of the first one's argument.
+
+    Raises:
+        ValueError: for seeds below 0 or of more than 32 bits.
+    """
+    if not 0 <= first <= 2**32 - count:
+        raise ValueError(f"{name}: expected seeds from 0 to {2**32 - 1}, got {first}")
+
+
 def _plan(arguments: argparse.Namespace) -> Any:
     if arguments.seeds < 1:
         raise ValueError(f"seeds: expected at least 1, got {arguments.seeds}")
+    check_seeds(arguments.first_seed, arguments.seeds, "first_seed")
     from jaxlfi.rl import registry
     from jaxlfi.rl.settings import PRESETS as SETTINGS_OF
     from jaxlfi.rl.training import Plan

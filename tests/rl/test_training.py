@@ -195,6 +195,8 @@ def test_the_command_is_resumed(tmp_path, capsys, monkeypatch):
         (["--domain", "point:1,2.5"], "domain: expected target between -2 and 2 (Phi), got 2.5"),
         (["--domain", "median", "median"], "domain: expected different ones, got 'median' twice"),
         (["--domain", "median", "--seeds", "0"], "seeds: expected at least 1, got 0"),
+        (["--domain", "median", "--first-seed", "-1"], "first_seed: expected seeds from 0 to 4294967295, got -1"),
+        (["--domain", "median", "--first-seed", str(10**20)], "first_seed: expected seeds from 0 to 4294967295"),
         (["--domain", "median", "--minibatches", "3"], "minibatches: expected minibatches x segments"),
         (["--domain", "median", "--discount", "2"], "discount: expected a number in [0, 1], got 2"),
     ],

@@ -100,21 +100,34 @@ def test_stages_are_replaced_by_files(stages, tmp_path, monkeypatch):
     ran, _ = stages
     policy = a_policy(tmp_path / "policy.npz")
     monkeypatch.setattr("jaxlfi.envs.whip.real2sim.recorded", lambda name: None)
-    monkeypatch.setattr("jaxlfi.runs.load.load", lambda folder: None)
+    monkeypatch.setattr("jaxlfi.cli.domains.domain", lambda environment, word: None)
     words = ["--object", "dlo-2", "--policy", str(policy), "--recording", "rollout.npz", "--posterior", "runs/found"]
     assert r2s2r.main([*words, "--out", str(tmp_path / "loop")]) == 0
     assert [words[0] for words in ran] == ["train", "deploy", "page"]
     assert ran[0][3] == "runs/found" and ran[1][2] == str(policy)
 
 
-def test_bad_input_is_one_line_and_leaves_nothing(stages, tmp_path, capsys):
-    other = a_policy(tmp_path / "other.npz", "line")
+class OfOthers:
+    """The run of another task."""
+
+    space = Space(("prey", "predators"), (True, True))
+    feasible = jaxlfi.Support([0.0, 0.0], [1.0, 1.0])
+
+
+def test_bad_input_is_one_line_and_leaves_nothing(stages, tmp_path, capsys, monkeypatch):
+    other, of_others = a_policy(tmp_path / "other.npz", "line"), tmp_path / "others"
+    of_others.mkdir()
+    monkeypatch.setattr("jaxlfi.runs.load.load", lambda folder: OfOthers())
     for words, expected in (
         (["--object", "dlo-9"], "expected one of dlo-0"),
         (["--object", "dlo-0", "--iterations", "0"], "iterations: expected at least 1"),
         (["--object", "dlo-0", "--policy", str(other)], "policy: expected environment 'whip', got one of 'line'"),
         (["--object", "dlo-0", "--recording", "none.npz"], "none.npz"),
         (["--object", "dlo-0", "--posterior", "none"], "none"),
+        (["--object", "dlo-0", "--posterior", str(of_others)], "domain: expected a posterior of "),
+        (["--object", "dlo-0", "--heuristic", "egde"], "heuristic: expected "),
+        (["--object", "dlo-0", "--seed", "-3"], "seed: expected seeds from 0 to 4294967295, got -3"),
+        (["--object", "dlo-0", "--total-steps", "0"], "total_steps: expected "),
     ):
         assert r2s2r.main([*words, "--out", str(tmp_path / "loop")]) == 2
         error = capsys.readouterr().err
@@ -123,6 +136,15 @@ def test_bad_input_is_one_line_and_leaves_nothing(stages, tmp_path, capsys):
     assert r2s2r.main(["--object", "dlo-0", "--out", str(tmp_path / "loop")]) == 0
     assert r2s2r.main(["--object", "dlo-1", "--out", str(tmp_path / "loop")]) == 2
     assert "out: expected a new folder, or one of the same command" in capsys.readouterr().err
+
+
+def test_it_goes_on_where_its_own_description_was_not_written_to_the_end(stages, tmp_path):
+    ran, _ = stages
+    out = tmp_path / "loop"
+    out.mkdir()
+    (out / "config.json.part").write_text("{")
+    assert r2s2r.main(["--object", "dlo-0", "--out", str(out)]) == 0
+    assert ran[-1][0] == "page" and not (out / "config.json.part").exists()
 
 
 def test_what_was_believed(tmp_path):

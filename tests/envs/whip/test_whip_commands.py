@@ -232,6 +232,16 @@ def test_a_sheet_shows_every_frame_and_explains_itself():
     assert figures.sheet_height(17) > figures.sheet_height(11) == figures.sheet_height(6)
 
 
+def test_an_animation_is_there_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
+    def killed(path, content):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(figures.files, "write_bytes", killed)
+    with pytest.raises(KeyboardInterrupt):
+        figures.save_animation(tmp_path / "film.gif", made_up_film(2, 20), "title", 0.05, np.ones(2))
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_animation_has_all_frames(tmp_path):
     shown = made_up_film(5, 40)
     path = figures.save_animation(tmp_path / "a" / "film.gif", shown, "title", 0.05, np.ones(5))
