@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxlfi.envs.whip.parameters import MILLIMETRES
 from jaxlfi.envs.whip.reference_objects.objects import load as load_object
-from jaxlfi.rl.domains import of_belief
+from jaxlfi.rl.domains import limits_of, of_belief
 from jaxlfi.runs.load import load as load_run
 
 FEM = ("dlo-0", "dlo-1", "dlo-2", "dlo-3")
@@ -101,8 +101,7 @@ class Study:
     def draws(self, name: str) -> np.ndarray:
         """Draws of a posterior as policies are trained on it, clipped, in natural units, shape [4000, 2]."""
         run = load_run(self.posterior(name))
-        limits = run.space.box_to_natural(run.feasible if run.heuristic.grows else run.support)
-        return np.asarray(of_belief(jax.random.key(1), run.belief, run.space, limits, DRAWS).theta)
+        return np.asarray(of_belief(jax.random.key(1), run.belief, run.space, limits_of(run), DRAWS).theta)
 
     def point(self, name: str) -> np.ndarray:
         """A point, "OBJECT-mean", "OBJECT-true" or "OBJECT-sysid": length (mm) and modulus (Pa), shape [2]."""

@@ -1,6 +1,6 @@
 """Domains as the command line names them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,39 @@ domains:
   point:X,Y,...   a point of your own, in natural units
 """
 """For `--help`."""
+
+
+def domains_of(environment: "Environment", words: Sequence[str]) -> dict[str, Callable]:
+    """How to draw from each of several domains, by different names.
+
+    Folders of one name, such as `seed_000` of two runs, are told apart by as many of their parents as it takes, and
+    points that agree in six digits by all of theirs.
+
+    Raises:
+        ValueError: as `domain`, and for the same one twice.
+    """
+    from collections import Counter
+
+    found = [domain(environment, word) for word in words]
+    counts = Counter(name for name, _ in found)
+    full = [_full_name(word) if counts[name] > 1 else (name,) for word, (name, _) in zip(words, found, strict=True)]
+    names: dict[str, Callable] = {}
+    for parts, (name, draw) in zip(full, found, strict=True):
+        rivals = [other for other in full if other[-1] == parts[-1]]
+        alike = lambda n, parts=parts, rivals=rivals: sum(other[-n:] == parts[-n:] for other in rivals) > 1
+        own = "-".join(parts[-next((n for n in range(1, len(parts)) if not alike(n)), len(parts)) :])
+        if own in names:
+            raise ValueError(f"domain: expected different ones, got {name!r} twice")
+        names[own] = draw
+    return names
+
+
+def _full_name(word: str) -> tuple[str, ...]:
+    """All parts of a name: of a folder its parents, too; of a point all digits."""
+    kind, _, rest = word.partition(":")
+    if kind == "point":
+        return ("point-" + "-".join(repr(float(number)) for number in rest.split(",")),)
+    return Path(word).resolve().parts[1:] if Path(word).is_dir() else (word,)
 
 
 def domain(environment: "Environment", word: str) -> tuple[str, Callable]:
@@ -50,6 +83,6 @@ def domain(environment: "Environment", word: str) -> tuple[str, Callable]:
     from jaxlfi.runs.load import load
 
     run = load(folder)
-    domains.check_belief(environment, run.space, run.space.box_to_natural(run.feasible))
-    limits = run.space.box_to_natural(run.feasible if run.heuristic.grows else run.support)
+    domains.check_belief(environment, run.space, run.space.box_to_natural(run.feasible), run.units)
+    limits = domains.limits_of(run)
     return folder.resolve().name, lambda key, n: domains.of_belief(key, run.belief, run.space, limits, n)

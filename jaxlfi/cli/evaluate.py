@@ -5,11 +5,12 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 
 import argparse
 import csv
+import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxlfi.cli.domains import DOMAINS, domain
+from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
 
@@ -53,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from jaxlfi.io import compile_cache
+    from jaxlfi.io import compile_cache, files
 
     compile_cache.enable()
     from rich.console import Console
@@ -65,16 +66,19 @@ def _run(arguments: argparse.Namespace) -> None:
 
     if arguments.out is not None and (arguments.out.exists() or arguments.out.suffix != ".csv"):
         raise ValueError(f"out: expected a new .csv file, got {arguments.out}")
+    if arguments.out is not None:
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)  # which may fail, and then does so before the work
     environment = registry.load(arguments.environment)
     policies = {str(path): load(path) for path in arguments.policies}
-    draws = dict(domain(environment, word) for word in arguments.domain)
+    draws = domains_of(environment, arguments.domain)
     rows = cross_evaluate(environment, policies, draws, arguments.episodes, arguments.seed)
     table = Table(*rows[0], title=f"{arguments.episodes} episodes on each domain")
     for row in rows:
         table.add_row(*(value if isinstance(value, str) else f"{value:.2f}" for value in row.values()))
     (Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)).print(table)
     if arguments.out is not None:
-        with arguments.out.open("x", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        files.write_bytes(arguments.out, text.getvalue().encode())

@@ -8,12 +8,12 @@ import contextlib
 import json
 import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxlfi import flags, source_fields
-from jaxlfi.cli.domains import DOMAINS, domain
+from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
 
@@ -192,18 +192,12 @@ def _plan(arguments: argparse.Namespace) -> Any:
     from jaxlfi.rl.training import Plan
 
     environment = registry.load(arguments.environment)
-    domains: dict[str, Callable] = {}
-    for word in arguments.domain:
-        name, draw = domain(environment, word)
-        if name in domains:
-            raise ValueError(f"domain: expected different ones, got {name!r} twice")
-        domains[name] = draw
     return Plan(
         reference=arguments.environment,
         environment=environment,
         settings=SETTINGS_OF[arguments.preset].replace(**arguments.settings),
         preset=arguments.preset,
-        domains=domains,
+        domains=domains_of(environment, arguments.domain),
         seeds=tuple(range(arguments.first_seed, arguments.first_seed + arguments.seeds)),
         tensorboard=arguments.tensorboard,
     )

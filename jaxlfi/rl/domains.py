@@ -1,6 +1,6 @@
 """Domains: the parameters of the environments that a policy is trained on (section VI-H)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support, check_within
 from jaxlfi.rl.environment import Environment
+from jaxlfi.runs.run import Run
 
 POOL = 4096
 """Points of a domain that is redrawn in every episode."""
@@ -46,6 +47,11 @@ def of_belief(key: jax.Array, belief: Belief, space: Space, limits: Support, n: 
     return Domain(limits.clip(space.to_natural(draws)))
 
 
+def limits_of(run: Run) -> Support:
+    """The box that draws of a run's posterior are clipped to, in natural units: Phi, or a support that was fixed."""
+    return run.space.box_to_natural(run.feasible if run.heuristic.grows else run.support)
+
+
 def uniform(key: jax.Array, support: Support, n: int) -> Domain:
     """Uniform draws over a box in natural units: PPO-U."""
     return Domain(support.sample(key, n))
@@ -56,16 +62,28 @@ def point(theta: Float[Array | np.ndarray, " dim"], n: int) -> Domain:
     return Domain(jnp.broadcast_to(jnp.asarray(theta, jnp.float32), (n, len(theta))))
 
 
-def check_belief(environment: Environment, space: Space, feasible: Support) -> None:
+def check_belief(environment: Environment, space: Space, feasible: Support, units: Sequence[str] | None = None) -> None:
     """Refuse the posterior of other parameters than an environment's.
 
+    Args:
+        environment: to train in.
+        space: of the posterior.
+        feasible: its Phi, in natural units.
+        units: of its parameters; "" where one has none, or none was declared; None where they are not known.
+
     Raises:
-        ValueError: for other names, or another Phi.
+        ValueError: for other names or units, or another Phi.
     """
     if space.names != environment.space.names:
         raise ValueError(
             f"domain: expected a posterior of {', '.join(environment.space.names)}, the parameters of "
             f"{environment.name}, got one of {', '.join(space.names)}"
+        )
+    pairs = zip(units or environment.units, environment.units, strict=True)
+    if any(own and other and own != other for own, other in pairs):
+        raise ValueError(
+            f"domain: expected a posterior in units {list(environment.units)}, those of {environment.name}, "
+            f"got one in {list(units)}"
         )
     check_within(feasible, environment.feasible, "domain")
 

@@ -216,6 +216,7 @@ def _run(plan, spec, state, observed, index, rows, seconds, final, place) -> Run
         space=plan.task.space,
         task=plan.task,
         origin=plan.origin(spec, observed.first),
+        units=tuple(plan.task.units),
     )
 
 

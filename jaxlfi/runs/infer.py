@@ -236,6 +236,7 @@ def _traced(key, task: Task, observation, support: Support, heuristic, settings:
         space=task.space,
         task=task,
         origin=Origin(),
+        units=tuple(task.units),
     )
 
 

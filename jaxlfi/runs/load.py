@@ -66,6 +66,9 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
             config.get("given_simulations"),
         )
         key = key_of(config["seed"])
+        units = tuple(map(str, config["units"])) if config.get("units") is not None else None
+        if units is not None and len(units) != space.dim:
+            raise ValueError(f"units: expected one for each of the {space.dim} parameters, got {len(units)}")
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise StoreError(f"{folder / 'config.json'}: expected a complete description of the run: {error}") from error
     task = _task(folder, config, task, space)
@@ -90,6 +93,7 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         space=space,
         task=task,
         origin=origin,
+        units=units,
     )
 
 
@@ -101,7 +105,7 @@ def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space
             task = registry.load(config["task"])
         except ValueError:  # the posterior can be used without it
             return None
-    if task is not None and (task.space != space or list(task.units) != list(config["units"])):
+    if task is not None and (task.space != space or list(task.units) != list(config.get("units", task.units))):
         raise StoreError(
             f"{folder}: expected the task as it was when the run was made, with parameters {list(space.labels)}, "
             f"got {list(task.space.labels)}"

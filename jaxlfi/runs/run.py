@@ -74,6 +74,7 @@ class Run:
         space: the map between natural units and inference space.
         task: what was inferred; None for a loaded run whose task cannot be found.
         origin: how the run is described in its config.json: task, configuration, support's name, preset.
+        units: of the parameters; None where its folder does not say.
     """
 
     belief: Belief
@@ -90,6 +91,7 @@ class Run:
     space: Space = struct.field(pytree_node=False)
     task: Task | None = struct.field(pytree_node=False)
     origin: Origin = struct.field(pytree_node=False)
+    units: tuple[str, ...] | None = struct.field(pytree_node=False, default=None)
 
     @property
     def posterior(self) -> Posterior:

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -209,6 +210,31 @@ def test_bad_input_is_one_line_and_leaves_nothing(words, expected, tmp_path, cap
     assert not list(tmp_path.iterdir())
 
 
+def test_domains_that_print_alike_are_told_apart(tmp_path, monkeypatch):
+    run = SimpleNamespace(space=LINE.space, feasible=LINE.space.box_to_inference(LINE.feasible), units=None)
+    run.heuristic, run.belief = SimpleNamespace(grows=True), None
+    monkeypatch.setattr("jaxlfi.runs.load.load", lambda folder: run)
+    folders = [tmp_path / name for name in ("a/one/posterior", "b/one/posterior", "b/two/posterior", "other")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    words = [*map(str, folders), "point:1,0.5", "point:1,0.50000001", "median"]
+    names = list(words_of.domains_of(LINE, words))
+    assert names == ["a-one-posterior", "b-one-posterior", "two-posterior", "other", "point-1.0-0.5",
+                     "point-1.0-0.50000001", "median"]  # fmt: skip
+    for twice in ([str(folders[0]), str(folders[1].parent / "../../a/one/posterior")], ["point:1,2", "point:1.0,2"]):
+        with pytest.raises(ValueError, match=r"domain: expected different ones, got '.*' twice"):
+            words_of.domains_of(LINE, twice)
+
+
+def test_a_posterior_in_other_units_is_no_domain():
+    domains.check_belief(LINE, LINE.space, LINE.feasible, ("", "m"))
+    domains.check_belief(LINE, LINE.space, LINE.feasible, ("", ""))  # a task that declares none
+    with pytest.raises(
+        ValueError, match=r"domain: expected a posterior in units \['', 'm'\], .*, got one in \['', 'mm'"
+    ):
+        domains.check_belief(LINE, LINE.space, LINE.feasible, ("", "mm"))
+
+
 def test_the_posterior_of_a_run_is_a_domain(tmp_path, capsys):
     """A run's mixture, clipped to Phi; the posterior of other parameters is refused."""
 
@@ -240,7 +266,7 @@ def test_saved_policies_are_evaluated_on_any_domain(finished, tmp_path, capsys):
     """The returns of the training's own table, and a NumPy loop's at a point."""
     out, _ = finished
     paths = [str(out / name / "policy.npz") for name in ("uniform/seed_000", "median/seed_005")]
-    file = tmp_path / "cross.csv"
+    file = tmp_path / "made" / "cross.csv"
     words = [REFERENCE, *paths, "--domain", "median", "point:1,-1", "--episodes", "40", "--out", str(file)]
     assert evaluating.main(words) == 0
     with file.open() as text:
@@ -258,6 +284,7 @@ def test_saved_policies_are_evaluated_on_any_domain(finished, tmp_path, capsys):
     assert float(rows[paths[1], "point-1--1"]["return"]) == pytest.approx(value.mean(), abs=1e-3)
     assert evaluating.main(words) == 2
     assert "out: expected a new .csv file" in capsys.readouterr().err
+    assert [path.name for path in file.parent.iterdir()] == ["cross.csv"]
 
 
 def test_each_policy_keeps_its_own_scaling():
