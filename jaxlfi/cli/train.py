@@ -125,7 +125,9 @@ def run(out: Path, environment: "Environment", console: "Console", figures: bool
             scalars = stack.enter_context(tensorboard.Scalars(out, names, settings.steps_per_update))
 
         def on_chunk(updates: int, curves: Mapping[str, Any]) -> None:
-            progress.advance(updates, f", return {np.nanmean(curves['value'][-updates:]):.2f}")
+            values = curves["value"][-updates:]
+            known = values[np.isfinite(values)]  # of updates in which an episode ended
+            progress.advance(updates, f", return {known.mean():.2f}" if known.size else "")
             if scalars:
                 scalars.write(curves)
 
@@ -140,10 +142,20 @@ def run(out: Path, environment: "Environment", console: "Console", figures: bool
     console.print(table)
     console.print(f"policies: {out}/DOMAIN/seed_NNN/policy.npz", markup=False)
     if figures:
-        from jaxlfi.figures import learning
+        draw(out, console)
 
-        learning.save_curves(out / "curves.png", result.names, result.curves["value"], settings.steps_per_update)
-        console.print(f"learning curves: {out / 'curves.png'}", markup=False)
+
+def draw(out: Path, console: "Console") -> None:
+    """Draw the learning curves of a finished training."""
+    from jaxlfi.figures import learning
+    from jaxlfi.io import files
+    from jaxlfi.rl import training
+
+    config = training.read_config(out)
+    names = tuple((one["domain"], one["seed"]) for one in config["trainings"])
+    values = files.read_arrays(out / "curves.npz")["value"]
+    learning.save_curves(out / "curves.png", names, values, training.settings_of(config).steps_per_update)
+    console.print(f"learning curves: {out / 'curves.png'}", markup=False)
 
 
 def is_training(out: Path) -> bool:
@@ -161,6 +173,8 @@ def resume(out: Path, console: "Console", figures: bool) -> None:
 
     config = training.read_config(out)
     if training.finished(out):
+        if figures and not (out / "curves.png").exists():  # it was stopped while it drew them
+            draw(out, console)
         console.print(f"{out} is complete: nothing to resume", markup=False)
         return
     if config["environment"] is None:

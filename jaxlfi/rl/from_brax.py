@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from jaxlfi.distributions.space import Space
-from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.support import Support, check_within
 from jaxlfi.rl.environment import EnvState, Signals
 
 MODELS = ("sys", "_mjx_model")
@@ -105,8 +105,8 @@ def from_brax(
         name: of the environment; by default that of its class.
 
     Raises:
-        ValueError: for a wrapped environment, one without a model, observations that are not one vector, and names that
-            do not fit.
+        ValueError: for a wrapped environment, one without a model, observations that are not one vector, names, units,
+            observations and bounds that do not fit, a point outside of Phi, and episodes without a step.
 
     Example:
         >>> from jaxlfi.rl import ppo
@@ -127,6 +127,21 @@ def from_brax(
         raise ValueError(f"env: expected observations that are one vector, got {env.observation_size}")
     if len(names) != support.dim:
         raise ValueError(f"names: expected {support.dim}, one a parameter of the support, got {list(names)}")
+    if unknown := [one for one in log if one not in names]:
+        raise ValueError(f"log: expected names of parameters ({', '.join(names)}), got {', '.join(unknown)}")
+    if units is not None and len(units) != len(names):
+        raise ValueError(f"units: expected {len(names)}, one a parameter, got {list(units)}")
+    if observations is not None and observations.size != env.observation_size:
+        raise ValueError(
+            f"observations: expected {env.observation_size}, as the environment has, got {observations.size}"
+        )
+    if steps < 1:
+        raise ValueError(f"steps: expected at least 1, got {steps}")
+    feasible = support if feasible is None else feasible
+    check_within(support, feasible)
+    nominal = np.asarray(support.centre if nominal is None else nominal, float)
+    if nominal.shape != (support.dim,) or not bool(feasible.contains(nominal)):
+        raise ValueError(f"nominal: expected {support.dim} numbers within Phi, got {nominal.tolist()}")
     return FromBrax(
         env=env,
         apply=apply,
@@ -134,9 +149,9 @@ def from_brax(
         name=name or type(env).__name__,
         space=Space(tuple(names), tuple(one in log for one in names)),
         units=tuple(units or [""] * len(names)),
-        feasible=feasible or support,
+        feasible=feasible,
         supports={"initial": support},
-        nominal=tuple(map(float, support.centre if nominal is None else nominal)),
+        nominal=tuple(map(float, nominal)),
         observations=observations or _plain("observation", int(env.observation_size)),
         actions=_plain("action", int(env.action_size)),
         steps=steps,

@@ -20,6 +20,7 @@ from flax import struct
 
 from jaxlfi.distributions.support import Support
 from jaxlfi.rl import domains, ppo
+from jaxlfi.rl.environment import Signals
 from jaxlfi.rl.from_brax import from_brax
 from jaxlfi.rl.settings import PPO
 
@@ -160,3 +161,25 @@ def test_what_does_not_fit_is_refused(slider):
     ):
         with pytest.raises(ValueError, match=expected):
             from_brax(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"log": ("mas",)}, r"log: expected names of parameters \(mass\), got mas"),
+        ({"units": ("kg", "m")}, r"units: expected 1, one a parameter, got \['kg', 'm'\]"),
+        ({"feasible": Support([0.1, 0.1], [5.0, 5.0])}, "support: expected bounds for 2 parameters, got 1"),
+        ({"feasible": Support([1.0], [5.0])}, "support: expected "),
+        ({"nominal": (9.0,)}, r"nominal: expected 1 numbers within Phi, got \[9.0\]"),
+        ({"nominal": (1.0, 1.0)}, "nominal: expected 1 numbers within Phi, got"),
+        (
+            {"observations": Signals(("x",) * 3, ("",) * 3, (0.0,) * 3, (1.0,) * 3)},
+            "observations: expected 2, .* got 3",
+        ),
+        ({"steps": 0}, "steps: expected at least 1, got 0"),
+    ],
+)
+def test_what_does_not_fit_its_parameters_is_refused(slider, changes, expected):
+    with pytest.raises(ValueError, match=expected) as caught:
+        from_brax(slider.env, mass_of, MASSES, ("mass",), **changes)
+    assert "\n" not in str(caught.value)

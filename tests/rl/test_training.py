@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("brax")
 
 import small
+from rich.console import Console
 from rl import events
 from rl.toy import SETTINGS, Line
 
@@ -182,8 +183,28 @@ def test_the_command_is_resumed(tmp_path, capsys, monkeypatch):
     np.testing.assert_allclose(
         events.scalars(out / "median/seed_000")["episodes/return"], np.stack([steps, returns], 1)
     )
-    assert parser.main(["resume", str(out)]) == 0
-    assert "complete: nothing to resume" in capsys.readouterr().out
+    for drawn in (True, False):
+        assert parser.main(["resume", str(out)]) == 0
+        printed = capsys.readouterr().out
+        assert "complete: nothing to resume" in printed and ("learning curves: " in printed) == drawn
+        assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("values", "expected"), [([[np.nan], [np.nan]], ""), ([[1.0], [np.nan]], ", return 1.00")])
+def test_a_return_is_shown_where_an_episode_has_ended(finished, monkeypatch, values, expected, recwarn):
+    from jaxlfi.io import progress
+
+    out, result = finished
+    shown = []
+    monkeypatch.setattr(progress.RoundProgress, "advance", lambda self, updates, text: shown.append(text))
+
+    def resumed(out, environment, on_chunk):
+        on_chunk(2, {"value": np.array(values)})
+        return result
+
+    monkeypatch.setattr(training, "resumed", resumed)
+    command.run(out, LINE, Console(quiet=True), figures=False)
+    assert shown == [expected] and not recwarn.list
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,7 @@ def test_a_saved_run_is_loaded_as_it_was(run, saved):
     np.testing.assert_array_equal(again.observed, run.observed)
     np.testing.assert_array_equal(again.x, run.x)
     assert again.space == run.space and again.task == run.task and again.warnings == run.warnings
+    assert again.units == run.units == run.task.units
     np.testing.assert_array_equal(again.draws(), run.draws())
 
 
