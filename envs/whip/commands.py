@@ -17,7 +17,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from jaxlfi.envs.whip import control as controlling
-from jaxlfi.envs.whip import formats, planner, rules
+from jaxlfi.envs.whip import formats, planner
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip import render as drawing
 from jaxlfi.envs.whip.episode import Whip
@@ -194,13 +194,7 @@ def _read_actions(path: str) -> np.ndarray:
     """The array "actions" of an .npz, which may be a plan, a rollout or a recording."""
     if not Path(path).exists():
         raise ValueError(f"policy: expected {', '.join(POLICIES)} or an .npz file, got {path!r}")
-    actions = atomic.read_arrays(Path(path)).get("actions")
-    if actions is None or actions.shape != (rules.STEPS, 2) or actions.dtype.kind not in "fiu":
-        got = "none" if actions is None else f"{actions.dtype} of shape {list(actions.shape)}"
-        raise ValueError(f"policy: expected an array actions of shape [{rules.STEPS}, 2] in {path}, got {got}")
-    if not np.isfinite(actions).all():
-        raise ValueError(f"policy: expected finite actions in {path}, got some that are not")
-    return actions.astype(np.float32)
+    return repetitions.actions_of(path).astype(np.float32)
 
 
 def _search(key: jax.Array, engine: Engine, parameters: WhipParameters) -> planner.Plan:

@@ -1,7 +1,6 @@
 """How policies fare on the FEM objects: at the paper's repetitions of the nominal place, and at displaced ones."""
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,11 @@ from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.reference_objects.deployment import Deployed, deploy, places
 from jaxlfi.envs.whip.reference_objects.objects import load
 from jaxlfi.envs.whip.reference_objects.observation import in_every_frame
-from jaxlfi.envs.whip.reference_objects.repetitions import acting
+from jaxlfi.envs.whip.reference_objects.repetitions import acting, episodes
 from jaxlfi.envs.whip.reference_objects.scene import PLACE
 from jaxlfi.envs.whip.render import SIZE
 from jaxlfi.envs.whip.vision.camera import Camera, side_camera
 from jaxlfi.envs.whip.vision.raster import segmentation
-from jaxlfi.io.host_devices import processors
 
 
 def scenes(displaced: int = DISPLACED, nominal: int = NOMINAL, seed: int = 0) -> list[tuple[jax.Array, Any, Camera]]:
@@ -39,8 +37,7 @@ def on_object(words: list[str], dlo: str, where: list[tuple[jax.Array, Any, Came
         return _row(deploy(key, load(dlo), begin(), scene, camera), camera)
 
     cases = [(acting(word), place) for word in words for place in where]
-    with ThreadPoolExecutor(processors()) as pool:  # MuJoCo steps without Python's lock
-        rows = list(pool.map(episode, cases))
+    rows = episodes(cases, episode)
     arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     return Performed(**{name: row.reshape(len(words), len(where), *row.shape[1:]) for name, row in arrays.items()})
 

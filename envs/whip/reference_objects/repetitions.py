@@ -2,10 +2,10 @@
 
 import csv
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -38,9 +38,8 @@ def acting(word: str) -> Callable[[], Act]:
         if action.shape != (2,) or not (np.abs(action) <= rules.ACTION_LIMIT).all():
             raise ValueError(f"policy: expected constant:DX,DZ of at most {rules.ACTION_LIMIT} m, got {word!r}")
         return lambda: lambda observation: action
-    arrays = files.read_arrays(Path(word))
-    if "actions" in arrays and arrays["actions"].shape == (rules.STEPS, 2):
-        plan = np.clip(arrays["actions"], -rules.ACTION_LIMIT, rules.ACTION_LIMIT)
+    if "actions" in files.read_arrays(Path(word)):
+        plan = np.clip(actions_of(word), -rules.ACTION_LIMIT, rules.ACTION_LIMIT)
 
         def begin() -> Act:
             steps = iter(plan)
@@ -49,6 +48,31 @@ def acting(word: str) -> Callable[[], Act]:
         return begin
     policy = policies.load(word).require("whip", OBSERVATIONS, ACTIONS)
     return lambda: policy
+
+
+def actions_of(path: str | Path) -> np.ndarray:
+    """The array "actions" of an .npz, which may be a plan, a rollout or a recording, in m, shape [16, 2].
+
+    Raises:
+        ValueError: for a file without it, another shape, and what is no finite number.
+    """
+    actions = files.read_arrays(Path(path)).get("actions")
+    if actions is None or actions.shape != (rules.STEPS, 2) or actions.dtype.kind not in "fiu":
+        got = "none" if actions is None else f"{actions.dtype} of shape {list(actions.shape)}"
+        raise ValueError(f"policy: expected an array actions of shape [{rules.STEPS}, 2] in {path}, got {got}")
+    if not np.isfinite(actions).all():
+        raise ValueError(f"policy: expected finite actions in {path}, got some that are not")
+    return actions
+
+
+Case = TypeVar("Case")
+Made = TypeVar("Made")
+
+
+def episodes(cases: Iterable[Case], of: Callable[[Case], Made]) -> list[Made]:
+    """An episode of each case, in their order, as many at a time as there are processors."""
+    with ThreadPoolExecutor(processors()) as pool:  # MuJoCo steps without Python's lock
+        return list(pool.map(of, cases))
 
 
 def repeat(
@@ -81,8 +105,7 @@ def repeat(
         return row
 
     cases = [(name, dlo, place) for name in begins for dlo in objects for place in range(n)]
-    with ThreadPoolExecutor(processors()) as pool:  # MuJoCo steps without Python's lock
-        return list(pool.map(episode, cases))
+    return episodes(cases, episode)
 
 
 def _row(name: str, dlo: str, place: int, one: Deployed) -> dict[str, Any]:

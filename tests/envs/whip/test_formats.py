@@ -118,7 +118,7 @@ def test_learners_see_each_action_in_the_frames_of_its_interval(tmp_path):
 
 
 def with_actions_of_frames(one: Recording) -> Rollout:
-    """As LeRobot records: an action in every row and nothing besides."""
+    """An action in every row; beside the rows there is the description alone."""
     rollout = formats.as_rollout(one)
     action = rollout.signals["action"]
     rows = Signal(one.times, action.held(one.times), action.names, action.unit)

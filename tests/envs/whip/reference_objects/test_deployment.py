@@ -127,10 +127,22 @@ def test_words_for_policies(tmp_path):
     for _ in range(2):  # every episode begins with the first action
         act = begin()
         np.testing.assert_allclose([act(None) for _ in range(16)][3], [0.012, 0.014])
+    for name, actions in (
+        ("nan", np.full((16, 2), np.nan)),
+        ("short", np.zeros((15, 2))),
+        ("words", [["a", "b"]] * 16),
+    ):
+        files.write_arrays(tmp_path / f"{name}.npz", {"actions": actions})
     for word, expected in (
         ("constant:0.1,0", "policy: expected constant:DX,DZ of at most 0.06 m"),
         ("constant:a", "policy: expected constant:DX,DZ"),
         (str(tmp_path / "none.npz"), "expected a whole"),
+        (str(tmp_path / "nan.npz"), "policy: expected finite actions in .*nan.npz, got some that are not"),
+        (
+            str(tmp_path / "short.npz"),
+            r"policy: expected an array actions of shape \[16, 2\] in .*, got float64 of shape",
+        ),
+        (str(tmp_path / "words.npz"), r"policy: expected an array actions of shape \[16, 2\] in .*, got <U"),
         (str(a_policy(tmp_path / "other.npz", "line")), "policy: expected environment 'whip', got one of 'line'"),
     ):
         with pytest.raises(ValueError, match=expected):
