@@ -14,6 +14,7 @@ from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip.real2sim import recorded
 from jaxlfi.io import files
 from jaxlfi.rl import training
+from jaxlfi.rl.settings import PRESETS
 
 
 def believe(study: Study, name: str) -> None:
@@ -48,6 +49,8 @@ def _record(study: Study, dlo: str) -> Path:
 
 def learn(study: Study, names: Sequence[str], seeds: int, settings: Sequence[str]) -> None:
     """Policies on domains, all seeds of all of them side by side; what the domains need is made before."""
+    for name in names:
+        _check_same(study.training(name), seeds, settings)
     names = [name for name in names if not (study.training(name) / "table.csv").exists()]
     if not names:
         return
@@ -56,6 +59,7 @@ def learn(study: Study, names: Sequence[str], seeds: int, settings: Sequence[str
         if name not in BROAD and kind != "true":
             believe(study, name if kind in (*HEURISTICS, "sysid") else f"{dlo}-edge")
     together = study.training("+".join(names))
+    _check_same(together, seeds, settings)
     if (together / "config.json").exists():
         _command(command_line.main, ["resume", str(together)])
     else:
@@ -64,6 +68,28 @@ def learn(study: Study, names: Sequence[str], seeds: int, settings: Sequence[str
         _command(train.main, [*words, "--out", str(together)], "train ")
     if len(names) > 1:
         split(together, [study.training(name) for name in names])
+
+
+def _check_same(out: Path, seeds: int, settings: Sequence[str]) -> None:
+    """Refuse a training that is there already with other seeds or settings than are asked for.
+
+    Raises:
+        ValueError: in one line.
+    """
+    if not (out / "config.json").exists():
+        return
+    config = training.read_config(out)
+    words = ["whip", "--domain", "uniform", "--out", str(out), *settings]
+    asked = PRESETS["quick"].replace(**train.parser().parse_args(words).settings)
+    found = training.settings_of(config)
+    if found != asked:
+        differ = [name for name, value in vars(asked).items() if value != vars(found)[name]]
+        raise ValueError(f"{out}: expected a training of the same settings, got another {', '.join(differ)}: remove it")
+    trained = {one["seed"] for one in config["trainings"]}
+    if trained != set(range(seeds)):
+        raise ValueError(
+            f"{out}: expected a training of {seeds} seeds, got one of {len(trained)}: remove it to train anew"
+        )
 
 
 def split(together: Path, outs: Sequence[Path]) -> None:

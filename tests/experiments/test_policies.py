@@ -23,10 +23,11 @@ from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.envs.whip.vision.camera import project, side_camera
 from jaxlfi.envs.whip.vision.keypoints import along
-from jaxlfi.io import files
+from jaxlfi.io import files, serialise
 from jaxlfi.rl import training
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.evaluation import evaluate
+from jaxlfi.rl.settings import PRESETS
 
 # ---------------------------------------------------------------------------------------------------------- barycentres
 
@@ -134,6 +135,21 @@ def test_domains_are_named_as_the_command_line_does(tmp_path):
     assert study.domain("dlo-1-none") == str(study.posterior("dlo-1-none"))
     length, young = truth("dlo-0")
     assert length == 200 and young == pytest.approx(1e5, rel=0.02)
+
+
+def test_a_training_of_other_seeds_or_settings_is_not_taken_for_the_one_asked_for(tmp_path):
+    study = Study(tmp_path)
+    out = study.training("uniform")
+    out.mkdir(parents=True)
+    config = {"format": training.FORMAT, "version": training.VERSION, "trainings": [{"domain": "u", "seed": 0}]}
+    config["settings"] = serialise.fields_to_json(PRESETS["quick"], serialise.class_name)
+    files.write_json(out / "config.json", config)
+    (out / "table.csv").write_text("")
+    making.learn(study, ["uniform"], 1, [])
+    with pytest.raises(ValueError, match="expected a training of 2 seeds, got one of 1"):
+        making.learn(study, ["uniform"], 2, [])
+    with pytest.raises(ValueError, match="expected a training of the same settings, got another total_steps: remove"):
+        making.learn(study, ["uniform"], 1, ["--total-steps", "960"])
 
 
 def test_domains_trained_side_by_side_get_folders_of_their_own(tmp_path):

@@ -83,6 +83,22 @@ def test_the_stages_follow_each_other(stages, tmp_path):
     assert [words[0] for words in ran] == ["page"]  # all else is there
 
 
+def test_the_commands_understand_the_words_of_their_stages(stages, tmp_path):
+    ran, _ = stages
+    words = ["--object", "dlo-0", "--out", str(tmp_path / "loop"), "--seed", "3", "--total-steps", "960"]
+    assert r2s2r.main(words) == 0
+    of = {kind: [one[1:] for one in ran if one[0] == kind] for kind in ("train", "infer or resume", "deploy")}
+    for one in of["train"]:
+        arguments = r2s2r.train.parser().parse_args(one)
+        assert (arguments.first_seed, arguments.settings) == (3, {"total_steps": 960})
+    (one,) = of["infer or resume"]
+    arguments = r2s2r.command_line.parse(one)
+    assert (arguments.heuristic, arguments.first_seed, arguments.preset) == ("edge", 3, "quick")
+    (one,) = of["deploy"]
+    arguments = r2s2r.whip.parser().parse_args(one)
+    assert (arguments.repetitions, arguments.seed, arguments.object) == (16, 3, ["dlo-0"])
+
+
 @pytest.mark.parametrize(("kind", "again"), [("train", "resume"), ("infer or resume", "resume"), ("deploy", "deploy")])
 def test_it_goes_on_where_it_was_stopped(stages, tmp_path, kind, again, capsys):
     ran, stopped = stages
