@@ -18,6 +18,7 @@ from rich.table import Table
 from jaxlfi import diagnostics
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.convergence import LAG
+from jaxlfi.bayessim.keys import key_of
 from jaxlfi.bayessim.presets import METHODS, PRESETS, all_rounds
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.widths import expected_widths
@@ -223,12 +224,12 @@ def sample(arguments: argparse.Namespace, console: Console) -> None:
     if out.exists() or out.is_symlink():
         raise ValueError(f"out: expected a new file, got {out}, which exists")
     if not 0 <= arguments.seed < 2**63:
-        raise ValueError(f"seed: expected at least 0, got {arguments.seed}")
+        raise ValueError(f"seed: expected a number from 0 to 2^63 - 1, got {arguments.seed}")
     posterior = load(arguments.folder).posterior
     if out.suffix == ".nc":
         export.write_netcdf(out, arguments.folder, arguments.number, arguments.seed)
     else:
-        draws = np.asarray(posterior.sample(jax.random.key(arguments.seed), arguments.number))
+        draws = np.asarray(posterior.sample(key_of(arguments.seed), arguments.number))
         names = posterior.space.names
         if out.suffix == ".npz":
             atomic.write_arrays(out, {"theta": draws, "names": np.asarray(names)})

@@ -472,6 +472,10 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
         compile_cache.enable()
 
 
+TYPICAL_CONFIGURATIONS = 6
+"""Of a comparison that names none: three supports, and one of them with three heuristics."""
+
+
 def _runs(arguments: argparse.Namespace) -> int:
     """How many runs a command is going to have, as far as its arguments show."""
     if arguments.command == "resume":
@@ -480,7 +484,7 @@ def _runs(arguments: argparse.Namespace) -> int:
             len(recorded.get("runs") or ()) if isinstance(recorded.get("runs"), list) else 2
         )  # a grid does not list its runs
     if arguments.command == "compare":
-        return arguments.seeds * len(arguments.configurations or "default")
+        return arguments.seeds * (len(arguments.configurations) if arguments.configurations else TYPICAL_CONFIGURATIONS)
     if arguments.command == "grid":
         return arguments.seeds * math.prod(axis.count(",") + 1 for axis in arguments.vary)
     if arguments.command == "diagnose":

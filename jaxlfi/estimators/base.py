@@ -110,9 +110,14 @@ class Estimator(Checked, abc.ABC):
         """Refuse settings that cannot work, by name; returns the settings."""
         check_fields(self)
         if (self.epochs > 0) == (self.steps > 0):
-            raise ValueError(f"expected epochs or steps, one of them above 0, got {self.epochs} and {self.steps}")
+            raise ValueError(f"epochs, steps: expected one of them above 0, got {self.epochs} and {self.steps}")
         if self.patience and not self.validation:
             raise ValueError("patience: expected validation above 0 to stop by, got validation=0")
+        if self.loss != "likelihood" and self.batch_size < 2:
+            raise ValueError(
+                f"batch_size: expected at least 2, as the loss {self.loss!r} compares the simulations of a minibatch, "
+                f"got {self.batch_size}"
+            )
         if self.record_size and self.embedding == "none":
             raise ValueError(f"record_size: expected 0 without an embedding, got {self.record_size}")
         return self

@@ -55,7 +55,7 @@ class Checkpoint:
             raise CheckpointError(f"{self.folder / 'start.npz'}: expected whole simulations, got: {error}") from error
 
     def write_round(self, index: int, state: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
-        """Keep a round's record and the state after it; of some arrays, only the last round's (`history.apart`)."""
+        """Keep a round's record and the state after it; of some arrays, only the last round's (`record.apart`)."""
         rows, final = apart(rows)
         atomic.write_arrays(
             self.folder / _round_name(index),

@@ -4,9 +4,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
+from jaxlfi.bayessim.keys import key_of
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.folder import StoreError, read_config
 from jaxlfi.runs.load import load
@@ -34,7 +34,7 @@ def to_inference_data(folder: Path | str, n: int = 1000, seed: int = 0) -> Any:
     """
     arviz = _arviz()
     run = load(folder)
-    draws = np.asarray(run.posterior.sample(jax.random.key(seed), n))
+    draws = np.asarray(run.posterior.sample(key_of(seed), n))
     names, observed = run.space.names, np.asarray(run.observed)
     try:
         seen = atomic.read_arrays(Path(folder) / "observation.npz")

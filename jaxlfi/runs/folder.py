@@ -112,7 +112,8 @@ def refuse_occupied(folder: Path) -> None:
     """Refuse to write where something is.
 
     Raises:
-        StoreError: if the folder exists and is not empty, or is a file, or a link to nothing.
+        StoreError: if the folder exists and is not empty, or is a file, a link to nothing, or the current folder, which
+            cannot be replaced.
     """
     if folder.is_symlink() and not folder.exists():
         raise StoreError(
@@ -120,6 +121,8 @@ def refuse_occupied(folder: Path) -> None:
         )
     if not folder.exists():
         return
+    if folder.samefile(Path.cwd()):
+        raise StoreError(f"out: expected a new or empty folder, got {str(folder)!r}, the current one")
     if not folder.is_dir() or any(folder.iterdir()):
         raise StoreError(
             f"out: expected a new or empty folder, got {str(folder)!r} which holds something: "
@@ -136,6 +139,7 @@ def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any])
         fill: called with the folder's temporary path, to write what else belongs into it.
     """
     refuse_occupied(folder)
+    folder = folder.resolve()  # a link to an empty folder stands for that folder
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         staging = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))

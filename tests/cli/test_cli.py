@@ -100,7 +100,7 @@ BAD = {
     "correction": (["infer", TASK, "--correction", "x"], "correction: expected one of"),
     "activation": (["infer", TASK, "--activation", "x"], "activation: expected one of"),
     "learning rate": (["infer", TASK, "--learning-rate", "nan"], "learning_rate: expected a number in (0, inf)"),
-    "epochs and steps": (["infer", TASK, "--epochs", "5", "--steps", "5"], "epochs or steps"),
+    "epochs and steps": (["infer", TASK, "--epochs", "5", "--steps", "5"], "epochs, steps: expected one"),
     "seeds": (["infer", TASK, "--seeds", "0"], "seeds: expected at least 1"),
     "hyperparameter length": (["infer", TASK, "--expansion", "1", "2", "3"], "expansion: expected one finite number or 2"),  # noqa: E501
     "foreign hyperparameter": (["infer", TASK, "--proximity", "0.3"], "proximity: expected a hyperparameter of edge"),

@@ -235,6 +235,17 @@ def test_occupied_folders_are_refused_and_empty_ones_taken(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "new"]
 
 
+def test_a_link_to_an_empty_folder_is_that_folder_and_the_current_one_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    folders.create(tmp_path / "link", {"a": 1}, lambda folder: None)
+    assert (tmp_path / "link").is_symlink() and json.loads((tmp_path / "real" / "config.json").read_text()) == {"a": 1}
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with pytest.raises(folders.StoreError, match=r"expected a new or empty folder, got '\.', the current one"):
+        folders.create(Path("."), {"a": 1}, lambda folder: None)
+
+
 # ---------------------------------------------------------------------------------------------------- provenance
 
 

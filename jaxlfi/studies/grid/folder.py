@@ -240,4 +240,4 @@ def table(grid: Grid, arrays: Mapping[str, np.ndarray]) -> str:
 def _meet(name: str) -> None:
     """Wait for the other processes, where there are some."""
     if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(f"jaxlfi sweep: {name}")
+        multihost_utils.sync_global_devices(f"jaxlfi grid: {name}")
