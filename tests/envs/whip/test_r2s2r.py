@@ -10,11 +10,11 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from envs_whip import a_policy
+from envs_whip import Rig, a_policy, found
 
 import jaxlfi
 from jaxlfi.distributions.space import Space
-from jaxlfi.envs.whip import r2s2r, r2s2r_page
+from jaxlfi.envs.whip import r2s2r, r2s2r_page, recording
 from jaxlfi.io import files
 
 
@@ -128,6 +128,7 @@ class OfOthers:
 
     space = Space(("prey", "predators"), (True, True))
     feasible = jaxlfi.Support([0.0, 0.0], [1.0, 1.0])
+    units = ("", "")
 
 
 def test_bad_input_is_one_line_and_leaves_nothing(stages, tmp_path, capsys, monkeypatch):
@@ -163,6 +164,20 @@ def test_it_goes_on_where_its_own_description_was_not_written_to_the_end(stages,
     assert ran[-1][0] == "page" and not (out / "config.json.part").exists()
 
 
+def test_a_rollout_is_recorded_once_and_what_a_kill_left_is_replaced(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxlfi.envs.whip.reference_objects.robot.ReferenceRig", Rig)
+    monkeypatch.setattr("jaxlfi.envs.whip.reference_objects.robot._found", found)
+    policy, path = a_policy(tmp_path / "policy.npz"), tmp_path / "rollout.npz"
+    path.write_text("part of one")
+    arguments = r2s2r.parser().parse_args(["--object", "dlo-0", "--out", str(tmp_path), "--seed", "3"])
+    assert r2s2r._rollout(arguments, policy, path, 1) == path
+    made = recording.read(path)
+    # Below its workspace after seven steps, the gripper is held still.
+    np.testing.assert_allclose(made.actions, np.repeat([[0.03, -0.03], [0, 0]], [7, 9], axis=0), atol=1e-6)
+    before = path.stat().st_mtime_ns
+    assert r2s2r._rollout(arguments, policy, path, 1) == path and path.stat().st_mtime_ns == before
+
+
 def test_what_was_believed(tmp_path):
     """Quantiles of a run's draws in natural units, beside its last support."""
 
@@ -179,3 +194,26 @@ def test_what_was_believed(tmp_path):
     assert [row["parameter"] for row in rows] == ["length", "young"]
     assert rows[0]["median"] == "200" and rows[0]["90 % interval"] == "155 to 245"
     assert rows[0]["last support"] == "100 to 300" and rows[1]["last support"] == "1000 to 1e+05"
+
+
+def test_the_page_says_all_of_it(tmp_path, monkeypatch):
+    out = tmp_path / "loop"
+    (out / "deployed").mkdir(parents=True)
+    (out / "deployed/table.csv").write_text("policy,object,return\nfirst<b>,dlo-0,1.2345\n")
+    (out / "policy_0").mkdir()
+    for name in ("film.gif", "policy_0/curves.png"):
+        (out / name).write_bytes(b"")
+    monkeypatch.setattr(r2s2r_page, "load", lambda folder: None)
+    monkeypatch.setattr(r2s2r_page, "believed", lambda folder, run: [{"run": folder.name, "median": "200"}])
+    policy = a_policy(tmp_path / "policy.npz")
+    arguments = r2s2r.parser().parse_args(["--object", "dlo-0", "--out", str(out)])
+    text = r2s2r_page.write(arguments, [policy]).read_text()
+    for part in (
+        "<td>posterior</td><td>200</td>",
+        "first&lt;b&gt;",
+        "<td>1.23</td>",
+        "policy_0/curves.png",
+        str(policy),
+    ):
+        assert part in text
+    assert "sheet.png" not in text
