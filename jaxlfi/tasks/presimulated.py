@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.simulation import Simulations, summarised_batch
 from jaxlfi.tasks.task import Task
 
@@ -22,16 +23,13 @@ def read_simulations(path: str | Path) -> dict[str, np.ndarray]:
     """The arrays of an .npz of simulations; see `presimulated`.
 
     Raises:
-        ValueError: for a file that cannot be read, or holds other arrays.
+        ValueError: for a file that cannot be read.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+            return {name: file[name] for name in file.files}
     except Exception as error:  # zipfile, numpy and the operating system each have their own
         raise ValueError(f"simulations: cannot read {str(path)!r}: {str(error).splitlines()[0]}") from error
-    if unknown := sorted(set(arrays) - set(ARRAYS)):
-        raise ValueError(f"simulations: expected arrays among {', '.join(ARRAYS)}, got {', '.join(unknown)}")
-    return arrays
 
 
 def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None = None) -> tuple[Simulations, Support]:
@@ -52,8 +50,10 @@ def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None 
         The simulations, and Theta_0 in inference space.
 
     Raises:
-        ValueError: for arrays that are missing, or of shapes that do not fit.
+        ValueError: for arrays that are missing, of other names, or of shapes that do not fit.
     """
+    if unknown := sorted(set(arrays) - set(ARRAYS)):
+        raise ValueError(f"simulations: expected arrays among {', '.join(ARRAYS)}, got {', '.join(unknown)}")
     theta = _array(arrays, "theta", (None, task.dim))
     rows = len(theta)
     if rows < MIN_ROWS:
@@ -83,6 +83,11 @@ def _summaries(task: Task, arrays: Mapping[str, Any], rows: int) -> tuple[jax.Ar
         trajectory = np.asarray(arrays["trajectory"], np.float32)
         if trajectory.ndim < 2 or len(trajectory) != rows:
             raise ValueError(f"simulations: expected {rows} trajectories, got shape {list(trajectory.shape)}")
+        if not task.on_host and trajectory.shape[1:] != (shape := simulator_shapes(task).trajectory):
+            raise ValueError(
+                f"simulations: expected trajectories of shape {list(shape)}, as the task's simulator makes, "
+                f"got {list(trajectory.shape[1:])}"
+            )
         _, x, failure = summarised_batch(task, jnp.asarray(trajectory), jnp.zeros(rows, jnp.int32))
         return x, failure
     x = jnp.asarray(_array(arrays, "x", (rows, None)))

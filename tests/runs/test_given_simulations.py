@@ -71,6 +71,16 @@ def test_their_posterior_is_the_exact_one():
     np.testing.assert_allclose(np.sqrt(np.diag(run.mixture.covariance)), deviation, rtol=0.4)
 
 
+def test_arrays_that_are_not_those_of_the_task_are_refused():
+    given = pairs(20)
+    with pytest.raises(ValueError, match=r"expected arrays among theta, .*, got log_densities"):
+        presimulated(gaussian(), given | {"log_densities": np.zeros(20)})
+    with pytest.raises(
+        ValueError, match=r"expected trajectories of shape \[2\], as the task's simulator makes, got \[3\]"
+    ):
+        presimulated(gaussian(), given | {"trajectory": np.zeros((20, 3))})
+
+
 def test_later_rounds_simulate_as_ever(tmp_path):
     given = pairs(60)
     given["trajectory"][:7] = np.nan
