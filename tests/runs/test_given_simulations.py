@@ -149,7 +149,7 @@ def test_a_file_that_is_none_is_refused(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"^simulations: cannot read"):
         read_simulations(tmp_path / "no.npz")
     with pytest.raises(ValueError, match=r"^simulations: expected arrays among .*, got weights$"):
-        read_simulations(tmp_path / "foreign.npz")
+        presimulated(gaussian(), read_simulations(tmp_path / "foreign.npz"))
     reference = "tests.runs.test_given_simulations:host_task"
     assert command("infer", reference, *FLAGS, "--simulations", tmp_path / "missing.npz", "--out", tmp_path / "x") == 2
     message = capsys.readouterr().err
