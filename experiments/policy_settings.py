@@ -50,7 +50,7 @@ AROUND: dict[str, tuple[PPO, dict[str, dict[str, float]]]] = {
         },
     ),
 }
-"""Where settings were looked for: a first guess and what was changed of it, then what that had led to."""
+"""A base and what is changed of it: first a guess, then `quick`, which came out of that."""
 FIRST_SEED = 1000
 """Seeds from here on are for choosing settings, and are reported nowhere else."""
 HELD_OUT = 64
@@ -99,10 +99,8 @@ def side_by_side(environment, draw, settings: Sequence[PPO], seeds: Sequence[int
         Mean returns of the updates, shape [updates, trainings], and the outcomes of their policies' episodes on other
         points of the domain, shape [trainings, HELD_OUT].
     """
-    first, stacked = (
-        settings[0],
-        jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(one) for one in leaves]), *settings),
-    )
+    first = settings[0]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(one) for one in leaves]), *settings)
     keys = jax.vmap(lambda seed: jax.random.split(jax.random.key(seed), 4))(jnp.asarray(seeds))
     points = POOL if first.redrawn else first.environments
     domains_of = lambda index, number: Domain(jnp.stack([draw(key[index], number).theta for key in keys]))

@@ -11,8 +11,8 @@ import tempfile
 import zlib
 from pathlib import Path
 
-# Where Python is told to keep no bytecode, every worker and every process that a test starts would compile the source
-# of all that it imports, for seconds: they share what is compiled, in a folder that goes when the tests end.
+# With PYTHONDONTWRITEBYTECODE set, every worker and every process started by a test would spend seconds on compiling
+# the Python modules that it imports. They share a bytecode cache in a temporary folder, which is removed at the end.
 if sys.dont_write_bytecode:
     sys.dont_write_bytecode, sys.pycache_prefix = False, tempfile.mkdtemp(prefix="jaxlfi-bytecode-")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -21,8 +21,8 @@ domains:
 def domains_of(environment: "Environment", words: Sequence[str]) -> dict[str, Callable]:
     """How to draw from each of several domains, by different names.
 
-    Folders of one name, such as `seed_000` of two runs, are told apart by as many of their parents as it takes, and
-    points that agree in six digits by all of theirs.
+    Folders of the same name, such as `seed_000` of two runs, are named with as many parent folders as make the names
+    unique; points whose coordinates agree to six digits are named with all digits.
 
     Raises:
         ValueError: as `domain`, and for the same one twice.

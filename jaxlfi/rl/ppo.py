@@ -206,8 +206,8 @@ def train(
 
 
 def _optimiser(settings: PPO, made: Int[Array, ""]) -> optax.GradientTransformation:
-    """Adam at the learning rate that remains after so many updates."""
-    rate = settings.learning_rate * (1 - settings.annealing * made / settings.updates)
+    """Adam at the learning rate that remains after so many updates; it does not fall any further after the last one."""
+    rate = settings.learning_rate * (1 - settings.annealing * jnp.minimum(made / settings.updates, 1.0))
     return optax.chain(
         optax.clip_by_global_norm(settings.max_gradient_norm),
         optax.adam(rate, eps=settings.adam_epsilon),

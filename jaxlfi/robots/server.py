@@ -118,7 +118,7 @@ class _Session:
                 self.robot.stop()
         except Exception as error:
             why = f"{why}; and stopping the robot failed: {error}"
-        with contextlib.suppress(Exception):  # the robot has been stopped, and there is nobody to be told
+        with contextlib.suppress(Exception):  # a journal that fails does not end the server
             self.journal({"event": "stopped", "why": why})
         return why
 

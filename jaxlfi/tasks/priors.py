@@ -16,8 +16,8 @@ from jaxlfi.distributions.truncation import MASS_DRAWS, mass_inside, rejection_s
 
 MIN_INSIDE = 0.01
 """Mass of a prior inside the support below which a run is refused: its draws would be those of a uniform prior."""
-PLACES = 8
-"""Places at which a prior is described."""
+FINGERPRINT_POINTS = 8
+"""Points at which priors are compared."""
 LOW_INSIDE = 0.1
 """Mass below which a run warns: 3 % of the draws, or more, are uniform over the support instead."""
 
@@ -81,11 +81,11 @@ def prior_mass(prior: Any, support: Support) -> Float[Array, ""]:
     return jnp.ones(()) if prior is None else mass_inside(_sampler(prior), support)
 
 
-def described(prior: Any, feasible: Support) -> list[float] | None:
-    """A prior in a few numbers, by which two can be told apart: its log-density at `PLACES` places in a box."""
+def fingerprint(prior: Any, feasible: Support) -> list[float] | None:
+    """The log-density of a prior at fixed points of a box; two priors are taken to be the same where it agrees."""
     if prior is None:
         return None
-    unit = np.random.default_rng(0).uniform(size=(PLACES, feasible.dim)).astype(np.float32)
+    unit = np.random.default_rng(0).uniform(size=(FINGERPRINT_POINTS, feasible.dim)).astype(np.float32)
     low, high = np.asarray(feasible.low), np.asarray(feasible.high)
     return np.asarray(prior.log_prob(jnp.asarray(low + unit * (high - low))), float).tolist()
 

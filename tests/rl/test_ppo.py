@@ -176,17 +176,17 @@ def test_trainings_side_by_side_are_those_by_themselves(train):
 
 def test_the_learning_rate_falls_evenly_to_what_is_left_of_it(domain):
     start = ppo.init(jax.random.key(0), LINE, SETTINGS, domain)
-    later = start.replace(updates=jnp.asarray(3))
 
     @jax.jit
-    def moved(rate, annealing):
+    def moved(rate, annealing, made=3):
         settings = SETTINGS.replace(learning_rate=rate, annealing=annealing)
-        return ppo.update(LINE, settings, later)[0].params
+        return ppo.update(LINE, settings, start.replace(updates=jnp.asarray(made)))[0].params
 
     left = 1 - 0.8 * 3 / SETTINGS.updates
     close = functools.partial(np.testing.assert_allclose, atol=1e-6)
     jax.tree.map(close, moved(4e-3, 0.8), moved(4e-3 * left, 0.0))
     assert left < 0.9
+    jax.tree.map(np.testing.assert_array_equal, moved(4e-3, 1.0, SETTINGS.updates + 1), start.params)
 
 
 def test_the_file_of_a_policy_acts_like_its_networks(domain):
