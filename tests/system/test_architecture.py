@@ -228,6 +228,7 @@ ASKED = {
         "jaxlfi.tasks.simulation": "calls a host simulator for many parameters at once",
         "jaxlfi.tasks.observation": "asks it for shapes, which JAX's simulators tell without being run",
         "jaxlfi.tasks.trials": "repeats it by one call for all trials",
+        "jaxlfi.tasks.presimulated": "compares given trajectories with the shape that a simulator of JAX tells",
         "jaxlfi.bayessim.host": "chooses the engine",
         "jaxlfi.runs.infer": "cannot trace it",
         "jaxlfi.studies.calibration.plan": "asks for shapes",
