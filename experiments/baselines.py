@@ -29,7 +29,7 @@ from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.record import theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.figures import seeds as strips
 from jaxlfi.figures import style

@@ -25,8 +25,9 @@ import numpy as np
 from rich.console import Console
 
 from experiments.widths import DRAWS, FLOOR, RULES, TUNING, drawn_cases, infer_all, own_cases, save
+from jaxlfi.bayessim.presets import settings_for
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.cli.commands import bootstrap_interval, preset_for
+from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.io import files as atomic
 from jaxlfi.tasks import registry
 from jaxlfi.tasks.task import Task
@@ -37,7 +38,7 @@ NAMES = ("summaries", "raw", "mlp", "series")
 
 def candidate(name: str, task: Task) -> tuple[Task, Settings]:
     """What a candidate observes, and the settings it infers by."""
-    quick = preset_for(task, "bayessim", "quick").replace(predictive=False)
+    quick = settings_for(task).replace(predictive=False)
     if name == "summaries":
         return task, quick
     raw = dataclasses.replace(task, summary="identity", summary_names=())

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.envs import mg1
 from jaxlfi.figures import History, density, open_collection, style
 from jaxlfi.io import files as atomic

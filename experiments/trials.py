@@ -32,7 +32,7 @@ from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_algebra import product, reduce
 from jaxlfi.envs import gaussian_linear

@@ -38,7 +38,7 @@ from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import QUICK, snle
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Mode, paired

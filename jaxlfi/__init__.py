@@ -40,6 +40,7 @@ _HOMES = {
     "load": "jaxlfi.runs.load",
     "option": "jaxlfi.fields",
     "repeated": "jaxlfi.tasks.trials",
+    "settings_for": "jaxlfi.bayessim.presets",
     "stack": "jaxlfi.bayessim.batch",
     "with_tails": "jaxlfi.tasks.priors",
 }

@@ -1,11 +1,15 @@
 """Presets: named settings of a run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from jaxlfi.bayessim.settings import Settings
+from jaxlfi.estimators import registry
 from jaxlfi.estimators.flow_estimators import SplineFlow
 from jaxlfi.estimators.likelihood_estimators import MixtureLikelihood
 from jaxlfi.estimators.mixture_network import MixtureNetwork
+from jaxlfi.fields import declared
+from jaxlfi.tasks.task import Task
 
 PAPER = Settings()
 """The paper's numbers to the letter (section III-C); they are the defaults of `Settings` and `MixtureNetwork`."""
@@ -108,3 +112,44 @@ METHODS: dict[str, Callable[[Settings], Settings]] = {
     "snle": snle,
 }
 """What a method makes of a preset, by the name the command line gives it. All are Algorithm 1 with other parts."""
+
+
+def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") -> Settings:
+    """A method at a preset, with the numbers that the task asks for in place of the preset's, as `jaxlfi infer` begins.
+
+    Args:
+        task: whose `settings` name fields of `Settings`, or of the estimators of the methods; those of estimators that
+            this method does not use are left out.
+        method: of `METHODS`.
+        preset: of `PRESETS`.
+
+    Raises:
+        ValueError: for settings of the task that no method has.
+    """
+    fields = {name for known in METHODS.values() for name in declared(known(PRESETS[preset]).estimator)}
+    if unknown := sorted(set(task.settings) - fields - set(declared(Settings))):
+        raise ValueError(f"{task.name}: settings: expected names of Settings or of an estimator, got {unknown[0]!r}")
+    wanted = lambda of: {name: value for name, value in task.settings.items() if name in declared(of)}
+    settings = PRESETS[preset]
+    settings = METHODS[method](settings.replace(**wanted(settings)))  # it divides the rounds in its way
+    return with_fields(settings, wanted(settings.estimator))
+
+
+def with_fields(settings: Settings, given: Mapping[str, Any]) -> Settings:
+    """Settings with those numbers replaced that are named, be they of the run or of its estimator.
+
+    Args:
+        settings: to begin with.
+        given: by name.
+
+    Raises:
+        ValueError: for a name that neither has.
+
+    Example:
+        >>> with_fields(QUICK, {"rounds": 5, "epochs": 10}).estimator.epochs
+        10
+    """
+    own = {name: value for name, value in given.items() if name in declared(settings)}
+    others = {name: value for name, value in given.items() if name not in own}
+    estimator = registry.converted(settings.estimator, type(settings.estimator), others)
+    return settings.replace(estimator=estimator, **own)

@@ -21,8 +21,10 @@ from typing import NoReturn
 
 import jaxlfi
 from jaxlfi import flags, source_fields
+from jaxlfi.cli import help_texts
 from jaxlfi.fields import Declared
 
+Commands = argparse._SubParsersAction  # argparse has no public name for it
 PRESETS = ("quick", "paper")
 METHODS = ("bayessim", "apt", "npe", "snle")
 HEURISTICS, ESTIMATORS = "jaxlfi.heuristics", "jaxlfi.estimators"
@@ -31,92 +33,6 @@ SETTINGS = "jaxlfi.bayessim.settings:Settings"
 """The class whose fields are the settings of a run."""
 FILE_WIDTH = 120
 """Characters in a line of output that goes to a file or a pipe."""
-
-GLOSSARY = """\
-names and symbols:
-  support         Theta, the box the parameters are drawn from; it is what the heuristics adapt
-  feasible        Phi, the limits that no adapted support leaves
-"""
-"""The part of the glossary in `--help` that is not made from the heuristics' hyperparameters."""
-
-MAIN_EXAMPLES = """\
-examples:
-  jaxlfi tasks                                   what there is to infer
-  jaxlfi infer lotka_volterra --support misspecified --heuristic edge --out runs/edge
-  jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
-  jaxlfi grid lotka_volterra --vary expansion=0.1,0.2,0.4 --out runs/grid
-  jaxlfi resume runs/comparison                  go on after a crash, to the same result bit for bit
-  jaxlfi sample runs/edge -n 1000                draws from the posterior, in natural units
-  jaxlfi diagnose runs/edge                      whether the posterior can be believed
-  jaxlfi report runs/comparison                  draw the pictures again
-
-Bad input ends with one line on stderr and exit status 2; nothing is ever overwritten.
-"""
-
-INFER_EXAMPLES = """\
-examples:
-  jaxlfi infer lotka_volterra --support misspecified --heuristic edge --out runs/edge
-  jaxlfi infer lotka_volterra --mass-threshold 0.01 --expansion 0.1 0.1 0.2 0.2 --out runs/gentle
-  jaxlfi infer spring:task --observation real.csv --support-low 1 0.1 --support-high 10 1 --out runs/spring
-  jaxlfi infer lotka_volterra --preset paper --seeds 4 --out runs/paper
-  jaxlfi infer whip --object dlo-0 --heuristic edge --out runs/dlo-0
-  jaxlfi infer whip --object dlo-2 rollout-7.npz --out runs/two-rollouts
-
-"""
-
-COMPARE_EXAMPLES = """\
-A configuration is SUPPORT (kept fixed) or SUPPORT+HEURISTIC. All configurations and seeds run side by side;
-the same seed means the same observation in all of them. All make the same number of rounds, whether their
-posteriors have settled or not.
-
-examples:
-  jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
-  jaxlfi compare lotka_volterra --configurations ok broad broad+centre --seeds 20 --out runs/broad
-
-"""
-
-
-GRID_EXAMPLES = """\
-Every combination of values is run with every seed, side by side in chunks that fit the memory; the same seed means
-the same observation in all of them. Hyperparameters on no axis keep the paper's values, or those of their flags.
-
-examples:
-  jaxlfi grid lotka_volterra --support misspecified --out runs/edge-grid \\
-      --vary zone_fraction=0.05,0.1,0.2 mass_threshold=0.001,0.005,0.05 expansion=0.1,0.2,0.4
-  jaxlfi grid lotka_volterra --heuristic mode --vary proximity=0.2,0.4 --vary expansion=0.1,0.2 --out runs/mode-grid
-
-"""
-
-DIAGNOSE_EXAMPLES = """\
-Truths are drawn from the run's own posterior, and from the prior over a support, and simulated. The run's method is
-asked for the posterior of each: by its network, where the run had one round and kept it (--method npe, or --rounds 1
---keep-network), else by repeating the whole inference side by side, in chunks that are saved as they end. A command
-that was stopped goes on when it is given again. It takes about as long as that many runs; a failed check does not
-change the exit status, 0.
-
-widths, of each parameter, at each reference:
-  honest        90 % intervals held 90 % of the truths, and are known to be of the right width to within 1.5
-  too narrow    they held fewer; the number is how many times as wide they would have to be. too wide: more
-  biased        truths lie to one side of the intervals' medians
-  undecided     too few truths to tell
-  At the posterior: is the method honest where this run ended up? Over a support: for objects of all kinds?
-
-checks, over a support:
-  rank          of each truth among its draws, by parameter (simulation-based calibration)
-  coverage      how often the densest region of a level holds the truth; around random points (TARP)
-  classifier    accuracy of a classifier that separates truths from draws, given the simulation
-  predictive    (of the run itself) whether its own observation looks like simulations of its own posterior
-verdicts:
-  over-confident, under-confident: posteriors are too narrow, too wide; biased low, high: they lie below, above
-  the truths. A check fails at p up to 0.01, corrected for the number of parameters.
-
-examples:
-  jaxlfi diagnose runs/npe
-  jaxlfi diagnose runs/edge --reference posterior,ok --truths 200
-  jaxlfi diagnose runs/edge --reference posterior --out runs/edge-at-its-posterior
-  jaxlfi diagnose runs/gaussian --against reference.csv
-
-"""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -178,76 +94,97 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
         families: classes whose fields have flags; by default all that are installed.
     """
     families = Families.of(()) if families is None else families
-    glossary = GLOSSARY + flags.glossary(families.rules)
-    formatter = argparse.RawDescriptionHelpFormatter
     top = OneLineParser(
         prog="jaxlfi",
         description="Likelihood-free inference that notices when the prior's support is wrong, and moves it.",
-        epilog=MAIN_EXAMPLES,
-        formatter_class=formatter,
+        epilog=help_texts.MAIN_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"jaxlfi {jaxlfi.__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_tasks(commands)
+    _add_infer(commands, families)
+    _add_compare(commands, families)
+    _add_grid(commands, families)
+    _add_resume(commands)
+    _add_sample(commands)
+    _add_diagnose(commands)
+    _add_report(commands)
+    for name in foreign_commands():
+        commands.add_parser(name, add_help=False, help=f"commands of its own: jaxlfi {name} --help")
+    return top
 
-    tasks = commands.add_parser("tasks", help="list tasks, or describe one", description="List tasks, or describe one.")
-    tasks.add_argument("name", nargs="?", metavar="TASK", help="describe this one: parameters, units, supports, truth")
 
-    infer = commands.add_parser(
+def _add_tasks(commands: Commands) -> None:
+    command = commands.add_parser(
+        "tasks", help="list tasks, or describe one", description="List tasks, or describe one."
+    )
+    command.add_argument(
+        "name", nargs="?", metavar="TASK", help="describe this one: parameters, units, supports, truth"
+    )
+
+
+def _add_infer(commands: Commands, families: Families) -> None:
+    command = commands.add_parser(
         "infer",
         help="infer a task's parameters",
         description="Infer a task's parameters from one observed trajectory, adapting the support.",
-        epilog=INFER_EXAMPLES + glossary,
-        formatter_class=formatter,
+        epilog=help_texts.INFER_EXAMPLES + _glossary(families),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    infer.add_argument(
+    command.add_argument(
         "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
     )
-    infer.add_argument(
+    command.add_argument(
         "--support-low",
         nargs="+",
         type=float,
         metavar="X",
         help="your own support's lower bounds, one a parameter, in natural units",
     )
-    infer.add_argument("--support-high", nargs="+", type=float, metavar="X", help="its upper bounds")
-    infer.add_argument(
+    command.add_argument("--support-high", nargs="+", type=float, metavar="X", help="its upper bounds")
+    command.add_argument(
         "--simulations",
         type=Path,
         metavar="FILE",
         help="an .npz of simulations made before, in place of the first round's: theta [N, D] in natural units, "
         "trajectory [N, ...] or summaries x [N, S], and where they were not drawn uniformly log_density [N]",
     )
-    infer.add_argument(
+    command.add_argument(
         "--heuristic",
         default="edge",
         metavar="NAME",
         help=_registered("how the support is adapted", families.rules, "edge"),
     )
-    _add_shared(infer, families, seeds=1)
+    _add_shared(command, families, seeds=1)
 
-    compare = commands.add_parser(
+
+def _add_compare(commands: Commands, families: Families) -> None:
+    command = commands.add_parser(
         "compare",
         help="run supports and heuristics side by side",
         description="Run supports and heuristics side by side, over several seeds, and tabulate the errors.",
-        epilog=COMPARE_EXAMPLES + glossary,
-        formatter_class=formatter,
+        epilog=help_texts.COMPARE_EXAMPLES + _glossary(families),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    compare.add_argument(
+    command.add_argument(
         "--configurations",
         nargs="+",
         metavar="SUPPORT[+HEURISTIC]",
         help="what to compare (default: ok, misspecified, broad, and misspecified with edge, mode, centre)",
     )
-    _add_shared(compare, families, seeds=4)
+    _add_shared(command, families, seeds=4)
 
-    grid = commands.add_parser(
+
+def _add_grid(commands: Commands, families: Families) -> None:
+    command = commands.add_parser(
         "grid",
         help="run a heuristic over a grid of its hyperparameters",
         description="Run a heuristic over a grid of its hyperparameters, to see how sensitive it is to them.",
-        epilog=GRID_EXAMPLES + glossary,
-        formatter_class=formatter,
+        epilog=help_texts.GRID_EXAMPLES + _glossary(families),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    grid.add_argument(
+    command.add_argument(
         "--vary",
         nargs="+",
         action="extend",
@@ -255,91 +192,100 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
         metavar="NAME=V,V,...",
         help="a hyperparameter and its values, as in expansion=0.1,0.2,0.4; several, or the flag again",
     )
-    grid.add_argument(
+    command.add_argument(
         "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
     )
-    grid.add_argument(
+    command.add_argument(
         "--heuristic",
         default="edge",
         metavar="NAME",
         help=_registered("whose hyperparameters vary", families.rules, "edge"),
     )
-    grid.add_argument(
+    command.add_argument(
         "--runs-per-chunk",
         type=int,
         metavar="N",
         help="runs computed and saved together (default: as many as there is memory for)",
     )
-    _add_shared(grid, families, seeds=4, networks=False)
+    _add_shared(command, families, seeds=4, networks=False)
 
-    resume = commands.add_parser(
+
+def _add_resume(commands: Commands) -> None:
+    command = commands.add_parser(
         "resume",
         help="go on with a run that was stopped",
         description="Go on with a run that was stopped or killed.",
     )
-    resume.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
-    _add_machine(resume)
+    command.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
+    _add_machine(command)
 
-    sample = commands.add_parser(
+
+def _add_sample(commands: Commands) -> None:
+    command = commands.add_parser(
         "sample",
         help="draw from the posterior of a run",
         description="Draw parameters from the posterior of a finished run, in natural units.",
     )
-    sample.add_argument("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
-    sample.add_argument("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
-    sample.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the draws (default: 0)")
-    sample.add_argument(
+    command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
+    command.add_argument("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the draws (default: 0)")
+    command.add_argument(
         "--out",
         type=Path,
         metavar="FILE",
         help="a new .csv or .npz file, or .nc for ArviZ's InferenceData (default: samples.csv in the folder)",
     )
 
-    diagnose = commands.add_parser(
+
+def _add_diagnose(commands: Commands) -> None:
+    command = commands.add_parser(
         "diagnose",
         help="check whether the posterior of a run can be believed",
         description="Check whether the posteriors of a run's method are calibrated, and whether its own fits.",
-        epilog=DIAGNOSE_EXAMPLES,
-        formatter_class=formatter,
+        epilog=help_texts.DIAGNOSE_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    diagnose.add_argument("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
-    diagnose.add_argument(
+    command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
+    command.add_argument(
         "--reference",
         metavar="NAME[,NAME]",
         help="where truths are drawn: posterior, the name of a support, or one of each (default: posterior, and the "
         "task's first support)",
     )
-    diagnose.add_argument("--truths", type=int, default=100, metavar="N", help="of each reference (default: 100)")
-    diagnose.add_argument(
+    command.add_argument("--truths", type=int, default=100, metavar="N", help="of each reference (default: 100)")
+    command.add_argument(
         "--draws", type=int, default=200, metavar="L", help="draws from the posterior of each (default: 200)"
     )
-    diagnose.add_argument("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
-    diagnose.add_argument(
+    command.add_argument("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
+    command.add_argument(
         "--task",
         metavar="TASK",
         help="what was inferred, for a run that was made in Python (default: the task recorded with the run)",
     )
-    diagnose.add_argument(
+    command.add_argument(
         "--against",
         type=Path,
         metavar="FILE",
         help="samples to compare the run's posterior with, in natural units: a .csv with the parameters' names as "
         'headings, or an .npz with an array "theta"',
     )
-    diagnose.add_argument(
+    command.add_argument(
         "--out", type=Path, metavar="DIR", help="a new folder for the results (default: diagnostics in the run's)"
     )
-    _add_machine(diagnose)
+    _add_machine(command)
 
-    report = commands.add_parser(
+
+def _add_report(commands: Commands) -> None:
+    command = commands.add_parser(
         "report",
         help="draw the pictures of a run",
         description="Draw all pictures of a folder from its saved files.",
     )
-    report.add_argument("folder", type=Path, metavar="DIR", help="a folder that infer, compare or grid wrote")
-    for name in foreign_commands():
-        commands.add_parser(name, add_help=False, help=f"commands of its own: jaxlfi {name} --help")
-    return top
+    command.add_argument("folder", type=Path, metavar="DIR", help="a folder that infer, compare or grid wrote")
+
+
+def _glossary(families: Families) -> str:
+    return help_texts.GLOSSARY + flags.glossary(families.rules)
 
 
 def foreign_commands() -> dict[str, EntryPoint]:

@@ -75,7 +75,7 @@ class Task:
         record_label: what the rows of a trajectory are counted by, for plots; by default "time" where there are
             `times`, else "record".
         settings: numbers of a run, by the names of `jaxlfi.Settings` and of its estimator's settings, that the command
-            line takes for this task in place of the preset's.
+            line, and `jaxlfi.settings_for`, take for this task in place of the preset's.
         hyperparameters: of heuristics, by the heuristic's name, that it takes in place of their defaults.
         name: what the task is called in files and figures.
 

@@ -18,7 +18,7 @@ from jaxlfi import factories, plugins
 from jaxlfi.bayessim import memory
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.cli import commands
+from jaxlfi.cli import asked, summaries
 from jaxlfi.cli import parser as cli
 from jaxlfi.envs.gaussian_linear import MIXING, NOISE
 from jaxlfi.estimators import registry as estimators
@@ -259,7 +259,7 @@ def test_compare_warns_of_posteriors_beyond_the_bounds_of_fixed_supports(compari
     runs = [jaxlfi.load(comparison / name) for name in names]
     specs = tuple(run.spec for run in runs)
     plan = executing.BatchPlan(run_store.COMPARE, TASK, runs[0].task, None, runs[0].settings, specs)
-    warnings = commands.support_warnings(plan, runs)
+    warnings = summaries.support_warnings(plan, runs)
     assert any(text.startswith("misspecified:") and "first upper 0 (2 of 2 runs" in text for text in warnings)
     assert not any(text.startswith("misspecified+edge") for text in warnings)
 
@@ -458,17 +458,29 @@ def test_a_pooling_is_the_tasks_own_unless_there_are_trials():
 def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line(tmp_path):
     task = oven()
     parse = lambda *words: cli.parser().parse_args(["infer", TASK, "--out", str(tmp_path), *words])
-    settings = commands.build_settings(parse(), task)
+    settings = asked.build_settings(parse(), task)
     assert (settings.rounds, settings.estimator.learning_rate) == (3, 0.25)
     assert settings.estimator.hidden == PRESETS["quick"].estimator.hidden
-    given = commands.build_settings(parse("--rounds", "7"), task)
+    given = asked.build_settings(parse("--rounds", "7"), task)
     assert (given.rounds, given.estimator.learning_rate) == (7, 0.25)
-    assert commands.build_settings(parse("--method", "npe"), task).rounds == 1  # of all simulations of the three
-    edge = commands.build_heuristic(parse("--expansion", "0.1"), "edge", settings, task)
+    assert asked.build_settings(parse("--method", "npe"), task).rounds == 1  # of all simulations of the three
+    edge = asked.build_heuristic(parse("--expansion", "0.1"), "edge", settings, task)
     np.testing.assert_array_equal(edge.mass_threshold, [0.125, 0.5])
     assert edge.expansion == 0.1
-    mode = commands.build_heuristic(parse(), "mode", PRESETS["paper"], task)
+    mode = asked.build_heuristic(parse(), "mode", PRESETS["paper"], task)
     assert mode == Mode()
+    assert jaxlfi.settings_for(task) == settings  # the same in Python
+
+
+def test_a_setting_that_a_task_asks_for_and_nothing_has_is_refused():
+    task = dataclasses.replace(gaussian(), name="oven", settings={"transforms": 3, "degrees": 7})
+    with pytest.raises(
+        ValueError, match="oven: settings: expected names of Settings or of an estimator, got 'degrees'"
+    ):
+        jaxlfi.settings_for(task)
+    task = dataclasses.replace(task, settings={"transforms": 3})  # of flows: the mixture network has none
+    assert jaxlfi.settings_for(task, "npe").estimator.transforms == 3
+    assert jaxlfi.settings_for(task, preset="paper") == PRESETS["paper"]
 
 
 def test_one_task_is_described(registered, capsys):
@@ -480,12 +492,6 @@ def test_one_task_is_described(registered, capsys):
 
 
 def test_default_configurations_are_the_matrix_of_the_paper():
-    assert commands.default_configurations(gaussian()) == [
+    assert asked.default_configurations(gaussian()) == [
         "ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre",
     ]  # fmt: skip
-
-
-def test_bootstrap_interval_covers_the_mean():
-    values = np.random.default_rng(1).normal(3.0, 1.0, 50)
-    low, high = commands.bootstrap_interval(values)
-    assert low < values.mean() < high and high - low == pytest.approx(2 * 1.96 / np.sqrt(50), rel=0.3)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from jaxlfi.bayessim.presets import PAPER, QUICK
-from jaxlfi.cli.commands import rounds_lines
+from jaxlfi.cli.summaries import rounds_lines
 
 
 def plan(settings, *configurations: str):

@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from jaxlfi.cli.commands import training_warnings
+from jaxlfi.cli.summaries import training_warnings
 from tests.small import FLAGS, SETTINGS, TASK, command, whole_runs  # noqa: F401 - a fixture
 
 

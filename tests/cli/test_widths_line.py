@@ -2,7 +2,7 @@
 
 import types
 
-from jaxlfi.cli.commands import widths_lines
+from jaxlfi.cli.summaries import widths_lines
 from jaxlfi.heuristics import Edge, Fixed, Truncate
 from tests.small import SETTINGS
 

@@ -17,7 +17,7 @@ from experiments.policies import results as policies
 from experiments.sota import rows as sota
 from experiments.sota.__main__ import METHODS as SOTA_METHODS
 from experiments.sota.cases import SETTINGS as SOTA_SETTINGS
-from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 
 ROOT = Path(__file__).parents[2] / "experiments"
 RESULTS = ROOT / "results"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments import baselines
-from jaxlfi.cli.commands import bootstrap_interval
+from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from tests.small import SETTINGS, gaussian, whole_runs  # noqa: F401 - a fixture
 
 

@@ -1,0 +1,92 @@
+"""What the arguments of `infer`, `compare` and `grid` ask for: settings, heuristics, supports, observations, seeds."""
+
+import argparse
+from collections.abc import Callable
+
+import numpy as np
+
+from jaxlfi.bayessim.presets import settings_for, with_fields
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators import registry as estimators
+from jaxlfi.heuristics import Heuristic, paired
+from jaxlfi.heuristics import registry as heuristics
+from jaxlfi.tasks.observation import read_for
+from jaxlfi.tasks.task import Task
+
+CONFIGURATION_DEFAULTS = ("ok", "misspecified", "broad")
+"""Supports that are compared by default, where the task has them."""
+
+
+def default_configurations(task: Task) -> list[str]:
+    """Up to three supports kept fixed, and the misspecified one (or else the first) with every heuristic."""
+    wanted = [name for name in CONFIGURATION_DEFAULTS if name in task.supports]
+    supports = wanted or list(task.supports)[:3]
+    adapted = "misspecified" if "misspecified" in supports else supports[0]
+    return [*supports, *(f"{adapted}+{heuristic}" for heuristic in ("edge", "mode", "centre"))]
+
+
+def build_settings(
+    arguments: argparse.Namespace, task: Task, change: Callable[[Settings], Settings] = lambda preset: preset
+) -> Settings:
+    """The settings of a task, then changed, and what was given in place of all that."""
+    preset = change(settings_for(task, arguments.method, arguments.preset))
+    given = dict(arguments.settings)
+    if "steps" in given and "epochs" not in given:
+        given["epochs"] = 0
+    if "epochs" in given and "steps" not in given:
+        given["steps"] = 0
+    if "simulation_budget" not in given and "simulations_per_round" in given:
+        # The fraction of failures that a round can bear stays the preset's.
+        given["simulation_budget"] = -(
+            -given["simulations_per_round"] * preset.simulation_budget // preset.simulations_per_round
+        )
+    if arguments.estimator is not None:
+        kind = estimators.load(arguments.estimator)
+        preset = preset.replace(estimator=estimators.converted(preset.estimator, kind, {}))
+    return with_fields(preset, given).check()
+
+
+def build_heuristic(arguments: argparse.Namespace, name: str, settings: Settings, task: Task) -> Heuristic:
+    """A heuristic with the hyperparameters that were given, or else those that the task asks for.
+
+    Components that it compares are matched first where networks start anew every round.
+    """
+    values = {**task.hyperparameters.get(name, {}), **heuristics.own(name, arguments.hyperparameters)}
+    return paired(heuristics.build(name, values, task.dim), settings.estimator.warm_start)
+
+
+def configuration_parts(name: str) -> tuple[str, str]:
+    """Support and heuristic of "support" or "support+heuristic"."""
+    support, plus, heuristic = name.partition("+")
+    if plus and ":" not in heuristic and heuristic not in heuristics.names():
+        known = ", ".join(heuristics.names())
+        raise ValueError(f"configurations: expected support+heuristic with one of {known}, got {name!r}")
+    if ":" in heuristic:
+        raise ValueError(f"configurations: expected a registered heuristic, which names a folder, got {name!r}")
+    return support, heuristic or "none"
+
+
+def support_of(arguments: argparse.Namespace, task: Task) -> tuple[str, Support]:
+    """The support to begin with, and its name: one of the task's, or "own"."""
+    low, high = arguments.support_low, arguments.support_high
+    if low is None and high is None:
+        name = arguments.support or next(iter(task.supports))
+        return name, task.support(name)
+    if low is None or high is None or arguments.support is not None:
+        raise ValueError("support: expected --support NAME, or --support-low and --support-high together")
+    return "own", task.support(Support(low, high))
+
+
+def observation_of(arguments: argparse.Namespace, task: Task) -> np.ndarray | None:
+    """The observed trajectory of the files that were given; None for the task's own."""
+    return None if arguments.observation is None else read_for(task, *arguments.observation)
+
+
+def seeds_of(arguments: argparse.Namespace) -> range:
+    """A seed for each run."""
+    if arguments.seeds < 1 or not 0 <= arguments.first_seed < 2**31 - arguments.seeds:
+        raise ValueError(
+            f"seeds: expected at least 1, and first_seed at least 0, got {arguments.seeds} and {arguments.first_seed}"
+        )
+    return range(arguments.first_seed, arguments.first_seed + arguments.seeds)

@@ -1,0 +1,86 @@
+"""What `--help` says below the flags."""
+
+GLOSSARY = """\
+names and symbols:
+  support         Theta, the box the parameters are drawn from; it is what the heuristics adapt
+  feasible        Phi, the limits that no adapted support leaves
+"""
+"""The part of the glossary in `--help` that is not made from the heuristics' hyperparameters."""
+
+MAIN_EXAMPLES = """\
+examples:
+  jaxlfi tasks                                   what there is to infer
+  jaxlfi infer lotka_volterra --support misspecified --heuristic edge --out runs/edge
+  jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
+  jaxlfi grid lotka_volterra --vary expansion=0.1,0.2,0.4 --out runs/grid
+  jaxlfi resume runs/comparison                  go on after a crash, to the same result bit for bit
+  jaxlfi sample runs/edge -n 1000                draws from the posterior, in natural units
+  jaxlfi diagnose runs/edge                      whether the posterior can be believed
+  jaxlfi report runs/comparison                  draw the pictures again
+
+Bad input ends with one line on stderr and exit status 2; nothing is ever overwritten.
+"""
+
+INFER_EXAMPLES = """\
+examples:
+  jaxlfi infer lotka_volterra --support misspecified --heuristic edge --out runs/edge
+  jaxlfi infer lotka_volterra --mass-threshold 0.01 --expansion 0.1 0.1 0.2 0.2 --out runs/gentle
+  jaxlfi infer spring:task --observation real.csv --support-low 1 0.1 --support-high 10 1 --out runs/spring
+  jaxlfi infer lotka_volterra --preset paper --seeds 4 --out runs/paper
+  jaxlfi infer whip --object dlo-0 --heuristic edge --out runs/dlo-0
+  jaxlfi infer whip --object dlo-2 rollout-7.npz --out runs/two-rollouts
+
+"""
+
+COMPARE_EXAMPLES = """\
+A configuration is SUPPORT (kept fixed) or SUPPORT+HEURISTIC. All configurations and seeds run side by side;
+the same seed means the same observation in all of them. All make the same number of rounds, whether their
+posteriors have settled or not.
+
+examples:
+  jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
+  jaxlfi compare lotka_volterra --configurations ok broad broad+centre --seeds 20 --out runs/broad
+
+"""
+
+GRID_EXAMPLES = """\
+Every combination of values is run with every seed, side by side in chunks that fit the memory; the same seed means
+the same observation in all of them. Hyperparameters on no axis keep the paper's values, or those of their flags.
+
+examples:
+  jaxlfi grid lotka_volterra --support misspecified --out runs/edge-grid \\
+      --vary zone_fraction=0.05,0.1,0.2 mass_threshold=0.001,0.005,0.05 expansion=0.1,0.2,0.4
+  jaxlfi grid lotka_volterra --heuristic mode --vary proximity=0.2,0.4 --vary expansion=0.1,0.2 --out runs/mode-grid
+
+"""
+
+DIAGNOSE_EXAMPLES = """\
+Truths are drawn from the run's own posterior, and from the prior over a support, and simulated. The run's method is
+asked for the posterior of each: by its network, where the run had one round and kept it (--method npe, or --rounds 1
+--keep-network), else by repeating the whole inference side by side, in chunks that are saved as they end. A command
+that was stopped goes on when it is given again. It takes about as long as that many runs; a failed check does not
+change the exit status, 0.
+
+widths, of each parameter, at each reference:
+  honest        90 % intervals held 90 % of the truths, and are known to be of the right width to within 1.5
+  too narrow    they held fewer; the number is how many times as wide they would have to be. too wide: more
+  biased        truths lie to one side of the intervals' medians
+  undecided     too few truths to tell
+  At the posterior: is the method honest where this run ended up? Over a support: for objects of all kinds?
+
+checks, over a support:
+  rank          of each truth among its draws, by parameter (simulation-based calibration)
+  coverage      how often the densest region of a level holds the truth; around random points (TARP)
+  classifier    accuracy of a classifier that separates truths from draws, given the simulation
+  predictive    (of the run itself) whether its own observation looks like simulations of its own posterior
+verdicts:
+  over-confident, under-confident: posteriors are too narrow, too wide; biased low, high: they lie below, above
+  the truths. A check fails at p up to 0.01, corrected for the number of parameters.
+
+examples:
+  jaxlfi diagnose runs/npe
+  jaxlfi diagnose runs/edge --reference posterior,ok --truths 200
+  jaxlfi diagnose runs/edge --reference posterior --out runs/edge-at-its-posterior
+  jaxlfi diagnose runs/gaussian --against reference.csv
+
+"""

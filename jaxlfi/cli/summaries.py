@@ -1,0 +1,148 @@
+"""What commands print at their end: tables of results, lines on rounds and widths, and warnings."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from jaxlfi import diagnostics
+from jaxlfi.bayessim.convergence import LAG
+from jaxlfi.bayessim.widths import expected_widths
+from jaxlfi.diagnostics.bootstrap import bootstrap_interval
+from jaxlfi.diagnostics.bounds import bound_summary
+from jaxlfi.runs import execute as executing
+from jaxlfi.runs.execute import BatchPlan
+from jaxlfi.runs.run import Run
+from jaxlfi.studies import calibration, grid
+
+
+def summary_table(plan: BatchPlan, runs: Sequence[Run]) -> Table:
+    """What came out: one line a configuration, over its seeds."""
+    lines = executing.results(plan, runs)
+    table = Table("configuration", "seeds", "theta error [95 %]", "median", "traj. error", "success", "final support")
+    for column in table.columns[:-1]:
+        column.no_wrap = True
+    natural = [plan.task.space.box_to_natural(run.belief.support) for run in runs]
+    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
+        own = [i for i, spec in enumerate(plan.specs) if spec.configuration == configuration]
+        column = lambda name, own=own: np.array([lines[i][name] for i in own])
+        error = column("theta_error")
+        trajectory = column("trajectory_error")
+        low = np.median([np.asarray(natural[i].low) for i in own], axis=0)
+        high = np.median([np.asarray(natural[i].high) for i in own], axis=0)
+        table.add_row(
+            escape(configuration),
+            str(len(own)),
+            _with_interval(error),
+            "-" if np.isnan(error).any() else f"{np.median(error):.2f}",
+            "-" if np.isnan(trajectory).all() else f"{np.nanmean(trajectory):.2f}",
+            f"{np.mean(column('success_rate')):.0%}",
+            escape(" ".join(f"[{a:.2g}, {b:.2g}]" for a, b in zip(low, high, strict=True))),
+        )
+    return table
+
+
+def _with_interval(values: np.ndarray) -> str:
+    """The mean, and its 95 % bootstrap interval over seeds where there are several."""
+    if np.isnan(values).any():
+        return "-"
+    if len(values) == 1:
+        return f"{values[0]:.2f}"
+    low, high = bootstrap_interval(values)
+    return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}]"
+
+
+def rounds_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
+    """Whether runs that may end once they have settled have done so, in a line for each configuration."""
+    lines: list[str] = []
+    if not 0 < plan.settings.min_rounds <= plan.settings.rounds:
+        return lines
+    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
+        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+        made = [np.count_nonzero(~np.asarray(run.history["settled"][:-1])) + 1 for run in own]
+        moved = [float(run.history["moved"][-1]) for run in own if not run.history["settled"][-1]]
+        extent = f"{made[0]}" if len(set(made)) == 1 else f"{min(made)} to {max(made)}"
+        verdict = "the posterior has settled"
+        if moved:
+            verdict = (
+                f"{len(moved)} of {len(own)} posteriors still moved, by up to {max(moved):.1f} of their standard "
+                f"deviations over the last {LAG} rounds (--rounds allows for more)"
+            )
+        lines.append(f"rounds of {configuration}: {extent}; {verdict}")
+    return lines
+
+
+def widths_lines(plan: BatchPlan) -> list[str]:
+    """How far the widths of the runs' posteriors can be trusted, in one line; several where heuristics differ in it."""
+    by_line: dict[str, list[str]] = {}
+    for spec in plan.specs:
+        names = by_line.setdefault(expected_widths(plan.settings, spec.heuristic), [])
+        names += [spec.configuration] * (spec.configuration not in names)
+    several = len(by_line) > 1
+    return [f"widths{' of ' + ', '.join(names) if several else ''}: {line}" for line, names in by_line.items()]
+
+
+def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
+    """In words, where the networks of some runs did not learn: gradients that were not finite."""
+    warnings = []
+    settings = plan.settings.estimator
+    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
+        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+        broken = sum(bool(np.any(np.asarray(run.history["nonfinite"]) > 0)) for run in own)
+        if broken:
+            steps = int(np.max([np.max(run.history["nonfinite"]) for run in own]))
+            warnings.append(
+                f"{configuration}: up to {steps} gradient steps of a round were not finite and were left out, in "
+                f"{broken} of {len(own)} runs: lower learning_rate ({settings.learning_rate:g}) or clip_norm "
+                f"({settings.clip_norm:g})."
+            )
+    return warnings
+
+
+def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
+    """In words, where runs ended with a bound that looks wrong and that their heuristic cannot move."""
+    warnings = []
+    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
+        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+        beliefs, grows = [run.belief for run in own], own[0].heuristic.grows
+        found = bound_summary(plan.task.space.labels, beliefs, own[0].feasible, grows=grows)
+        warnings += [f"{configuration}: {text}" for text in found]
+    return warnings
+
+
+def checks_table(checks: Sequence[calibration.Check]) -> Table:
+    """One line a check."""
+    table = Table("check", "statistic", "expected", "p-value", "verdict")
+    for check in checks:
+        p_value = "" if np.isnan(check.p_value) else f"{check.p_value:.2g}"
+        colour = {"": "", diagnostics.OK: "green"}.get(check.verdict, "red")
+        cells = map(escape, (check.name, check.statistic, check.expected, p_value, check.verdict))
+        table.add_row(*cells, style=colour)
+    return table
+
+
+def marginal_table(study: grid.Grid, arrays: Mapping[str, np.ndarray]) -> Table:
+    """One line a value of each hyperparameter, over the seeds and the other hyperparameters."""
+    table = Table("hyperparameter", "value", "runs", "theta error", "traj. error", "success")
+    for place, axis in enumerate(study.axes):
+        for index, value in enumerate(axis.values):
+            theta, trajectory, success = (
+                np.ravel(np.take(arrays[name], index, axis=place))
+                for name in ("theta_error", "trajectory_error", "success_rate")
+            )
+            table.add_row(
+                axis.name,
+                f"{value:g}",
+                str(len(theta)),
+                _mean_and_sd(theta),
+                _mean_and_sd(trajectory),
+                f"{np.mean(success):.0%}",
+            )
+    return table
+
+
+def _mean_and_sd(values: np.ndarray) -> str:
+    """Mean and standard deviation of the values that are known."""
+    values = values[np.isfinite(values)]
+    return f"{np.mean(values):.2f} ± {np.std(values, ddof=min(1, values.size - 1)):.2f}" if values.size else "-"
