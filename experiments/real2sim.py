@@ -148,7 +148,7 @@ def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str,
     for name, configuration, seed, history in every:
         run = jaxlfi.load(history.folder)
         low, middle, high = np.quantile(run.posterior.sample(jax.random.key(1), 4000), [0.05, 0.5, 0.95], axis=0)
-        support = run.space.box_to_natural(run.belief.support)
+        support = run.final_support()
         gap = gaps(history.folder)
         lines.append(
             {

@@ -64,7 +64,7 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
 def believed(folder: Path, run: Run) -> list[dict[str, str]]:
     """Median and 90 % interval of each parameter, and the support that the run ended with, in natural units."""
     quantiles = np.quantile(np.asarray(run.draws()), (0.05, 0.5, 0.95), axis=0)
-    box = run.space.box_to_natural(run.belief.support)
+    box = run.final_support()
     return [
         {
             "run": str(folder),

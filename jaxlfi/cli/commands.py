@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
@@ -172,7 +171,7 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
         _say(console, _COMPLETE.format(folder=folder))
         return None
     plan = executing.reopen(folder)
-    if changed := executing.changed_versions(config):
+    if changed := executing.changed_machine(config):
         _warn(console, f"begun with {', '.join(changed)}: the result may differ in rounding from an uninterrupted one")
     return folder, plan
 
@@ -185,10 +184,7 @@ def _resume_grid(folder: Path, console: Console) -> Prepared | None:
     if config.get("status") == "finished":
         _say(console, _COMPLETE.format(folder=folder))
         return None
-    changed = executing.changed_versions(config)
-    if config.get("devices") != (here := jax.local_device_count()):
-        changed.append(f"{config.get('devices')} devices, now {here}")
-    if changed:
+    if changed := executing.changed_machine(config):
         _warn(console, f"begun with {', '.join(changed)}: results differ by rounding")
     return folder, grid.reopen(folder)
 
@@ -277,7 +273,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
         raise
     executing.finish(folder, plan, runs)
     console.print(summaries.summary_table(plan, runs))
-    for warning in (*summaries.training_warnings(plan, runs), *summaries.support_warnings(plan, runs)):
+    for warning in summaries.warnings(plan, runs):
         _warn(console, warning)
     for line in (*summaries.rounds_lines(plan, runs), *summaries.widths_lines(plan)):
         _say(console, line)

@@ -23,7 +23,7 @@ def summary_table(plan: BatchPlan, runs: Sequence[Run]) -> Table:
     table = Table("configuration", "seeds", "theta error [95 %]", "median", "traj. error", "success", "final support")
     for column in table.columns[:-1]:
         column.no_wrap = True
-    natural = [plan.task.space.box_to_natural(run.belief.support) for run in runs]
+    natural = [run.final_support() for run in runs]
     for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
         own = [i for i, spec in enumerate(plan.specs) if spec.configuration == configuration]
         column = lambda name, own=own: np.array([lines[i][name] for i in own])
@@ -81,6 +81,24 @@ def widths_lines(plan: BatchPlan) -> list[str]:
         names += [spec.configuration] * (spec.configuration not in names)
     several = len(by_line) > 1
     return [f"widths{' of ' + ', '.join(names) if several else ''}: {line}" for line, names in by_line.items()]
+
+
+def warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
+    """In words, what went wrong in a batch: simulations that failed, training that failed, bounds that look wrong."""
+    return [*failure_warnings(plan, runs), *training_warnings(plan, runs), *support_warnings(plan, runs)]
+
+
+def failure_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
+    """In words, where some runs had no simulation to begin with, while others of the batch had."""
+    found = []
+    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
+        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+        if empty := sum(int(run.history["succeeded"][0]) == 0 for run in own):
+            found.append(
+                f"{configuration}: all simulations of the first round failed in {empty} of {len(own)} runs, whose "
+                "posteriors say nothing: is the simulator defined on this support?"
+            )
+    return found
 
 
 def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:

@@ -27,6 +27,8 @@ MAP_STEPS = 300
 """Steps of Adam in each ascent."""
 MAP_RATE = 0.02
 """Adam's initial step size, as a fraction of half the support's width; it decays to zero."""
+ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
+"""How far a bound in natural units can be off, relative to its size."""
 
 
 @struct.dataclass
@@ -115,7 +117,13 @@ def _sample(key: jax.Array, posterior: Posterior, n: int) -> Array:
 @functools.partial(jax.jit, static_argnums=2)
 def _log_prob(posterior: Posterior, theta: Array, natural: bool) -> Array:
     """Log-density over natural units or over inference space, at a point in the same."""
-    inner = posterior.space.to_inference(theta) if natural else theta
+    box, space = posterior.support, posterior.space
+    inner = space.to_inference(theta) if natural else theta
+    if natural:  # a logarithm's rounding takes no point on a bound out of the support
+        low, high = space.to_natural(box.low), space.to_natural(box.high)
+        rounding = ROUNDING * jnp.maximum(jnp.abs(low), jnp.abs(high))
+        inside = jnp.all((theta >= low - rounding) & (theta <= high + rounding), axis=-1, keepdims=True)
+        inner = jnp.where(inside, box.clip(inner), inner)
     finite = jnp.all(jnp.isfinite(inner), axis=-1)
     inner = jnp.where(finite[..., None], inner, posterior.support.centre)
     log_prob = truncated_log_prob(posterior.density.log_prob(inner), inner, posterior.support, posterior.mass_inside)

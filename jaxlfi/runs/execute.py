@@ -298,12 +298,16 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
     return plan, Observed(*Checkpoint(folder).read_start())
 
 
-def changed_versions(config: Mapping[str, Any]) -> list[str]:
-    """In words, which packages are of other versions than when a folder was begun: the same bits need the same ones."""
+def changed_machine(config: Mapping[str, Any]) -> list[str]:
+    """In words, which versions or how many devices are others than when a folder was begun: bits depend on both."""
     recorded = config.get("versions", {})
     now = folders.versions()
     changed = [name for name in VERSIONS if recorded.get(name) not in (None, now[name])]
-    return [f"{name} {recorded[name]}, now {now[name]}" for name in changed]
+    words = [f"{name} {recorded[name]}, now {now[name]}" for name in changed]
+    runs, here = config.get("runs"), jax.local_device_count()
+    if isinstance(runs, list):
+        here = min(here, len(runs))
+    return words + [f"{then} devices, now {here}" for then in [config.get("devices")] if then not in (None, here)]
 
 
 def _spec(description: dict[str, Any]) -> RunSpec:

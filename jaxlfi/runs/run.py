@@ -18,7 +18,7 @@ from jaxlfi.diagnostics.bounds import bound_warnings
 from jaxlfi.distributions.arguments import is_concrete
 from jaxlfi.distributions.belief import Belief, uninformed
 from jaxlfi.distributions.mixture import GaussianMixture
-from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network
 from jaxlfi.estimators.dataset import Dataset
@@ -133,6 +133,11 @@ class Run:
     def mixture(self) -> GaussianMixture:
         """The posterior as a mixture of Gaussians, in inference space."""
         return self.belief.mixture
+
+    def final_support(self, space: SpaceName = "natural") -> Support:
+        """The support that the run ended with, which its posterior is truncated to; bounds of shape [D]."""
+        box = self.belief.support
+        return self.space.box_to_natural(box) if is_natural(space) else box
 
     @property
     def warnings(self) -> list[str]:

@@ -1,11 +1,11 @@
-"""Training that fails is warned of, and settings that train nothing are refused, in one line."""
+"""Simulations and training that fail are warned of, and settings that train nothing are refused, in one line."""
 
 import types
 
 import numpy as np
 import pytest
 
-from jaxlfi.cli.summaries import training_warnings
+from jaxlfi.cli.summaries import failure_warnings, training_warnings
 from tests.small import FLAGS, SETTINGS, TASK, command, whole_runs  # noqa: F401 - a fixture
 
 
@@ -30,6 +30,14 @@ def test_each_configuration_whose_training_failed_is_named():
     assert len(warnings) == 1
     assert warnings[0].startswith("wide+none: up to 17 gradient steps of a round were not finite")
     assert "in 1 of 2 runs" in warnings[0] and "learning_rate (0.001)" in warnings[0] and "\n" not in warnings[0]
+
+
+def test_each_configuration_without_a_simulation_to_begin_with_is_named():
+    begun = lambda first: types.SimpleNamespace(history={"succeeded": np.array([first, 100])})
+    plan = plan_of("ok", "wrong", "wrong", "wrong")
+    assert failure_warnings(plan, [begun(100), begun(1), begun(100), begun(100)]) == []
+    (warning,) = failure_warnings(plan, [begun(100), begun(0), begun(7), begun(0)])
+    assert warning.startswith("wrong: all simulations of the first round failed in 2 of 3 runs")
 
 
 def test_training_that_diverges_is_warned_of(tmp_path, capsys):

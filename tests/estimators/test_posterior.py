@@ -153,6 +153,20 @@ def test_the_maximum_at_a_bound_is_found_there():
     assert bool(BOX.contains(beyond.map()))
 
 
+@pytest.mark.parametrize("bound", range(2))
+def test_a_maximum_on_a_bound_of_a_logarithm_has_a_density(bound):
+    """Its logarithm, rounded twice, may lie beyond the bound: of many bounds, about half did."""
+    for offset in np.linspace(0.0, 0.1, 40):
+        box = Support([-1.0 - offset, -2.0], [1.5 + offset, 2.5])
+        one = POSTERIOR.replace(support=box)
+        corner = SPACE.to_natural(jnp.stack([box.low, box.high])[bound])
+        assert np.isfinite(one.log_prob(corner))
+        outside = corner * jnp.array([0.99999 if bound == 0 else 1.00001, 1.0])
+        assert np.isneginf(one.log_prob(outside))
+    beyond = posterior(gaussian([[-3.0, 0.5], [3.0, 0.5]][bound], np.diag(SD**2)))
+    assert np.isfinite(beyond.log_prob(beyond.map()))
+
+
 def test_maxima_in_natural_units_and_in_inference_space_differ():
     """Of a log-normal: exp(mu - sigma^2) over the parameter, exp(mu) over its logarithm."""
     np.testing.assert_allclose(POSTERIOR.map(), [np.exp(MU[0] - SD[0] ** 2), MU[1]], rtol=5e-3)

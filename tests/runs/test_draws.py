@@ -110,7 +110,7 @@ def test_no_draws_lie_on_a_bound(ways):
 def test_the_draws_have_the_density_that_log_prob_says(ways, space):
     run, draws = ways
     theta = draws["infer"] if space == "natural" else np.asarray(run.space.to_inference(jnp.asarray(draws["infer"])))
-    box = run.belief.support if space == "inference" else run.space.box_to_natural(run.belief.support)
+    box = run.final_support(space)
     low, high, cells = np.asarray(box.low, float), np.asarray(box.high, float), 240
     edges = np.linspace(low, high, cells + 1)
     middle = 0.5 * (edges[1:] + edges[:-1])

@@ -53,7 +53,7 @@ def test_what_is_exported(folder):
     assert set(data.posterior.data_vars) == {"mass", "drag"}
     for d, name in enumerate(("mass", "drag")):
         np.testing.assert_array_equal(data.posterior[name].values, draws[None, :, d])
-    box = run.space.box_to_natural(run.belief.support)
+    box = run.final_support()
     assert float(box.low[0]) <= data.posterior["mass"].values.min() and data.posterior["mass"].attrs["units"] == "kg"
     assert data.posterior.attrs["task"] == "spring" and data.posterior.attrs["seed"] == "3"
     np.testing.assert_array_equal(data.observed_data["trajectory"].values, OBSERVED)

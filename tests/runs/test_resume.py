@@ -8,6 +8,7 @@ import pytest
 
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
+from jaxlfi.runs.execute import changed_machine
 from jaxlfi.runs.folder import read_ledger
 from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401 - a fixture
 
@@ -141,3 +142,11 @@ def test_resuming_by_other_versions_warns(stopped, tmp_path, capsys, package, wa
     printed = " ".join(capsys.readouterr().out.split())
     assert (f"warning: begun with {package} 0.0.1, now" in printed) == warned
     assert ("warning: begun with" in printed) == warned
+
+
+def test_resuming_on_another_number_of_devices_is_told_apart(stopped):
+    """As many as runs are used at most."""
+    config = json.loads((stopped / "config.json").read_text())
+    assert config["devices"] == 1 and changed_machine(config) == []
+    assert changed_machine(config | {"devices": 7}) == ["7 devices, now 1"]
+    assert changed_machine({"runs": 12, "devices": None}) == []  # not recorded
