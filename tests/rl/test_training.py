@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("brax")
 
 import small
+from killed import Killed, kill_at
 from rich.console import Console
 from rl import events
 from rl.toy import SETTINGS, Line
@@ -112,11 +113,35 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_bits(finished, tmp_path
             training.resumed(again, LINE, stop)
     assert not training.finished(again)
     training.resumed(again, LINE, stop if training.updates_done(again) < 4 else lambda updates, curves: None)
+    assert_same_results(out, again)
+
+
+def assert_same_results(out, again):
+    """Equal to the last bit, but for the seconds that it took."""
     for path in out.rglob("*.npz"):
         first, second = files.read_arrays(path), files.read_arrays(again / path.relative_to(out))
         for name in first.keys() - {"seconds", "schema"}:
             np.testing.assert_array_equal(first[name], second[name], err_msg=f"{path} {name}")
     assert (out / "table.csv").read_text() == (again / "table.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("nth", "midway", "updates"), [(3, False, 3), (4, True, 3), (6, True, 4), (9, False, 4), (11, True, 4)]
+)
+def test_a_training_that_was_killed_at_a_write_goes_on_to_the_same_bits(
+    finished, nth, midway, updates, tmp_path, monkeypatch
+):
+    """At checkpoints, curves, a policy, and the table; `midway` leaves half a file."""
+    out, _ = finished
+    again = tmp_path / "again"
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        kill_at(patch, nth, midway)
+        training.begin(plan(), again)
+        training.resumed(again, LINE, lambda updates, curves: None)
+    assert training.updates_done(again) == updates and not training.finished(again)
+    training.resumed(again, LINE, lambda updates, curves: None)
+    assert_same_results(out, again)
+    assert not list(again.rglob("*.part"))
 
 
 def test_what_cannot_be_gone_on_with_is_refused(finished, tmp_path):

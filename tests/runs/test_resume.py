@@ -10,37 +10,11 @@ from jaxlfi.io import files as atomic
 from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.runs.execute import changed_machine
 from jaxlfi.runs.folder import read_ledger
+from tests.killed import Killed, kill_at
 from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401 - a fixture
 
 ARGUMENTS = ("infer", TASK, "--support", "misspecified", *FLAGS, "--seeds", "2", "--out")
 """One program for all tests; what is killed has two runs, and so two of some files."""
-
-
-class Killed(BaseException):
-    """The process dies here."""
-
-
-def kill_at(monkeypatch, nth: int, midway: bool):
-    """Let the nth write to a file be the process's last act; `midway` leaves half of it: a .part, or half a line."""
-    write_bytes, append_line, count = atomic.write_bytes, atomic.append_line, [0]
-
-    def write(path, content, durable=False):
-        count[0] += 1
-        if count[0] == nth and midway:
-            path.with_name(path.name + ".part").write_bytes(content[: len(content) // 2])
-            raise Killed
-        write_bytes(path, content, durable)
-        if count[0] == nth:
-            raise Killed
-
-    def append(path, line):
-        count[0] += 1
-        append_line(path, line[: len(line) // 2] if count[0] == nth and midway else line)
-        if count[0] == nth:
-            raise Killed
-
-    monkeypatch.setattr(atomic, "write_bytes", write)
-    monkeypatch.setattr(atomic, "append_line", append)
 
 
 def test_a_run_killed_at_any_write_resumes_to_the_same_bits(tmp_path, monkeypatch):
