@@ -1,5 +1,8 @@
 """What is kept of a study: a few small files, from which tables and figures are made.
 
+What was collected before of policies that are still the same stays where it is not found anew: evaluations are too
+many files to keep, and a study can go on without making them again.
+
 posteriors.csv      what each object may be: medians or points with 90 % intervals
 trainings.npz       NAME/...: returns of training episodes [U, S], the points trained on, returns on held-out points
 simulation.npz      POLICY@DOMAIN/...: of each episode [S, E]: return, hits, exits, length
@@ -17,13 +20,14 @@ from pathlib import Path
 import numpy as np
 
 from experiments.policies import actions
-from experiments.policies.evaluation import STILLS, domains_of, objects_of
+from experiments.policies.evaluation import STILLS, domains_of, fingerprints, objects_of
+from experiments.policies.results import grouped
 from experiments.policies.study import FEM, HEURISTICS, NOMINAL, OBJECTS, PAPER, Study, truth
 from jaxlfi.io import files
 from jaxlfi.rl import training
 from jaxlfi.runs.folder import environment
 
-PER_EPISODE = ("value", "hit", "clean", "outside", "failed", "steps")
+PER_EPISODE = ("value", "hit", "clean", "outside", "failed", "steps", "fingerprints")
 
 
 def collect(study: Study) -> None:
@@ -36,12 +40,16 @@ def collect(study: Study) -> None:
         "simulation": [(policy, domain) for policy in names for domain in domains_of(policy)],
         "objects": [(policy, dlo) for policy in names for dlo in objects_of(policy)],
     }
+    own = {policy: fingerprints(study, policy) for policy in trained} | {
+        name: fingerprints(study, name) for name in actions.NAMES if study.actions(name).exists()
+    }
     for where, wanted in pairs.items():
-        kept = {}
+        before, kept = _grouped(study.out / f"{where}.npz"), {}
         for policy, on in wanted:
-            path = study.out / "runs" / where / policy / f"{on}.npz"
-            if path.exists():
-                kept |= {f"{policy}@{on}/{name}": row for name, row in _episodes(path, policy, on).items()}
+            path, pair = study.out / "runs" / where / policy / f"{on}.npz", f"{policy}@{on}"
+            found = _episodes(path, policy, on) if path.exists() else before.get(pair)
+            if found is not None and np.array_equal(found["fingerprints"], own[policy]):
+                kept |= {f"{pair}/{name}": row for name, row in found.items()}
         files.write_arrays(study.out / f"{where}.npz", kept)
     found = {name: study.actions(name) for name in actions.NAMES if study.actions(name).exists()}
     files.write_arrays(
@@ -53,6 +61,10 @@ def collect(study: Study) -> None:
         study.out / "stills.npz", {f"{name}/{key}": row for name, strip in strips.items() for key, row in strip.items()}
     )
     files.write_json(study.out / "provenance.json", _provenance(study))
+
+
+def _grouped(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    return grouped(path) if path.exists() else {}
 
 
 def _episodes(path: Path, policy: str, on: str) -> dict[str, np.ndarray]:
@@ -86,18 +98,24 @@ def _trainings(study: Study) -> dict[str, np.ndarray]:
 
 
 def _posteriors(study: Study) -> None:
+    out, before = study.out / "posteriors.csv", {}
+    if out.exists():
+        with out.open(newline="") as file:
+            before = {(row["object"], row["how"]): list(row.values())[2:] for row in csv.DictReader(file)}
     rows = []
     for dlo in OBJECTS:
         for how in HEURISTICS:
             if study.has(f"{dlo}-{how}"):
                 low, middle, high = np.quantile(study.draws(f"{dlo}-{how}"), [0.05, 0.5, 0.95], axis=0)
                 rows.append((dlo, how, *np.stack([middle, low, high], axis=1).ravel()))
+            elif (dlo, how) in before:
+                rows.append((dlo, how, *map(float, before[dlo, how])))
         if study.has(f"{dlo}-sysid"):
             found = json.loads(study.sysid(dlo).read_text())
             rows.append((dlo, "sysid", *np.stack([found["theta"], *found["interval"]], axis=1).ravel()))
         rows.append((dlo, "true", *np.stack([truth(dlo), [np.nan] * 2, [np.nan] * 2], axis=1).ravel()))
     names = ("length", "length_low", "length_high", "young", "young_low", "young_high")
-    with (study.out / "posteriors.csv").open("w", newline="") as file:
+    with out.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["object", "how", *names])
         writer.writerows([dlo, how, *(f"{number:.6g}" for number in numbers)] for dlo, how, *numbers in rows)
@@ -105,10 +123,11 @@ def _posteriors(study: Study) -> None:
 
 def _provenance(study: Study) -> dict:
     """Where it comes from: the command of each run and training, and its versions where they are others than now."""
-    collected, runs = environment(), {}
+    out = study.out / "provenance.json"
+    collected, runs = environment(), json.loads(out.read_text())["runs"] if out.exists() else {}
     for path in sorted((study.out / "runs").glob("p*/*/config.json")):
         config = json.loads(path.read_text())
         wanted = ["command_line", "started", *(["settings"] if path.parts[-3] == "policies" else [])]
         wanted += ["versions"] * (config["versions"] != collected["versions"])
         runs[f"{path.parts[-3]}/{path.parts[-2]}"] = {name: config[name] for name in wanted}
-    return {"collected": collected, "runs": runs}
+    return {"collected": collected, "runs": dict(sorted(runs.items()))}

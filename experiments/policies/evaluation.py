@@ -1,10 +1,12 @@
 """Which policy is evaluated on what, in simulation and on the FEM objects; a file for each pair, which is kept.
 
-runs/simulation/POLICY/DOMAIN.npz   `simulation.Performed` of the policies of all seeds, in the same episodes
+runs/simulation/POLICY/DOMAIN.npz   `simulation.Performed` of the policies of all seeds, in the same episodes, and
+                                    `fingerprints` of their files: of a policy trained anew, nothing is kept
 runs/objects/POLICY/OBJECT.npz      likewise, at the same places
 runs/stills/POLICY@OBJECT.npz       film strips of a few
 """
 
+import hashlib
 import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -48,26 +50,27 @@ def in_simulation(study: Study, policies: Iterable[str], episodes: int) -> None:
     """Evaluate policies in simulation."""
     simulation = Simulation(study, make(), episodes)
     for policy in policies:
-        paths = _files(study, policy)
+        paths, own = _files(study, policy), fingerprints(study, policy)
         for name in domains_of(policy):
             out = study.out / "runs" / "simulation" / policy / f"{name}.npz"
-            if _is_there(out, (len(paths), episodes)) or not study.has(name):
+            if _is_there(out, (len(paths), episodes), own) or not study.has(name):
                 continue
             print(f"simulation: {policy} on {name}", flush=True)
             if policy in actions.NAMES:
-                _write(out, simulation.of_actions(files.read_arrays(paths[0])["actions"], name))
+                _write(out, simulation.of_actions(files.read_arrays(paths[0])["actions"], name), own)
             else:
-                _write(out, simulation.of_policies([load(path) for path in paths], name))
+                _write(out, simulation.of_policies([load(path) for path in paths], name), own)
 
 
 def on_objects(study: Study, policies: Iterable[str], displaced: int) -> None:
     """Evaluate policies on the FEM objects, one object after another."""
     where, policies = deployments.scenes(displaced), list(policies)
     for dlo, policy in itertools.product(FEM, policies):
-        paths, out = _files(study, policy), study.out / "runs" / "objects" / policy / f"{dlo}.npz"
-        if dlo in objects_of(policy) and not _is_there(out, (len(paths), len(where))):
+        paths, own = _files(study, policy), fingerprints(study, policy)
+        out = study.out / "runs" / "objects" / policy / f"{dlo}.npz"
+        if dlo in objects_of(policy) and not _is_there(out, (len(paths), len(where)), own):
             print(f"objects: {policy} on {dlo}", flush=True)
-            _write(out, deployments.on_object([str(path) for path in paths], dlo, where))
+            _write(out, deployments.on_object([str(path) for path in paths], dlo, where), own)
 
 
 def stills(study: Study) -> None:
@@ -80,15 +83,24 @@ def stills(study: Study) -> None:
             files.write_arrays(out, deployments.stills(_files(study, policy)[0], dlo, jax.random.key(0)))
 
 
+def fingerprints(study: Study, policy: str) -> np.ndarray:
+    """What tells the files of a policy, one a seed, from those of another training."""
+    return np.array([hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in _files(study, policy)])
+
+
 def _files(study: Study, policy: str) -> list[Path]:
     return [study.actions(policy)] if policy in actions.NAMES else study.policies()[policy]
 
 
-def _is_there(path: Path, shape: tuple[int, int]) -> bool:
-    """Whether a file has as many policies and episodes as are asked for."""
-    return path.exists() and files.read_arrays(path)["value"].shape == shape
+def _is_there(path: Path, shape: tuple[int, int], fingerprints: np.ndarray) -> bool:
+    """Whether a file has as many episodes as are asked for, of these very policies."""
+    if not path.exists():
+        return False
+    found = files.read_arrays(path)
+    return found["value"].shape == shape and np.array_equal(found["fingerprints"], fingerprints)
 
 
-def _write(path: Path, performed: Performed) -> None:
+def _write(path: Path, performed: Performed, fingerprints: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    files.write_arrays(path, {name: np.asarray(value) for name, value in vars(performed).items()})
+    rows = {name: np.asarray(value) for name, value in vars(performed).items()}
+    files.write_arrays(path, rows | {"fingerprints": fingerprints})

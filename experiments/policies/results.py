@@ -59,12 +59,13 @@ def load(folder: Path) -> Results:
     """Read a study's folder."""
     with (folder / "posteriors.csv").open(newline="") as file:
         posteriors = list(csv.DictReader(file))
-    pairs = {where: _grouped(folder / f"{where}.npz") for where in ("simulation", "objects")}
+    pairs = {where: grouped(folder / f"{where}.npz") for where in ("simulation", "objects")}
     split = {where: {tuple(name.split("@")): rows for name, rows in own.items()} for where, own in pairs.items()}
-    return Results(**split, trainings=_grouped(folder / "trainings.npz"), posteriors=posteriors)
+    return Results(**split, trainings=grouped(folder / "trainings.npz"), posteriors=posteriors)
 
 
-def _grouped(path: Path) -> dict[str, dict[str, np.ndarray]]:
+def grouped(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Arrays that were written as NAME/WHAT, by name."""
     out: dict[str, dict[str, np.ndarray]] = {}
     for key, row in files.read_arrays(path).items():
         name, _, what = key.rpartition("/")

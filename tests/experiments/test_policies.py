@@ -10,10 +10,10 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("brax")
 
-from experiments.policies import findings, intervals, making, report, results, sysid, tables
+from experiments.policies import collection, evaluation, findings, intervals, making, report, results, sysid, tables
 from experiments.policies.barycentres import barycentre, soft_dtw
 from experiments.policies.evaluation import domains_of, objects_of
-from experiments.policies.simulation import KNOWN, lowest, perform
+from experiments.policies.simulation import KNOWN, Performed, lowest, perform
 from experiments.policies.study import FEM, ORDER, PAPER, SIMULATED, Study, chosen, truth
 from jaxlfi.envs.whip import recording, trajectory
 from jaxlfi.envs.whip.environment import make
@@ -177,6 +177,33 @@ def test_domains_trained_side_by_side_get_folders_of_their_own(tmp_path):
     own = files.read_arrays(outs[1] / "domains.npz")
     np.testing.assert_array_equal(own["trained"], points["trained"][2:])
     assert own["parameters"].tolist() == ["length", "young"]
+
+
+def test_evaluations_are_kept_with_the_policies_that_they_are_of(tmp_path):
+    study, episodes = Study(tmp_path), 3
+    shapes = {"actions": (1, 3, 16, 2), "gripper": (1, 3, 16), "lowest": (1, 3, 16)}
+    performed = Performed(**{name: np.ones(shapes.get(name, (1, 3))) for name in Performed.__annotations__})
+    study.actions("constant").parent.mkdir(parents=True)
+    files.write_arrays(study.actions("constant"), {"actions": np.zeros((16, 2))})
+    out = tmp_path / "runs" / "simulation" / "constant" / "uniform.npz"
+    evaluation._write(out, performed, evaluation.fingerprints(study, "constant"))
+    is_there = lambda n: evaluation._is_there(out, (1, n), evaluation.fingerprints(study, "constant"))
+    assert is_there(episodes) and not is_there(episodes + 1)
+
+    collection.collect(study)
+    before = (tmp_path / "simulation.npz").read_bytes()
+    assert results.load(tmp_path).simulated("constant", "uniform").tolist() == [[1.0] * episodes]
+    (tmp_path / "posteriors.csv").write_text((tmp_path / "posteriors.csv").read_text() + "sim-in,edge,1,2,3,4,5,6\n")
+    out.unlink()
+    collection.collect(study)
+    assert (tmp_path / "simulation.npz").read_bytes() == before  # though it is not there any more
+    assert "sim-in,edge,1,2,3,4,5,6\n" in (tmp_path / "posteriors.csv").read_text()
+
+    evaluation._write(out, performed, evaluation.fingerprints(study, "constant"))
+    files.write_arrays(study.actions("constant"), {"actions": np.full((16, 2), 0.01)})
+    assert not is_there(episodes)
+    collection.collect(study)
+    assert results.load(tmp_path).simulation == {}
 
 
 def test_the_lowest_keypoint_is_seen_where_it_is():
