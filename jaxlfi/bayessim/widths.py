@@ -3,7 +3,7 @@
 import math
 
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.heuristics import Heuristic, Truncate
+from jaxlfi.heuristics import Heuristic
 
 MEASURE = "expected from the settings; `jaxlfi diagnose` measures it"
 """How that is known."""
@@ -18,7 +18,7 @@ def expected_widths(settings: Settings, heuristic: Heuristic) -> str:
 
     Args:
         settings: of the run.
-        heuristic: of the run; one that truncates draws every round from the prior.
+        heuristic: of the run.
     """
     return f"{_expected(settings, heuristic)} ({MEASURE})"
 
@@ -29,7 +29,7 @@ def _expected(settings: Settings, heuristic: Heuristic) -> str:
         return "right in principle, as all simulations are drawn from the prior"
     if settings.estimator.of_summaries:
         return "right in principle, as a likelihood does not depend on the proposals"
-    if isinstance(heuristic, Truncate) or float(settings.defensive) == 1:
+    if heuristic.proposes_from_prior or float(settings.defensive) == 1:
         return "right in principle, as every round draws from the prior over its support"
     if settings.estimator.loss != "likelihood":
         if correction == "none":

@@ -43,6 +43,8 @@ class Heuristic(Checked, abc.ABC):
         grows: whether the support can grow. Where it cannot, posterior mass at a bound has to be reported to the user.
         compares_components: whether components are compared by their index with those of the previous posterior. They
             are matched first (`Matched`) where networks start anew each round.
+        proposes_from_prior: whether every round draws from the prior over its support, whatever the posterior: the
+            beliefs that it returns are not informed.
 
     Example:
         >>> from jaxlfi.fields import hyperparameter
@@ -61,6 +63,7 @@ class Heuristic(Checked, abc.ABC):
 
     grows: ClassVar[bool] = True
     compares_components: ClassVar[bool] = False
+    proposes_from_prior: ClassVar[bool] = False
 
     @abc.abstractmethod
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:

@@ -30,6 +30,11 @@ class Choice(Heuristic):
         return any(rule.grows for rule in self.rules)
 
     @property
+    def proposes_from_prior(self) -> bool:
+        """Whether all of the rules do."""
+        return all(rule.proposes_from_prior for rule in self.rules)
+
+    @property
     def compares_components(self) -> bool:
         """Whether any rule compares components."""
         return any(rule.compares_components for rule in self.rules)

@@ -36,6 +36,11 @@ class Matched(Heuristic):
         """Whether the rule can let the support grow."""
         return self.rule.grows
 
+    @property
+    def proposes_from_prior(self) -> bool:
+        """Whether the rule always proposes from the prior."""
+        return self.rule.proposes_from_prior
+
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Reorder the posterior's components (not before the first round), then apply the rule."""
         order = match(previous.mixture, posterior, previous.support)

@@ -36,6 +36,7 @@ class Truncate(Heuristic):
     """
 
     grows = False
+    proposes_from_prior = True
 
     quantile: Value = hyperparameter(1e-3, help="posterior mass given up beyond each bound", low=0, below=0.5)
 

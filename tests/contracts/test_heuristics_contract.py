@@ -91,6 +91,7 @@ def test_its_belief_is_the_posteriors(name):
     belief, _ = applied(RULES[name], PROBLEM)
     theta = jnp.asarray(np.random.default_rng(5).uniform(-2, 2, (20, DIM)), jnp.float32)
     np.testing.assert_allclose(belief.mixture.log_prob(theta), posterior.log_prob(theta), rtol=1e-4, atol=1e-4)
+    assert bool(belief.informed) != RULES[name].proposes_from_prior
 
 
 @every_rule
