@@ -34,6 +34,7 @@ class HostEngine(BatchEngine):
         super().__init__(task, settings, inputs, devices=jax.local_devices()[:1], first=first)
         part = lambda one, *axes: program(functools.partial(one, task), self.mesh, (None, 0, 0, None, *axes))
         self._propose_many, self._update_many = part(propose_one), part(update_one, 0)
+        self._last_seen: list[Discrepancy | None] = [None] * len(inputs.x)
 
     def compile(self, state: State, index: int = 0) -> None:
         """Compile the parts of a round ahead of their first use, while no simulator waits."""
@@ -48,23 +49,23 @@ class HostEngine(BatchEngine):
 
     def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
         """Step every run; see `BatchEngine.round`."""
-        place = jnp.asarray(index)
+        place, settled = jnp.asarray(index), np.asarray(state.progress.settled)
         if index == 0 and self.first is not None:
             simulations = self.first_round()
         else:
-            simulations = self._simulated(*self._propose(state, place), state.progress.settled)
+            simulations = self._simulated(*self._propose(state, place), settled)
         state, info = _call(self._update_many, self.settings, self.inputs, state, place, simulations)
-        return state, jax.device_get(record(info, state.progress, self._checked(state)))
+        return state, jax.device_get(record(info, state.progress, self._checked(state, settled)))
 
     def _propose(self, state: State, place: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _call(self._propose_many, self.settings, self.inputs, state, place)
 
-    def _simulated(self, theta: jax.Array, keys: jax.Array, settled: jax.Array) -> Simulations:
+    def _simulated(self, theta: jax.Array, keys: jax.Array, settled: np.ndarray) -> Simulations:
         shape, wanted = self.inputs.observed.shape[1:], self.settings.simulations_per_round
         return _stacked(
             [
                 self._nothing(own) if over else simulate_in_waves(key, self.task, own, wanted, shape)
-                for key, own, over in zip(keys, theta, np.asarray(settled), strict=True)
+                for key, own, over in zip(keys, theta, settled, strict=True)
             ]
         )
 
@@ -74,20 +75,22 @@ class HostEngine(BatchEngine):
         x = jnp.zeros((len(theta), self.inputs.x.shape[-1]))
         return Simulations(theta, x, jnp.zeros(len(theta), jnp.int32), flags, flags, jnp.ones(len(theta)))
 
-    def _checked(self, state: State) -> Discrepancy:
-        """How far the runs' posteriors are from truth and observation."""
+    def _checked(self, state: State, settled: np.ndarray) -> Discrepancy:
+        """How far the runs' posteriors are from truth and observation; of runs at their end, as was seen before."""
         theta, keys = _call(_check_draws, self.inputs, state)
-        observed = self.inputs.observed
+        for run, (own, key) in enumerate(zip(theta, keys, strict=True)):
+            last = self._last_seen[run]
+            if settled[run] and last is not None:
+                self._last_seen[run] = last.replace(simulated=jnp.zeros_like(last.simulated))
+            else:
+                self._last_seen[run] = self._discrepancy(key, own, self.inputs.observed[run])
+        return _stacked(self._last_seen)
+
+    def _discrepancy(self, key: jax.Array, theta: jax.Array, observed: jax.Array) -> Discrepancy:
         if not self.settings.predictive:
-            return _stacked([not_simulated(self.task, own, observed[0], self.inputs.x.shape[-1]) for own in theta])
-        return _stacked(
-            [
-                compared(
-                    self.task, own, *map(jnp.asarray, simulate_batch(key, self.task, own, observed.shape[1:])), seen
-                )
-                for key, own, seen in zip(keys, theta, observed, strict=True)
-            ]
-        )
+            return not_simulated(self.task, theta, observed, self.inputs.x.shape[-1])
+        simulated = simulate_batch(key, self.task, theta, observed.shape)
+        return compared(self.task, theta, *map(jnp.asarray, simulated), observed)
 
 
 _check_draws = jax.jit(jax.vmap(check_draws))

@@ -12,6 +12,7 @@ from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
 from jaxlfi.bayessim.convergence import LAG, STILL, advanced, not_begun
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import HostEngine
+from jaxlfi.diagnostics import POSTERIOR_SAMPLES
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.heuristics import Edge
 from jaxlfi.runs import execute as executing
@@ -53,14 +54,14 @@ def test_a_run_does_not_settle_before_its_least_rounds():
     assert settled == [False] * 5 + [True] * 2  # it stands still from the fourth round on
 
 
-def batch(engine=BatchEngine, task=None, seeds=SEEDS):
+def batch(engine=BatchEngine, task=None, seeds=SEEDS, settings=SETTINGS):
     """Runs on a wrong support, stepped together: the last states, and the records of all rounds, [rounds, runs]."""
     task = task or gaussian()
     specs = [RunSpec("", "misspecified", task.support("misspecified"), Edge(), seed) for seed in seeds]
     observed = np.tile(OBSERVED, (len(specs), 1))
     inputs, _ = stack_inputs(specs, observed, observed)
-    one, rows = engine(task, SETTINGS, inputs), []
-    state = drive(one, one.start(), range(SETTINGS.rounds), lambda i, state, row, s: rows.append(row))
+    one, rows = engine(task, settings, inputs), []
+    state = drive(one, one.start(), range(settings.rounds), lambda i, state, row, s: rows.append(row))
     return one.fetch(state), {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
@@ -110,9 +111,13 @@ def test_a_traced_run_makes_the_same_rounds(together):
 def test_a_host_simulator_is_not_called_for_runs_at_their_end(whole_runs):  # noqa: F811 - the fixture
     counting = Counting()
     task = dataclasses.replace(gaussian(), simulate=HostSimulator(counting))
-    state, rows = batch(HostEngine, task, seeds=range(3))
-    assert len(set(np.asarray(state.progress.rounds).tolist())) > 1, "expected runs of different lengths"
-    assert sum(counting.calls) == rows["attempted"].sum()
+    state, rows = batch(HostEngine, task, seeds=range(3), settings=SETTINGS.replace(predictive=True))
+    own = np.asarray(state.progress.rounds)
+    assert len(set(own.tolist())) > 1, "expected runs of different lengths"
+    made = np.arange(len(rows["settled"]))[:, None] < own
+    np.testing.assert_array_equal(rows["predictive_simulations"], POSTERIOR_SAMPLES * made)
+    assert sum(counting.calls) == rows["attempted"].sum() + rows["predictive_simulations"].sum()
+    assert np.all(np.isfinite(rows["sample_trajectory_error"]))  # of runs at their end, as was seen before
 
 
 def test_a_run_that_settled_before_it_was_killed_resumes_to_the_same_bits(tmp_path, whole_runs):  # noqa: F811
