@@ -391,6 +391,19 @@ def mean_and_each(values: list[float]) -> str:
     return f"{np.mean(values):.2f} ({', '.join(f'{value:.2f}' for value in values)})"
 
 
+def test_what_the_study_says():
+    found = policies.load(RESULTS / "policies" / "study")
+    at_truth = lambda policy, dlo: found.simulated(policy, f"{dlo}-true")
+    ahead = lambda dlo, other: at_truth(f"{dlo}-edge", dlo).mean() - at_truth(other, dlo).mean()
+    text = " ".join(README.split("**What this says.**")[1].split("**Beside the paper's learner.**")[0].split())
+    stiff = ahead("sim-stiff", "uniform"), ahead("sim-stiff", "sim-stiff-none")
+    assert "{:.2f} ahead of PPO-U and {:.2f} ahead of policies on the fixed".format(*stiff) in text
+    for dlo in ("sim-in", "sim-long"):
+        for policy in (f"{dlo}-edge", f"{dlo}-none", "uniform"):
+            assert 1.75 < at_truth(policy, dlo).mean() < 2.0
+    assert all(0.45 < ahead(dlo, "feasible") < 0.85 for dlo in ("sim-in", "sim-stiff", "sim-long"))
+
+
 @pytest.mark.parametrize(
     ("learner", "steps", "name", "policies"),
     [

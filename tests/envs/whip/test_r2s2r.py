@@ -184,8 +184,8 @@ def test_what_was_believed(tmp_path):
     class Run:
         space = Space(("length", "young"), (False, True))
 
-        class belief:
-            support = jaxlfi.Support([100.0, float(np.log(1e3))], [300.0, float(np.log(1e5))])
+        def final_support(self):
+            return jaxlfi.Support([100.0, 1e3], [300.0, 1e5])
 
         def draws(self):
             return np.stack([np.linspace(150, 250, 101), np.full(101, 2e4)], axis=1)
