@@ -49,11 +49,7 @@ def write(out: Path, readme: Path | None = None) -> None:
         before, rest = whole.split(BEGIN)
         after = rest.split(END)[1]
         files.write_bytes(readme, f"{before}{BEGIN}\n\n{text(found)}\n\n{END}{after}".encode())
-    strips: dict[str, dict[str, np.ndarray]] = {}
-    for key, row in files.read_arrays(out / "stills.npz").items():
-        name, _, what = key.rpartition("/")
-        strips.setdefault(name, {})[what] = row
-    figures.save(out, found, strips)
+    figures.save(out, found, results.grouped(out / "stills.npz"))
 
 
 def _write_csv(path: Path, rows: Sequence[Row]) -> None:

@@ -43,8 +43,8 @@ class Heuristic(Checked, abc.ABC):
         grows: whether the support can grow. Where it cannot, posterior mass at a bound has to be reported to the user.
         compares_components: whether components are compared by their index with those of the previous posterior. They
             are matched first (`Matched`) where networks start anew each round.
-        proposes_from_prior: whether every round draws from the prior over its support, whatever the posterior: the
-            beliefs that it returns are not informed.
+        proposes_from_prior: whether parameters to simulate are always drawn from the prior truncated to the support,
+            and never from the posterior. `informed` is then false in every belief that it returns.
 
     Example:
         >>> from jaxlfi.fields import hyperparameter
