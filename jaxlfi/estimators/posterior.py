@@ -121,8 +121,8 @@ def _log_prob(posterior: Posterior, theta: Array, natural: bool) -> Array:
     inner = space.to_inference(theta) if natural else theta
     if natural:  # a logarithm's rounding takes no point on a bound out of the support
         low, high = space.to_natural(box.low), space.to_natural(box.high)
-        rounding = ROUNDING * jnp.maximum(jnp.abs(low), jnp.abs(high))
-        inside = jnp.all((theta >= low - rounding) & (theta <= high + rounding), axis=-1, keepdims=True)
+        low, high = low - ROUNDING * jnp.abs(low), high + ROUNDING * jnp.abs(high)
+        inside = jnp.all((theta >= low) & (theta <= high), axis=-1, keepdims=True)
         inner = jnp.where(inside, box.clip(inner), inner)
     finite = jnp.all(jnp.isfinite(inner), axis=-1)
     inner = jnp.where(finite[..., None], inner, posterior.support.centre)

@@ -167,6 +167,14 @@ def test_a_maximum_on_a_bound_of_a_logarithm_has_a_density(bound):
     assert np.isfinite(beyond.log_prob(beyond.map()))
 
 
+def test_below_the_lower_bound_of_many_decades_there_is_no_density():
+    """A rounding of the upper bound is larger than the lower one."""
+    wide = POSTERIOR.replace(support=Support([-10.0, -2.0], [20.0, 2.5]))
+    low = float(np.exp(-10.0))
+    assert np.isfinite(wide.log_prob(jnp.array([1.001 * low, 0.5])))
+    assert np.isneginf(wide.log_prob(jnp.array([0.999 * low, 0.5])))
+
+
 def test_maxima_in_natural_units_and_in_inference_space_differ():
     """Of a log-normal: exp(mu - sigma^2) over the parameter, exp(mu) over its logarithm."""
     np.testing.assert_allclose(POSTERIOR.map(), [np.exp(MU[0] - SD[0] ** 2), MU[1]], rtol=5e-3)
