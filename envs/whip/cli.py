@@ -1,4 +1,4 @@
-"""The command line of the whipping task: `jaxlfi whip render | plan | deploy | control | convert`.
+"""The command line of the whipping task: `jaxlfi whip render | plan | deploy | control | record | convert | ...`.
 
 This module imports neither jax nor numpy, so that `--help` answers at once.
 """
@@ -11,6 +11,7 @@ from pathlib import Path
 from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import OneLineParser
 from jaxlfi.envs.whip import require_mujoco
+from jaxlfi.envs.whip.vision import options
 
 EXAMPLES = """\
 examples:
@@ -20,6 +21,9 @@ examples:
   jaxlfi whip render --length 200 --young 2.5e4 --policy runs/plan.npz --out runs/shorter
   jaxlfi whip deploy runs/policies/uniform/seed_000/policy.npz constant:0.03,-0.03 --object dlo-0 --out runs/deployed
   jaxlfi whip control policy.npz --robot socket://127.0.0.1:5005 --max-speed 0.2 --out rollout.npz
+  jaxlfi whip record --object dlo-2 --detector learnt --out seen.npz
+  jaxlfi whip pictures --count 200 --renderer mujoco --out runs/pictures
+  jaxlfi whip train-vision --out runs/vision
   jaxlfi whip convert rollout.npz rollout.mcap
   jaxlfi whip convert first.npz second.mcap runs/whips              a LeRobot data set of two episodes
   jaxlfi whip convert "runs/whips#episode=1" second.npz
@@ -32,8 +36,8 @@ def parser() -> argparse.ArgumentParser:
     formatter = argparse.RawDescriptionHelpFormatter
     top = OneLineParser(
         prog="jaxlfi whip",
-        description="Render rollouts of the DLO whipping task, plan whips, let policies whip, control robots, and "
-        "convert recordings.",
+        description="Render rollouts of the DLO whipping task, plan whips, let policies whip, control robots, learn to "
+        "see, and record and convert rollouts.",
         epilog=EXAMPLES,
         formatter_class=formatter,
     )
@@ -81,6 +85,7 @@ def parser() -> argparse.ArgumentParser:
     deploy.add_argument(
         "--object", nargs="+", required=True, metavar="NAME", help="what to act on: dlo-0, dlo-1, dlo-2, dlo-3"
     )
+    options.add_detector(deploy)
     deploy.add_argument("--repetitions", type=int, default=16, metavar="N", help="places (default: 16)")
     deploy.add_argument("--seed", type=int, default=0, metavar="N", help="seed of places and noise (default: 0)")
     deploy.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
@@ -121,6 +126,8 @@ def parser() -> argparse.ArgumentParser:
     control.add_argument("--remote", action="store_true", help="let the driver be on another host")
     control.add_argument("--seed", type=int, default=0, metavar="N", help="of a reference object's camera (default: 0)")
     control.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .npz, beside it a new .json")
+
+    options.add(commands)
 
     convert = commands.add_parser(
         "convert",
@@ -169,9 +176,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         from jaxlfi.io import compile_cache
 
         compile_cache.enable()
-        from jaxlfi.envs.whip import commands
-
-        getattr(commands, arguments.command)(arguments)
+        if arguments.command in options.COMMANDS:
+            from jaxlfi.envs.whip.vision import commands
+        else:
+            from jaxlfi.envs.whip import commands
+        getattr(commands, options.COMMANDS.get(arguments.command, arguments.command))(arguments)
 
     return exit_status("jaxlfi whip", work)
 

@@ -30,6 +30,7 @@ from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.reference_objects import objects, repetitions
 from jaxlfi.envs.whip.reference_objects.simulation import UnstableError
 from jaxlfi.envs.whip.vision.camera import side_camera
+from jaxlfi.envs.whip.vision.commands import sights
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
 from jaxlfi.robots.loop import Log
@@ -119,9 +120,11 @@ def deploy(arguments: argparse.Namespace) -> None:
         raise ValueError(f"repetitions: expected at least 1, got {n}")
     named = [objects.load(name) for name in dict.fromkeys(arguments.object)]
     begins = {word: repetitions.acting(word) for word in arguments.policies}
-    with Progress(console=Console(stderr=True)) as progress:
+    seen_by = sights(arguments.detector, arguments.renderer, arguments.weights)
+    with seen_by as seeing, Progress(console=Console(stderr=True)) as progress:
         bar = progress.add_task("episodes", total=len(begins) * len(named) * n)
-        rows = repetitions.repeat(jax.random.key(arguments.seed), begins, named, n, lambda: progress.advance(bar))
+        advance, key = lambda: progress.advance(bar), jax.random.key(arguments.seed)
+        rows = repetitions.repeat(key, begins, named, n, advance, seeing)
     out.mkdir(parents=True, exist_ok=True)
     repetitions.write(out / "episodes.csv", rows)
     lines = repetitions.summary(rows)

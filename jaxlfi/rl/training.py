@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi.io import files, serialise
+from jaxlfi.io import files, serialise, trees
 from jaxlfi.rl import ppo
 from jaxlfi.rl.domains import POOL, Domain, Draw
 from jaxlfi.rl.environment import Environment
@@ -216,27 +216,18 @@ def _rows(made: Update) -> dict[str, np.ndarray]:
 # ------------------------------------------------------------------------------------------------------------- files
 
 
-def _plain(leaf: Any) -> np.ndarray:
-    keys = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    return np.asarray(jax.random.key_data(leaf) if keys else leaf)
-
-
 def _write_checkpoint(path: Path, done: int, curves: Mapping[str, np.ndarray], state: Training) -> None:
-    leaves = {f"state{name}": _plain(leaf) for name, leaf in run_folders.named_leaves(state).items()}
+    leaves = trees.to_arrays(state, "state")
     rows = {f"curve/{name}": row for name, row in curves.items()}
     files.write_arrays(path, {"done": np.asarray(done)} | rows | leaves, compress=False, durable=True)
 
 
 def _read_checkpoint(path: Path, like: Training) -> tuple[int, dict[str, np.ndarray], Training]:
     arrays = _read(path)
-    leaves = []
-    for name, leaf in run_folders.named_leaves(like).items():
-        array, expected = arrays.get(f"state{name}"), _plain(leaf)
-        if array is None or array.shape != expected.shape or array.dtype != expected.dtype:
-            raise StoreError(f"{path}: expected {name} of shape {expected.shape}, got another or none")
-        keys = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        leaves.append(jax.random.wrap_key_data(jnp.asarray(array)) if keys else jnp.asarray(array))
-    state = jax.tree.unflatten(jax.tree.structure(like), leaves)
+    try:
+        state = trees.from_arrays(arrays, like, "state")
+    except ValueError as error:
+        raise StoreError(f"{path}: {error}") from error
     curves = {name.removeprefix("curve/"): row for name, row in arrays.items() if name.startswith("curve/")}
     return int(arrays["done"]), curves, state
 

@@ -11,12 +11,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.bayessim.record import FINAL, apart
 from jaxlfi.io import files as atomic
+from jaxlfi.io import trees
 from jaxlfi.tasks.simulation import Simulations
 
 FOLDER = "checkpoint"
@@ -63,7 +63,7 @@ class Checkpoint:
             compress=False,
             durable=True,
         )
-        leaves = {name: np.asarray(leaf) for name, leaf in _named_leaves(state).items()}
+        leaves = trees.to_arrays(state)
         done = {_DONE: np.asarray(index + 1)}
         atomic.write_arrays(self.folder / "state.npz", leaves | done | final, compress=False, durable=True)
 
@@ -90,15 +90,10 @@ class Checkpoint:
             template: a state of the same shapes, or of `jax.ShapeDtypeStruct`.
         """
         arrays = self._read("state.npz")
-        names = _named_leaves(template)
-        for name, leaf in names.items():
-            array = self._named(arrays, "state.npz", name)
-            if array.shape != leaf.shape or array.dtype != leaf.dtype:
-                raise CheckpointError(
-                    f"{self.folder / 'state.npz'}: expected {name} of shape {leaf.shape} and type "
-                    f"{leaf.dtype}, got {array.shape} and {array.dtype}"
-                )
-        return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in names])
+        try:
+            return trees.from_arrays(arrays, template)
+        except ValueError as error:
+            raise CheckpointError(f"{self.folder / 'state.npz'}: {error}") from error
 
     def remove(self) -> None:
         """Clean up after a run that is complete."""
@@ -118,8 +113,3 @@ class Checkpoint:
 
 def _round_name(index: int) -> str:
     return f"round_{index:03d}.npz"
-
-
-def _named_leaves(tree: Any) -> dict[str, Any]:
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}

@@ -31,6 +31,7 @@ from jaxlfi.bayessim.record import FINAL, ledger_line
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.widths import expected_widths
 from jaxlfi.io import files as atomic
+from jaxlfi.io import trees
 from jaxlfi.io.serialise import json_safe
 from jaxlfi.runs import describe
 from jaxlfi.tasks import priors, summaries
@@ -241,7 +242,7 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
         },
     )
     if keep_network or run.amortised or not run.settings.estimator.closed_form:
-        atomic.write_arrays(folder / "network.npz", named_leaves(run.network))
+        atomic.write_arrays(folder / "network.npz", trees.named_leaves(run.network))
 
 
 def save(run: "Run", folder: Path) -> Path:
@@ -257,12 +258,6 @@ def save(run: "Run", folder: Path) -> Path:
         raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
     create(folder, run_config(run.task, run.origin, run.spec, run.settings), fill)
     return folder
-
-
-def named_leaves(tree: Any) -> dict[str, Any]:
-    """A pytree as named arrays, by the places of its leaves."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
 
 
 def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:

@@ -18,6 +18,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.io import files as atomic
+from jaxlfi.io import trees
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.folder import StoreError
@@ -160,7 +161,7 @@ def _network(
     estimator, obs = settings.estimator.reading(layout), math.prod(layout)
     make: Callable[[], Network] = lambda: untrained(jax.random.key(0), estimator, obs, feasible, space, prior)
     template = jax.eval_shape(make)
-    expected = folders.named_leaves(template)
+    expected = trees.named_leaves(template)
     arrays = _arrays(path, tuple(expected))
     for name, leaf in expected.items():
         if arrays[name].shape != leaf.shape:

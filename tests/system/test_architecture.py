@@ -282,7 +282,7 @@ def test_who_may_import_which_library(path):
         "gymnasium": (f"{ENVS}.whip", "experiments"),
         "stable_baselines3": ("experiments",),
         "brax": ("jaxlfi.rl",),
-        "onnx": ("jaxlfi.rl",),
+        "onnx": ("jaxlfi.rl", f"{ENVS}.whip.vision.export"),
         "tensorboardX": ("jaxlfi.rl.tensorboard",),
         "pyarrow": ("jaxlfi.io.lerobot",),
         "mcap": ("jaxlfi.io.mcap",),

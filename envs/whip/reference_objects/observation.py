@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,25 @@ IMAGE_SIZE = 256
 """Side of the segmentation images, in pixels (section VI-C)."""
 HEX = {name: "#" + "".join(f"{round(255 * channel):02X}" for channel in RGBA[name][:3]) for name in (*COLOURS, "dlo")}
 """Colours of the cubes and the DLO."""
+
+
+SEEN_THROUGH = "noisy segmentation images"
+"""How recordings say that an object was seen by `found`."""
+
+
+class Sight(Protocol):
+    """Finds keypoints in frames of one scene, as `found` does.
+
+    Attributes:
+        words: through what it sees, as recordings say it.
+    """
+
+    words: str
+
+    def __call__(
+        self, key: jax.Array, camera: Camera, frame: Frames, cube_side: Float[Array, ""] | float
+    ) -> tuple[Float[np.ndarray, "10 2"], Bool[np.ndarray, "10"]]:
+        """Keypoints of a frame, NaN where not seen, and which were seen."""
 
 
 def look(key: jax.Array, camera: Camera, frame: Frames, cube_side: Float[Array, ""] | float) -> Int[Array, "size size"]:
@@ -51,17 +71,26 @@ def _mapped(function, key, camera, frames, cube_side):
     return jax.lax.map(one, jnp.arange(frames.gripper.shape[0]))
 
 
-def record(key: jax.Array, rig: ReferenceRig, actions: Float[Array, "16 2"]) -> tuple[Recording, Frames]:
+def record(
+    key: jax.Array, rig: ReferenceRig, actions: Float[Array, "16 2"], sight: Sight | None = None
+) -> tuple[Recording, Frames]:
     """One rollout as a camera sees it, and its true frames.
 
     Args:
         key: of the camera's noise.
         rig: with the object in its gripper.
         actions: displacements of the gripper's set-point, in m, shape [16, 2].
+        sight: what finds keypoints in a frame; by default `found`.
     """
     actions, camera, dlo = np.asarray(actions, float), side_camera(rig.place), rig.dlo
     times, frames = rig.rollout(actions)
-    keypoints, seen = in_every_frame(found, key, camera, frames, rig.place.cube_side)
+    if sight is None:
+        keypoints, seen = in_every_frame(found, key, camera, frames, rig.place.cube_side)
+    else:
+        several = [jax.tree.map(lambda leaf, i=i: leaf[i], frames) for i in range(len(times))]
+        keys = [jax.random.fold_in(key, i) for i in range(len(times))]
+        looked = [sight(key, camera, frame, rig.place.cube_side) for key, frame in zip(keys, several, strict=True)]
+        keypoints, seen = (np.stack(part) for part in zip(*looked, strict=True))
     recording = Recording(
         times=times,
         gripper=frames.gripper,
@@ -72,7 +101,7 @@ def record(key: jax.Array, rig: ReferenceRig, actions: Float[Array, "16 2"]) -> 
         source="simulated",
         description=(
             f"FEM reference object for a DLO of silicone, {1e3 * dlo.length:.0f} mm long, Shore {dlo.hardness}: "
-            "seen through noisy segmentation images"
+            f"seen through {SEEN_THROUGH if sight is None else sight.words}"
         ),
         frame_rate=1 / FRAME_INTERVAL,
         control_interval=CONTROL_INTERVAL,

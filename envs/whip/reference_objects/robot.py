@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxlfi.envs.whip.observer import Observer
 from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
-from jaxlfi.envs.whip.reference_objects.observation import HEX, IMAGE_SIZE, found
+from jaxlfi.envs.whip.reference_objects.observation import HEX, IMAGE_SIZE, SEEN_THROUGH, Sight, found
 from jaxlfi.envs.whip.reference_objects.scene import PLACE, SIMULATOR
 from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig, stacked
 from jaxlfi.envs.whip.rig import START
@@ -31,7 +31,14 @@ class ReferenceRobot:
         film: true frames so far: one, then the ten of each command.
     """
 
-    def __init__(self, key: jax.Array, dlo: ReferenceObject, place=PLACE, camera: Camera | None = None):
+    def __init__(
+        self,
+        key: jax.Array,
+        dlo: ReferenceObject,
+        place=PLACE,
+        camera: Camera | None = None,
+        sight: Sight | None = None,
+    ):
         """Let the object come to rest, and see it.
 
         Args:
@@ -39,15 +46,17 @@ class ReferenceRobot:
             dlo: the object in the gripper.
             place: the scene.
             camera: that sees it; by default the side camera of the scene.
+            sight: what finds keypoints in a frame; by default `observation.found`.
 
         Raises:
             UnstableError: if the object cannot come to rest.
         """
         self.camera = side_camera(place) if camera is None else camera
+        words = SEEN_THROUGH if sight is None else sight.words
         self.about = {
             "camera": self.camera,
             "source": "simulated",
-            "description": f"{dlo.name} acted on by a policy, seen through noisy segmentation images",
+            "description": f"{dlo.name} acted on by a policy, seen through {words}",
             "image_size": IMAGE_SIZE,
             "colours": HEX,
             "provenance": {"simulator": SIMULATOR},
@@ -55,6 +64,7 @@ class ReferenceRobot:
         self.simulated_clock = Simulated()
         self.observations: list[np.ndarray] = []
         self.actions: list[np.ndarray] = []
+        self._sight = _found if sight is None else sight
         self._key, self._side, self._observer = key, jnp.float32(place.cube_side), Observer()
         self._rig = ReferenceRig(dlo, place)
         self._target = np.array(START)
@@ -86,7 +96,7 @@ class ReferenceRobot:
         padding = frame.replace(dlo=padded(frame.dlo, POINTS))
         single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), padding)
         key = jax.random.fold_in(self._key, len(self.observations))
-        keypoints, seen = _found(key, self.camera, single, self._side)
+        keypoints, seen = self._sight(key, self.camera, single, self._side)
         self._seen = np.asarray(seen)
         self.observations.append(self._observer.observe(frame.gripper, np.asarray(keypoints), self._seen))
 

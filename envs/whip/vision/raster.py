@@ -27,6 +27,19 @@ class Bodies:
     offsets: Float[Array, "bodies 6"]
 
 
+@struct.dataclass
+class Hits:
+    """What the ray through each pixel hits first.
+
+    Attributes:
+        body: number of the body, from 1 on; 0 where there is none. Shape [size, size].
+        nearness: one over the distance along the camera's axis, in 1/m; 0 where there is none. Shape [size, size].
+    """
+
+    body: Int[Array, "size size"]
+    nearness: Float[Array, "size size"]
+
+
 def segmentation(
     camera: Camera,
     frames: Frames,
@@ -50,31 +63,45 @@ def segmentation(
     Returns:
         Labels: 0 background, 1 to 6 the cubes, bottom-up, 7 the DLO; rows downwards, columns to the right.
     """
-    cubes, bar = _cubes(frames.cubes, frames.orientations, cube_side), _bar(frames.dlo, width)
-    bodies = jax.tree.map(lambda *parts: jnp.concatenate(parts), cubes, bar)
-    labels = jnp.minimum(jnp.arange(bodies.offsets.shape[0]) + 1, DLO)
-    faces, towards = _faces(camera, bodies)
-    axis = ((jnp.arange(size) + 0.5) / size - 0.5) / camera.focal_length
+    return jnp.minimum(first_hits(camera, labelled(frames, cube_side, width), size).body, DLO)
 
-    def draw(image, body):
-        labels, nearest = image
-        label, (x, y, z), towards = body
+
+def labelled(frames: Frames, cube_side: Float[Array, ""] | float, width: Float[Array, ""] | float = SECTION) -> Bodies:
+    """The bodies that have labels: the cubes, bottom-up, then the pieces of the DLO."""
+    cubes = boxes(frames.cubes, frames.orientations, jnp.full((len(COLOURS), 3), 0.5 * cube_side))
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), cubes, _bar(frames.dlo, width))
+
+
+def first_hits(camera: Camera, bodies: Bodies, size: int) -> Hits:
+    """What is seen of some bodies, none of which the camera is inside of."""
+    numbers = jnp.arange(bodies.offsets.shape[0]) + 1
+    faces, towards = planes(camera, bodies)
+    axis = slopes(camera, size)
+
+    def draw(hits, body):
+        number, (x, y, z), towards = body
         enters, leaves = jnp.full((size, size), jnp.inf), jnp.zeros((size, size))
         for face in range(6):  # not an axis, as XLA's reductions over short axes are slow on CPU
             plane = x[face] * axis + (y[face] * axis + z[face])[:, None]
             enters = jnp.where(towards[face], jnp.minimum(enters, plane), enters)
             leaves = jnp.where(towards[face], leaves, jnp.maximum(leaves, plane))
-        hit = (enters >= leaves) & (enters > nearest)
-        return (jnp.where(hit, label, labels), jnp.where(hit, enters, nearest)), None
+        hit = (enters >= leaves) & (enters > hits.nearness)
+        return Hits(jnp.where(hit, number, hits.body), jnp.where(hit, enters, hits.nearness)), None
 
-    image = (jnp.zeros((size, size), jnp.int32), jnp.zeros((size, size)))
-    return jax.lax.scan(draw, image, (labels, faces, towards))[0][0]
+    nothing = Hits(jnp.zeros((size, size), jnp.int32), jnp.zeros((size, size)))
+    return jax.lax.scan(draw, nothing, (numbers, faces, towards))[0]
 
 
-def _cubes(centres, orientations, side) -> Bodies:
+def slopes(camera: Camera, size: int) -> Float[Array, " size"]:
+    """How far the rays of a row's or a column's pixels lead to the right or down, per distance ahead."""
+    return ((jnp.arange(size) + 0.5) / size - 0.5) / camera.focal_length
+
+
+def boxes(centres: Float[Array, "n 3"], orientations: Float[Array, "n 4"], half_sizes: Float[Array, "n 3"]) -> Bodies:
+    """Boxes by their centres in m, orientations as unit quaternions, and half their sizes in m."""
     axes = jnp.swapaxes(rotation(orientations), -1, -2)
     normals = jnp.concatenate([axes, -axes], axis=-2)
-    return Bodies(normals, jnp.sum(normals * centres[:, None], axis=-1) + 0.5 * side)
+    return Bodies(normals, jnp.sum(normals * centres[:, None], axis=-1) + jnp.tile(half_sizes, 2))
 
 
 def _bar(centreline, width) -> Bodies:
@@ -99,8 +126,11 @@ def _unit(vectors):
     return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _faces(camera: Camera, bodies: Bodies):
-    """The planes of faces in the camera's axes, three coefficients [B, 6] each, and which of them face the camera."""
+def planes(camera: Camera, bodies: Bodies):
+    """The faces as the camera sees them, three coefficients [B, 6] each, and which of them face it.
+
+    A face's plane has the nearness x right + y down + z on the ray that leads so far to the right and down.
+    """
     ahead = bodies.offsets - jnp.sum(bodies.normals * camera.position, axis=-1)
     towards = ahead < 0
     ahead = jnp.where(jnp.abs(ahead) < 1e-9, 1e-9, ahead)  # a plane through the pinhole
