@@ -20,8 +20,9 @@ from jaxlfi.envs.whip.physics.engines import pick as pick_engine
 from jaxlfi.envs.whip.reference_objects import objects, repetitions
 from jaxlfi.envs.whip.reference_objects.observation import Sight, record
 from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig
-from jaxlfi.envs.whip.vision import detectors, labelled, making, pictures, scenes, scores, training, weights
+from jaxlfi.envs.whip.vision import detectors, export, labelled, making, pictures, scenes, scores, training, weights
 from jaxlfi.envs.whip.vision.making import Asked
+from jaxlfi.envs.whip.vision.options import FORMATS
 from jaxlfi.envs.whip.vision.photographer import Photographer
 from jaxlfi.envs.whip.vision.renderers import RENDERERS
 from jaxlfi.io import files
@@ -118,14 +119,18 @@ def train_vision(arguments: argparse.Namespace) -> None:
     out, wanted = arguments.out, arguments.only or list(NETWORKS)
     preset = training.PRESETS[arguments.preset]
     if arguments.steps is not None:
+        if arguments.steps < 1:
+            raise ValueError(f"steps: expected at least 1, got {arguments.steps}")
         shorter = {name: dataclasses.replace(getattr(preset, name), steps=arguments.steps) for name in NETWORKS}
         preset = dataclasses.replace(preset, **shorter)
     asked = {
         "preset": arguments.preset,
-        "settings": dataclasses.asdict(preset),
+        "settings": {name: value for name, value in dataclasses.asdict(preset).items() if name != "networks"},
         "seed": arguments.seed,
         "pictures": [str(folder) for folder in arguments.pictures],
     }
+    for folder in arguments.pictures:
+        pictures.check(folder)
     _begin(out, asked)
     figures = {}
     for name in wanted:
@@ -138,6 +143,23 @@ def train_vision(arguments: argparse.Namespace) -> None:
             table.add_row(what, ", ".join(f"{number:.3f}" for number in np.atleast_1d(value)))
         Console().print(table)
     print(f"wrote {', '.join(str(out / f'{name}.npz') for name in figures)}")
+
+
+def export_vision(arguments: argparse.Namespace) -> None:
+    """`jaxlfi whip export-vision`.
+
+    Raises:
+        ValueError: for bad input.
+        ImportError: without the extra of the format.
+    """
+    out, suffix = arguments.out, FORMATS[arguments.format]
+    if out.exists() or out.suffix != suffix:
+        raise ValueError(f"out: expected a new {suffix} file, got {out}")
+    path = weights.SHIPPED["segmenter"] if arguments.weights is None else arguments.weights / "segmenter.npz"
+    segmenter = weights.load(path, "segmenter")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    (export.save_onnx if arguments.format == "onnx" else export.save_stablehlo)(segmenter, out)
+    print(f"wrote {out}, the segmenter {path.name}")
 
 
 def _segmenter(out: Path, preset: training.Preset, arguments: argparse.Namespace) -> None:

@@ -8,7 +8,8 @@ from typing import Any, Literal, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
+from scipy import ndimage
 
 from jaxlfi.envs.whip.vision import masks, transporter, weights
 from jaxlfi.envs.whip.vision.keypoints import ON_DLO
@@ -80,8 +81,8 @@ class Learnt:
         return _transported(self.transporter.module, self.transporter.params, labels)
 
     def labels(self, picture: Array) -> Array:
-        """The segmentation of a picture."""
-        return segment(self.segmenter.module, self.segmenter.params, checked(picture))
+        """The segmentation of a picture, without what lies apart from the objects."""
+        return whole(segment(self.segmenter.module, self.segmenter.params, checked(picture)))
 
 
 def checked(picture: Any) -> np.ndarray:
@@ -102,6 +103,22 @@ def checked(picture: Any) -> np.ndarray:
     from PIL import Image
 
     return np.asarray(Image.fromarray(rgb).resize((SIZE, SIZE), Image.Resampling.BILINEAR))
+
+
+def whole(labels: Int[Array, "size size"]) -> Int[np.ndarray, "size size"]:
+    """Labels without the pixels that networks strew about: of each cube, its largest connected part.
+
+    Of the DLO, which may be hidden in its middle, all parts are kept that have a seventh of the largest one's pixels.
+    """
+    labels = np.asarray(labels)
+    out = np.zeros_like(labels)
+    for label in range(1, DLO + 1):
+        parts, n = ndimage.label(labels == label, np.ones((3, 3)))
+        if n:
+            sizes = np.bincount(parts.ravel())
+            sizes[0] = 0
+            out[(sizes >= (sizes.max() / 7 if label == DLO else sizes.max()))[parts]] = label
+    return out
 
 
 def downsized(mask: Bool[Array, "size size"]) -> Array:

@@ -37,8 +37,8 @@ XML = f"""
   <asset>
     <texture name="table" type="2d" builtin="flat" width="{TEXTURE}" height="{TEXTURE}"/>
     <texture name="wall" type="2d" builtin="flat" width="{TEXTURE}" height="{TEXTURE}"/>
-    <material name="table" texture="table" texrepeat="{1 / COVERED} {1 / COVERED}" texuniform="true"/>
-    <material name="wall" texture="wall" texrepeat="{1 / COVERED} {1 / COVERED}" texuniform="true"/>
+    <material name="table" texture="table" texrepeat="{2 / COVERED} {2 / COVERED}" texuniform="true" specular="0"/>
+    <material name="wall" texture="wall" texrepeat="{2 / COVERED} {2 / COVERED}" texuniform="true" specular="0"/>
   </asset>
   <worldbody>
     <camera name="camera"/>

@@ -37,6 +37,9 @@ class Detector:
         missing: probability that a point of the DLO is not found in a frame; it then stays where it was last seen.
         bias: standard deviation of each coordinate's constant error in a trajectory, in normalised pixels.
         slip: standard deviation of the error of the gripper's measured x and z in each frame, in m.
+        places: of the points, as fractions of the DLO's length, shape [4]; None where they are drawn as said above.
+        moved: standard deviation of the points' places between trajectories, where there are `places`.
+        slide: standard deviation of their places in each frame, where there are `places`.
     """
 
     nearest: Float[Array, ""] | float = 0.25
@@ -48,6 +51,9 @@ class Detector:
     missing: Float[Array, ""] | float = 0.0
     bias: Float[Array, ""] | float = 0.0
     slip: Float[Array, ""] | float = 0.0
+    places: Float[Array, "4"] | tuple[float, ...] | None = None
+    moved: Float[Array, ""] | float = 0.0
+    slide: Float[Array, ""] | float = 0.0
 
 
 CLEAN = Detector()
@@ -96,12 +102,16 @@ def begin(key: jax.Array, detector: Detector) -> Tracking:
     """Start a trajectory: draw the positions and the order of the keypoints on the DLO."""
     key_arcs, key_order, key_shuffled, key_bias = jax.random.split(key, 4)
     slack = detector.farthest - detector.nearest - (ON_DLO - 1) * detector.spacing
-    steps = jnp.sort(jax.random.uniform(key_arcs, (ON_DLO,))) * slack + jnp.arange(ON_DLO) * detector.spacing
+    if detector.places is None:
+        steps = jnp.sort(jax.random.uniform(key_arcs, (ON_DLO,))) * slack + jnp.arange(ON_DLO) * detector.spacing
+        arcs = detector.nearest + steps
+    else:
+        arcs = jnp.asarray(detector.places) + detector.moved * jax.random.normal(key_arcs, (ON_DLO,))
     shuffled = jax.random.bernoulli(key_shuffled, detector.shuffled)
     order = jnp.where(shuffled, jax.random.permutation(key_order, ON_DLO), jnp.arange(ON_DLO))
     bias = detector.bias * jax.random.normal(key_bias, (KEYPOINTS, 2))
     nowhere = jnp.zeros((KEYPOINTS, 2))
-    return Tracking((detector.nearest + steps)[order], bias, last=nowhere, begun=jnp.asarray(False))
+    return Tracking(arcs[order], bias, last=nowhere, begun=jnp.asarray(False))
 
 
 def track(
@@ -114,8 +124,13 @@ def track(
         were seen in this frame, shape [10]; the detector's next state. In the first frame all are seen. Keypoints may
         lie outside of the image, where `project` puts them.
     """
-    key_noise, key_missing = jax.random.split(key)
-    points = jnp.concatenate([along(frames.dlo, tracking.arcs), frames.cubes])
+    arcs = tracking.arcs
+    if detector.places is None:
+        key_noise, key_missing = jax.random.split(key)
+    else:
+        key_noise, key_missing, key_slide = jax.random.split(key, 3)
+        arcs = jnp.clip(arcs + detector.slide * jax.random.normal(key_slide, (ON_DLO,)), 0.0, 1.0)
+    points = jnp.concatenate([along(frames.dlo, arcs), frames.cubes])
     deviation = jnp.where(jnp.arange(KEYPOINTS) < ON_DLO, detector.noise, detector.cube_noise)
     noise = deviation[:, None] * jax.random.normal(key_noise, (KEYPOINTS, 2))
     found = project(camera, points) + tracking.bias + noise

@@ -21,6 +21,8 @@ from jaxlfi.envs.whip.vision.renderers import RENDERERS, Renderer
 
 A_ROLLOUT = 4
 """Pictures of a rollout, at different times and with different looks."""
+STREWN = 3
+"""One in so many pictures of random scenes has its cubes strewn about."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,23 +77,28 @@ def make(asked: Asked, folder: Path, engine: Engine, on_picture: Callable[[int],
     with RENDERERS[asked.renderer](pictures.SIZE) as renderer:
         first = pictures.begun(folder, {"made": dataclasses.asdict(asked)})
         on_picture(first)
-        key = jax.random.key(asked.seed)
         for number, sight in sights(asked, engine, first):
-            rgb, labels = picture(jax.random.fold_in(key, number), renderer, sight, asked.sharp)
+            rgb, labels = _taken(asked, number, renderer, sight)
             pictures.add(folder, number, rgb, labels, source=asked.renderer, **sight.facts)
             on_picture(number + 1)
     return pictures.finish(folder)
 
 
-def picture(
-    key: jax.Array, renderer: Renderer, sight: Sight, sharp: bool, look: looks.Look | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """One picture with its labels, as bytes; with a random look, where none is given."""
-    key_look, key_shot, key_taken = jax.random.split(key, 3)
-    if look is None:
-        look = jax.device_get(_look(key_look, _single(sight.frame)))
-    rgb, labels = renderer.render(sight.camera, sight.frame, sight.cube_side, look)
-    return (rgb if sharp else np.asarray(_taken(key_shot, key_taken, rgb))), labels
+def look(asked: Asked, number: int, sight: Sight) -> looks.Look:
+    """The look of a picture of a data set."""
+    return jax.device_get(_look(_keys(asked, number)[0], _single(sight.frame)))
+
+
+def _taken(asked: Asked, number: int, renderer: Renderer, sight: Sight) -> tuple[np.ndarray, np.ndarray]:
+    """A picture of a data set with its labels, as bytes."""
+    rgb, labels = renderer.render(sight.camera, sight.frame, sight.cube_side, look(asked, number, sight))
+    _, key_shot, key_taken = _keys(asked, number)
+    return (rgb if asked.sharp else np.asarray(_photographed(key_shot, key_taken, rgb))), labels
+
+
+def _keys(asked: Asked, number: int) -> jax.Array:
+    """Keys of a picture's look, of its camera's faults, and of their noise."""
+    return jax.random.split(jax.random.fold_in(jax.random.key(asked.seed), number), 3)
 
 
 def sights(asked: Asked, engine: Engine, first: int) -> Iterator[tuple[int, Sight]]:
@@ -107,7 +114,8 @@ def sights(asked: Asked, engine: Engine, first: int) -> Iterator[tuple[int, Sigh
 
 def _simulated(engine: Engine, key: jax.Array, begin: int) -> Callable[[int, int], Sight]:
     """A batch of random scenes; of one that is unstable, only its start is seen."""
-    rolled = scenes.rollouts(key, engine, scenes.BATCH)
+    key_rollouts, key_strewn = jax.random.split(key)
+    rolled = scenes.rollouts(key_rollouts, engine, scenes.BATCH)
 
     def sight(rollout: int, which: int) -> Sight:
         one = jax.tree.map(lambda leaf: leaf[rollout], rolled)
@@ -115,8 +123,11 @@ def _simulated(engine: Engine, key: jax.Array, begin: int) -> Callable[[int, int
         order = np.random.default_rng((begin + rollout, 7)).permutation(steps)
         step = int(order[which]) if one.valid else 0
         scene = {"rollout": begin + rollout, "step": step, **_numbers(one.parameters)}
-        frame = jax.tree.map(lambda leaf: leaf[step], one.frames)
-        return _sight(frame, side_camera(one.parameters), float(one.parameters.cube_side), scene)
+        frame, side = jax.tree.map(lambda leaf: leaf[step], one.frames), float(one.parameters.cube_side)
+        number = A_ROLLOUT * rollout + which
+        if number % STREWN == 0:
+            frame = jax.device_get(_strewn(jax.random.fold_in(key_strewn, number), _single(frame), side))
+        return _sight(frame, side_camera(one.parameters), side, scene)
 
     return sight
 
@@ -162,10 +173,11 @@ def _single(frame: Frames) -> Frames:
 
 
 _look = jax.jit(looks.draw)
+_strewn = jax.jit(scenes.strewn)
 _along = jax.jit(lambda line: along(line, jnp.asarray(EVEN)))
 
 
 @jax.jit
-def _taken(key_shot, key_taken, rgb):
+def _photographed(key_shot, key_taken, rgb):
     taken = photograph.taken(key_taken, photograph.draw(key_shot), rgb.astype(jnp.float32) / 255)
     return jnp.round(255 * taken).astype(jnp.uint8)

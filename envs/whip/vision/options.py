@@ -10,10 +10,13 @@ COMMANDS = {
     "pictures": "make_pictures",
     "import-pictures": "import_pictures",
     "train-vision": "train_vision",
+    "export-vision": "export_vision",
     "record": "record_object",
 }
 """Commands, and the functions of `commands` that carry them out."""
 RENDERERS = ("raycast", "mujoco")
+FORMATS = {"onnx": ".onnx", "stablehlo": ".npz"}
+"""Formats of exported networks, and how the names of their files end."""
 _RENDERER = (
     "raycast: this project's, which is always there; mujoco: MuJoCo's, with shadows and smoothed edges, which needs "
     "EGL or OSMesa"
@@ -92,6 +95,19 @@ def add(commands: argparse._SubParsersAction) -> None:
     train.add_argument("--steps", type=int, metavar="N", help="of each training (default: the preset's)")
     train.add_argument("--seed", type=int, default=0, metavar="N", help="of everything that is random (default: 0)")
     train.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder, or one to go on with")
+
+    export = commands.add_parser(
+        "export-vision",
+        help="the segmenting network as one file that runs elsewhere",
+        description="Write the network that segments pictures as one file, from bytes [256, 256, 3] to labels "
+        "[256, 256]: ONNX, for onnxruntime and others (extra onnx), or StableHLO, for JAX on cpu, cuda or tpu (extra "
+        "stablehlo).",
+    )
+    export.add_argument("--format", choices=FORMATS, default="onnx", help="of the file (default: onnx)")
+    export.add_argument(
+        "--weights", type=Path, metavar="DIR", help="by train-vision (default: those that come with the package)"
+    )
+    export.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .onnx, or .npz of StableHLO")
 
     record = commands.add_parser(
         "record",

@@ -64,7 +64,8 @@ def begun(folder: Path, header: Mapping[str, Any]) -> int:
     wanted = {"schema": SCHEMA, "version": VERSION, "size": SIZE, "labels": list(LABELS), **header}
     if folder.exists() and not folder.is_dir():
         raise PicturesError(f"out: expected a new folder, got {folder}, which is a file")
-    if not folder.exists() or not any(folder.iterdir()):
+    # What was killed as it began leaves a part of its first file.
+    if not folder.exists() or all(path.suffix == ".part" for path in folder.iterdir()):
         folder.mkdir(parents=True, exist_ok=True)
         files.write_json(folder / HEADER, {**wanted, "count": None})
         (folder / INDEX).touch()
@@ -115,7 +116,10 @@ def read(folder: Path) -> Pictures:
         raise PicturesError(
             f"{folder}: expected a whole data set, got one that was interrupted: give its command again"
         )
-    lines = (folder / INDEX).read_text().splitlines() if (folder / INDEX).exists() else []
+    try:
+        lines = (folder / INDEX).read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PicturesError(f"{folder / INDEX}: expected a text file, got a missing or damaged one") from error
     if len(lines) != header["count"] or not lines:
         raise PicturesError(f"{folder / INDEX}: expected {header['count']} lines, got {len(lines)}")
     entries = tuple(_entry(folder, number, line) for number, line in enumerate(lines, start=1))
@@ -125,6 +129,20 @@ def read(folder: Path) -> Pictures:
         entries=entries,
         header=header,
     )
+
+
+def check(folder: Path) -> Mapping[str, Any]:
+    """What is said of a folder.
+
+    Raises:
+        PicturesError: where it does not hold a whole data set.
+    """
+    header = _header(folder)
+    if header["count"] is None:
+        raise PicturesError(
+            f"{folder}: expected a whole data set, got one that was interrupted: give its command again"
+        )
+    return header
 
 
 def together(sets: Iterable[Pictures]) -> Pictures:
@@ -141,7 +159,7 @@ def together(sets: Iterable[Pictures]) -> Pictures:
 def _header(folder: Path) -> dict[str, Any]:
     try:
         header = json.loads((folder / HEADER).read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, RecursionError, ValueError) as error:
         raise PicturesError(f"expected a folder of pictures, got {folder}, without a readable {HEADER}") from error
     if not isinstance(header, dict) or header.get("schema") != SCHEMA or "count" not in header:
         raise PicturesError(f"{folder / HEADER}: expected the schema {SCHEMA!r}, got another kind of file")
@@ -154,7 +172,7 @@ def _header(folder: Path) -> dict[str, Any]:
 def _entry(folder: Path, number: int, line: str) -> Mapping[str, Any]:
     try:
         entry = json.loads(line)
-    except ValueError:
+    except (RecursionError, ValueError):
         entry = None
     if not isinstance(entry, dict) or not all(isinstance(entry.get(name), str) for name in ENTRY):
         raise PicturesError(f"{folder / INDEX}, line {number}: expected {', '.join(ENTRY)}, got {line[:60]!r}")
@@ -168,7 +186,8 @@ def _image(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     try:
         with Image.open(path) as image:
             array = np.asarray(image)
-    except (OSError, SyntaxError, ValueError) as error:  # Pillow has each of them for a damaged file
+    # Pillow has each of them for a damaged file.
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise PicturesError(f"{path}: expected a whole PNG file, got a missing or damaged one") from error
     if array.shape != shape or array.dtype != np.uint8:
         raise PicturesError(f"{path}: expected {' x '.join(map(str, shape))} bytes, got {array.shape} of {array.dtype}")

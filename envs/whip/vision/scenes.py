@@ -12,13 +12,16 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlfi.envs.whip import planner
 from jaxlfi.envs.whip.exploration import exploratory_actions
-from jaxlfi.envs.whip.frames import Frames
+from jaxlfi.envs.whip.frames import COLOURS, Frames
 from jaxlfi.envs.whip.parameters import FEASIBLE, WhipParameters, randomised
 from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.quaternions import normalised
 from jaxlfi.envs.whip.trajectory import seen
 
 BATCH = 50
 """Rollouts that are simulated at a time."""
+STREWN = (0.25, -0.08, 0.02), (0.74, 0.08, 0.4)
+"""Between which cubes are strewn, in m."""
 
 
 @struct.dataclass
@@ -54,6 +57,22 @@ def random_actions(key: jax.Array) -> Float[Array, "16 2"]:
     whips = jnp.asarray(exploratory_actions())
     whips = planner.inside(jnp.concatenate([whips[:2], jax.random.permutation(key_order, whips[2:])]))
     return jnp.where(jax.random.bernoulli(key_kind), walk, whips)
+
+
+def strewn(key: jax.Array, frame: Frames, cube_side: Float[Array, ""] | float) -> Frames:
+    """The same frame with its cubes anywhere: half of them lie on the table, half are in flight.
+
+    Of random actions few topple the stack, and a network that has not seen it toppled knows cubes by their neighbours.
+    """
+    key_place, key_flight, key_yaw, key_turn = jax.random.split(key, 4)
+    n = len(COLOURS)
+    places = jax.random.uniform(key_place, (n, 3), minval=jnp.array(STREWN[0]), maxval=jnp.array(STREWN[1]))
+    flies = jax.random.bernoulli(key_flight, shape=(n, 1))
+    yaw = jax.random.uniform(key_yaw, (n,), maxval=np.pi)
+    lies = jnp.stack([jnp.cos(yaw / 2), 0 * yaw, 0 * yaw, jnp.sin(yaw / 2)], axis=-1)
+    turned = normalised(jax.random.normal(key_turn, (n, 4)))
+    heights = jnp.where(flies[:, 0], places[:, 2], 0.5 * cube_side)
+    return frame.replace(cubes=places.at[:, 2].set(heights), orientations=jnp.where(flies, turned, lies))
 
 
 @functools.partial(jax.jit, static_argnums=1)

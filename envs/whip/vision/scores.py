@@ -63,15 +63,16 @@ def summary(
     there = ~np.isnan(at[..., 0])
     off = np.linalg.norm(lines_found - lines_true, axis=-1)
     in_picture = ~np.isnan(lines_true[:, 0, 0])
+    not_there = (~there & ~np.isnan(seen_at[..., 0])).any(axis=1) | (~in_picture & ~np.isnan(lines_found[:, 0, 0]))
     return {
         "DLO overlap": float(np.nanmean(overlap[:, -1])),
         "cubes overlap": float(np.nanmean(overlap[:, :-1])),
-        "worst cube overlap": float(np.nanmean(overlap[:, :-1], axis=0).min()),
+        "worst cube overlap": min(float(np.nanmean(one)) for one in overlap[:, :-1].T if not np.isnan(one).all()),
         "centroid median (px)": float(np.nanmedian(away)),
         "centroid 99 % (px)": float(np.nanquantile(away, 0.99)),
         "keypoint median (px)": float(np.nanmedian(off)),
         "keypoint 99 % (px)": float(np.nanquantile(off, 0.99)),
         "cubes missed": float(np.mean(np.isnan(seen_at[..., 0])[there])),
         "DLOs missed": float(np.mean(np.isnan(lines_found[in_picture, 0, 0]))),
-        "seen but not there": float(np.mean((~there & ~np.isnan(seen_at[..., 0])).any(axis=1))),
+        "seen but not there": float(np.mean(not_there)),
     }

@@ -22,6 +22,8 @@ from jaxlfi.envs.whip.vision.masks import despeckled
 from jaxlfi.envs.whip.vision.pictures import Pictures
 from jaxlfi.envs.whip.vision.raster import DLO, noisy, segmentation
 from jaxlfi.envs.whip.vision.scenes import Rollouts
+from jaxlfi.envs.whip.vision.segmenter import Segmenter
+from jaxlfi.envs.whip.vision.transporter import Transporter
 from jaxlfi.envs.whip.vision.weights import Weights
 
 POINTS = 33
@@ -33,6 +35,7 @@ class Preset:
     """How both networks are trained.
 
     Attributes:
+        networks: the segmenter and the transporter.
         pictures: number that the segmenter learns from.
         segmenter: its training.
         parts: of pictures in a batch.
@@ -42,6 +45,7 @@ class Preset:
         pairs: of frames in a batch.
     """
 
+    networks: tuple[Segmenter, Transporter]
     pictures: int
     segmenter: Training
     parts: int
@@ -51,10 +55,11 @@ class Preset:
     pairs: int
 
 
+NETWORKS = Segmenter(), Transporter()
 PRESETS: Mapping[str, Preset] = {
-    "quick": Preset(2400, Training(3600, 3e-3), 16, 128, 500, Training(4000, 1e-3), 32),
+    "quick": Preset(NETWORKS, 2400, Training(3600, 3e-3), 16, 128, 500, Training(4000, 1e-3), 32),
     # 64 epochs of pictures, and 50 epochs of 1,500 rollouts of 17 frames (section VI-C).
-    "paper": Preset(2400, Training(64 * 150, 3e-3), 16, 256, 1500, Training(50 * 797, 1e-3), 32),
+    "paper": Preset(NETWORKS, 2400, Training(64 * 150, 3e-3), 16, 256, 1500, Training(50 * 797, 1e-3), 32),
 }
 """Presets by name: on two cores, "quick" takes less than an hour, and "paper" a night."""
 OnChunk = Callable[[int, np.ndarray], Any]
@@ -64,7 +69,7 @@ def train_segmenter(
     preset: Preset, data: Pictures, seed: int, checkpoint: Path | None, on_chunk: OnChunk
 ) -> tuple[Weights, Float[np.ndarray, " steps"]]:
     """A network that segments pictures, and the loss of each step of its training."""
-    module = segmenter.Segmenter()
+    module, _ = preset.networks
     key_start, key_steps = jax.random.split(jax.random.key(seed))
     batches = segmenter.Batches(jnp.asarray(data.rgb), jnp.asarray(data.labels))
     loss = functools.partial(segmenter.loss, module=module, batch=preset.parts, crop=preset.crop)
@@ -77,7 +82,7 @@ def train_transporter(
     preset: Preset, masks: UInt8[np.ndarray, "n time 64 64 1"], seed: int, checkpoint: Path | None, on_chunk: OnChunk
 ) -> tuple[Weights, Float[np.ndarray, " steps"]]:
     """A network that finds keypoints in masks of the DLO, and the loss of each step of its training."""
-    module = transporter.Transporter()
+    _, module = preset.networks
     key_start, key_steps = jax.random.split(jax.random.key(seed))
     loss = functools.partial(transporter.loss, module=module, batch=preset.pairs)
     start, pairs = weights.initial(module, key_start), transporter.Pairs(jnp.asarray(masks))

@@ -93,10 +93,14 @@ class Transporter(nn.Module):
         return self.painter(features)
 
     def places(self, masks: Float[Array, "batch 64 64 channels"]) -> Float[Array, "batch keypoints 2"]:
-        """Keypoints, in normalised pixels: the means of heat maps."""
-        heat = self.maps(self.placement(masks))
-        weight = jax.nn.softmax(heat.reshape(len(masks), -1, self.keypoints), axis=1)
-        return jnp.einsum("bpk,pd->bkd", weight, _grid().reshape(-1, 2), precision="highest")
+        """Keypoints, in normalised pixels."""
+        return means(self.maps(self.placement(masks)))
+
+
+def means(heat: Float[Array, "batch 16 16 keypoints"]) -> Float[Array, "batch keypoints 2"]:
+    """Means of the distributions whose logits are heat maps, in normalised pixels."""
+    weight = jax.nn.softmax(heat.reshape(len(heat), -1, heat.shape[-1]), axis=1)
+    return jnp.einsum("bpk,pd->bkd", weight, _grid().reshape(-1, 2), precision="highest")
 
 
 def around(places: Float[Array, "batch keypoints 2"]) -> Float[Array, "batch 16 16 keypoints"]:

@@ -1,0 +1,1 @@
+"""What the whip's learnt vision sees, and what seeing costs."""

@@ -1,0 +1,110 @@
+"""How well pictures are segmented and keypoints found, on scenes and renderers that nothing was learnt from.
+
+    python -m experiments.vision segmentation --out experiments/results/vision
+    python -m experiments.vision keypoints --out experiments/results/vision
+    python -m experiments.vision errors --out experiments/results/vision
+    python -m experiments.vision speed --out experiments/results/vision
+
+The data sets of pictures lie in runs/vision-study; they are made where they are missing (MuJoCo's renderer needs EGL or
+OSMesa).
+"""
+
+import argparse
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxlfi.io import files
+
+PICTURES = 240
+"""Of each data set."""
+SETS: Mapping[str, Mapping] = {
+    "ray caster": {"renderer": "raycast", "seed": 1001, "objects": ()},
+    "MuJoCo": {"renderer": "mujoco", "seed": 1001, "objects": ()},
+    "MuJoCo, FEM objects": {"renderer": "mujoco", "seed": 1002, "objects": ("dlo-0", "dlo-1", "dlo-2", "dlo-3")},
+}
+"""Data sets that methods are judged on: the ray caster's is of new scenes, the others are of another renderer, too. The
+first two are of the same scenes and looks."""
+TUNED_ON = {"renderer": "raycast", "seed": 1003, "objects": ()}
+"""What the thresholds of colours are chosen on."""
+
+
+def segmentation(arguments: argparse.Namespace) -> None:
+    """Overlaps, distances and misses of the ray caster's own labels, of thresholds of colours, and of the network."""
+    from experiments.vision import segmenting
+
+    rows = segmenting.compared(arguments.pictures, arguments.weights)
+    write(arguments.out / "segmentation.csv", rows)
+
+
+def keypoints(arguments: argparse.Namespace) -> None:
+    """How keypoints follow the DLO: the transporter's, those of the centreline, and the noise models'."""
+    from experiments.vision import following
+
+    rows, arrays = following.compared(arguments.weights)
+    write(arguments.out / "keypoints.csv", rows)
+    files.write_arrays(arguments.out / "keypoints.npz", arrays)
+
+
+def errors(arguments: argparse.Namespace) -> None:
+    """The errors of learnt detectors in pictures by MuJoCo, which simulations are given, too."""
+    from experiments.vision import errors as measuring
+
+    rows, arrays = measuring.measured(arguments.weights)
+    for row in rows:
+        write(arguments.out / f"errors-{row['detector']}.csv", [row])
+    files.write_arrays(arguments.out / "errors.npz", arrays)
+
+
+def speed(arguments: argparse.Namespace) -> None:
+    """Milliseconds a frame on one core: of the network, and of whole detectors."""
+    import os
+
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX starts its threads
+    from experiments.vision import speeds
+
+    write(arguments.out / "speed.csv", speeds.measured(arguments.weights))
+
+
+def write(path: Path, rows: Sequence[Mapping]) -> None:
+    """Write rows as csv, and print them as a table."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows([{name: _short(value) for name, value in row.items()} for row in rows])
+    files.write_bytes(path, text.getvalue().encode())
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *([_short(value) for value in row.values()] for row in rows)]
+    print("\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines))
+
+
+def _short(value) -> str:
+    return value if isinstance(value, str) else f"{value:.3f}" if np.isfinite(value) else ""
+
+
+def main() -> None:
+    """Run a stage."""
+    top = argparse.ArgumentParser(
+        prog="python -m experiments.vision",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    stages = top.add_subparsers(required=True, metavar="STAGE")
+    for stage in (segmentation, keypoints, errors, speed):
+        one = stages.add_parser(stage.__name__, help=stage.__doc__, description=stage.__doc__)
+        one.set_defaults(stage=stage)
+        one.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the tables")
+        one.add_argument("--weights", type=Path, metavar="DIR", help="(default: those that come with the package)")
+        if stage is segmentation:
+            one.add_argument(
+                "--pictures", type=Path, default=Path("runs/vision-study"), metavar="DIR", help="data sets"
+            )
+    arguments = top.parse_args()
+    arguments.stage(arguments)
+
+
+if __name__ == "__main__":
+    main()
