@@ -422,3 +422,9 @@ def test_how_long_the_learner_of_the_paper_took():
     kept = arrays("policies/sb3/curves")
     minutes = np.concatenate([kept["16/seconds"], kept["2048/seconds"]]) / 60
     assert f"A training took {minutes.min():.0f} to {minutes.max():.0f} minutes" in README
+
+
+@pytest.mark.parametrize("name", ["segmentation", "keypoints", "errors-learnt", "errors-learnt-transporter", "speed"])
+def test_learnt_vision(name):
+    for row in rows(f"vision/{name}.csv"):
+        assert f"| {' | '.join(row.values())} |" in README

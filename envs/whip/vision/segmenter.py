@@ -27,7 +27,7 @@ class Segmenter(nn.Module):
     @nn.compact
     def __call__(self, rgb: Float[Array, "batch height width 3"]) -> Float[Array, "batch height width 8"]:
         """Logits of the labels of each pixel, of colours from 0 to 1; height and width are multiples of 16."""
-        x = _blocks(2 * rgb - 1, BLOCK)
+        x = blocks(2 * rgb - 1, BLOCK)
         skipped = []
         for depth, width in enumerate(self.widths):
             if depth:
@@ -36,7 +36,7 @@ class Segmenter(nn.Module):
             x = nn.relu(_conv(width)(x)) if depth < 2 else _residual(width, x)
         for width, skip in zip(self.widths[-2::-1], reversed(skipped), strict=True):
             x = nn.relu(_conv(width)(jnp.concatenate([_enlarged(x), skip], axis=-1)))
-        return _pixels(nn.Conv(len(LABELS) * BLOCK**2, (1, 1))(x), BLOCK)
+        return pixels(nn.Conv(len(LABELS) * BLOCK**2, (1, 1))(x), BLOCK)
 
 
 def _conv(width: int, stride: int = 1) -> nn.Conv:
@@ -48,15 +48,15 @@ def _residual(width: int, x: Array) -> Array:
     return x + nn.relu(_conv(width)(inner))
 
 
-def _blocks(x: Array, side: int) -> Array:
+def blocks(x: Array, side: int) -> Array:
     """Blocks of pixels as channels."""
     n, height, width, channels = x.shape
     x = x.reshape(n, height // side, side, width // side, side, channels)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(n, height // side, width // side, side * side * channels)
 
 
-def _pixels(x: Array, side: int) -> Array:
-    """The inverse of `_blocks`."""
+def pixels(x: Array, side: int) -> Array:
+    """The inverse of `blocks`."""
     n, height, width, channels = x.shape
     x = x.reshape(n, height, width, side, side, channels // side**2)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(n, height * side, width * side, channels // side**2)

@@ -57,7 +57,7 @@ class Preset:
 
 NETWORKS = Segmenter(), Transporter()
 PRESETS: Mapping[str, Preset] = {
-    "quick": Preset(NETWORKS, 2400, Training(3600, 3e-3), 16, 128, 500, Training(4000, 1e-3), 32),
+    "quick": Preset(NETWORKS, 2400, Training(3600, 3e-3), 16, 128, 500, Training(3000, 1e-3), 32),
     # 64 epochs of pictures, and 50 epochs of 1,500 rollouts of 17 frames (section VI-C).
     "paper": Preset(NETWORKS, 2400, Training(64 * 150, 3e-3), 16, 256, 1500, Training(50 * 797, 1e-3), 32),
 }

@@ -15,6 +15,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from jaxlfi.envs.whip.vision.keypoints import ON_DLO
+from jaxlfi.envs.whip.vision.segmenter import pixels
 
 SIZE = 64
 """Side of the masks, in pixels."""
@@ -37,7 +38,7 @@ class Encoder(nn.Module):
     def __call__(self, masks: Float[Array, "batch 64 64 channels"]) -> Float[Array, "batch 16 16 width"]:
         """Features of each mask."""
         x = masks
-        for width, stride in ((self.width // 2, 1), (self.width // 2, 2), (self.width, 2), (self.width, 1)):
+        for width, stride in ((self.width // 2, 2), (self.width // 2, 1), (self.width, 2), (self.width, 1)):
             x = nn.relu(_normalised(nn.Conv(width, (3, 3), strides=stride)(x)))
         return x
 
@@ -57,10 +58,10 @@ class Decoder(nn.Module):
     def __call__(self, features: Float[Array, "batch 16 16 width"]) -> Float[Array, "batch 64 64 channels"]:
         """The mask that the features say."""
         x = features
-        for width in (self.width, self.width // 2):
-            x = nn.relu(_normalised(nn.Conv(width, (3, 3))(x)))
-            x = jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)
-        return nn.Conv(self.channels, (3, 3))(x)
+        for _ in range(2):
+            x = nn.relu(_normalised(nn.Conv(self.width, (3, 3))(x)))
+        side = SIZE // GRID
+        return pixels(nn.Conv(self.channels * side**2, (3, 3))(x), side)
 
 
 class Transporter(nn.Module):

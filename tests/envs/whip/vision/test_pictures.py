@@ -149,7 +149,7 @@ DAMAGES = {
     "another version": (header(version=2), "version: expected 1, got 2"),
     "another size": (header(size=128), "size: expected 256, got 128"),
     "other labels": (header(labels=list(LABELS[::-1])), r"labels: expected \['background', 'red'"),
-    "no index": (lambda folder: (folder / INDEX).unlink(), "index.jsonl: expected 2 lines, got 0"),
+    "no index": (lambda folder: (folder / INDEX).unlink(), "index.jsonl: expected a text file"),
     "a line too few": (index(lambda line: []), "index.jsonl: expected 2 lines, got 1"),
     "a line too many": (index(lambda line: [line, line]), "index.jsonl: expected 2 lines, got 3"),
     "another count": (header(count=7), "index.jsonl: expected 7 lines, got 2"),

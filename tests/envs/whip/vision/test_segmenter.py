@@ -40,9 +40,9 @@ def test_every_pixel_has_logits_of_eight_labels(small):
 
 def test_blocks_of_pixels_are_put_back_where_they_were():
     x = jnp.arange(2 * 8 * 12 * 3.0).reshape(2, 8, 12, 3)
-    blocks = segmenter._blocks(x, 4)
+    blocks = segmenter.blocks(x, 4)
     np.testing.assert_array_equal(blocks[1, 0, 2].reshape(4, 4, 3), x[1, :4, 8:12])
-    np.testing.assert_array_equal(segmenter._pixels(blocks, 4), x)
+    np.testing.assert_array_equal(segmenter.pixels(blocks, 4), x)
 
 
 def test_it_has_less_than_a_million_weights():
