@@ -8,7 +8,7 @@ from typing import Literal
 
 def task(
     object: tuple[str, ...] | str | None = None,
-    detector: Literal["clean", "mask", "noisy", "transporter"] = "mask",
+    detector: Literal["clean", "mask", "noisy", "transporter", "learnt", "learnt-transporter"] = "mask",
     nuisances: Literal["fixed", "random"] = "fixed",
     engine: Literal["auto", "native", "mjx", "warp"] = "auto",
     pooling: Literal["mean", "all", "moments"] = "mean",

@@ -58,7 +58,10 @@ def parser() -> argparse.ArgumentParser:
         'the top cube, found by a search; or an .npz with an array "actions" [16, 2] in m (default: explore)',
     )
     render.add_argument(
-        "--detector", default="clean", metavar="NAME", help="clean, mask, noisy or transporter (default: clean)"
+        "--detector",
+        default="clean",
+        metavar="NAME",
+        help="a model of its errors: clean, mask, noisy, transporter, learnt or learnt-transporter (default: clean)",
     )
     render.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
 

@@ -141,7 +141,7 @@ def make(detector: str = "mask", engine: str = "auto") -> WhipEnvironment:
     """The whipping task.
 
     Args:
-        detector: of keypoints: "clean", "mask", "noisy" or "transporter".
+        detector: of keypoints: "clean", "mask", "noisy", "transporter", "learnt" or "learnt-transporter".
         engine: the physics: "auto", "native", "mjx" or "warp".
 
     Raises:

@@ -80,7 +80,8 @@ class WhipGym(gymnasium.Env):
         Args:
             parameters: of the scene, by default mu; or a function of a key that draws those of every episode, such as
                 `initial_domain`.
-            detector: of keypoints, or its name: "clean", "mask", "noisy" or "transporter".
+            detector: of keypoints, or its name: "clean", "mask", "noisy", "transporter", "learnt" or
+                "learnt-transporter".
             engine: the physics, or its name (`physics.engines.pick`).
             render_mode: "rgb_array" for `render`.
             nuisances: "fixed": every episode is in the scene that is given; "random": in one of its length and modulus,

@@ -53,7 +53,7 @@ SUMMARY_NAMES = (
 
 def task(
     object: str | Sequence[str] | None = None,
-    detector: Literal["clean", "mask", "noisy", "transporter"] = "mask",
+    detector: Literal["clean", "mask", "noisy", "transporter", "learnt", "learnt-transporter"] = "mask",
     nuisances: Literal["fixed", "random"] = "fixed",
     engine: Literal["auto", "native", "mjx", "warp"] = "auto",
     pooling: Literal["mean", "all", "moments"] = "mean",
@@ -71,7 +71,8 @@ def task(
             Several recorded rollouts of one object, a name or path each, are believed together (`whip_task`). By
             default, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory actions.
         detector: the errors of simulated keypoints (`vision.keypoints.DETECTORS`). They should resemble those of the
-            detector that the observation was made with; for the reference objects, that is "mask".
+            detector that the observation was made with: for the reference objects' recordings that come with the
+            package "mask", and for those of `jaxlfi whip record` the detector's own name, or "mask" for "centreline".
         nuisances: "fixed": density, cubes and placement are as in mu; "random": only their ranges are known.
         engine: the physics: "auto" is the one that suits the platform.
         pooling: how the summaries of several rollouts become one. With few simulations their "mean" serves as well as

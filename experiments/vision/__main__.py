@@ -82,7 +82,15 @@ def write(path: Path, rows: Sequence[Mapping]) -> None:
 
 
 def _short(value) -> str:
-    return value if isinstance(value, str) else f"{value:.3f}" if np.isfinite(value) else ""
+    return (
+        value
+        if isinstance(value, str)
+        else f"{value:.4f}"
+        if abs(value) < 0.1
+        else f"{value:.3f}"
+        if np.isfinite(value)
+        else ""
+    )
 
 
 def main() -> None:

@@ -426,5 +426,6 @@ def test_how_long_the_learner_of_the_paper_took():
 
 @pytest.mark.parametrize("name", ["segmentation", "keypoints", "errors-learnt", "errors-learnt-transporter", "speed"])
 def test_learnt_vision(name):
-    for row in rows(f"vision/{name}.csv"):
-        assert f"| {' | '.join(row.values())} |" in README
+    with (RESULTS / "vision" / f"{name}.csv").open(newline="") as file:
+        for row in csv.reader(file):
+            assert f"| {' | '.join(row)} |".replace("|  |", "| |") in README

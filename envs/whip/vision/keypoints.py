@@ -68,8 +68,20 @@ NOISY = Detector(noise=0.01, cube_noise=0.001)
 """The quarters of the DLO with noise of 2.6 pixels of 256."""
 TRANSPORTER = Detector(nearest=0.1, spacing=0.1, shuffled=1.0, noise=0.01, cube_noise=0.001, missing=0.02)
 """Unknown positions in an unknown order, like unsupervised keypoints."""
+LEARNT = Detector(noise=0.0015, cube_noise=0.0002, bias=0.0009, slip=MASK.slip)
+"""The errors of `detectors`' "learnt" in pictures by MuJoCo (`python -m experiments.vision errors`), but for the few
+keypoints that are far away."""
+LEARNT_TRANSPORTER = LEARNT.replace(places=(0.045, 0.47, 0.65, 0.91), moved=0.034, slide=0.041, noise=0.016, bias=0.0)
+"""Those of "learnt-transporter", likewise."""
 DETECTORS: Mapping[str, Detector] = types.MappingProxyType(
-    {"clean": CLEAN, "mask": MASK, "noisy": NOISY, "transporter": TRANSPORTER}
+    {
+        "clean": CLEAN,
+        "mask": MASK,
+        "noisy": NOISY,
+        "transporter": TRANSPORTER,
+        "learnt": LEARNT,
+        "learnt-transporter": LEARNT_TRANSPORTER,
+    }
 )
 """Detectors by name."""
 

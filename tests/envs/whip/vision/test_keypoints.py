@@ -214,3 +214,19 @@ def test_the_gripper_slips_by_its_own_amount(key):
     error = np.asarray(measured(key_slipping, MASK, gripper) - gripper) / 0.002
     assert stats.kstest(error.ravel(), "norm").pvalue > 1e-3
     np.testing.assert_array_equal(measured(key_exact, Detector(), gripper), gripper)
+
+
+def test_points_with_places_of_their_own_move_and_slide(key):
+    """Along a straight DLO seen at a right angle, so that arcs can be read off the picture."""
+    places, n = np.array([0.1, 0.45, 0.6, 0.9]), 400
+    detector = CLEAN.replace(places=tuple(places), moved=0.02, slide=0.03)
+    line = np.linspace([0.40, 0.0, 0.36], [0.40, 0.0, 0.16], 25)
+    still = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], (20, *leaf.shape[1:])), FRAMES)
+    still = still.replace(dlo=jnp.broadcast_to(jnp.asarray(line, jnp.float32), (20, 25, 3)))
+    found, _ = many(jax.random.split(key, n), detector, CAMERA, still)
+    ends = np.asarray(project(CAMERA, jnp.asarray(line[[0, -1]], jnp.float32)))[:, 1]
+    arcs = (np.asarray(found)[:, :, :4, 1] - ends[0]) / (ends[1] - ends[0])
+    np.testing.assert_allclose(arcs.mean(axis=(0, 1)), places, atol=5 * 0.02 / n**0.5)
+    np.testing.assert_allclose(arcs.std(axis=1, ddof=1).mean(axis=0)[:3], 0.03, rtol=0.03)
+    expected = (0.02**2 + 0.03**2 / 20) ** 0.5
+    np.testing.assert_allclose(arcs.mean(axis=1).std(axis=0), expected, rtol=5 / (2 * n) ** 0.5)

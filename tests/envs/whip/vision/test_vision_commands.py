@@ -8,7 +8,7 @@ from PIL import Image
 
 pytest.importorskip("mujoco")
 
-from jaxlfi.envs.whip import cli, recording
+from jaxlfi.envs.whip import cli
 from jaxlfi.envs.whip.vision import pictures, scenes, training, weights
 from jaxlfi.envs.whip.vision.learning import Training
 from jaxlfi.envs.whip.vision.segmenter import Segmenter
@@ -96,22 +96,6 @@ def test_bad_input_gets_one_line_and_leaves_nothing(words, message, tmp_path, mo
     error = capsys.readouterr().err.strip()
     assert message in error and len([line for line in error.splitlines() if "error" in line]) == 1
     assert sorted(path.name for path in tmp_path.iterdir() if not path.is_dir() or any(path.iterdir())) == ["full"]
-
-
-def test_an_object_is_recorded_through_pictures(tmp_path, capsys):
-    """By the ray caster, which is everywhere; as by labels, but for the errors of what is learnt."""
-    for detector in ("learnt", "centreline"):
-        words = ("--detector", detector, "--renderer", "raycast", "--out", tmp_path / f"{detector}.npz")
-        assert run("record", "--object", "dlo-3", *words) == 0
-    assert "161 frames" in capsys.readouterr().out
-    learnt, by_labels = (recording.read(tmp_path / f"{name}.npz") for name in ("learnt", "centreline"))
-    assert "pictures (raycast) by the detector learnt" in learnt.description
-    np.testing.assert_array_equal(learnt.actions, by_labels.actions)
-    np.testing.assert_allclose(learnt.gripper, by_labels.gripper, atol=1e-6)
-    assert learnt.seen.mean() > 0.98
-    both = learnt.seen & by_labels.seen
-    off = 256 * np.linalg.norm(learnt.keypoints - by_labels.keypoints, axis=-1)[both]
-    assert np.median(off) < 2 and np.quantile(off, 0.95) < 6
 
 
 def test_a_labs_own_pictures_are_imported(tmp_path):
