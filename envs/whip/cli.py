@@ -126,6 +126,7 @@ def parser() -> argparse.ArgumentParser:
         metavar=("X1", "X2", "Z1", "Z2"),
         help="limits of the set-point's x and z, in m. Limits can be tightened, not loosened (default: the policy's)",
     )
+    options.add_detector(control)
     control.add_argument("--remote", action="store_true", help="let the driver be on another host")
     control.add_argument("--seed", type=int, default=0, metavar="N", help="of a reference object's camera (default: 0)")
     control.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .npz, beside it a new .json")

@@ -148,12 +148,14 @@ def control(arguments: argparse.Namespace) -> None:
         raise ValueError(f"out: expected a new .npz file beside which there is no .json, got {out}")
     act = repetitions.acting(arguments.policy)()
     loop = controlling.loop_of(act, arguments)
-    robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote)
-    loop = dataclasses.replace(loop, clock=getattr(robot, "simulated_clock", loop.clock))
-    try:
-        log = loop.run(robot, act, on_end=lambda log: _write_log(out, log, about))
-    except UnstableError as error:
-        raise RobotError(f"robot: {error}") from error
+    with sights(arguments.detector, arguments.renderer, arguments.weights) as seeing:
+        sight = seeing(jax.random.fold_in(jax.random.key(arguments.seed), 2**31 - 1))
+        robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote, sight)
+        loop = dataclasses.replace(loop, clock=getattr(robot, "simulated_clock", loop.clock))
+        try:
+            log = loop.run(robot, act, on_end=lambda log: _write_log(out, log, about))
+        except UnstableError as error:
+            raise RobotError(f"robot: {error}") from error
     if log.stopped:
         raise RobotError(f"robot: stopped after {len(log.actions)} of {loop.steps} steps: {log.stopped}")
 

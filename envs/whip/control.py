@@ -113,13 +113,14 @@ def loop_of(act: Act, arguments: argparse.Namespace) -> Loop:
     return dataclasses.replace(loop, limits=limits, holds=arguments.holds, **changes)
 
 
-def robot_of(word: str, seed: int, remote: bool) -> tuple[Robot, dict[str, Any]]:
+def robot_of(word: str, seed: int, remote: bool, sight: Any = None) -> tuple[Robot, dict[str, Any]]:
     """The robot that a word stands for, and what a recording is to say of it.
 
     Args:
         word: "socket://HOST:PORT", the name of a reference object, or "module:Factory" with options after commas.
         seed: of a reference object's camera.
         remote: whether other hosts than this one are let.
+        sight: what finds keypoints in a reference object's frames; by default `observation.found`.
 
     Raises:
         ValueError: for other words, and for what is no robot.
@@ -134,7 +135,7 @@ def robot_of(word: str, seed: int, remote: bool) -> tuple[Robot, dict[str, Any]]
         from jaxlfi.envs.whip.reference_objects import objects
         from jaxlfi.envs.whip.reference_objects.robot import ReferenceRobot
 
-        robot = ReferenceRobot(jax.random.key(seed), objects.load(word))
+        robot = ReferenceRobot(jax.random.key(seed), objects.load(word), sight=sight)
     if not isinstance(robot, Robot):
         raise ValueError(f"robot: expected {word!r} to have observe, act and stop, got {type(robot).__name__}")
     try:

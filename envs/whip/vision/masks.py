@@ -38,7 +38,8 @@ def keypoints(
     labels = despeckled(labels)
     line, dlo_seen = centreline(labels, grip)
     cubes, cubes_seen = centroids(labels)
-    points = jnp.concatenate([along(line, jnp.asarray(arcs)), cubes])
+    # The line along a handful of pixels may lead far away.
+    points = jnp.clip(jnp.concatenate([along(line, jnp.asarray(arcs)), cubes]), 0.0, 1.0)
     seen = jnp.concatenate([jnp.broadcast_to(dlo_seen, len(arcs)), cubes_seen])
     return jnp.where(seen[:, None], points, jnp.nan), seen
 

@@ -125,7 +125,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def add_detector(command: argparse.ArgumentParser) -> None:
-    """Options of commands in which an FEM reference object is seen."""
+    """Options of commands in which FEM reference objects are seen; of other robots they say nothing."""
     command.add_argument(
         "--detector",
         default="centreline",
