@@ -8,6 +8,8 @@ START = (0.40, 0.36)
 """Where the gripper begins, x and z in m: the longest DLO just clears the table."""
 STACK = 0.60
 """Where the stack of cubes stands, x in m."""
+HAND = (0.02, 0.015, 0.03)
+"""Half the gripper's width, depth and height, in m; the DLO is held at the middle of its lower side."""
 CONTROL_INTERVAL = 0.16
 """Between two actions, in s."""
 HIT_DISTANCE = 0.06

@@ -10,10 +10,8 @@ import numpy as np
 from jaxlfi.envs.whip import frames
 from jaxlfi.envs.whip.parameters import MEDIAN, WhipParameters
 from jaxlfi.envs.whip.physics.chain import Chain, link_inertias, link_masses
-from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, GRAVITY, RGBA, SECTION, STACK, START
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, GRAVITY, HAND, RGBA, SECTION, STACK, START
 
-HAND = (0.02, 0.015, 0.03)
-"""Half the gripper's width, depth and height, in m; the DLO is held at the middle of its lower side."""
 CUBES = len(frames.COLOURS)
 SINKING = np.array([40.06, 106.59, 159.92, 199.98, 226.71, 240.08]) * 1e-6
 """Total penetration of the contacts below each cube of a stack at rest, bottom-up, in m.

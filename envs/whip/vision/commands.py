@@ -243,8 +243,11 @@ def _keep(out, name, made, losses, figures, arguments) -> None:
 
 
 def _whole(folder: Path) -> bool:
-    header = folder / pictures.HEADER
-    return header.exists() and json.loads(header.read_text()).get("count") is not None
+    try:
+        pictures.check(folder)
+    except pictures.PicturesError:
+        return False
+    return True
 
 
 def _made(asked: Asked, folder: Path) -> int:

@@ -15,9 +15,9 @@ import mujoco
 import numpy as np
 
 from jaxlfi.envs.whip.frames import Frames
-from jaxlfi.envs.whip.rig import SECTION
+from jaxlfi.envs.whip.rig import HAND, SECTION
 from jaxlfi.envs.whip.vision.camera import Camera
-from jaxlfi.envs.whip.vision.looks import CLUTTER, HAND, Look, Surface
+from jaxlfi.envs.whip.vision.looks import CLUTTER, Look, Surface
 from jaxlfi.envs.whip.vision.raster import DLO
 
 TEXTURE = 512

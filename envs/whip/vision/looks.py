@@ -13,13 +13,11 @@ from jaxlfi.envs.whip.frames import COLOURS, Frames
 from jaxlfi.envs.whip.rig import RGBA
 
 CLUTTER = 6
-"""Things in the background at most."""
+"""Maximum number of background objects."""
 PATTERNS = ("plain", "chequered", "striped")
 """What tables and walls are covered with."""
 WAVES = 6
 """Plane waves that grain and stains are made of."""
-HAND = (0.02, 0.015, 0.03)
-"""Half the gripper's width, depth and height, in m."""
 PALETTE = np.array([RGBA[name][:3] for name in (*COLOURS, "dlo")])
 """Colours of the labels 1 to 7, shape [7, 3]."""
 
@@ -45,7 +43,7 @@ class Surface:
 
 @struct.dataclass
 class Boxes:
-    """Things that are boxes.
+    """Boxes in a scene that have no label: background objects, and a hand.
 
     Attributes:
         centres: in m, shape [n, 3].
@@ -71,7 +69,7 @@ class Look:
         gripper: its colour, shape [3].
         table, wall: what they are covered with.
         wall_distance: from the plane of motion to the wall behind it, in m.
-        clutter: things on the table behind the plane of motion, and in the hand of the last of them a part of the DLO.
+        clutter: background objects, and last a hand that hides a part of the DLO.
         lights: directions towards two lights, shape [2, 3].
         brightness: of the lights, shape [2].
         ambient: light from everywhere.
@@ -150,7 +148,7 @@ def plain(frame: Frames) -> Look:
 
 
 def _jittered(key: jax.Array, colours: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """The colours as other pigments and cameras have them: still told apart by their names."""
+    """The colours with hue, saturation and value perturbed, so little that they can still be told apart."""
     key_hue, key_saturation, key_value = jax.random.split(key, 3)
     hue, saturation, value = jnp.moveaxis(_hsv(colours), -1, 0)
     n = hue.shape
@@ -175,7 +173,7 @@ def _surface(key: jax.Array) -> Surface:
 
 
 def _clutter(key: jax.Array, frame: Frames) -> Boxes:
-    """Things of subdued colours behind the plane of motion; the last is a hand before the DLO."""
+    """Background objects of low saturation, and last a hand between the camera and the DLO."""
     keys = jax.random.split(key, 15)
     n = CLUTTER
     half = jnp.exp(jax.random.uniform(keys[0], (n, 3), minval=np.log(0.008), maxval=np.log(0.07)))

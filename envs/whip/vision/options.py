@@ -121,7 +121,13 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--actions", metavar="FILE", help='an .npz with an array "actions" [16, 2] in m (default: exploratory actions)'
     )
     record.add_argument("--seed", type=int, default=0, metavar="N", help="of the camera and the scene's look")
-    record.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .npz, beside it a new .json")
+    record.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="the recording, a new .npz; its description is written beside it as .json",
+    )
 
 
 def add_detector(command: argparse.ArgumentParser) -> None:

@@ -84,10 +84,9 @@ def _streaked(picture, motion):
         for axis in range(2):
             shift = motion[1 - axis] * moment
             whole = jnp.clip(jnp.abs(shift), 0.0, 1.0)
-            one = jnp.where(shift > 0, 1, -1)
             forward = jnp.concatenate([jnp.take(part, jnp.arange(1), axis), _without(part, axis, last=True)], axis)
             backward = jnp.concatenate([_without(part, axis, last=False), jnp.take(part, jnp.array([-1]), axis)], axis)
-            part = (1 - whole) * part + whole * jnp.where(one > 0, forward, backward)
+            part = (1 - whole) * part + whole * jnp.where(shift > 0, forward, backward)
         moved = moved + part / 4
     return moved
 

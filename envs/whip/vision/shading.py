@@ -5,8 +5,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.envs.whip.frames import Frames
 from jaxlfi.envs.whip.quaternions import rotation
+from jaxlfi.envs.whip.rig import HAND
 from jaxlfi.envs.whip.vision.camera import Camera
-from jaxlfi.envs.whip.vision.looks import HAND, Look, Surface
+from jaxlfi.envs.whip.vision.looks import Look, Surface
 from jaxlfi.envs.whip.vision.raster import DLO, Bodies, boxes, first_hits, labelled, planes, slopes
 
 CUBES = DLO - 1

@@ -69,7 +69,7 @@ def overlap(ours, theirs, label: int) -> float:
 
 
 def random_look(seed: int, frame) -> looks.Look:
-    """Of other colours, with things behind the scene and a hand before it."""
+    """Other colours, with background objects, and a hand before the scene."""
     rng = np.random.default_rng(seed)
     look = plain(colours=np.clip(PALETTE * rng.uniform(0.8, 1.1, (7, 3)), 0, 1))
     half, centres = rng.uniform(0.01, 0.05, (7, 3)), rng.uniform([0.2, 0.1, 0.0], [0.7, 0.14, 0.4], (7, 3))
@@ -84,7 +84,7 @@ def random_look(seed: int, frame) -> looks.Look:
 
 @CASES
 def test_labels_are_those_of_the_ray_caster(renderer, caster, seed, camera):
-    """With a hand before the DLO, and things behind."""
+    """With a hand before the DLO, and background objects."""
     frame = flat(seed)
     look = random_look(seed, frame)
     _, ours = caster.render(camera, frame, SIDE, look)

@@ -11,9 +11,10 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from jaxlfi.envs.whip.rig import HAND
 from jaxlfi.envs.whip.vision import looks
 from jaxlfi.envs.whip.vision.camera import project
-from jaxlfi.envs.whip.vision.looks import CLUTTER, HAND, PALETTE, WAVES
+from jaxlfi.envs.whip.vision.looks import CLUTTER, PALETTE, WAVES
 from jaxlfi.envs.whip.vision.raster import DLO, segmentation
 from jaxlfi.envs.whip.vision.renderers import RENDERERS, RayCaster
 from jaxlfi.envs.whip.vision.shading import SHINE, shaded
@@ -22,7 +23,7 @@ from tests.envs.whip.vision.test_raster import SIDEWAYS, STACK, TILTED, centreli
 SIZE, SIDE = 64, 0.03
 CAMERAS = pytest.mark.parametrize("camera", [SIDEWAYS, TILTED], ids=["side", "tilted"])
 NOTHING, TABLE, WALL, GRIPPER, CLUTTERED = 0, 8, 9, 10, 11
-"""What is hit, besides the labels; things in the background are 11 and more."""
+"""Numbers of what a ray hits, beyond the labels; background objects are 11 and more."""
 
 
 @functools.cache
@@ -126,7 +127,7 @@ def few(wrong, share=0.002) -> bool:
 
 
 def strewn(frame, *, hand: bool):
-    """The plain look with a hand before the DLO's middle and things beside it, or with these only."""
+    """The plain look with a hand before the DLO's middle and background objects beside it, or with these only."""
     n = CLUTTER + 1
     centres = np.array([0.2, 0.1, 0.05]) + np.arange(n)[:, None] * [0.09, 0.004, 0.04]
     centres[3] = [0.50, -0.10, 0.22]  # nearer than cubes
