@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -99,7 +100,7 @@ class WhipEnvironment:
             steps=rules.STEPS,
             moved=("gripper x", "gripper z"),
             limits=LIMITS,
-            detector={"name": name, **{key: float(value) for key, value in vars(detector).items()}},
+            detector={"name": name, **{key: np.asarray(x).tolist() for key, x in vars(detector).items()}},
         )
 
     @property

@@ -26,6 +26,7 @@ from jaxlfi.figures.collection import Collection
 from jaxlfi.figures.history import History
 from jaxlfi.heuristics import Edge, Fixed
 from jaxlfi.io import files as atomic
+from jaxlfi.io import trees
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.run import Origin
 from jaxlfi.studies import calibration as study
@@ -61,9 +62,7 @@ def make(out, support: str, heuristic, rounds: int, scale: float = 1.0, shift: f
         atomic.write_arrays(beside / "dataset.npz", empty)
         network = untrained(jax.random.key(0), FAST, len(X), task.inference.feasible, task.space)
         wrong = Normaliser(np.full(2, shift, np.float32), np.full(2, scale, np.float32), network.normaliser.name)
-        atomic.write_arrays(
-            beside / "network.npz", run_store.named_leaves(jax.device_get(network.replace(normaliser=wrong)))
-        )
+        atomic.write_arrays(beside / "network.npz", trees.to_arrays(network.replace(normaliser=wrong)))
 
     run_store.create(out, config, fill)
     return out

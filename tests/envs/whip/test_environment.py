@@ -1,5 +1,7 @@
 """The whipping task as policies are trained on it: units, scaling, keys, rewards."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ pytest.importorskip("mujoco")
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.environment import make
 from jaxlfi.envs.whip.parameters import HIGHEST, LOWEST
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.rl import registry
 from jaxlfi.rl.environment import Environment
 
@@ -56,6 +59,16 @@ def test_its_policies_will_say_what_a_robot_must_keep_to(whip):
     assert (facts.limits.low, facts.limits.high) == ((0.275, 0.1), (0.6, 0.5))
     assert facts.detector["name"] == "clean" and facts.detector["spacing"] == 0.25
     assert make(detector="mask", engine="native").deployment.detector["name"] == "mask"
+
+
+@pytest.mark.parametrize("name", DETECTORS)
+def test_what_they_say_of_any_detector_can_be_written_as_json(name):
+    said = json.loads(json.dumps(make(detector=name, engine="native").deployment.detector))
+    assert said.pop("name") == name
+    places = said.pop("places")
+    known = DETECTORS[name]
+    assert places == (None if known.places is None else pytest.approx(known.places))
+    assert said == {key: pytest.approx(getattr(known, key)) for key in said} and len(said) == 11
 
 
 def test_an_episode_begins_in_a_scene_of_theta_with_nuisances_of_its_own(whip, started):
