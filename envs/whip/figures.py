@@ -2,7 +2,7 @@
 
 import dataclasses
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -107,22 +107,35 @@ def save_animation(path: Path, film: Film, title: str, interval: float, freshnes
     """
     size, margin, head = film.labels.shape[-1], 6, 52
     width, height = size + 2 * margin, size + margin + head
-    frames = []
     with style.context():
         figure = style.new_figure(width / 100, height / 100)
         figure.set_layout_engine("none")
         axes = figure.add_axes((margin / width, margin / height, size / width, size / height))
         figure.suptitle(title, fontsize=7.5, y=1 - 3 / height, va="top")
         picture = _Picture(axes, film, scale=2.5)
-        for t, fresh in enumerate(freshness):
-            picture.show(t, fresh)
-            figure.canvas.draw()
-            # Frames have few colours, and dithering would flicker.
-            frame = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
-            frames.append(frame.quantize(64, dither=Image.Dither.NONE))
+        return save_gif(path, figure, len(film.labels), lambda t: picture.show(t, freshness[t]), interval)
+
+
+def save_gif(path: Path, figure: Figure, frames: int, show: Callable[[int], None], interval: float) -> Path:
+    """Write an animated gif of a figure.
+
+    Args:
+        path: of the .gif file.
+        figure: to be animated; a hundredth of an inch is a pixel.
+        frames: their number.
+        show: puts the frame of a number into the figure.
+        interval: between frames, in s; the format resolves hundredths.
+    """
+    pictures = []
+    for t in range(frames):
+        show(t)
+        figure.canvas.draw()
+        # Frames have few colours, and dithering would flicker.
+        picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
+        pictures.append(picture.quantize(64, dither=Image.Dither.NONE))
     path.parent.mkdir(parents=True, exist_ok=True)
     content, duration = io.BytesIO(), round(1000 * interval)
-    frames[0].save(content, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
+    pictures[0].save(content, "GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0)
     files.write_bytes(path, content.getvalue())  # all of it, or nothing
     return path
 

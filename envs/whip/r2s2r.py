@@ -25,12 +25,14 @@ from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import OneLineParser
 from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip import require_mujoco
+from jaxlfi.envs.whip.vision import options
 
 EXAMPLES = """\
 examples:
   jaxlfi r2s2r --object dlo-0 --heuristic edge --out runs/r2s2r
   jaxlfi r2s2r --object dlo-3 --policy runs/uniform/uniform/seed_000/policy.npz --iterations 2 --out runs/twice
   jaxlfi r2s2r --object dlo-0 --recording my-rollout.npz --out runs/recorded
+  jaxlfi r2s2r --object dlo-0 --detector learnt --out runs/seen
 
 """
 REPETITIONS = 16
@@ -65,6 +67,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz in place of the first training")
     top.add_argument("--recording", type=Path, metavar="FILE", help="a recorded rollout in place of the first one")
     top.add_argument("--posterior", type=Path, metavar="RUN", help="a finished run in place of the first inference")
+    options.add_detector(top)
     top.add_argument("--debug", action="store_true", help="show where an error came from")
     return top
 
@@ -107,6 +110,7 @@ def _begin(arguments: argparse.Namespace) -> None:
     from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS, make
     from jaxlfi.envs.whip.real2sim import recorded
     from jaxlfi.envs.whip.reference_objects import objects
+    from jaxlfi.envs.whip.vision.commands import sights
     from jaxlfi.heuristics import registry as heuristics
     from jaxlfi.io import files
     from jaxlfi.rl import policy
@@ -126,6 +130,8 @@ def _begin(arguments: argparse.Namespace) -> None:
         recorded(str(arguments.recording))
     if arguments.posterior:
         domain(make(), str(arguments.posterior))
+    with sights(arguments.detector, arguments.renderer, arguments.weights):
+        pass
     asked = {
         name: None if value is None else str(value)
         for name, value in vars(arguments).items()
@@ -167,10 +173,15 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
         begun = (out / "config.json").exists()
         _command(
             command_line.main if begun else train.main,
-            ["resume", str(out)] if begun else ["whip", "--domain", domain, "--out", str(out), *preset, *steps],
+            ["resume", str(out)] if begun else [_whip(arguments), "--domain", domain, "--out", str(out), *preset, *steps],
             f"a policy on {domain}",
         )
     return next(out.glob("*/seed_*/policy.npz"))
+
+
+def _whip(arguments: argparse.Namespace) -> str:
+    """The simulator, whose keypoints have the errors of what sees the object."""
+    return "whip" if arguments.detector == "centreline" else f"whip,detector={arguments.detector}"
 
 
 def _rollout(arguments: argparse.Namespace, policy: Path, path: Path, iteration: int) -> Path:
@@ -182,11 +193,14 @@ def _rollout(arguments: argparse.Namespace, policy: Path, path: Path, iteration:
     from jaxlfi.envs.whip import recording
     from jaxlfi.envs.whip.reference_objects.deployment import deploy
     from jaxlfi.envs.whip.reference_objects.objects import load
+    from jaxlfi.envs.whip.vision.commands import sights
     from jaxlfi.rl import policy as policies
 
     _say(f"a rollout of {policy} on {arguments.object}")
     key = jax.random.fold_in(jax.random.key(arguments.seed), iteration)
-    deployed = deploy(key, load(arguments.object), policies.load(policy), whole=True)
+    with sights(arguments.detector, arguments.renderer, arguments.weights) as sight:
+        act, dlo = policies.load(policy), load(arguments.object)
+        deployed = deploy(key, dlo, act, whole=True, sight=sight(jax.random.fold_in(key, 2**31 - 1)))
     if deployed.recording is None:
         raise ValueError(f"{policy}: expected a rollout that can be recorded, got an unstable simulation")
     path.unlink(missing_ok=True)  # of a rollout that was not written to its end
@@ -196,7 +210,7 @@ def _rollout(arguments: argparse.Namespace, policy: Path, path: Path, iteration:
 
 def _infer(arguments: argparse.Namespace, rollouts: Sequence[Path], out: Path) -> Path:
     if not (out / "posterior.npz").exists():
-        words = ["infer", "whip", "--object", *map(str, rollouts), "--heuristic", arguments.heuristic]
+        words = ["infer", _whip(arguments), "--object", *map(str, rollouts), "--heuristic", arguments.heuristic]
         words += ["--preset", arguments.preset, "--first-seed", str(arguments.seed), "--out", str(out)]
         begun = (out / "config.json").exists()
         _command(command_line.main, ["resume", str(out)] if begun else words, f"what {arguments.object} may be")
@@ -209,6 +223,8 @@ def _deploy(arguments: argparse.Namespace, policies: Sequence[Path]) -> None:
         shutil.rmtree(out, ignore_errors=True)
         words = ["deploy", *map(str, policies), "--object", arguments.object, "--repetitions", str(REPETITIONS)]
         words += ["--seed", str(arguments.seed), "--out", str(out)]
+        words += ["--detector", arguments.detector, "--renderer", arguments.renderer]
+        words += ["--weights", str(arguments.weights)] if arguments.weights else []
         _command(whip.main, words, f"all policies on {arguments.object}")
 
 

@@ -46,7 +46,8 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
     pictures += [*sorted(out.glob("**/policy*/curves.png")), *sorted(out.glob("iteration_*/posterior/figures/*.png"))]
     parts = (
         f"<h1>{html.escape(arguments.object)}: from the object to a policy, and back</h1>",
-        f"<p>Heuristic {html.escape(arguments.heuristic)}, preset {arguments.preset}, seed {arguments.seed}.</p>",
+        f"<p>Heuristic {html.escape(arguments.heuristic)}, preset {arguments.preset}, seed {arguments.seed}, "
+        f"seen by the detector {arguments.detector}.</p>",
         "<h2>What was believed</h2>",
         _table([row for folder in runs for row in believed(folder, load(folder))]),
         "<h2>What was trained on</h2>",

@@ -41,12 +41,13 @@ def segmentation(arguments: argparse.Namespace) -> None:
 
 
 def keypoints(arguments: argparse.Namespace) -> None:
-    """How keypoints follow the DLO: the transporter's, those of the centreline, and the noise models'."""
-    from experiments.vision import following
+    """How keypoints follow the DLO: the transporter's, the centreline's, and those of noise models; with pictures."""
+    from experiments.vision import figures, following
 
     rows, arrays = following.compared(arguments.weights)
     write(arguments.out / "keypoints.csv", rows)
     files.write_arrays(arguments.out / "keypoints.npz", arrays)
+    figures.save(arguments.out, arrays)
 
 
 def errors(arguments: argparse.Namespace) -> None:

@@ -15,22 +15,26 @@ from jaxlfi.envs.whip.vision.raster import noisy, segmentation
 
 ROLLOUTS, SEED = 100, 2001
 """Random rollouts that no network has seen."""
+SHOWN = 6
+"""Rollouts that pictures show, the first that were stable."""
 
 
 def compared(folder: Path | None) -> tuple[list[dict], dict[str, np.ndarray]]:
-    """A row for each detector, and where its keypoints were along the DLO."""
+    """A row for each detector, and where its keypoints were along the DLO; of a few rollouts, what is seen of them."""
     key_rollouts, key_masks, key_noise = jax.random.split(jax.random.key(SEED), 3)
     rolled = scenes.rollouts(key_rollouts, pick("auto"), ROLLOUTS)
     rolled = jax.tree.map(lambda leaf: leaf[rolled.valid], rolled)
     masks, lines = training.dlo_masks(key_masks, rolled)
     path = weights.SHIPPED["transporter"] if folder is None else folder / "transporter.npz"
-    learnt = training.followed(weights.load(path, "transporter"), masks, lines)
-    found = {"transporter": learnt, "centreline": _geometric(key_noise, rolled, lines)}
+    learnt = training.keypoints_of(weights.load(path, "transporter"), masks)
+    geometric = _geometric(key_noise, rolled, lines)
+    found = {"transporter": follow(learnt, lines), "centreline": follow(geometric, lines)}
     for name in ("mask", "transporter"):
-        found[f"noise model {name}"] = _simulated(key_noise, DETECTORS[name], rolled, lines)
+        found[f"noise model {name}"] = follow(_simulated(key_noise, DETECTORS[name], rolled), lines)
     rows = [_row(name, following) for name, following in found.items()]
     arrays = {f"{name}/{part}": getattr(one, part) for name, one in found.items() for part in ("arcs", "away")}
-    return rows, arrays
+    shown = {"masks": masks[..., 0], "transporter": learnt, "centreline": geometric}
+    return rows, arrays | {f"shown/{part}": array[:SHOWN] for part, array in shown.items()}
 
 
 def _row(name: str, following: Following) -> dict:
@@ -46,7 +50,7 @@ def _row(name: str, following: Following) -> dict:
     }
 
 
-def _geometric(key, rolled: scenes.Rollouts, lines) -> Following:
+def _geometric(key, rolled: scenes.Rollouts, lines) -> np.ndarray:
     """The quarters of the line along a noisy mask; frames in which the DLO is not seen are left as they were before."""
 
     @jax.jit
@@ -64,16 +68,16 @@ def _geometric(key, rolled: scenes.Rollouts, lines) -> Following:
                 jax.random.fold_in(key, i * 100 + t), side_camera(parameters), frame, parameters.cube_side
             )
             places[i, t] = keypoints[:4] if seen[:4].all() else places[i, max(t - 1, 0)]
-    return follow(places, lines)
+    return places
 
 
-def _simulated(key, detector, rolled: scenes.Rollouts, lines) -> Following:
+def _simulated(key, detector, rolled: scenes.Rollouts) -> np.ndarray:
     @jax.jit
     def one(key, parameters, frames):
         return detect(key, detector, side_camera(parameters), frames)[0][:, :4]
 
     places = []
-    for i in range(len(lines)):
+    for i in range(len(rolled.valid)):
         parameters, frames = jax.tree.map(lambda leaf, i=i: jnp.asarray(leaf[i]), (rolled.parameters, rolled.frames))
         places.append(np.asarray(one(jax.random.fold_in(key, i), parameters, frames)))
-    return follow(np.stack(places), lines)
+    return np.stack(places)

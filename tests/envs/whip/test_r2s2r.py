@@ -99,6 +99,17 @@ def test_the_commands_understand_the_words_of_their_stages(stages, tmp_path):
     assert (arguments.repetitions, arguments.seed, arguments.object) == (16, 3, ["dlo-0"])
 
 
+def test_what_sees_the_object_is_what_simulations_have_the_errors_of(stages, tmp_path):
+    ran, _ = stages
+    seeing = ["--detector", "learnt", "--renderer", "raycast"]
+    assert r2s2r.main(["--object", "dlo-0", "--out", str(tmp_path / "loop"), *seeing]) == 0
+    of = {kind: [one[1:] for one in ran if one[0] == kind] for kind in ("train", "infer or resume", "deploy")}
+    assert [one[0] for one in of["train"]] == ["whip,detector=learnt"] * 2
+    assert of["infer or resume"][0][:2] == ["infer", "whip,detector=learnt"]
+    arguments = r2s2r.whip.parser().parse_args(of["deploy"][0])
+    assert (arguments.detector, arguments.renderer, arguments.weights) == ("learnt", "raycast", None)
+
+
 @pytest.mark.parametrize(("kind", "again"), [("train", "resume"), ("infer or resume", "resume"), ("deploy", "deploy")])
 def test_it_goes_on_where_it_was_stopped(stages, tmp_path, kind, again, capsys):
     ran, stopped = stages
@@ -143,6 +154,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(stages, tmp_path, capsys, monk
         (["--object", "dlo-0", "--posterior", "none"], "none"),
         (["--object", "dlo-0", "--posterior", str(of_others)], "domain: expected a posterior of "),
         (["--object", "dlo-0", "--heuristic", "egde"], "heuristic: expected "),
+        (["--object", "dlo-0", "--detector", "learnt", "--renderer", "raycast", "--weights", "none"], "segmenter.npz"),
         (["--object", "dlo-0", "--seed", "-3"], "seed: expected seeds from 0 to 4294967295, got -3"),
         (["--object", "dlo-0", "--total-steps", "0"], "total_steps: expected "),
     ):
