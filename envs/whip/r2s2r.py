@@ -173,7 +173,9 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
         begun = (out / "config.json").exists()
         _command(
             command_line.main if begun else train.main,
-            ["resume", str(out)] if begun else [_whip(arguments), "--domain", domain, "--out", str(out), *preset, *steps],
+            ["resume", str(out)]
+            if begun
+            else [_whip(arguments), "--domain", domain, "--out", str(out), *preset, *steps],
             f"a policy on {domain}",
         )
     return next(out.glob("*/seed_*/policy.npz"))

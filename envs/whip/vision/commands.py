@@ -53,14 +53,17 @@ def import_pictures(arguments: argparse.Namespace) -> None:
     Raises:
         ValueError: for bad input.
     """
-    names = dict(_pair(word) for word in arguments.name)
-    if arguments.coco is not None:
-        count = labelled.from_coco(arguments.coco, arguments.images, arguments.out, names)
-    else:
-        if arguments.classes is None:
-            raise ValueError("classes: expected the file of the classes' names, got none")
-        classes = labelled.read_classes(arguments.classes)
-        count = labelled.from_yolo(arguments.yolo, arguments.images, arguments.out, classes, names)
+    names, out = dict(_pair(word) for word in arguments.name), arguments.out
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        bar = progress.add_task("pictures", total=None)
+        show = lambda done, count: progress.update(bar, completed=done, total=count)
+        if arguments.coco is not None:
+            count = labelled.from_coco(arguments.coco, arguments.images, out, names, show)
+        else:
+            if arguments.classes is None:
+                raise ValueError("classes: expected the file of the classes' names, got none")
+            classes = labelled.read_classes(arguments.classes)
+            count = labelled.from_yolo(arguments.yolo, arguments.images, out, classes, names, show)
     print(f"wrote {count} pictures, {arguments.out / pictures.INDEX} names them")
 
 

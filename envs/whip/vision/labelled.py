@@ -31,6 +31,13 @@ CLASSES = "classes.txt"
 """What tools write beside the labels of YOLO."""
 KNOWN = f"one of {', '.join(LABELS)}"
 
+OnPicture = Callable[[int, int], Any]
+"""Is told how many pictures there are so far, and how many there will be."""
+
+
+def _nobody(done: int, count: int) -> None:
+    """Whom nothing is told."""
+
 
 @dataclasses.dataclass(frozen=True)
 class _Shape:
@@ -49,7 +56,9 @@ class _Photograph:
     shapes: tuple[_Shape, ...]
 
 
-def from_coco(annotations: Path, images: Path, out: Path, names: Mapping[str, str] = {}) -> int:
+def from_coco(
+    annotations: Path, images: Path, out: Path, names: Mapping[str, str] = {}, on_picture: OnPicture = _nobody
+) -> int:
     """Make a data set of photographs from COCO instance segmentation; returns the number of its pictures.
 
     Segmentations are polygons, with coordinates in pixels from the picture's upper left corner, or run lengths (RLE),
@@ -61,6 +70,7 @@ def from_coco(annotations: Path, images: Path, out: Path, names: Mapping[str, st
         images: folder that the `file_name`s are relative to.
         out: a new folder.
         names: names of categories to those of labels, or to "background".
+        on_picture: called after each picture.
 
     Raises:
         ValueError: for files that are missing or damaged, names that are not known, and annotations that do not fit
@@ -81,10 +91,18 @@ def from_coco(annotations: Path, images: Path, out: Path, names: Mapping[str, st
         if label := labels[annotation["category_id"]]:
             shapes[key].append(_Shape(label, _coco_mask(annotation.get("segmentation"), sizes[key], where)))
     photographs = [_Photograph(images / files[key], files[key], tuple(shapes[key])) for key in entries]
-    return _write(out, {"format": "COCO", "annotations": annotations.name, "names": dict(names)}, photographs)
+    made = {"format": "COCO", "annotations": annotations.name, "names": dict(names)}
+    return _write(out, made, photographs, on_picture)
 
 
-def from_yolo(labels: Path, images: Path, out: Path, classes: Sequence[str], names: Mapping[str, str] = {}) -> int:
+def from_yolo(
+    labels: Path,
+    images: Path,
+    out: Path,
+    classes: Sequence[str],
+    names: Mapping[str, str] = {},
+    on_picture: OnPicture = _nobody,
+) -> int:
     """Make a data set of photographs from YOLO segmentation; returns the number of its pictures.
 
     Lines are "class x1 y1 x2 y2 ...": the number of a class from 0, and a polygon's points, from 0 to 1 of the
@@ -98,6 +116,7 @@ def from_yolo(labels: Path, images: Path, out: Path, classes: Sequence[str], nam
         out: a new folder.
         classes: names of the classes, in order.
         names: names of classes to those of labels, or to "background".
+        on_picture: called after each picture.
 
     Raises:
         ValueError: for files that are missing or damaged, names that are not known, and lines that are no shapes,
@@ -113,7 +132,7 @@ def from_yolo(labels: Path, images: Path, out: Path, classes: Sequence[str], nam
                 outline = _outline(numbers, (1, 1), where) * size
                 shapes.append(_Shape(label, functools.partial(_filled, (outline,))))
         photographs.append(_Photograph(path, path.relative_to(images).as_posix(), tuple(shapes)))
-    return _write(out, {"format": "YOLO", "classes": list(classes), "names": dict(names)}, photographs)
+    return _write(out, {"format": "YOLO", "classes": list(classes), "names": dict(names)}, photographs, on_picture)
 
 
 def read_classes(path: Path) -> list[str]:
@@ -139,12 +158,13 @@ def read_classes(path: Path) -> list[str]:
     return classes
 
 
-def _write(out: Path, made: Mapping[str, Any], photographs: Sequence[_Photograph]) -> int:
+def _write(out: Path, made: Mapping[str, Any], photographs: Sequence[_Photograph], on_picture: OnPicture) -> int:
     begun = pictures.begun(out, {"made": {**made, "pictures": len(photographs)}})
     for number, photograph in enumerate(photographs[begun:], start=begun):
         image = _upright(photograph.path)
         labels = _drawn(photograph.shapes, *image.size)
         pictures.add(out, number, _resized(image), labels, source="photograph", file=photograph.name)
+        on_picture(number + 1, len(photographs))
     return pictures.finish(out)
 
 
@@ -376,8 +396,8 @@ def _labels_of(used: Iterable[str], names: Mapping[str, str]) -> dict[str, int]:
     labels = {name: mapped.get(name.strip().casefold(), _own(name)) for name in used}
     if unknown := [repr(name) for name, label in labels.items() if label is None]:
         raise ValueError(
-            f"classes: expected {KNOWN}, or names that `names` maps to these, as {{{unknown[0]}: 'background'}}, got "
-            f"{', '.join(unknown)}"
+            f"classes: expected {KNOWN}, or names that are mapped to these (--name {unknown[0]}=dlo, or =background to "
+            f"leave them out), got {', '.join(unknown)}"
         )
     return labels
 

@@ -336,7 +336,9 @@ def test_an_interrupted_data_set_goes_on(tmp_path, monkeypatch):
         from_yolo(tmp_path, texts, "out")
     with pytest.raises(ValueError, match="interrupted"):
         pictures.read(tmp_path / "out")
-    data = from_yolo(tmp_path, texts, "out")
+    told = []
+    data = from_yolo(tmp_path, texts, "out", on_picture=lambda *so_far: told.append(so_far))
+    assert told == [(3, 4), (4, 4)]
     np.testing.assert_array_equal(data.rgb, whole.rgb)
     np.testing.assert_array_equal(data.labels, whole.labels)
     assert data.entries == whole.entries
@@ -391,7 +393,7 @@ class TestRefusedOfCoco:
             (bad([SQUARE], category_id=9), r"annotation 7: category_id: expected one of the categories, got 9"),
             (
                 bad([SQUARE], category_id=4),
-                r"classes: expected one of background, red, .*dlo, .*\{'apple': 'background'\}",
+                r"classes: expected one of background, red, .*dlo, .*--name 'apple'=dlo",
             ),
             (coco([], files=[]), r"coco\.json: expected pictures, got none"),
             (coco([], [("b.png", 4, 4)]), r"b\.png: expected a picture, got no file"),
