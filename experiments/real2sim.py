@@ -1,6 +1,7 @@
 """Real2Sim of the four FEM reference objects: posteriors on a fixed support and adapted by EDGE, and their errors.
 
     python -m experiments.real2sim --runs runs/real2sim --out experiments/results/real2sim
+    python -m experiments.real2sim --runs runs/real2sim-learnt --out experiments/results/real2sim-learnt --detector learnt
 
 Runs `jaxlfi compare whip --object dlo-K --configurations initial initial+edge` for each object (finished runs are not
 repeated), reports the result of every seed in table.csv, and draws counterparts of the paper's figures from the folders
@@ -25,6 +26,7 @@ from matplotlib.figure import Figure
 
 import jaxlfi
 from jaxlfi.cli import parser as cli
+from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip.episode import OBSERVATION
 from jaxlfi.figures import History, open_collection, samples, style
 from jaxlfi.io import files as atomic
@@ -167,6 +169,16 @@ def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str,
     return lines
 
 
+def recorded(name: str, detector: str, folder: Path) -> str:
+    """A rollout of an object as a detector sees it, in pictures by MuJoCo, which is made if it is missing."""
+    path = folder / "recordings" / f"{name}.npz"
+    if not path.with_suffix(".json").exists():
+        path.unlink(missing_ok=True)  # of a recording that was interrupted
+        if status := whip.main(["record", "--object", name, "--detector", detector, "--out", str(path)]):
+            raise SystemExit(status)
+    return str(path)
+
+
 def main() -> None:
     """Run what is missing, then draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -176,11 +188,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--objects", nargs="+", default=OBJECTS, help="names, or recorded rollouts' .npz")
     parser.add_argument("--seeds", type=int, default=3, help="runs of each configuration, in one batch")
+    parser.add_argument("--detector", default="centreline", help="what sees the objects, as in `jaxlfi whip record`")
     arguments = parser.parse_args()
     runs = {}
     for name in arguments.objects:
-        folder = arguments.runs / Path(name).stem
-        words = ["compare", "whip", "--object", name, "--seeds", str(arguments.seeds)]
+        folder, task, rollout = arguments.runs / Path(name).stem, "whip", name
+        if arguments.detector != "centreline":
+            task, rollout = f"whip,detector={arguments.detector}", recorded(name, arguments.detector, arguments.runs)
+        words = ["compare", task, "--object", rollout, "--seeds", str(arguments.seeds)]
         words += ["--configurations", *CONFIGURATIONS, "--out", str(folder), "--keep-network"]
         if not (folder / "config.json").exists():
             if status := cli.main(words):
