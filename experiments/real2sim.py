@@ -1,7 +1,7 @@
 """Real2Sim of the four FEM reference objects: posteriors on a fixed support and adapted by EDGE, and their errors.
 
     python -m experiments.real2sim --runs runs/real2sim --out experiments/results/real2sim
-    python -m experiments.real2sim --runs runs/real2sim-learnt --out experiments/results/real2sim-learnt --detector learnt
+    python -m experiments.real2sim --runs runs/seen --out experiments/results/real2sim-learnt --detector learnt
 
 Runs `jaxlfi compare whip --object dlo-K --configurations initial initial+edge` for each object (finished runs are not
 repeated), reports the result of every seed in table.csv, and draws counterparts of the paper's figures from the folders
