@@ -275,10 +275,10 @@ def test_the_keys_of_a_run_are_split_in_one_module(path):
 
 @everywhere
 def test_who_may_import_which_library(path):
-    """Plots are drawn by modules called figures, physics is the whip's, policies are Brax's; experiments may do all."""
+    """Plots are drawn by modules called figures, physics is MuJoCo's, policies are Brax's; experiments may do all."""
     allowed = {
         "matplotlib": ("jaxlfi.figures", f"{ENVS}.whip.figures", "experiments"),
-        "mujoco": (f"{ENVS}.whip", "experiments"),
+        "mujoco": (f"{ENVS}.whip", f"{ENVS}.mujoco", "experiments"),
         "gymnasium": (f"{ENVS}.whip", "experiments"),
         "stable_baselines3": ("experiments",),
         "brax": ("jaxlfi.rl",),

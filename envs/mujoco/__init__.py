@@ -1,0 +1,28 @@
+"""Real2Sim of any MuJoCo model: its doubtful numbers, inferred from a log of controls and sensors.
+
+Needs the extra `mujoco`.
+"""
+
+from pathlib import Path
+
+
+def task(config: Path | None = None, log: tuple[Path, ...] = ()):
+    """The task that a TOML file describes (`jaxlfi.envs.mujoco.config`).
+
+    Args:
+        config: the file, which there has to be.
+        log: recordings in place of those that the file names; several are episodes of the same parameters.
+
+    Raises:
+        ImportError: where MuJoCo is not installed, with what to install.
+        ValueError: for whatever does not fit together, in one line.
+    """
+    try:
+        import mujoco  # noqa: F401
+    except ImportError as error:
+        raise ImportError("tasks of MuJoCo models need MuJoCo: pip install 'jaxlfi[mujoco]'") from error
+    if config is None:
+        raise ValueError("config: expected a TOML file that describes a task, as mujoco,config=arm.toml; got none")
+    from jaxlfi.envs.mujoco.config import read
+
+    return read(config, log)

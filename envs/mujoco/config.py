@@ -1,0 +1,105 @@
+"""The TOML file that describes a task.
+
+model = "pendulum.xml"              # beside this file
+log = ["swing.csv"]                 # recordings, one for each episode
+measured = ["angle"]                # by default all signals but the controls
+
+[parameters."joint/hinge/damping"]
+support = [0.001, 0.01]             # Theta_0
+feasible = [0.0001, 0.1]            # Phi; by default Theta_0
+unit = "N m s/rad"
+log = true                          # infer its logarithm
+
+[noise]                             # standard deviations; of other signals it is estimated
+angle = 0.002
+
+[initial]                           # other than the model's
+"hinge/qpos" = 0.5
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxlfi.envs.mujoco.model_task import mujoco_task
+from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.tasks.task import Task
+
+KEYS: Mapping[str, type] = {
+    "model": str,
+    "log": list,
+    "measured": list,
+    "parameters": dict,
+    "noise": dict,
+    "initial": dict,
+    "name": str,
+}
+PARAMETER = ("support", "feasible", "unit", "log", "truth")
+
+
+def read(path: Path, recorded: Sequence[Path] = ()) -> Task:
+    """The task that a file describes.
+
+    Args:
+        path: of the file.
+        recorded: recordings in place of its own.
+
+    Raises:
+        ValueError: for a file that is missing, damaged or describes no task, in one line.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            config = tomllib.load(file)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: expected a TOML file, got a missing or damaged one: {error}") from error
+    for name, value in config.items():
+        if name not in KEYS:
+            raise ValueError(f"{path}: expected keys among {', '.join(KEYS)}, got {name!r}")
+        if not isinstance(value, KEYS[name]):
+            raise ValueError(f"{path}: {name}: expected a {KEYS[name].__name__}, got {value!r}")
+    for name in ("model", "parameters"):
+        if not config.get(name):
+            raise ValueError(f"{path}: expected {name}, got none")
+    given = [Path(one) for one in recorded] or [path.parent / str(one) for one in config.get("log", [])]
+    if not given:
+        raise ValueError(f"{path}: expected recordings, as log = [FILE], or mujoco,config={path},log=FILE; got none")
+    try:
+        found = [_parameter(name, table) for name, table in config["parameters"].items()]
+        return mujoco_task(
+            path.parent / config["model"],
+            found,
+            given,
+            config.get("measured"),
+            {name: _number(value, f"noise: {name}") for name, value in config.get("noise", {}).items()},
+            {name: _number(value, f"initial: {name}") for name, value in config.get("initial", {}).items()},
+            name=config.get("name", path.stem),
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _parameter(name: str, table: Any) -> Parameter:
+    where = f"parameters: {name!r}"
+    if not isinstance(table, dict) or "support" not in table:
+        raise ValueError(f"{where}: expected support = [LOW, HIGH], got {table!r}")
+    if unknown := [key for key in table if key not in PARAMETER]:
+        raise ValueError(f"{where}: expected keys among {', '.join(PARAMETER)}, got {', '.join(unknown)}")
+    bounds = {}
+    for key in ("support", "feasible"):
+        pair = table.get(key, table["support"])
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise ValueError(f"{where}: {key}: expected [LOW, HIGH], got {pair!r}")
+        bounds[key] = tuple(_number(number, f"{where}: {key}") for number in pair)
+    log, unit, truth = table.get("log", False), table.get("unit", ""), table.get("truth")
+    if not isinstance(log, bool) or not isinstance(unit, str):
+        raise ValueError(f"{where}: expected log = true or false and a unit in quotes, got {log!r} and {unit!r}")
+    truth = None if truth is None else _number(truth, f"{where}: truth")
+    return Parameter(name, bounds["support"], bounds["feasible"], unit, log, truth)
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{where}: expected a number, got {value!r}")
+    return float(value)

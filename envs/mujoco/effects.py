@@ -1,0 +1,116 @@
+"""What parameters do: change the model, the state that episodes begin in, the sensors or the controls."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from jaxlfi.envs.mujoco import parameters
+from jaxlfi.envs.mujoco.parameters import Edit, near
+
+STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+"""Time, positions, velocities and activations."""
+_SIZES = {int(mujoco.mjtJoint.mjJNT_FREE): (7, 6), int(mujoco.mjtJoint.mjJNT_BALL): (4, 3)}
+"""Numbers of the positions and velocities of joints that have more than one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Effects:
+    """What each of D parameters does; its number is the second of each pair.
+
+    Attributes:
+        edits: of the model.
+        starts: places in the state that episodes begin in.
+        biases: signals that an offset is added to.
+        deviations: signals whose noise it is the standard deviation of.
+        delay: the parameter that is the controls' delay, if any is.
+    """
+
+    edits: tuple[tuple[Edit, int], ...] = ()
+    starts: tuple[tuple[int, int], ...] = ()
+    biases: tuple[tuple[int, int], ...] = ()
+    deviations: tuple[tuple[int, int], ...] = ()
+    delay: int | None = None
+
+
+def effects(
+    spec: mujoco.MjSpec,
+    model: mujoco.MjModel,
+    names: Sequence[str],
+    supports: Sequence[tuple[float, float]],
+    signals: Sequence[str],
+) -> Effects:
+    """What parameters do, by their names.
+
+    Args:
+        spec: of the model.
+        model: as compiled, unchanged.
+        names: of the parameters (`parameters`).
+        supports: of the parameters: the model has to differ between their bounds.
+        signals: that are measured.
+
+    Raises:
+        ValueError: for names that match nothing or several things, and parameters without an effect, in one line.
+    """
+    found: dict[str, list] = {"edits": [], "starts": [], "biases": [], "deviations": []}
+    delay = None
+    for d, (name, support) in enumerate(zip(names, supports, strict=True)):
+        kind, _, rest = name.partition("/")
+        if kind == "sensor":
+            what, signal = _of_sensor(rest, name, signals)
+            found[what].append((signal, d))
+        elif kind == "initial":
+            found["starts"].append((state_place(model, rest, name), d))
+        elif kind == "control":
+            if rest != "delay" or not model.nu:
+                raise ValueError(f"parameters: expected control/delay of a model with actuators, got {name!r}")
+            delay = d
+        else:
+            one = parameters.edit(spec, model, name)
+            parameters.check_effect(spec, one, support)
+            found["edits"].append((one, d))
+    # A body's mass scales its inertia; whatever of it is inferred besides is meant as it is.
+    found["edits"].sort(key=lambda pair: not pair[0].name.endswith("/mass"))
+    return Effects(**{what: tuple(several) for what, several in found.items()}, delay=delay)
+
+
+def initial_state(model: mujoco.MjModel, initial: Mapping[str, float]) -> Float[np.ndarray, " state"]:
+    """The model's own initial state, but for some numbers by JOINT/qpos and JOINT/qvel.
+
+    Raises:
+        ValueError: for joints that the model does not have.
+    """
+    data, state = mujoco.MjData(model), np.zeros(mujoco.mj_stateSize(model, STATE))
+    mujoco.mj_getState(model, data, state, STATE)
+    for name, number in initial.items():
+        state[state_place(model, name, f"initial/{name}")] = number
+    return state
+
+
+def state_place(model: mujoco.MjModel, rest: str, name: str) -> int:
+    """Where JOINT/qpos, or JOINT/qvel[2], is in a state.
+
+    Raises:
+        ValueError: for joints that the model does not have, and several numbers.
+    """
+    match = parameters.FORM.fullmatch(rest)
+    if match is None or match["attribute"] not in ("qpos", "qvel"):
+        raise ValueError(f"parameters: expected initial/JOINT/qpos or initial/JOINT/qvel, got {name!r}")
+    joints = [model.joint(i).name for i in range(model.njnt)]
+    if match["element"] not in joints:
+        raise ValueError(f"parameters: {name!r}: expected a joint {near(match['element'], joints)}")
+    joint, velocity = model.joint(match["element"]), match["attribute"] == "qvel"
+    index = None if match["index"] is None else int(match["index"])
+    place = parameters.place(np.zeros(_SIZES.get(int(joint.type[0]), (1, 1))[velocity]), index, name)
+    return 1 + place + (model.nq + int(joint.dofadr[0]) if velocity else int(joint.qposadr[0]))
+
+
+def _of_sensor(rest: str, name: str, signals: Sequence[str]) -> tuple[str, int]:
+    signal, _, what = rest.rpartition("/")
+    if signal not in signals:
+        raise ValueError(f"parameters: {name!r}: expected a signal {near(signal, signals)}, got {signal!r}")
+    if what not in ("bias", "noise"):
+        raise ValueError(f"parameters: {name!r}: expected bias or noise, got {what!r}")
+    return {"bias": "biases", "noise": "deviations"}[what], signals.index(signal)

@@ -1,0 +1,156 @@
+"""What was recorded: controls and sensors over time, by name, in SI units and radians.
+
+| file | times | signals |
+|---|---|---|
+| .npz | the array `times` (s) | arrays [T], or [T, n] for NAME[0] to NAME[n - 1] |
+| .csv | the first column, headed "time [s]" | columns headed "NAME [unit]"; an empty cell is a missing sample |
+| .mcap, folder of a LeRobot data set | of each signal | by the names of their numbers; needs the extra `robotics` |
+
+Signals may have clocks of their own: in a table, a row then has empty cells (NaN) where a signal has no sample. Times
+may begin anywhere; they are counted from the first one.
+"""
+
+import csv
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxlfi.io import files
+
+UNITS: Mapping[str, float] = {
+    **dict.fromkeys(
+        ("", "1", "s", "m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N m", "Nm", "N*m", "V", "A"), 1.0
+    ),
+    **{"ms": 1e-3, "us": 1e-6, "mm": 1e-3, "cm": 1e-2, "mm/s": 1e-3, "cm/s": 1e-2, "mN": 1e-3, "mN m": 1e-3},
+    **dict.fromkeys(("deg", "°", "deg/s", "°/s", "deg/s^2"), np.pi / 180),
+    **{"rpm": np.pi / 30, "g": 9.80665},
+}
+"""What a number in each unit of a heading is in SI units and radians; "g" is the acceleration."""
+HEADING = re.compile(r"\s*(?P<name>[^\[(]*(?:\[\d+\])?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?\s*")
+TIMES = ("times", "time", "t")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Log:
+    """A recording.
+
+    Attributes:
+        times: in s from the first one, increasing, shape [T].
+        signals: by name, NaN where there is no sample, shape [T] each.
+        name: of the file.
+
+    Raises:
+        ValueError: for what is no recording.
+    """
+
+    times: Float[np.ndarray, " time"]
+    signals: Mapping[str, Float[np.ndarray, " time"]]
+    name: str = "log"
+
+    def __post_init__(self):
+        times = np.asarray(self.times, float)
+        if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise ValueError(f"{self.name}: expected at least two increasing times, got others")
+        signals = {name: np.asarray(values, float) for name, values in self.signals.items()}
+        for name, values in signals.items():
+            if values.shape != times.shape:
+                raise ValueError(
+                    f"{self.name}: {name}: expected a sample for each of {len(times)} times, got {list(values.shape)}"
+                )
+            if np.isinf(values).any() or np.isnan(values).all():
+                raise ValueError(f"{self.name}: {name}: expected finite samples, got infinite ones or none at all")
+        object.__setattr__(self, "times", times - times[0])
+        object.__setattr__(self, "signals", signals)
+
+    def held(self, name: str, times: np.ndarray) -> np.ndarray:
+        """The last sample of a signal at other times, and before its first that one; shape that of `times`."""
+        there = np.flatnonzero(np.isfinite(self.signals[name]))
+        last = np.searchsorted(self.times[there], times + 1e-9, side="right") - 1
+        return self.signals[name][there[np.maximum(last, 0)]]
+
+
+def read(path: Path) -> Log:
+    """Read a recording.
+
+    Raises:
+        ValueError: for a file that is missing, damaged or no recording, in one line.
+        ImportError: where the extra `robotics` is needed and not installed.
+    """
+    path = Path(path)
+    if path.suffix == ".npz":
+        return _of_arrays(files.read_arrays(path), str(path))
+    if path.suffix == ".csv":
+        return _of_table(path)
+    if path.suffix == ".mcap" or path.is_dir():
+        return _of_robotics(path)
+    raise ValueError(f"log: expected NAME.npz, NAME.csv, NAME.mcap or the folder of a LeRobot data set, got {path}")
+
+
+def _of_arrays(arrays: Mapping[str, np.ndarray], where: str) -> Log:
+    known = [name for name in TIMES if name in arrays]
+    if len(known) != 1:
+        raise ValueError(f"{where}: expected one array of times, called {TIMES[0]!r}, got {sorted(arrays)}")
+    signals: dict[str, np.ndarray] = {}
+    for name, values in arrays.items():
+        if name == known[0]:
+            continue
+        if values.dtype.kind not in "biuf" or values.ndim not in (1, 2):
+            raise ValueError(
+                f"{where}: {name}: expected numbers [T] or [T, n], got {values.dtype} {list(values.shape)}"
+            )
+        signals |= {name: values} if values.ndim == 1 else {f"{name}[{i}]": row for i, row in enumerate(values.T)}
+    return Log(arrays[known[0]], signals, where)
+
+
+def _of_table(path: Path) -> Log:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = [row for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: expected a CSV file, got one that is missing or no text") from error
+    if len(rows) < 3:
+        raise ValueError(f"{path}: expected a line of headings and two of numbers, got {len(rows)} lines")
+    names, factors = zip(*(_heading(text, path) for text in rows[0]), strict=True)
+    if names[0].casefold() not in TIMES:
+        raise ValueError(f"{path}: expected times in the first column, headed 'time [s]', got {rows[0][0]!r}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"{path}: expected each heading once, got {', '.join(names)}")
+    table = np.full((len(rows) - 1, len(names)), np.nan)
+    for number, row in enumerate(rows[1:]):
+        if len(row) != len(names):
+            raise ValueError(f"{path}: line {number + 2}: expected {len(names)} cells, got {len(row)}")
+        try:
+            table[number] = [float(cell) if cell.strip() else np.nan for cell in row]
+        except ValueError as error:
+            raise ValueError(f"{path}: line {number + 2}: expected numbers, got {','.join(row)[:60]!r}") from error
+    table *= factors
+    return Log(table[:, 0], dict(zip(names[1:], table[:, 1:].T, strict=True)), str(path))
+
+
+def _heading(text: str, path: Path) -> tuple[str, float]:
+    """A signal's name, and what its unit is in SI units."""
+    match = HEADING.fullmatch(text)
+    name, unit = (match["name"].strip(), (match["unit"] or "").strip()) if match else ("", "")
+    if not name or unit not in UNITS:
+        raise ValueError(f"{path}: expected a heading as 'NAME [unit]' with a unit of {', '.join(UNITS)}, got {text!r}")
+    return name, UNITS[unit]
+
+
+def _of_robotics(path: Path) -> Log:
+    from jaxlfi.io import lerobot, mcap
+
+    rollout = mcap.read(path) if path.suffix == ".mcap" else lerobot.read(path, None)
+    times = np.unique(np.concatenate([signal.times for signal in rollout.signals.values()]))
+    signals: dict[str, np.ndarray] = {}
+    for signal in rollout.signals.values():
+        rows = np.searchsorted(times, signal.times)
+        for name, values in zip(signal.names, signal.values.T, strict=True):
+            if name in signals:
+                raise ValueError(f"{path}: expected each signal once, got {name!r} twice")
+            signals[name] = np.full(len(times), np.nan)
+            signals[name][rows] = values
+    return Log(times, signals, str(path))

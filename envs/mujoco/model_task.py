@@ -1,0 +1,178 @@
+"""A task of a MuJoCo model: which of its numbers are doubted, and what was recorded of the real thing."""
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlfi.distributions.support import Support
+from jaxlfi.envs.mujoco import logs, noise
+from jaxlfi.envs.mujoco.effects import effects, initial_state
+from jaxlfi.envs.mujoco.logs import Log
+from jaxlfi.envs.mujoco.measured import add_sensors
+from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.envs.mujoco.simulator import FAILURES, Simulator
+from jaxlfi.tasks.host import HostSimulator
+from jaxlfi.tasks.task import Task
+
+SAMPLES = 30
+"""Rows of an episode that the network sees, at most."""
+
+
+def samples(trajectory: Float[Array, "rows signals"], rows: tuple[int, ...]) -> Float[Array, " obs"]:
+    """Some rows of a trajectory, as they are."""
+    return jnp.ravel(trajectory[np.asarray(rows)])
+
+
+def mujoco_task(
+    model: str | Path | mujoco.MjSpec,
+    parameters: Sequence[Parameter],
+    recorded: Sequence[Log | str | Path] | Log | str | Path,
+    measured: Sequence[str] | None = None,
+    noises: Mapping[str, float] | None = None,
+    initial: Mapping[str, float] | None = None,
+    summary: str | Callable[[jax.Array], jax.Array] = "samples",
+    threads: int | None = None,
+    **others: Any,
+) -> Task:
+    """Infer numbers of a MuJoCo model from recordings of controls and sensors.
+
+    A trajectory has a row for each time of the recordings at which something was measured, episodes one after another,
+    and a column for each measured signal; what was not sampled is 0, in simulations too. Every episode begins in the
+    same state and has the same parameters.
+
+    Args:
+        model: an MJCF file, its text, or a specification.
+        parameters: what is inferred (`parameters.Parameter`).
+        recorded: recordings, or their files (`logs`): one for each episode. Signals that are called as the model's
+            actuators are its controls, held between samples.
+        measured: signals that are compared: sensors of the model, and joint/NAME/qpos, joint/NAME/qvel,
+            body/NAME/pos[0], body/NAME/quat[0]. By default all of the recording but its controls.
+        noises: standard deviations of the signals' noise. Of others it is estimated from the first recording.
+        initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
+        summary: "samples", up to 30 rows of each episode at equal intervals; or as for `jaxlfi.Task`.
+        threads: of simulations; by default as many as processors.
+        **others: of `jaxlfi.Task`.
+
+    Raises:
+        ValueError: for whatever does not fit together, in one line, before anything is simulated.
+    """
+    spec = _specification(model)
+    several = [recorded] if isinstance(recorded, Log | str | Path) else list(recorded)
+    if not several or not parameters:
+        raise ValueError("expected at least one recording and one parameter, got none")
+    episodes = [one if isinstance(one, Log) else logs.read(Path(one)) for one in several]
+    if measured is None:
+        controls = {one.name for one in spec.actuators}
+        measured = [name for name in episodes[0].signals if name not in controls]
+    if not measured or len(set(measured)) < len(measured):
+        raise ValueError(f"measured: expected at least one signal, each once, got {', '.join(measured) or 'none'}")
+    names = [one.name for one in parameters]
+    inferred = {name.split("/")[1] for name in names if name.startswith("sensor/") and name.endswith("/noise")}
+    deviations = _deviations(episodes[0], measured, noises or {}, inferred)
+    add_sensors(spec, measured)
+    compiled = _compiled(spec)
+    does = effects(spec, compiled, names, [one.support for one in parameters], measured)
+
+    def build(theta: np.ndarray) -> mujoco.MjModel:
+        own = spec.copy()
+        for one, d in does.edits:
+            one.apply(own, float(theta[d]))
+        return own.compile()
+
+    starts = [initial_state(compiled, initial or {})] * len(episodes)
+    simulator = Simulator(compiled, build, episodes, measured, deviations, starts, does, threads)
+    return task_of(simulator, parameters, measured, summary, **{"name": spec.modelname or "mujoco"} | others)
+
+
+def task_of(
+    simulator: Simulator,
+    parameters: Sequence[Parameter],
+    measured: Sequence[str],
+    summary: str | Callable[[jax.Array], jax.Array] = "samples",
+    **others: Any,
+) -> Task:
+    """The task of a simulator; see `mujoco_task`."""
+    if summary == "samples":
+        summary = functools.partial(samples, rows=_rows([len(times) for times in simulator.times]))
+    supports = [one.support for one in parameters]
+    feasible = [one.feasible or one.support for one in parameters]
+    truth = [one.truth for one in parameters]
+    return Task(
+        HostSimulator(simulator),
+        names=[one.name for one in parameters],
+        units=[one.unit for one in parameters],
+        log=[one.name for one in parameters if one.log],
+        supports={"initial": _box(supports), "feasible": _box(feasible)},
+        feasible=_box(feasible),
+        truth=None if None in truth else np.asarray(truth, np.float32),
+        observation=simulator.observation,
+        summary=summary,
+        failures=FAILURES,
+        channels=measured,
+        times=simulator.times[0] if len(simulator.times) == 1 else None,
+        **others,
+    )
+
+
+def _specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
+    if isinstance(model, mujoco.MjSpec):
+        return model.copy()
+    text = str(model)
+    try:
+        if text.lstrip().startswith("<"):
+            return mujoco.MjSpec.from_string(text)
+        if not Path(text).is_file():
+            raise ValueError(f"model: expected an MJCF file, got none called {text!r}")
+        return mujoco.MjSpec.from_file(text)
+    except ValueError as error:
+        raise ValueError(f"model: {' '.join(str(error).split()).removeprefix('model: ')}") from error
+
+
+def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ValueError(f"model: MuJoCo refuses it: {' '.join(str(error).split())}") from error
+
+
+def _deviations(log: Log, measured: Sequence[str], given: Mapping[str, float], inferred: set[str]) -> dict[str, float]:
+    """Standard deviations of the noise of signals: given, inferred (here 0), or estimated."""
+    if unknown := [name for name in given if name not in measured]:
+        raise ValueError(f"noises: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
+    found = {}
+    for name in measured:
+        if name in given:
+            found[name] = float(given[name])
+            if not found[name] >= 0:
+                raise ValueError(f"noises: {name}: expected a standard deviation of at least 0, got {given[name]}")
+        elif name in inferred:
+            found[name] = 0.0
+        elif name not in log.signals:
+            raise ValueError(f"measured: expected signals of {log.name}: {', '.join(log.signals)}; got {name!r}")
+        else:
+            try:
+                found[name] = noise.standard_deviation(log.signals[name])
+            except ValueError as error:
+                raise ValueError(f"noises: {name}: {error}") from error
+    return found
+
+
+def _rows(lengths: Sequence[int]) -> tuple[int, ...]:
+    """Rows at equal intervals of episodes that lie one after another, the first and the last among them."""
+    rows, begin = [], 0
+    for length in lengths:
+        rows += [begin + int(row) for row in np.unique(np.linspace(0, length - 1, min(SAMPLES, length)).round())]
+        begin += length
+    return tuple(rows)
+
+
+def _box(bounds: Sequence[tuple[float, float]]) -> Support:
+    low, high = np.asarray(bounds, np.float32).T
+    return Support(low, high)

@@ -1,0 +1,207 @@
+"""What is doubted: numbers of a model by element and attribute, as they are called in MJCF.
+
+| name | what |
+|---|---|
+| `joint/hinge/damping`, `geom/foot/friction[0]`, `actuator/motor/gear[0]` | attributes of elements |
+| `body/link/mass`, `body/link/inertia[1]`, `body/link/ipos[0]` | of a body as a whole, though its geoms make it up |
+| `option/gravity[0]` | of all of it |
+| `initial/hinge/qpos`, `initial/hinge/qvel`, `initial/box/qpos[2]` | the state that episodes begin in |
+| `sensor/angle/bias`, `sensor/angle/noise` | what a sensor adds: an offset, and the standard deviation of its noise |
+| `control/delay` | seconds after which a control acts |
+
+Every simulation has a model of its own that is compiled anew, so that whatever depends on a number is derived from it.
+A body's mass changes its inertia alike, as for one of another density.
+"""
+
+import dataclasses
+import difflib
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+KINDS = ("body", "joint", "geom", "site", "actuator", "tendon", "equality", "pair")
+"""Elements of models whose attributes can be inferred."""
+INERTIAL = ("mass", "inertia", "ipos", "iquat")
+"""Attributes of a body that its geoms may make up."""
+FORM = re.compile(r"(?P<element>.+)/(?P<attribute>[a-z_]+)(?:\[(?P<index>\d+)\])?")
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A number that is inferred.
+
+    Attributes:
+        name: see above.
+        support: its bounds in Theta_0.
+        feasible: its bounds in Phi; by default those of Theta_0, which then cannot grow.
+        unit: for tables and plots.
+        log: whether its logarithm is inferred.
+        truth: where it is known.
+
+    Raises:
+        ValueError: for bounds that are reversed, or a support that is not within Phi.
+    """
+
+    name: str
+    support: tuple[float, float]
+    feasible: tuple[float, float] | None = None
+    unit: str = ""
+    log: bool = False
+    truth: float | None = None
+
+    def __post_init__(self):
+        for label, bounds in (("support", self.support), ("feasible", self.feasible or self.support)):
+            if not (len(bounds) == 2 and bounds[0] < bounds[1]):  # NaN is not, either
+                raise ValueError(f"parameters: {self.name!r}: {label}: expected LOW below HIGH, got {list(bounds)}")
+        (low, high), (least, most) = self.support, self.feasible or self.support
+        if low < least or high > most:
+            raise ValueError(
+                f"parameters: {self.name!r}: support: expected bounds within feasible, [{least:g}, {most:g}], "
+                f"got [{low:g}, {high:g}]"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Edit:
+    """Gives a model's specification a value."""
+
+    name: str
+    apply: Callable[[mujoco.MjSpec, float], None]
+
+
+def edit(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Edit:
+    """What gives an attribute of an element a value.
+
+    Args:
+        spec: of the model.
+        model: as compiled, unchanged.
+        name: "KIND/ELEMENT/attribute", with [index] for one of several numbers.
+
+    Raises:
+        ValueError: for a name that matches nothing, or several numbers, or no number, in one line.
+    """
+    match = FORM.fullmatch(name)
+    if match is None:
+        raise ValueError(f"parameters: expected names as joint/hinge/damping or geom/foot/friction[0], got {name!r}")
+    element, attribute = match["element"], match["attribute"]
+    index = None if match["index"] is None else int(match["index"])
+    found = _found(spec, element, name)
+    if element == "body/world":
+        raise ValueError(f"parameters: {name!r}: expected a body that moves, got the world")
+    if element.startswith("body/") and attribute in INERTIAL:
+        return _inertial(model, element.partition("/")[2], attribute, index, name)
+    value = getattr(found, attribute, None) if not attribute.startswith("_") else None
+    if isinstance(value, bool) or not isinstance(value, int | float | np.ndarray):
+        known = [other for other in dir(found) if _is_number(getattr(found, other, None))]
+        raise ValueError(f"parameters: {name!r}: expected an attribute {near(attribute, known)}, got {attribute!r}")
+    where = place(value, index, name, first=attribute in ("damping", "stiffness"))
+
+    def apply(spec: mujoco.MjSpec, number: float) -> None:
+        target = _found(spec, element, name)
+        if where is None:
+            setattr(target, attribute, number)
+        else:
+            values = np.array(getattr(target, attribute), float)
+            values[where] = number
+            setattr(target, attribute, values)
+
+    return Edit(name, apply)
+
+
+def _found(spec: mujoco.MjSpec, element: str, name: str) -> Any:
+    """The element of a specification that a parameter is of."""
+    if element == "option":
+        return spec.option
+    kind, _, own = element.partition("/")
+    if kind not in KINDS or not own:
+        raise ValueError(f"parameters: {name!r}: expected one that begins with {near(kind, [*KINDS, 'option'])}")
+    found = getattr(spec, kind)(own)
+    if found is None:
+        several = {"body": "bodies", "equality": "equalities"}.get(kind, f"{kind}s")
+        names = [one.name for one in getattr(spec, several) if one.name]
+        raise ValueError(f"parameters: {name!r}: expected a {kind} {near(own, names)}, got {own!r}")
+    return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype.kind == "f")
+
+
+def place(value: Any, index: int | None, name: str, first: bool = False) -> int | None:
+    """Where in an attribute a parameter is; the first of the coefficients of a joint's damping is the damping."""
+    count = np.size(value)
+    if not isinstance(value, np.ndarray):
+        if index is not None:
+            raise ValueError(f"parameters: {name!r}: expected no index, as it is a single number")
+        return None
+    if index is None and (first or count == 1):
+        return 0
+    if index is None:
+        raise ValueError(f"parameters: {name!r}: expected one of its {count} numbers, as {name}[0], got all of them")
+    if index >= count:
+        raise ValueError(f"parameters: {name!r}: expected an index from 0 to {count - 1}, got {index}")
+    return index
+
+
+def _inertial(model: mujoco.MjModel, body: str, attribute: str, index: int | None, name: str) -> Edit:
+    """Of a body's inertial frame, which is made explicit: as compiled, but for one number."""
+    compiled = model.body(body)
+    own = {key: np.array(getattr(compiled, key)) for key in INERTIAL}
+    if own["mass"][0] <= 0 and attribute != "mass":
+        raise ValueError(f"parameters: {name!r}: expected a body that has a mass, got one without")
+    where = place(own[attribute] if attribute != "mass" else float(own["mass"][0]), index, name)
+
+    def apply(spec: mujoco.MjSpec, number: float) -> None:
+        target = spec.body(body)
+        if not target.explicitinertial:
+            for key in INERTIAL:
+                setattr(target, key, float(own[key][0]) if key == "mass" else own[key])
+            target.explicitinertial = True
+            target.fullinertia = np.full((6, 1), np.nan)  # another way to say what `inertia` and `iquat` say
+        if attribute == "mass":
+            target.inertia = np.array(target.inertia) * (number / target.mass if target.mass > 0 else 1.0)
+            target.mass = number
+        else:
+            values = np.array(getattr(target, attribute))
+            values[where] = number
+            setattr(target, attribute, values)
+
+    return Edit(name, apply)
+
+
+def check_effect(spec: mujoco.MjSpec, one: Edit, support: tuple[float, float]) -> None:
+    """Refuse a parameter that the compiled model does not depend on.
+
+    Raises:
+        ValueError: naming it.
+    """
+    compiled = []
+    for number in support:
+        changed = spec.copy()
+        one.apply(changed, number)
+        try:
+            compiled.append(changed.compile())
+        except ValueError as error:
+            raise ValueError(
+                f"parameters: {one.name!r}: MuJoCo refuses a model with {number:g}: {' '.join(str(error).split())}"
+            ) from error
+    if _bytes(compiled[0]) == _bytes(compiled[1]):
+        raise ValueError(
+            f"parameters: {one.name!r}: expected a number that the model depends on: it is the same with "
+            f"{support[0]:g} and {support[1]:g} (another attribute may override it, as an explicit inertial a density)"
+        )
+
+
+def _bytes(model: mujoco.MjModel) -> bytes:
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def near(got: str, known: Sequence[str]) -> str:
+    """Of names that are known, those most like the one that was given."""
+    near = difflib.get_close_matches(got, known, 4, 0.4) or sorted(known)[:8]
+    return f"such as {', '.join(near)}" if near else "(there are none with a name)"

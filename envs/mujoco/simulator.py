@@ -1,0 +1,186 @@
+"""Simulations of a model under the recorded controls, by MuJoCo's threaded rollouts."""
+
+import contextlib
+import threading
+from collections.abc import Callable, Mapping, Sequence
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxlfi.envs.mujoco import measured
+from jaxlfi.envs.mujoco.effects import Effects
+from jaxlfi.envs.mujoco.logs import Log
+from jaxlfi.io.host_devices import processors
+
+CHUNK = 128
+"""Models that are rolled out in one call, which bounds the memory of their states."""
+UNSTABLE, REFUSED = 1, 2
+"""Why a simulation fails, as `FAILURES` numbers it."""
+FAILURES = ("unstable", "refused by MuJoCo")
+_LOCK = threading.Lock()
+"""Held while a pool of threads is in use, which does one rollout at a time."""
+
+
+class Simulator:
+    """Simulates all episodes of parameter vectors; `jaxlfi.HostSimulator` calls it.
+
+    Attributes:
+        times: of the rows of each episode, in s.
+        observation: what was recorded, episodes one after another, shape [sum T, C]; 0 where there is no sample.
+        there: whether there is a sample, shape [sum T, C].
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        build: Callable[[np.ndarray], mujoco.MjModel],
+        logs: Sequence[Log],
+        signals: Sequence[str],
+        noise: Mapping[str, float],
+        starts: Sequence[np.ndarray],
+        does: Effects = Effects(),
+        threads: int | None = None,
+    ):
+        """Recordings are checked; nothing is simulated yet.
+
+        Args:
+            model: as it is, with a sensor for each signal.
+            build: makes the model of a parameter vector [D], of the same sizes; raises ValueError where it cannot.
+            logs: one for each episode, with the model's actuators and the measured signals.
+            signals: that are measured (`measured`).
+            noise: standard deviation of each signal's noise.
+            starts: the state (`effects.STATE`) that each episode begins in.
+            does: what parameters do besides.
+            threads: by default as many as processors.
+
+        Raises:
+            ValueError: for recordings that do not fit the model, in one line.
+        """
+        self._model, self._build, self._does = model, build, does
+        self._logs, self._signals, self._starts = tuple(logs), tuple(signals), tuple(starts)
+        self._places = measured.places(model, signals)
+        self._noise = np.array([noise[name] for name in signals])
+        self._actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
+        rows = [self._measured_rows(log) for log in logs]
+        self.times = [log.times[own] for log, own in zip(logs, rows, strict=True)]
+        recorded = np.concatenate(
+            [
+                np.stack([log.signals[name] for name in signals], axis=1)[own]
+                for log, own in zip(logs, rows, strict=True)
+            ]
+        )
+        self.there = np.isfinite(recorded)
+        self.observation = np.where(self.there, recorded, 0.0).astype(np.float32)
+        self._threads = threads or processors()
+        self._pool: mujoco.rollout.Rollout | None = None
+
+    def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
+        """Rows of a log with a sample of anything that is measured."""
+        known = ", ".join(log.signals)
+        if missing := [name for name in self._actuators if name not in log.signals]:
+            raise ValueError(
+                f"{log.name}: expected a control for each actuator of the model, got none of {', '.join(missing)} "
+                f"among {known}"
+            )
+        if missing := [name for name in self._signals if name not in log.signals]:
+            raise ValueError(f"{log.name}: expected signals {', '.join(missing)}, got {known}")
+        if log.times[-1] < self._model.opt.timestep:
+            raise ValueError(
+                f"{log.name}: expected more than a step of the model, {self._model.opt.timestep:g} s, "
+                f"got {log.times[-1]:g} s"
+            )
+        return np.flatnonzero(np.isfinite([log.signals[name] for name in self._signals]).any(axis=0))
+
+    def __call__(
+        self, rng: np.random.Generator, theta: Float[np.ndarray, "n dim"]
+    ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
+        """Measurements with their noise, and 0 or why each simulation failed."""
+        clean, outcome = self.clean(theta)
+        deviation = np.tile(self._noise, (len(theta), 1))
+        for signal, d in self._does.deviations:
+            deviation[:, signal] = theta[:, d]
+        noisy = clean + deviation[:, None] * rng.standard_normal(clean.shape)
+        return np.where(self.there, noisy, 0.0), outcome
+
+    def clean(
+        self, theta: Float[np.ndarray, "n dim"]
+    ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
+        """Measurements without noise, and 0 or why each simulation failed; those that failed are zero."""
+        theta = np.asarray(theta, float)
+        rows, outcome = np.zeros((len(theta), *self.observation.shape)), np.zeros(len(theta), int)
+        with _LOCK, _quietly():
+            for first in range(0, len(theta), CHUNK):
+                part = slice(first, first + CHUNK)
+                rows[part], outcome[part] = self._rolled(theta[part])
+        for signal, d in self._does.biases:
+            rows[:, :, signal] += theta[:, d, None]
+        rows[outcome != 0] = 0.0
+        return rows, outcome
+
+    def _rolled(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        models = [self._made(row) for row in theta]
+        outcome = np.array([0 if model else REFUSED for model in models])
+        good = np.flatnonzero(outcome == 0)
+        rows = np.zeros((len(theta), *self.observation.shape))
+        if not len(good):
+            return rows, outcome
+        if self._pool is None:
+            self._pool = mujoco.rollout.Rollout(nthread=self._threads)
+        data = [mujoco.MjData(self._model) for _ in range(self._threads)]
+        begin = 0
+        for log, times, own in zip(self._logs, self.times, self._starts, strict=True):
+            start = np.tile(own, (len(good), 1))
+            for place, d in self._does.starts:
+                start[:, place] = theta[good, d]
+            grid = self._grid(times)
+            states, sensors = self._pool.rollout(
+                [models[row] for row in good], data, start, self._controls(log, theta[good], grid)
+            )
+            # MuJoCo begins anew where a simulation has become unstable, and its clock with it.
+            step = self._model.opt.timestep
+            stopped = np.abs(states[:, -1, 0] - own[0] - len(grid) * step) > step / 2
+            values = sensors[:, :, self._places]
+            stopped |= ~np.isfinite(values).all(axis=(1, 2)) | ~np.isfinite(states[:, -1]).all(axis=1)
+            outcome[good[stopped]] = UNSTABLE
+            rows[good, begin : begin + len(times)] = _between(grid, values, times)
+            begin += len(times)
+        return rows, outcome
+
+    def _grid(self, times: np.ndarray) -> np.ndarray:
+        """Times of the model's steps that reach beyond an episode's last measurement."""
+        step = self._model.opt.timestep
+        return step * np.arange(int(np.ceil(times[-1] / step - 1e-9)) + 1)
+
+    def _controls(self, log: Log, theta: np.ndarray, grid: np.ndarray) -> np.ndarray:
+        """Controls of each model at each step, shape [N, steps, actuators]."""
+        delays = np.zeros(len(theta)) if self._does.delay is None else theta[:, self._does.delay]
+        when = grid - delays[:, None]
+        held = [log.held(name, when) for name in self._actuators]
+        return np.stack(held, axis=-1) if held else np.zeros((len(theta), len(grid), 0))
+
+    def _made(self, theta: np.ndarray) -> mujoco.MjModel | None:
+        """A model of its own; None where MuJoCo refuses it, as for a body of negative mass."""
+        try:
+            return self._build(theta)
+        except ValueError:
+            return None
+
+
+def _between(grid: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Values [N, steps, C] at other times, linearly between steps."""
+    after = np.clip(np.searchsorted(grid, times - 1e-9), 1, len(grid) - 1)
+    share = np.clip((times - grid[after - 1]) / (grid[after] - grid[after - 1]), 0.0, 1.0)[:, None]
+    return (1 - share) * values[:, after - 1] + share * values[:, after]
+
+
+@contextlib.contextmanager
+def _quietly():
+    """Without MuJoCo's warnings, which it prints and appends to a file: failures are counted here."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)

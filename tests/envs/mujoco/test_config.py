@@ -1,0 +1,109 @@
+"""Tasks that TOML files describe."""
+
+import csv
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+from envs_mujoco import ARM, recorded
+
+from jaxlfi.cli import parser as cli
+from jaxlfi.envs.mujoco.config import read
+from jaxlfi.tasks import registry
+
+CONFIG = """
+model = "arm.xml"
+log = ["swing.csv"]
+measured = ["angle"]
+
+[parameters."joint/elbow/damping"]
+support = [0.01, 0.2]
+feasible = [0.001, 1]
+unit = "N m s/rad"
+log = true
+truth = 0.03
+
+[parameters."control/delay"]
+support = [0, 0.1]
+truth = 0
+
+[noise]
+angle = 0.002
+
+[initial]
+"shoulder/qpos" = 0.25
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "arm.xml").write_text(ARM)
+    log = recorded()
+    with (tmp_path / "swing.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time [s]", "motor [N m]", "angle [deg]"])
+        writer.writerows(zip(log.times, log.signals["motor"], np.rad2deg(log.signals["angle"]), strict=True))
+    (tmp_path / "arm.toml").write_text(CONFIG)
+    return tmp_path
+
+
+def test_a_file_says_all_of_it(folder):
+    task = registry.load(f"mujoco,config={folder / 'arm.toml'}")
+    assert task.name == "arm" and task.names == ("joint/elbow/damping", "control/delay")
+    assert task.units == ("N m s/rad", "") and task.log == ("joint/elbow/damping",) and task.channels == ("angle",)
+    np.testing.assert_allclose(task.truth, [0.03, 0])
+    np.testing.assert_allclose(task.feasible.high, [1, 0.1])
+    np.testing.assert_allclose(task.observation[:, 0], recorded().signals["angle"], atol=1e-6)
+    rows, _ = task.simulate.function.clean([[0.03, 0.0]])
+    np.testing.assert_allclose(rows[0, :, 0], recorded(start=(0.25, 0.0)).signals["angle"], atol=1e-9)
+    noisy, _ = task.simulate.function(np.random.default_rng(0), np.array([[0.03, 0.0]]))
+    assert np.std(noisy - rows) == pytest.approx(0.002, rel=4 / np.sqrt(2 * 101))
+
+
+def test_another_recording_in_its_place(folder):
+    (folder / "other.csv").write_text("time [s],motor,angle [rad]\n0,0,0.5\n1,0,0.25\n")
+    task = registry.load(f"mujoco,config={folder / 'arm.toml'},log={folder / 'other.csv'}")
+    assert task.observation[:, 0].tolist() == [0.5, 0.25]
+    both = registry.load(f"mujoco,config={folder / 'arm.toml'},log={folder / 'other.csv'};{folder / 'swing.csv'}")
+    assert both.observation.shape == (103, 1)
+
+
+def test_without_a_file_it_says_what_it_needs(capsys):
+    assert cli.main(["tasks", "mujoco"]) == 2
+    assert "config: expected a TOML file that describes a task, as mujoco,config=arm.toml" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('model = "arm.xml"', "", "expected model, got none"),
+        ('model = "arm.xml"', "model = 3", "model: expected a str, got 3"),
+        ('model = "arm.xml"', 'model = "leg.xml"', "expected an MJCF file, got none called "),
+        ('log = ["swing.csv"]', "", "expected recordings, as log = \\[FILE\\], or mujoco,config="),
+        ('log = ["swing.csv"]', 'log = ["none.csv"]', "none.csv: expected a CSV file"),
+        ("[noise]", "[noises]", "expected keys among model, log, .* got 'noises'"),
+        ("angle = 0.002", 'angle = "low"', "noise: angle: expected a number, got 'low'"),
+        ("support = [0, 0.1]", "support = [0.1, 0]", "'control/delay': support: expected LOW below HIGH"),
+        ("support = [0, 0.1]", "support = 0.1", "'control/delay': support: expected \\[LOW, HIGH\\], got 0.1"),
+        ("support = [0, 0.1]", "", "'control/delay': expected support = \\[LOW, HIGH\\]"),
+        ("support = [0, 0.1]", "support = [0, 0.1]\nbounds = 1", "expected keys among support, .* got bounds"),
+        ("log = true", "log = 1", "expected log = true or false and a unit in quotes"),
+        ("feasible = [0.001, 1]", "feasible = [0.1, 1]", "support: expected bounds within feasible"),
+        ("feasible = [0.001, 1]", "feasible = [0, 1]", "expected positive bounds for the log parameters"),
+        ("joint/elbow/damping", "joint/elbo/damping", "expected a joint such as elbow, got 'elbo'"),
+        ('"shoulder/qpos"', '"wrist/qpos"', "expected a joint such as "),
+        ("[initial]", "[initial", "expected a TOML file, got a missing or damaged one"),
+    ],
+)
+def test_files_that_describe_no_task_are_one_line(folder, capsys, old, new, expected):
+    path = folder / "arm.toml"
+    assert old in CONFIG
+    path.write_text(CONFIG.replace(old, new))
+    with pytest.raises(ValueError, match=expected) as caught:
+        read(path)
+    assert "\n" not in str(caught.value)
+    out = folder / "run"
+    assert cli.main(["infer", f"mujoco,config={path}", "--out", str(out)]) == 2
+    assert "Traceback" not in capsys.readouterr().err and not out.exists()
