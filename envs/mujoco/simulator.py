@@ -151,7 +151,7 @@ class Simulator:
     def _grid(self, times: np.ndarray) -> np.ndarray:
         """Times of the model's steps that reach beyond an episode's last measurement."""
         step = self._model.opt.timestep
-        return step * np.arange(int(np.ceil(times[-1] / step - 1e-9)) + 1)
+        return step * np.arange(max(int(np.ceil(times[-1] / step - 1e-9)), 1) + 1)
 
     def _controls(self, log: Log, theta: np.ndarray, grid: np.ndarray) -> np.ndarray:
         """Controls of each model at each step, shape [N, steps, actuators]."""
