@@ -17,6 +17,8 @@ EVERY = 2
 """Control steps between the frames of the sheet."""
 BLACK = 2 * 255
 """Twice what a byte of a mask can be: the DLO is grey, and its keypoints stand out."""
+MARGIN = 0.03
+"""About the keypoints, in widths of the image."""
 MARKS: Mapping[str, Mapping] = {
     "transporter": {"marker": "o", "markersize": 4.5, "markeredgecolor": "white", "markeredgewidth": 0.5},
     "centreline": {"marker": "x", "markersize": 3.5, "markeredgewidth": 0.8},
@@ -60,13 +62,21 @@ def _film(path: Path, shown: Mapping[str, np.ndarray]) -> None:
     save_gif(path, figure, steps, show, SLOWNESS * CONTROL_INTERVAL)
 
 
+def _window(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The square that holds all points of a rollout, so that a DLO that is a tenth of the picture can be seen."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = max(high - low) / 2 + MARGIN
+    return (low + high) / 2 - half, (low + high) / 2 + half
+
+
 class _Panel:
     """A rollout on axes: the mask of the DLO, and in it the keypoints, of one colour each."""
 
     def __init__(self, axes: Axes, shown: Mapping[str, np.ndarray], rollout: int):
         self._masks, self._points = shown["masks"][rollout], {name: shown[name][rollout] for name in MARKS}
         self._image = axes.imshow(self._masks[0], extent=(0, 1, 1, 0), cmap="Greys", vmin=0, vmax=BLACK)
-        axes.set(xticks=[], yticks=[], xlim=(0, 1), ylim=(1, 0))
+        (left, up), (right, down) = _window(np.concatenate([points.reshape(-1, 2) for points in self._points.values()]))
+        axes.set(xticks=[], yticks=[], xlim=(left, right), ylim=(down, up))
         self._lines = {
             name: [axes.plot([], [], linestyle="none", color=colour, **mark)[0] for colour in style.SET_COLOURS[:4]]
             for name, mark in MARKS.items()
