@@ -52,7 +52,7 @@ def effects(
         signals: that are measured.
 
     Raises:
-        ValueError: for names that match nothing or several things, and parameters without an effect, in one line.
+        ValueError: for names that match nothing or several numbers, and parameters without an effect, in one line.
     """
     found: dict[str, list] = {"edits": [], "starts": [], "biases": [], "deviations": []}
     delay = None

@@ -1,4 +1,4 @@
-"""A task of a MuJoCo model: which of its numbers are doubted, and what was recorded of the real thing."""
+"""An inference task of a MuJoCo model: its unknown parameters, and recordings of the real system."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence

@@ -1,6 +1,5 @@
 """Simulations of a model under the recorded controls, by MuJoCo's threaded rollouts."""
 
-import contextlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
@@ -12,6 +11,7 @@ from jaxtyping import Float, Int
 from jaxlfi.envs.mujoco import measured
 from jaxlfi.envs.mujoco.effects import Effects
 from jaxlfi.envs.mujoco.logs import Log
+from jaxlfi.envs.mujoco.quiet import quietly
 from jaxlfi.io.host_devices import processors
 
 CHUNK = 128
@@ -110,7 +110,7 @@ class Simulator:
         """Measurements without noise, and 0 or why each simulation failed; those that failed are zero."""
         theta = np.asarray(theta, float)
         rows, outcome = np.zeros((len(theta), *self.observation.shape)), np.zeros(len(theta), int)
-        with _LOCK, _quietly():
+        with _LOCK, quietly():
             for first in range(0, len(theta), CHUNK):
                 part = slice(first, first + CHUNK)
                 rows[part], outcome[part] = self._rolled(theta[part])
@@ -173,14 +173,3 @@ def _between(grid: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndar
     after = np.clip(np.searchsorted(grid, times - 1e-9), 1, len(grid) - 1)
     share = np.clip((times - grid[after - 1]) / (grid[after] - grid[after - 1]), 0.0, 1.0)[:, None]
     return (1 - share) * values[:, after - 1] + share * values[:, after]
-
-
-@contextlib.contextmanager
-def _quietly():
-    """Without MuJoCo's warnings, which it prints and appends to a file: failures are counted here."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)

@@ -4,7 +4,6 @@ The contacts within the stack of cubes take four fifths of a step. While the cub
 the gripper or the DLO comes near them in an interval, that interval is simulated again with them.
 """
 
-import contextlib
 import dataclasses
 import functools
 import threading
@@ -18,6 +17,7 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlfi.envs.mujoco.quiet import quietly
 from jaxlfi.envs.whip.parameters import WhipParameters
 from jaxlfi.envs.whip.physics.edits import edited_bare_model, edited_model
 from jaxlfi.envs.whip.physics.engine import State, ramp, settled
@@ -125,17 +125,6 @@ def _near(scene: Scene, places, cubes, length, side) -> np.ndarray:
     return near
 
 
-@contextlib.contextmanager
-def _quietly():
-    """Suppress MuJoCo's warnings, which it prints and appends to a file: failures are counted here."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
-
-
 class _ModelCache:
     """The models of one kind that were built last, and the memory that threads simulate them in."""
 
@@ -154,7 +143,7 @@ class _ModelCache:
             return (qpos, qvel), np.zeros(0, bool), np.zeros((0, self._scene.substeps, self._base.nsensor, 3))
         models = [self._model(scene) for scene in parameters]
         start = np.concatenate([np.zeros((len(models), 1)), qpos, qvel], axis=1)
-        with _quietly():
+        with quietly():
             states, points = self._rollout.rollout(models, self._data, start, control)
         end = states[:, -1]
         # MuJoCo stops the clock of a simulation that has become unstable.

@@ -32,11 +32,11 @@ CLASSES = "classes.txt"
 KNOWN = f"one of {', '.join(LABELS)}"
 
 OnPicture = Callable[[int, int], Any]
-"""Is told how many pictures there are so far, and how many there will be."""
+"""Called after each picture with the number of pictures done, and the number of all."""
 
 
-def _nobody(done: int, count: int) -> None:
-    """Whom nothing is told."""
+def _no_progress(done: int, count: int) -> None:
+    """Progress is not reported."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ class _Photograph:
 
 
 def from_coco(
-    annotations: Path, images: Path, out: Path, names: Mapping[str, str] = {}, on_picture: OnPicture = _nobody
+    annotations: Path, images: Path, out: Path, names: Mapping[str, str] = {}, on_picture: OnPicture = _no_progress
 ) -> int:
     """Make a data set of photographs from COCO instance segmentation; returns the number of its pictures.
 
@@ -101,7 +101,7 @@ def from_yolo(
     out: Path,
     classes: Sequence[str],
     names: Mapping[str, str] = {},
-    on_picture: OnPicture = _nobody,
+    on_picture: OnPicture = _no_progress,
 ) -> int:
     """Make a data set of photographs from YOLO segmentation; returns the number of its pictures.
 

@@ -148,7 +148,7 @@ def plain(frame: Frames) -> Look:
 
 
 def _jittered(key: jax.Array, colours: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """The colours with hue, saturation and value perturbed, so little that they can still be told apart."""
+    """The colours with small random changes of hue, saturation and value; they stay distinguishable."""
     key_hue, key_saturation, key_value = jax.random.split(key, 3)
     hue, saturation, value = jnp.moveaxis(_hsv(colours), -1, 0)
     n = hue.shape

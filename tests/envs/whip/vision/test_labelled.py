@@ -336,9 +336,9 @@ def test_an_interrupted_data_set_goes_on(tmp_path, monkeypatch):
         from_yolo(tmp_path, texts, "out")
     with pytest.raises(ValueError, match="interrupted"):
         pictures.read(tmp_path / "out")
-    told = []
-    data = from_yolo(tmp_path, texts, "out", on_picture=lambda *so_far: told.append(so_far))
-    assert told == [(3, 4), (4, 4)]
+    progress = []
+    data = from_yolo(tmp_path, texts, "out", on_picture=lambda *so_far: progress.append(so_far))
+    assert progress == [(3, 4), (4, 4)]
     np.testing.assert_array_equal(data.rgb, whole.rgb)
     np.testing.assert_array_equal(data.labels, whole.labels)
     assert data.entries == whole.entries
