@@ -15,6 +15,12 @@ angle = 0.002
 
 [initial]                           # other than the model's
 "hinge/qpos" = 0.5
+
+[discrepancy]                       # what the model gets wrong: a standard deviation, and for how long (s)
+angle = { deviation = 0.01, time = 0.2 }
+
+[supports.wide]                     # another first guess, for --support wide
+"joint/hinge/damping" = [0.0001, 0.1]
 """
 
 import tomllib
@@ -22,6 +28,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
 from jaxlfi.tasks.task import Task
@@ -33,6 +40,8 @@ KEYS: Mapping[str, type] = {
     "parameters": dict,
     "noise": dict,
     "initial": dict,
+    "discrepancy": dict,
+    "supports": dict,
     "name": str,
 }
 PARAMETER = ("support", "feasible", "unit", "log", "truth")
@@ -74,6 +83,8 @@ def read(path: Path, recorded: Sequence[Path] = ()) -> Task:
             config.get("measured"),
             {name: _number(value, f"noise: {name}") for name, value in config.get("noise", {}).items()},
             {name: _number(value, f"initial: {name}") for name, value in config.get("initial", {}).items()},
+            {name: _discrepancy(name, table) for name, table in config.get("discrepancy", {}).items()},
+            {label: _guess(label, table) for label, table in config.get("supports", {}).items()},
             name=config.get("name", path.stem),
         )
     except ValueError as error:
@@ -88,15 +99,31 @@ def _parameter(name: str, table: Any) -> Parameter:
         raise ValueError(f"{where}: expected keys among {', '.join(PARAMETER)}, got {', '.join(unknown)}")
     bounds = {}
     for key in ("support", "feasible"):
-        pair = table.get(key, table["support"])
-        if not isinstance(pair, list) or len(pair) != 2:
-            raise ValueError(f"{where}: {key}: expected [LOW, HIGH], got {pair!r}")
-        bounds[key] = tuple(_number(number, f"{where}: {key}") for number in pair)
+        bounds[key] = _pair(table.get(key, table["support"]), f"{where}: {key}")
     log, unit, truth = table.get("log", False), table.get("unit", ""), table.get("truth")
     if not isinstance(log, bool) or not isinstance(unit, str):
         raise ValueError(f"{where}: expected log = true or false and a unit in quotes, got {log!r} and {unit!r}")
     truth = None if truth is None else _number(truth, f"{where}: truth")
     return Parameter(name, bounds["support"], bounds["feasible"], unit, log, truth)
+
+
+def _guess(label: str, table: Any) -> dict[str, tuple[float, float]]:
+    if not isinstance(table, dict):
+        raise ValueError(f"supports: {label}: expected bounds [LOW, HIGH] of parameters, got {table!r}")
+    return {name: _pair(pair, f"supports: {label}: {name!r}") for name, pair in table.items()}
+
+
+def _discrepancy(name: str, table: Any) -> Discrepancy:
+    where = f"discrepancy: {name}"
+    if not isinstance(table, dict) or set(table) != {"deviation", "time"}:
+        raise ValueError(f"{where}: expected {{ deviation = NUMBER, time = SECONDS }}, got {table!r}")
+    return Discrepancy(**{key: _number(value, f"{where}: {key}") for key, value in table.items()})
+
+
+def _pair(pair: Any, where: str) -> tuple[float, float]:
+    if not isinstance(pair, list) or len(pair) != 2:
+        raise ValueError(f"{where}: expected [LOW, HIGH], got {pair!r}")
+    return _number(pair[0], where), _number(pair[1], where)
 
 
 def _number(value: Any, where: str) -> float:

@@ -72,6 +72,21 @@ class Log:
         last = np.searchsorted(self.times[there], times + 1e-9, side="right") - 1
         return self.signals[name][there[np.maximum(last, 0)]]
 
+    def mean_held(self, name: str, times: np.ndarray, interval: float) -> np.ndarray:
+        """Means of a held signal over intervals that begin at other times; shape that of `times`.
+
+        Unlike its values they are continuous in the times: a delay by a part of a step makes a difference.
+        """
+        there = np.flatnonzero(np.isfinite(self.signals[name]))
+        since, values = self.times[there], self.signals[name][there]
+        before = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(since))])
+
+        def integral(to: np.ndarray) -> np.ndarray:
+            last = np.maximum(np.searchsorted(since, to, side="right") - 1, 0)
+            return before[last] + values[last] * (to - since[last])
+
+        return (integral(times + interval) - integral(times)) / interval
+
 
 def read(path: Path) -> Log:
     """Read a recording.

@@ -1,5 +1,6 @@
 """An inference task of a MuJoCo model: its unknown parameters, and recordings of the real system."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import logs, noise
+from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import effects, initial_state
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
@@ -37,6 +39,8 @@ def mujoco_task(
     measured: Sequence[str] | None = None,
     noises: Mapping[str, float] | None = None,
     initial: Mapping[str, float] | None = None,
+    discrepancies: Mapping[str, Discrepancy] | None = None,
+    supports: Mapping[str, Mapping[str, tuple[float, float]]] | None = None,
     summary: str | Callable[[jax.Array], jax.Array] = "samples",
     threads: int | None = None,
     **others: Any,
@@ -56,6 +60,8 @@ def mujoco_task(
             body/NAME/pos[0], body/NAME/quat[0]. By default all of the recording but its controls.
         noises: standard deviations of the signals' noise. Of others it is estimated from the first recording.
         initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
+        discrepancies: what the model gets wrong of signals, beyond their noise; `least_squares` finds it.
+        supports: other first guesses by name: the bounds of some parameters, those of others being their `support`.
         summary: "samples", up to 30 rows of each episode at equal intervals; or as for `jaxlfi.Task`.
         threads: of simulations; by default as many as processors.
         **others: of `jaxlfi.Task`.
@@ -87,8 +93,11 @@ def mujoco_task(
         return own.compile()
 
     starts = [initial_state(compiled, initial or {})] * len(episodes)
-    simulator = Simulator(compiled, build, episodes, measured, deviations, starts, does, threads)
-    return task_of(simulator, parameters, measured, summary, **{"name": spec.modelname or "mujoco"} | others)
+    if unknown := [name for name in discrepancies or {} if name not in measured]:
+        raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
+    simulator = Simulator(compiled, build, episodes, measured, deviations, starts, does, discrepancies, threads)
+    others = {"name": spec.modelname or "mujoco"} | others
+    return task_of(simulator, parameters, measured, summary, supports, **others)
 
 
 def task_of(
@@ -96,12 +105,15 @@ def task_of(
     parameters: Sequence[Parameter],
     measured: Sequence[str],
     summary: str | Callable[[jax.Array], jax.Array] = "samples",
+    guesses: Mapping[str, Mapping[str, tuple[float, float]]] | None = None,
     **others: Any,
 ) -> Task:
     """The task of a simulator; see `mujoco_task`."""
     if summary == "samples":
         summary = functools.partial(samples, rows=_rows([len(times) for times in simulator.times]))
-    supports = [one.support for one in parameters]
+    supports = {"initial": _box([one.support for one in parameters])}
+    for label, bounds in (guesses or {}).items():
+        supports[label] = _box([one.support for one in _guessed(parameters, label, bounds)])
     feasible = [one.feasible or one.support for one in parameters]
     truth = [one.truth for one in parameters]
     return Task(
@@ -109,7 +121,7 @@ def task_of(
         names=[one.name for one in parameters],
         units=[one.unit for one in parameters],
         log=[one.name for one in parameters if one.log],
-        supports={"initial": _box(supports), "feasible": _box(feasible)},
+        supports=supports | {"feasible": _box(feasible)},
         feasible=_box(feasible),
         truth=None if None in truth else np.asarray(truth, np.float32),
         observation=simulator.observation,
@@ -119,6 +131,16 @@ def task_of(
         times=simulator.times[0] if len(simulator.times) == 1 else None,
         **others,
     )
+
+
+def _guessed(
+    parameters: Sequence[Parameter], label: str, bounds: Mapping[str, tuple[float, float]]
+) -> list[Parameter]:
+    """Parameters with other bounds of Theta_0."""
+    known = [one.name for one in parameters]
+    if unknown := [name for name in bounds if name not in known]:
+        raise ValueError(f"supports: {label}: expected some of {', '.join(known)}, got {', '.join(unknown)}")
+    return [dataclasses.replace(one, support=bounds.get(one.name, one.support)) for one in parameters]
 
 
 def _specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:

@@ -1,5 +1,6 @@
 """Simulations of a model under the recorded controls, by MuJoCo's threaded rollouts."""
 
+import copy
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxlfi.envs.mujoco import measured
+from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import Effects
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.quiet import quietly
@@ -30,6 +32,7 @@ class Simulator:
         times: of the rows of each episode, in s.
         observation: what was recorded, episodes one after another, shape [sum T, C]; 0 where there is no sample.
         there: whether there is a sample, shape [sum T, C].
+        noise: standard deviation of each signal's noise, shape [C]; 0 where it is inferred.
     """
 
     def __init__(
@@ -41,6 +44,7 @@ class Simulator:
         noise: Mapping[str, float],
         starts: Sequence[np.ndarray],
         does: Effects = Effects(),
+        discrepancies: Mapping[str, Discrepancy] | None = None,
         threads: int | None = None,
     ):
         """Recordings are checked; nothing is simulated yet.
@@ -53,6 +57,7 @@ class Simulator:
             noise: standard deviation of each signal's noise.
             starts: the state (`effects.STATE`) that each episode begins in.
             does: what parameters do besides.
+            discrepancies: what the model gets wrong of signals; nothing of others.
             threads: by default as many as processors.
 
         Raises:
@@ -61,7 +66,8 @@ class Simulator:
         self._model, self._build, self._does = model, build, does
         self._logs, self._signals, self._starts = tuple(logs), tuple(signals), tuple(starts)
         self._places = measured.places(model, signals)
-        self._noise = np.array([noise[name] for name in signals])
+        self.noise = np.array([noise[name] for name in signals])
+        self._discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
         self._actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
         rows = [self._measured_rows(log) for log in logs]
         self.times = [log.times[own] for log, own in zip(logs, rows, strict=True)]
@@ -75,6 +81,17 @@ class Simulator:
         self.observation = np.where(self.there, recorded, 0.0).astype(np.float32)
         self._threads = threads or processors()
         self._pool: mujoco.rollout.Rollout | None = None
+
+    def finer(self, factor: int = 10) -> "Simulator":
+        """The same, integrated by Runge-Kutta in steps that are shorter by a factor."""
+        finer, build = copy.copy(self), self._build
+
+        def sharpened(model: mujoco.MjModel) -> mujoco.MjModel:
+            model.opt.timestep, model.opt.integrator = self._model.opt.timestep / factor, mujoco.mjtIntegrator.mjINT_RK4
+            return model
+
+        finer._model, finer._build = sharpened(copy.copy(self._model)), lambda theta: sharpened(build(theta))
+        return finer
 
     def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
         """Rows of a log with a sample of anything that is measured."""
@@ -96,12 +113,14 @@ class Simulator:
     def __call__(
         self, rng: np.random.Generator, theta: Float[np.ndarray, "n dim"]
     ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
-        """Measurements with their noise, and 0 or why each simulation failed."""
+        """Measurements with their noise and discrepancies, and 0 or why each simulation failed."""
         clean, outcome = self.clean(theta)
-        deviation = np.tile(self._noise, (len(theta), 1))
+        deviation = np.tile(self.noise, (len(theta), 1))
         for signal, d in self._does.deviations:
             deviation[:, signal] = theta[:, d]
         noisy = clean + deviation[:, None] * rng.standard_normal(clean.shape)
+        for signal, process in self._discrepancies.items():
+            noisy[:, :, signal] += np.concatenate([process.draws(rng, len(theta), own) for own in self.times], axis=1)
         return np.where(self.there, noisy, 0.0), outcome
 
     def clean(
@@ -154,10 +173,10 @@ class Simulator:
         return step * np.arange(max(int(np.ceil(times[-1] / step - 1e-9)), 1) + 1)
 
     def _controls(self, log: Log, theta: np.ndarray, grid: np.ndarray) -> np.ndarray:
-        """Controls of each model at each step, shape [N, steps, actuators]."""
+        """Controls of each model over each step, shape [N, steps, actuators]."""
         delays = np.zeros(len(theta)) if self._does.delay is None else theta[:, self._does.delay]
         when = grid - delays[:, None]
-        held = [log.held(name, when) for name in self._actuators]
+        held = [log.mean_held(name, when, self._model.opt.timestep) for name in self._actuators]
         return np.stack(held, axis=-1) if held else np.zeros((len(theta), len(grid), 0))
 
     def _made(self, theta: np.ndarray) -> mujoco.MjModel | None:

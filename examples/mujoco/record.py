@@ -2,49 +2,161 @@
 
     python examples/mujoco/record.py
 
-The integrator is another (Runge-Kutta, a tenth of the step), and there are forces that the models do not have: stiction
-that falls with speed, and the drag of a cable. The truths are those of the .toml files.
+The integrator is another (Runge-Kutta, a tenth of the step), and there are forces that the models do not have: friction
+that falls with speed, the drag of a cable, a gear's backlash, air. The truths are those of the .toml files; `recorded`
+takes others.
 """
 
 import csv
+import dataclasses
+import tomllib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
+from jaxlfi.envs.mujoco.effects import effects, initial_state
+from jaxlfi.envs.mujoco.logs import Log
+
 FOLDER = Path(__file__).parent
-NOISE = 0.002
-"""Standard deviation of the encoders' noise, in rad."""
+STEP = 0.0002
+"""Of what stands for reality, in s; a tenth of the models'."""
 
 
-def furuta():
-    """Write furuta.csv: four seconds of a torque that falls while its frequency rises, at 100 Hz."""
-    spec = mujoco.MjSpec.from_file(str(FOLDER / "furuta.xml"))
-    spec.option.timestep, spec.option.integrator = 0.0002, mujoco.mjtIntegrator.mjINT_RK4
-    spec.joint("pendulum").damping[0] = 0.0003
-    spec.joint("arm").frictionloss = 0.006
-    spec.geom("arm").mass = 0.09
-    model = spec.compile()
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+@dataclasses.dataclass(frozen=True)
+class Reality:
+    """What an example's recording is made by, besides its model.
+
+    Attributes:
+        times: of the samples, in s.
+        controls: of each actuator, shape [T].
+        act: gives the simulated machine its controls and the forces that the model does not have, before each step;
+            called with model, data and the controls that were asked for.
+        units: of controls and sensors, as the table's headings have them.
+    """
+
+    times: np.ndarray
+    controls: Mapping[str, np.ndarray]
+    act: Callable[[mujoco.MjModel, mujoco.MjData, np.ndarray], None]
+    units: Mapping[str, str]
+
+
+def furuta() -> Reality:
+    """A torque that falls while its frequency rises; stiction, and a cable that pulls the arm back."""
     times = 0.01 * np.arange(400)
     torque = 0.08 * np.sin(2 * np.pi * times * (1.0 + 0.3 * times)) * np.exp(-0.15 * times)
-    angles = []
-    for force in torque:
-        angles.append(data.qpos.copy())
-        data.ctrl[0] = force
-        for _ in range(50):
-            speed, angle = data.qvel[0], data.qpos[0]
-            stiction = -0.0002 * np.tanh(speed / 0.01) * np.exp(-((speed / 0.3) ** 2))
-            cable = -0.00005 * angle
-            data.qfrc_applied[0] = stiction + cable
-            mujoco.mj_step(model, data)
-    measured = np.array(angles) + NOISE * rng.standard_normal((len(times), 2))
-    with (FOLDER / "furuta.csv").open("w", newline="") as file:
+
+    def act(model, data, controls):
+        speed, angle = data.qvel[0], data.qpos[0]
+        data.ctrl[:] = controls
+        data.qfrc_applied[0] = -0.0002 * np.tanh(speed / 0.01) * np.exp(-((speed / 0.3) ** 2)) - 0.00005 * angle
+
+    return Reality(times, {"motor": torque}, act, {"motor": "N m", "arm angle": "rad", "pendulum angle": "rad"})
+
+
+def arm() -> Reality:
+    """Two torques of their own frequencies; the elbow's gear has backlash, both joints stick a little."""
+    times = 0.01 * np.arange(500)
+    shoulder = 0.9 * np.sin(2 * np.pi * times * (0.3 + 0.08 * times))
+    elbow = 0.5 * np.sin(2 * np.pi * times * (0.9 - 0.05 * times) + 1.0)
+    gap, engaged = 0.006, [0.0, 0.0]  # s that the gear needs to cross it; the side it is on, and since when
+
+    def act(model, data, controls):
+        side = np.sign(controls[1])
+        if data.time == 0.0 or side != engaged[0]:
+            engaged[:] = side, data.time
+        data.ctrl[:] = controls[0], controls[1] * (data.time - engaged[1] >= gap)
+        data.qfrc_applied[:] = -0.01 * np.tanh(data.qvel / 0.02) * np.exp(-((data.qvel / 0.4) ** 2))
+
+    units = {"shoulder": "", "elbow": "", "shoulder angle": "rad", "elbow angle": "rad"}
+    return Reality(times, {"shoulder": shoulder, "elbow": elbow}, act, units)
+
+
+def puck() -> Reality:
+    """The puck flies off, slides, and comes back from the wall; the air brakes it a little."""
+
+    def act(model, data, controls):
+        data.qfrc_applied[:2] = -0.001 * data.qvel[:2] * np.hypot(*data.qvel[:2])
+
+    return Reality(0.01 * np.arange(120), {}, act, {"distance": "m"})
+
+
+def finger() -> Reality:
+    """The cable is pulled and let go, twice; its friction keeps a little of the pull."""
+    times = 0.02 * np.arange(200)
+    pull = 8.0 * np.clip(np.sin(2 * np.pi * times / 2.0), 0.0, None) + 2.0 * (times > 2.5)
+    loss = 0.02
+
+    def act(model, data, controls):
+        data.ctrl[:] = controls * (1 - loss * np.tanh(data.ten_velocity[0] / 0.05))
+
+    return Reality(times, {"pull": pull}, act, {"pull": "N", "bend": "rad"})
+
+
+EXAMPLES: Mapping[str, Callable[[], Reality]] = {"furuta": furuta, "arm": arm, "puck": puck, "finger": finger}
+
+
+def recorded(name: str, truth: Mapping[str, float] | None = None, seed: int = 0) -> Log:
+    """A recording of an example.
+
+    Args:
+        name: of the example.
+        truth: its parameters by name; by default those of its .toml file.
+        seed: of the sensors' noise.
+    """
+    with (FOLDER / f"{name}.toml").open("rb") as file:
+        config = tomllib.load(file)
+    reality, noise = EXAMPLES[name](), config["noise"]
+    truth = truth or {key: table["truth"] for key, table in config["parameters"].items()}
+    spec = mujoco.MjSpec.from_file(str(FOLDER / config["model"]))
+    supports = [tuple(table["support"]) for table in config["parameters"].values()]
+    nominal = spec.compile()
+    does = effects(spec, nominal, list(truth), supports, list(noise))
+    numbers = list(truth.values())
+    for edit, d in does.edits:
+        edit.apply(spec, numbers[d])
+    spec.option.timestep, spec.option.integrator = STEP, mujoco.mjtIntegrator.mjINT_RK4
+    model = spec.compile()
+    start = initial_state(nominal, config.get("initial", {}))
+    for place, d in does.starts:
+        start[place] = numbers[d]
+    delay = 0.0 if does.delay is None else numbers[does.delay]
+    controls = Log(reality.times, reality.controls)
+    measured = _simulated(model, start, reality, controls, delay, list(noise))
+    measured += list(noise.values()) * np.random.default_rng(seed).standard_normal(measured.shape)
+    return Log(reality.times, dict(reality.controls) | dict(zip(noise, measured.T, strict=True)), name)
+
+
+def _simulated(model, start, reality: Reality, controls: Log, delay: float, signals: list[str]) -> np.ndarray:
+    """What the sensors would read without noise, shape [T, C]."""
+    data = mujoco.MjData(model)
+    mujoco.mj_setState(model, data, start, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    steps = round((reality.times[1] - reality.times[0]) / STEP)
+    when = STEP * np.arange(steps * len(reality.times)) - delay
+    asked = np.stack([controls.mean_held(own, when, STEP) for own in reality.controls] or [[]] * len(when), axis=-1)
+    asked = asked.reshape(len(when), model.nu)
+    places = [int(model.sensor(own).adr[0]) for own in signals]
+    rows = []
+    for step, now in enumerate(asked):
+        if step % steps == 0:
+            mujoco.mj_forward(model, data)
+            rows.append(data.sensordata[places].copy())
+        reality.act(model, data, now)
+        mujoco.mj_step(model, data)
+    return np.array(rows)
+
+
+def write(name: str) -> None:
+    """Write an example's recording as a table, on a clock that does not begin at zero."""
+    log, units = recorded(name), EXAMPLES[name]().units
+    with (FOLDER / f"{name}.csv").open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["time [s]", "motor [N m]", "arm angle [rad]", "pendulum angle [rad]"])
-        rows = zip(12.5 + times, torque, *measured.T, strict=True)  # a clock that does not begin at zero
-        writer.writerows([f"{number:.6g}" for number in row] for row in rows)
+        writer.writerow(["time [s]", *(f"{signal} [{unit}]" if unit else signal for signal, unit in units.items())])
+        columns = [12.5 + log.times, *(log.signals[signal] for signal in units)]
+        writer.writerows([f"{number:.6g}" for number in row] for row in zip(*columns, strict=True))
 
 
 if __name__ == "__main__":
-    furuta()
+    for one in EXAMPLES:
+        write(one)

@@ -86,8 +86,8 @@ def test_noise_is_estimated_where_it_is_not_given():
     }
     parameters, sequences = arm(type(log)(log.times, signals))
     task = from_sysid(parameters, sequences, noise={"velocity": 0.01})
-    assert task.simulate.function._noise[0] == pytest.approx(0.05, rel=0.4)
-    assert task.simulate.function._noise[1:].tolist() == [0.01] * 3
+    assert task.simulate.function.noise[0] == pytest.approx(0.05, rel=0.4)
+    assert task.simulate.function.noise[1:].tolist() == [0.01] * 3
 
 
 def test_what_does_not_fit():

@@ -1,0 +1,85 @@
+"""What a model gets wrong of a measured signal, as a random process that simulations are given besides noise.
+
+Inference believes its simulator: intervals are too narrow where the real machine has forces that the model does not
+have. A Gaussian process on each signal says how far the model may be wrong, and for how long
+(Kennedy and O'Hagan, 2001, doi:10.1111/1467-9868.00294); here an Ornstein-Uhlenbeck process.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+_PERSISTS = np.exp(-1.0)
+"""The autocorrelation of an Ornstein-Uhlenbeck process after its correlation time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Discrepancy:
+    """An Ornstein-Uhlenbeck process.
+
+    Attributes:
+        deviation: its standard deviation, in the signal's unit.
+        time: after which its autocorrelation has fallen to 1/e, in s.
+
+    Raises:
+        ValueError: for numbers that are not such.
+    """
+
+    deviation: float
+    time: float
+
+    def __post_init__(self):
+        if not (0 <= self.deviation < np.inf and 0 < self.time < np.inf):
+            raise ValueError(
+                "discrepancy: expected a standard deviation of at least 0 and a correlation time above 0 s, "
+                f"got {self.deviation:g} and {self.time:g}"
+            )
+
+    def covariance(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time time"]:
+        """Of its values at some times."""
+        return self.deviation**2 * np.exp(-np.abs(times[:, None] - times) / self.time)
+
+    def draws(self, rng: np.random.Generator, n: int, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "n time"]:
+        """Independent draws of its values at increasing times, exact for any intervals."""
+        keep = np.exp(-np.diff(times) / self.time)
+        values = rng.standard_normal((n, len(times)))
+        for t, share in enumerate(keep, start=1):
+            values[:, t] = share * values[:, t - 1] + np.sqrt(1 - share**2) * values[:, t]
+        return self.deviation * values
+
+
+def estimated(residuals: Sequence[np.ndarray], times: Sequence[np.ndarray], noise: float) -> Discrepancy:
+    """The process that residuals of a fit look like, by their autocovariance.
+
+    Args:
+        residuals: of a signal, those of each episode; NaN where there is no sample. Shape [T] each.
+        times: of the samples, in s.
+        noise: the standard deviation of white noise, which is no discrepancy.
+    """
+    spacing = float(np.median(np.concatenate([np.diff(own) for own in times])))
+    on_grid = [_on_grid(own, when, spacing) for own, when in zip(residuals, times, strict=True)]
+    covariances = _autocovariances(on_grid)
+    variance = max(covariances[0] - noise**2, 0.0)
+    fallen = np.flatnonzero(covariances[1:] < _PERSISTS * variance)
+    lag = 1 + fallen[0] if len(fallen) else len(covariances)
+    return Discrepancy(float(np.sqrt(variance)), float(lag * spacing))
+
+
+def _on_grid(values: np.ndarray, times: np.ndarray, spacing: float) -> np.ndarray:
+    """Values at equal intervals, NaN between samples."""
+    rows = np.round((times - times[0]) / spacing).astype(int)
+    grid = np.full(rows[-1] + 1, np.nan)
+    grid[rows] = values
+    return grid
+
+
+def _autocovariances(episodes: Sequence[np.ndarray]) -> np.ndarray:
+    """About zero, at lags up to a half of the longest episode."""
+    found = []
+    for lag in range(max(len(own) for own in episodes) // 2):
+        products = np.concatenate([own[lag:] * own[: len(own) - lag] for own in episodes if len(own) > lag])
+        products = products[np.isfinite(products)]
+        found.append(products.mean() if len(products) else 0.0)
+    return np.array(found)
