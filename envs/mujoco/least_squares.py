@@ -64,7 +64,8 @@ class Residuals:
     """
 
     def __init__(self, task: Task, observation: np.ndarray | None = None):
-        """
+        """Nothing is simulated yet.
+
         Args:
             task: of a MuJoCo model.
             observation: another recording in place of the task's own, in the same rows.
@@ -75,7 +76,7 @@ class Residuals:
         simulator = getattr(task.simulate, "function", None)
         if not isinstance(simulator, Simulator):
             raise ValueError(f"task: expected one of a MuJoCo model, got {task.name}")
-        self._task, self.simulator, self.simulations = task, simulator, 0
+        self._log, self.simulator, self.simulations = np.asarray(task.space.log), simulator, 0
         self.observed = np.asarray(simulator.observation if observation is None else observation, float)
         there = simulator.there
         spread = np.array([self.observed[own, c].std() for c, own in enumerate(there.T)])
@@ -85,14 +86,18 @@ class Residuals:
     def __call__(self, coordinates: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n rows"]:
         """Of all that was measured, for several points."""
         self.simulations += len(coordinates)
-        clean, outcome = self.simulator.clean(np.asarray(self._task.space.to_natural(coordinates)))
+        clean, outcome = self.simulator.clean(self.natural(coordinates))
         scaled = ((clean + self.defect - self.observed) / self.noise)[:, self.simulator.there]
         scaled[outcome != 0] = _FAILED
         return scaled
 
+    def natural(self, coordinates: Float[np.ndarray, "*n dim"]) -> Float[np.ndarray, "*n dim"]:
+        """From inference space to natural units, in double precision, which differences need."""
+        return np.where(self._log, np.exp(np.where(self._log, coordinates, 0.0)), coordinates)
+
     def correct(self, point: Float[np.ndarray, " dim"]) -> None:
         """Add from now on what a finer integrator changes at a point; nothing where either fails."""
-        theta = np.asarray(self._task.space.to_natural(point[None]))
+        theta = self.natural(point[None])
         (coarse, failed), (fine, refused) = self.simulator.clean(theta), self.simulator.finer().clean(theta)
         self.simulations += 2
         self.defect = (fine - coarse)[0] if not (failed.any() or refused.any()) else np.zeros(self.observed.shape)
@@ -131,7 +136,7 @@ def fit(task: Task, start: Sequence[float], box: Support | None = None, observat
     discrepancies = _discrepancies(residuals, found.fun - defect)
     reach = 1.6449 * np.sqrt(np.diagonal(covariance))
     ends = np.clip(np.stack([found.x - reach, found.x + reach]), low, high)
-    natural = np.asarray(task.space.to_natural(np.concatenate([found.x[None], ends])))
+    natural = residuals.natural(np.concatenate([found.x[None], ends]))
     margin = 10 * STEP * (high - low)
     at_bound = (found.x - low < margin) | (high - found.x < margin)
     misfit = float(np.sqrt(np.mean(found.fun**2)))
@@ -169,7 +174,9 @@ def best_fits(
     return [dataclasses.replace(one, simulations=spent) for one in different]
 
 
-def _solved(residuals: Residuals, start: np.ndarray, low: np.ndarray, high: np.ndarray) -> scipy.optimize.OptimizeResult:
+def _solved(
+    residuals: Residuals, start: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> scipy.optimize.OptimizeResult:
     margin = STEP * (high - low)  # SciPy's method starts inside of its bounds
     return scipy.optimize.least_squares(
         lambda point: residuals(point[None])[0],
@@ -198,9 +205,7 @@ def _discrepancies(residuals: Residuals, scaled: np.ndarray) -> tuple[Discrepanc
     )
 
 
-def _covariances(
-    residuals: Residuals, discrepancies: Sequence[Discrepancy]
-) -> Float[np.ndarray, "measured measured"]:
+def _covariances(residuals: Residuals, discrepancies: Sequence[Discrepancy]) -> Float[np.ndarray, "measured measured"]:
     """Of all that was measured, in variances of the noise: white noise and discrepancies."""
     there, lengths = residuals.simulator.there, [len(own) for own in residuals.simulator.times]
     rows, signals = there.shape

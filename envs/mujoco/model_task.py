@@ -133,9 +133,7 @@ def task_of(
     )
 
 
-def _guessed(
-    parameters: Sequence[Parameter], label: str, bounds: Mapping[str, tuple[float, float]]
-) -> list[Parameter]:
+def _guessed(parameters: Sequence[Parameter], label: str, bounds: Mapping[str, tuple[float, float]]) -> list[Parameter]:
     """Parameters with other bounds of Theta_0."""
     known = [one.name for one in parameters]
     if unknown := [name for name in bounds if name not in known]:

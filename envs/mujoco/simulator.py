@@ -1,6 +1,7 @@
 """Simulations of a model under the recorded controls, by MuJoCo's threaded rollouts."""
 
 import copy
+import dataclasses
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
@@ -81,6 +82,21 @@ class Simulator:
         self.observation = np.where(self.there, recorded, 0.0).astype(np.float32)
         self._threads = threads or processors()
         self._pool: mujoco.rollout.Rollout | None = None
+
+    def under(self, change: Callable[[np.ndarray], np.ndarray]) -> "Simulator":
+        """The same under other controls.
+
+        Args:
+            change: of the samples of each control, shape [T].
+        """
+        other = copy.copy(self)
+        other._logs = tuple(
+            dataclasses.replace(
+                log, signals=dict(log.signals) | {name: change(log.signals[name]) for name in self._actuators}
+            )
+            for log in self._logs
+        )
+        return other
 
     def finer(self, factor: int = 10) -> "Simulator":
         """The same, integrated by Runge-Kutta in steps that are shorter by a factor."""

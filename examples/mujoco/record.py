@@ -97,13 +97,16 @@ def finger() -> Reality:
 EXAMPLES: Mapping[str, Callable[[], Reality]] = {"furuta": furuta, "arm": arm, "puck": puck, "finger": finger}
 
 
-def recorded(name: str, truth: Mapping[str, float] | None = None, seed: int = 0) -> Log:
+def recorded(
+    name: str, truth: Mapping[str, float] | None = None, seed: int | None = 0, backwards: bool = False
+) -> Log:
     """A recording of an example.
 
     Args:
         name: of the example.
         truth: its parameters by name; by default those of its .toml file.
-        seed: of the sensors' noise.
+        seed: of the sensors' noise; None for none.
+        backwards: the controls run backwards with the other sign.
     """
     with (FOLDER / f"{name}.toml").open("rb") as file:
         config = tomllib.load(file)
@@ -122,10 +125,13 @@ def recorded(name: str, truth: Mapping[str, float] | None = None, seed: int = 0)
     for place, d in does.starts:
         start[place] = numbers[d]
     delay = 0.0 if does.delay is None else numbers[does.delay]
-    controls = Log(reality.times, reality.controls)
+    order = (lambda values: -values[::-1]) if backwards else (lambda values: values)
+    asked = {actuator: order(values) for actuator, values in reality.controls.items()}
+    controls = Log(reality.times, asked)
     measured = _simulated(model, start, reality, controls, delay, list(noise))
-    measured += list(noise.values()) * np.random.default_rng(seed).standard_normal(measured.shape)
-    return Log(reality.times, dict(reality.controls) | dict(zip(noise, measured.T, strict=True)), name)
+    if seed is not None:
+        measured += list(noise.values()) * np.random.default_rng(seed).standard_normal(measured.shape)
+    return Log(reality.times, asked | dict(zip(noise, measured.T, strict=True)), name)
 
 
 def _simulated(model, start, reality: Reality, controls: Log, delay: float, signals: list[str]) -> np.ndarray:
