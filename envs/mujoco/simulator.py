@@ -154,6 +154,24 @@ class Simulator:
         rows[outcome != 0] = 0.0
         return rows, outcome
 
+    def states(
+        self, theta: Float[np.ndarray, "n dim"], episode: int = 0
+    ) -> tuple[list[mujoco.MjModel], Float[np.ndarray, " steps"], Float[np.ndarray, "n steps state"]]:
+        """Models of parameter vectors, times of their steps in an episode, and their states (`effects.STATE`) then.
+
+        Raises:
+            ValueError: for models that MuJoCo refuses. States of simulations that become unstable begin anew.
+        """
+        theta = np.asarray(theta, float)
+        models, grid = [self._build(row) for row in theta], self._grid(self.times[episode])
+        start = np.tile(self._starts[episode], (len(theta), 1))
+        for place, d in self._does.starts:
+            start[:, place] = theta[:, d]
+        controls = self._controls(self._logs[episode], theta, grid)
+        with quietly():
+            states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self._model), start, controls)
+        return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
+
     def _rolled(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         models = [self._made(row) for row in theta]
         outcome = np.array([0 if model else REFUSED for model in models])
