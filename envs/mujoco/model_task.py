@@ -127,7 +127,8 @@ def task_of(
         observation=simulator.observation,
         summary=summary,
         failures=FAILURES,
-        channels=measured,
+        channels=[f"{name} [{unit}]" if unit else name for name, unit in zip(measured, simulator.units, strict=True)],
+        record_label="time [s]" if len(simulator.times) == 1 else None,
         times=simulator.times[0] if len(simulator.times) == 1 else None,
         **others,
     )

@@ -34,6 +34,7 @@ class Simulator:
         observation: what was recorded, episodes one after another, shape [sum T, C]; 0 where there is no sample.
         there: whether there is a sample, shape [sum T, C].
         signals: that are measured, C of them.
+        units: of the signals; "" where the sensor does not say.
         noise: standard deviation of each signal's noise, shape [C]; 0 where it is inferred.
     """
 
@@ -68,6 +69,7 @@ class Simulator:
         self._model, self._build, self._does = model, build, does
         self._logs, self.signals, self._starts = tuple(logs), tuple(signals), tuple(starts)
         self._places = measured.places(model, signals)
+        self.units = tuple(measured.unit(model, name) for name in signals)
         self.noise = np.array([noise[name] for name in signals])
         self._discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
         self._actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
@@ -120,6 +122,9 @@ class Simulator:
             )
         if missing := [name for name in self.signals if name not in log.signals]:
             raise ValueError(f"{log.name}: expected signals {', '.join(missing)}, got {known}")
+        for name, unit in zip(self.signals, self.units, strict=True):
+            if unit and log.units.get(name, unit) != unit:
+                raise ValueError(f"{log.name}: {name}: expected {unit} as the sensor, got {log.units[name]}")
         if log.times[-1] < self._model.opt.timestep:
             raise ValueError(
                 f"{log.name}: expected more than a step of the model, {self._model.opt.timestep:g} s, "
