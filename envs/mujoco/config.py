@@ -15,6 +15,9 @@ angle = 0.002
 
 [initial]                           # other than the model's
 "hinge/qpos" = 0.5
+
+[policy]                            # what policies are to do (`jaxlfi.envs.mujoco.goal`); inference does not read it
+interval = 0.02
 """
 
 import tomllib
@@ -33,6 +36,7 @@ KEYS: Mapping[str, type] = {
     "parameters": dict,
     "noise": dict,
     "initial": dict,
+    "policy": dict,
     "name": str,
 }
 PARAMETER = ("support", "feasible", "unit", "log", "truth")
@@ -49,6 +53,30 @@ def read(path: Path, recorded: Sequence[Path] = ()) -> Task:
         ValueError: for a file that is missing, damaged or describes no task, in one line.
     """
     path = Path(path)
+    config = load(path)
+    given = [Path(one) for one in recorded] or [path.parent / str(one) for one in config.get("log", [])]
+    if not given:
+        raise ValueError(f"{path}: expected recordings, as log = [FILE], or mujoco,config={path},log=FILE; got none")
+    try:
+        return mujoco_task(
+            path.parent / config["model"],
+            parameters_of(config),
+            given,
+            config.get("measured"),
+            numbers(config, "noise"),
+            numbers(config, "initial"),
+            name=config.get("name", path.stem),
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def load(path: Path) -> dict[str, Any]:
+    """The tables of a file, with a model and parameters among them.
+
+    Raises:
+        ValueError: for a file that is missing or damaged, or has others.
+    """
     try:
         with path.open("rb") as file:
             config = tomllib.load(file)
@@ -62,22 +90,50 @@ def read(path: Path, recorded: Sequence[Path] = ()) -> Task:
     for name in ("model", "parameters"):
         if not config.get(name):
             raise ValueError(f"{path}: expected {name}, got none")
-    given = [Path(one) for one in recorded] or [path.parent / str(one) for one in config.get("log", [])]
-    if not given:
-        raise ValueError(f"{path}: expected recordings, as log = [FILE], or mujoco,config={path},log=FILE; got none")
-    try:
-        found = [_parameter(name, table) for name, table in config["parameters"].items()]
-        return mujoco_task(
-            path.parent / config["model"],
-            found,
-            given,
-            config.get("measured"),
-            {name: _number(value, f"noise: {name}") for name, value in config.get("noise", {}).items()},
-            {name: _number(value, f"initial: {name}") for name, value in config.get("initial", {}).items()},
-            name=config.get("name", path.stem),
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return config
+
+
+def parameters_of(config: Mapping[str, Any]) -> list[Parameter]:
+    """What is inferred.
+
+    Raises:
+        ValueError: for parameters without bounds, or with other keys.
+    """
+    return [_parameter(name, table) for name, table in config["parameters"].items()]
+
+
+def numbers(config: Mapping[str, Any], table: str) -> dict[str, float]:
+    """A table of numbers by name; empty where there is none.
+
+    Raises:
+        ValueError: for what is no table, or no number.
+    """
+    found = config.get(table, {})
+    if not isinstance(found, dict):
+        raise ValueError(f"{table}: expected a table of numbers, got {found!r}")
+    return {name: number(value, f"{table}: {name}") for name, value in found.items()}
+
+
+def pair(value: Any, where: str) -> tuple[float, float]:
+    """Two bounds.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError(f"{where}: expected [LOW, HIGH], got {value!r}")
+    return number(value[0], where), number(value[1], where)
+
+
+def number(value: Any, where: str) -> float:
+    """A number.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{where}: expected a number, got {value!r}")
+    return float(value)
 
 
 def _parameter(name: str, table: Any) -> Parameter:
@@ -86,20 +142,9 @@ def _parameter(name: str, table: Any) -> Parameter:
         raise ValueError(f"{where}: expected support = [LOW, HIGH], got {table!r}")
     if unknown := [key for key in table if key not in PARAMETER]:
         raise ValueError(f"{where}: expected keys among {', '.join(PARAMETER)}, got {', '.join(unknown)}")
-    bounds = {}
-    for key in ("support", "feasible"):
-        pair = table.get(key, table["support"])
-        if not isinstance(pair, list) or len(pair) != 2:
-            raise ValueError(f"{where}: {key}: expected [LOW, HIGH], got {pair!r}")
-        bounds[key] = tuple(_number(number, f"{where}: {key}") for number in pair)
+    bounds = {key: pair(table.get(key, table["support"]), f"{where}: {key}") for key in ("support", "feasible")}
     log, unit, truth = table.get("log", False), table.get("unit", ""), table.get("truth")
     if not isinstance(log, bool) or not isinstance(unit, str):
         raise ValueError(f"{where}: expected log = true or false and a unit in quotes, got {log!r} and {unit!r}")
-    truth = None if truth is None else _number(truth, f"{where}: truth")
+    truth = None if truth is None else number(truth, f"{where}: truth")
     return Parameter(name, bounds["support"], bounds["feasible"], unit, log, truth)
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{where}: expected a number, got {value!r}")
-    return float(value)

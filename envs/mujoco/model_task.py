@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import logs, noise
-from jaxlfi.envs.mujoco.effects import effects, initial_state
+from jaxlfi.envs.mujoco.effects import built, effects, initial_state
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -63,7 +63,7 @@ def mujoco_task(
     Raises:
         ValueError: for whatever does not fit together, in one line, before anything is simulated.
     """
-    spec = _specification(model)
+    spec = specification(model)
     several = [recorded] if isinstance(recorded, Log | str | Path) else list(recorded)
     if not several or not parameters:
         raise ValueError("expected at least one recording and one parameter, got none")
@@ -77,15 +77,10 @@ def mujoco_task(
     inferred = {name.split("/")[1] for name in names if name.startswith("sensor/") and name.endswith("/noise")}
     deviations = _deviations(episodes[0], measured, noises or {}, inferred)
     add_sensors(spec, measured)
-    compiled = _compiled(spec)
+    compiled = compile_spec(spec)
     does = effects(spec, compiled, names, [one.support for one in parameters], measured)
 
-    def build(theta: np.ndarray) -> mujoco.MjModel:
-        own = spec.copy()
-        for one, d in does.edits:
-            one.apply(own, float(theta[d]))
-        return own.compile()
-
+    build = functools.partial(built, spec, does)
     starts = [initial_state(compiled, initial or {})] * len(episodes)
     simulator = Simulator(compiled, build, episodes, measured, deviations, starts, does, threads)
     return task_of(simulator, parameters, measured, summary, **{"name": spec.modelname or "mujoco"} | others)
@@ -109,8 +104,8 @@ def task_of(
         names=[one.name for one in parameters],
         units=[one.unit for one in parameters],
         log=[one.name for one in parameters if one.log],
-        supports={"initial": _box(supports), "feasible": _box(feasible)},
-        feasible=_box(feasible),
+        supports={"initial": box(supports), "feasible": box(feasible)},
+        feasible=box(feasible),
         truth=None if None in truth else np.asarray(truth, np.float32),
         observation=simulator.observation,
         summary=summary,
@@ -121,7 +116,12 @@ def task_of(
     )
 
 
-def _specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
+def specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
+    """A model's specification: of an MJCF file, its text, or a copy of the one that is given.
+
+    Raises:
+        ValueError: where there is none, in one line.
+    """
     if isinstance(model, mujoco.MjSpec):
         return model.copy()
     text = str(model)
@@ -135,7 +135,12 @@ def _specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
         raise ValueError(f"model: {' '.join(str(error).split()).removeprefix('model: ')}") from error
 
 
-def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The model of a specification.
+
+    Raises:
+        ValueError: where MuJoCo refuses it, in one line.
+    """
     try:
         return spec.compile()
     except ValueError as error:
@@ -173,6 +178,7 @@ def _rows(lengths: Sequence[int]) -> tuple[int, ...]:
     return tuple(rows)
 
 
-def _box(bounds: Sequence[tuple[float, float]]) -> Support:
+def box(bounds: Sequence[tuple[float, float]]) -> Support:
+    """Bounds of parameters, one pair each, as a box."""
     low, high = np.asarray(bounds, np.float32).T
     return Support(low, high)
