@@ -104,8 +104,8 @@ def task_of(
         names=[one.name for one in parameters],
         units=[one.unit for one in parameters],
         log=[one.name for one in parameters if one.log],
-        supports={"initial": box(supports), "feasible": box(feasible)},
-        feasible=box(feasible),
+        supports={"initial": _box(supports), "feasible": _box(feasible)},
+        feasible=_box(feasible),
         truth=None if None in truth else np.asarray(truth, np.float32),
         observation=simulator.observation,
         summary=summary,
@@ -178,7 +178,6 @@ def _rows(lengths: Sequence[int]) -> tuple[int, ...]:
     return tuple(rows)
 
 
-def box(bounds: Sequence[tuple[float, float]]) -> Support:
-    """Bounds of parameters, one pair each, as a box."""
+def _box(bounds: Sequence[tuple[float, float]]) -> Support:
     low, high = np.asarray(bounds, np.float32).T
     return Support(low, high)
