@@ -121,6 +121,7 @@ class MujocoEnvironment:
         self._timestep = compiled.opt.timestep
         self._substeps = round(goal.interval / self._timestep)
         self._data = mjx.make_data(self.models.base)
+        self._accelerations = bool(np.any(compiled.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC))
         self._noise = np.array([(noises or {}).get(name, 0.0) for name in goal.signals])
         longest = 0.0 if self._does.delay is None else float(self.feasible.high[self._does.delay])
         self._before = int(np.ceil(longest / goal.interval - 1e-6)) + 1
@@ -140,7 +141,7 @@ class MujocoEnvironment:
         qpos, qvel, act = jnp.split(start, self._cuts)
         numbers, refused = self.models.numbers(theta)
         inner = Inner(qpos, qvel, act, jnp.zeros_like(qvel), jnp.asarray(self._rest), numbers, theta, refused, key)
-        values = self._values(mjx.forward(*self._loaded(inner, inner.controls[-1])))
+        values = self._values(*self._loaded(inner, inner.controls[-1]))
         no = jnp.asarray(False)
         seen, reward = self._seen(key_noise, theta, values), jnp.asarray(0.0, jnp.float32)  # not of a weak type
         return EnvState(inner, seen, reward, no, no, self._facts(values, no))
@@ -157,7 +158,7 @@ class MujocoEnvironment:
 
         data, _ = jax.lax.scan(substep, data, jnp.arange(self._substeps))
         # MuJoCo's sensors are those of the state before a step: of the state after it they are read besides.
-        values = self._values(mjx.forward(model, data))
+        values = self._values(model, data)
         numbers = jnp.concatenate([data.qpos, data.qvel, values])
         failed = before.refused | ~jnp.all(jnp.isfinite(numbers) & (jnp.abs(numbers) < LARGEST))
         after = before.replace(
@@ -198,7 +199,13 @@ class MujocoEnvironment:
         since = (index * self._timestep - theta[self._does.delay]) / self.reading.goal.interval
         return controls[jnp.clip(self._before - 1 + jnp.floor(since + 1e-5).astype(int), 0, self._before - 1)]
 
-    def _values(self, data: mjx.Data) -> Float[Array, " signals"]:
+    def _values(self, model: mjx.Model, data: mjx.Data) -> Float[Array, " signals"]:
+        """Signals of this state; what accelerations would need is left out where no sensor measures any."""
+        if self._accelerations:
+            data = mjx.sensor_acc(model, mjx.forward(model, data))  # which forward leaves out without constraints
+        else:
+            data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
+            data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
         return data.sensordata[self.reading.places]
 
     def _seen(self, key: jax.Array, theta: Float[Array, " dim"], values: Float[Array, " signals"]) -> Array:

@@ -33,7 +33,13 @@ except ImportError as error:
 CACHED = 65536
 """Models whose numbers are kept, a few hundred bytes each."""
 INSIDE = 1e-3
-"""How far from the bounds of Phi models are compared, as a fraction of its width: a friction of exactly 0 is none."""
+"""How far from the bounds of Phi models are compared, as a fraction of its width: what is exactly 0 may be left out."""
+FRICTIONS = ("dof_frictionloss", "tendon_frictionloss")
+"""Fields whose numbers MJX takes for those of a joint that is locked where they are 0 and were not in the base."""
+OF_HEIGHT_FIELDS = {"geom_rbound_hfield"}
+"""What MJX holds fixed, and needs for height fields only."""
+LEAST_FRICTION = 1e-9
+"""N, or N m: in place of none."""
 PROBES = 4
 """Models at random parameters that are compared besides."""
 
@@ -112,8 +118,10 @@ class Models:
         """Leaves of the MJX model that are others than the nominal one's."""
         put = mjx.put_model(model)
         if jax.tree.structure(put) != self._tree:
-            fixed = ", ".join(_static_differences(self.base, put)) or "its structure"
-            raise ValueError(f"{where}: expected numbers that MJX can vary, got one that changes {fixed}")
+            fixed = _static_differences(self.base, put)
+            if set(fixed) != OF_HEIGHT_FIELDS or model.nhfield:
+                changed = ", ".join(fixed) or "its structure"
+                raise ValueError(f"{where}: expected numbers that MJX can vary, got one that changes {changed}")
         found = set()
         for place, (before, after) in enumerate(zip(self._leaves, jax.tree.leaves(put), strict=True)):
             if np.shape(before) != np.shape(after):
@@ -129,8 +137,13 @@ class Models:
         return found
 
     def _numbers(self, model: mujoco.MjModel) -> np.ndarray:
-        own = [np.ravel(_number(model, path)) for path in self._paths]
-        return np.concatenate(own).astype(np.float32) if own else np.zeros(0, np.float32)
+        own = [np.zeros(0)]
+        for path, place in zip(self._paths, self._places, strict=True):
+            number = _number(model, path)
+            if path[-1] in FRICTIONS:
+                number = np.where(np.asarray(self._leaves[place]) > 0, np.maximum(number, LEAST_FRICTION), number)
+            own.append(np.ravel(number))
+        return np.concatenate(own).astype(np.float32)
 
     def _compiled(self, theta: Any) -> tuple[np.ndarray, np.ndarray]:
         """Numbers and refusals of a batch of any number of axes; NumPy in, NumPy out."""
