@@ -281,6 +281,13 @@ def test_a_posterior_in_other_units_is_no_domain():
         domains.check_belief(LINE, LINE.space, LINE.feasible, ("", "mm"))
 
 
+def test_bounds_that_were_logarithms_may_be_rounded():
+    rounded = Support([0.25 * (1 - 1e-6), -2.0], [4.0 * (1 + 1e-6), 2.0])
+    domains.check_belief(LINE, LINE.space, rounded)
+    with pytest.raises(ValueError, match="inside the feasible domain Phi"):
+        domains.check_belief(LINE, LINE.space, Support([0.249, -2.0], [4.0, 2.0]))
+
+
 def test_the_posterior_of_a_run_is_a_domain(tmp_path, capsys):
     """A run's mixture, clipped to Phi; the posterior of other parameters is refused."""
 
