@@ -89,7 +89,7 @@ def check_belief(environment: Environment, space: Space, feasible: Support, unit
         )
     # A bound that was inferred as a logarithm comes back from there rounded.
     own, known = (np.asarray([box.low, box.high], float) for box in (feasible, environment.feasible))
-    same = own.shape == known.shape and np.isclose(own, known, rtol=ROUNDING, atol=0)
+    same = np.isclose(own, known, rtol=ROUNDING, atol=0)
     check_within(Support(*np.where(same, known, own)), environment.feasible, "domain")
 
 

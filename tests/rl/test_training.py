@@ -21,6 +21,7 @@ from jaxlfi import infer
 from jaxlfi.cli import domains as words_of
 from jaxlfi.cli import evaluate as evaluating
 from jaxlfi.cli import train as command
+from jaxlfi.distributions.support import Support
 from jaxlfi.io import files
 from jaxlfi.rl import domains, training
 from jaxlfi.rl.evaluation import cross_evaluate
