@@ -180,7 +180,7 @@ def trained(
 def played(reality: Reality, policies: Mapping[tuple[str, int], Policy], episodes: int) -> dict[tuple[str, int], Any]:
     """Returns [E] and last distances [E] by policy."""
     found = {}
-    with RoundProgress(Console(), len(policies), 0, "on the recording's simulator", unit="policy") as progress:
+    with RoundProgress(Console(), len(policies), 0, "on the recording's simulator", unit="evaluation") as progress:
         for name, policy in policies.items():
             own = [reality.play(policy, seed) for seed in range(episodes)]
             off = {f"{signal} off": np.array([last[signal] for _, last in own]) for signal in own[0][1]}
