@@ -9,7 +9,7 @@ amplifies from round to round. The same batch on the same number of devices repe
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -216,6 +216,11 @@ class BatchEngine:
         self._padded = len(devices) * math.ceil(self.runs / len(devices))
         self.inputs = self.place(inputs)
         self.first = first
+
+    @property
+    def examples(self) -> Mapping[str, str]:
+        """What is known of failures, by their reason: nothing, of simulations that are compiled."""
+        return {}
 
     def start(self) -> State:
         """The state before the first round."""

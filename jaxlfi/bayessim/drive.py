@@ -1,7 +1,8 @@
 """The one way through the rounds of a batch."""
 
 import time
-from collections.abc import Callable
+import types
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -45,20 +46,23 @@ def drive(
         began = time.perf_counter()
         state, row = engine.round(state, index)
         if index == 0:
-            require_success(row["succeeded"], row["failed"], engine.task)
+            require_success(row["succeeded"], row["failed"], engine.task, engine.examples)
         on_round(index, state, row, time.perf_counter() - began)
         if np.all(row["settled"]):
             break
     return state
 
 
-def require_success(succeeded: np.ndarray, failed: np.ndarray, task: Task) -> None:
+def require_success(
+    succeeded: np.ndarray, failed: np.ndarray, task: Task, examples: Mapping[str, str] = types.MappingProxyType({})
+) -> None:
     """Refuse to go on where no simulation of the first round succeeded, in any run.
 
     Args:
         succeeded: number of successes of each run.
         failed: failures by reason, of all runs or of one.
         task: for the reasons' names.
+        examples: what is known of failures, by their reason.
 
     Raises:
         SimulatorError: with the counts by reason.
@@ -67,4 +71,5 @@ def require_success(succeeded: np.ndarray, failed: np.ndarray, task: Task) -> No
         return
     counts = np.sum(np.atleast_2d(failed), axis=0)
     listed = ", ".join(f"{reason}: {count}" for reason, count in zip(task.reasons, counts, strict=True))
-    raise SimulatorError(f"simulate: expected some valid simulations in the first round, got none ({listed})")
+    known = "".join(f"; {reason}: {message}" for reason, message in examples.items())
+    raise SimulatorError(f"simulate: expected some valid simulations in the first round, got none ({listed}){known}")

@@ -122,6 +122,8 @@ class Task:
         store("units", tuple(self.units) if self.units is not None else ("",) * len(names))
         if not callable(self.simulate):
             raise ValueError(f"simulate: expected a function, got {type(self.simulate).__name__}")
+        if clash := set(self.failures) & set(self.simulate.reasons if self.on_host else ()):
+            raise ValueError(f"failures: expected other names than those of every simulator, got {sorted(clash)}")
         if len(self.units) != len(names):
             raise ValueError(f"units: expected one for each of the {len(names)} parameters, got {len(self.units)}")
         if len(set(names)) != len(names) or not names:
@@ -177,8 +179,13 @@ class Task:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """All reasons of failure, in the order of their codes from 1: the task's own, then "non_finite"."""
-        return (*self.failures, "non_finite")
+        """All reasons of failure, in the order of their codes from 1: the task's own, its simulator's, "non_finite"."""
+        return (*self.failures, *(self.simulate.reasons if self.on_host else ()), "non_finite")
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether its simulations are made one by one on the host, each with a generator of its own."""
+        return self.on_host and self.simulate.each
 
     def named_summaries(self, count: int) -> tuple[str, ...]:
         """Names of the summary's `count` numbers.
