@@ -71,7 +71,7 @@ class RoundProgress:
     def compiled(self, seconds: float) -> None:
         """Say how long compiling took; the estimate of the time left starts now."""
         self._console.print(f"compiled in {seconds:.1f} s")
-        self._began = time.monotonic()
+        self._began = self._shown = time.monotonic()
 
     def simulated(self, done: int, wanted: int) -> None:
         """So many simulations have arrived of those wanted; said now and then, where they are slow."""

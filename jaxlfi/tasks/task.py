@@ -15,6 +15,7 @@ import numpy as np
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support, check_within
 from jaxlfi.tasks import priors, summaries
+from jaxlfi.tasks.command import Command
 from jaxlfi.tasks.host import HostSimulator
 
 Simulate = Callable[..., Any]
@@ -149,6 +150,40 @@ class Task:
         if self.prior is not None:
             priors.check_prior(self.prior, len(names))
         is_natural(self.prior_space)
+
+    @classmethod
+    def from_command(
+        cls,
+        template: str,
+        names: Sequence[str],
+        supports: Mapping[str, Support],
+        feasible: Support,
+        *,
+        timeout: float | None = None,
+        **others: Any,
+    ) -> "Task":
+        """The task of a simulator that is a program, in any language (`jaxlfi.tasks.command.Command`).
+
+        Args:
+            template: its command, such as "./sim --theta {theta} --seed {seed}". It writes a trajectory to standard
+                output as .npy or JSON.
+            names: one name for each parameter.
+            supports: boxes Theta_0 by name.
+            feasible: Phi.
+            timeout: seconds after which a simulation is given up; None waits for ever.
+            others: more fields of the task.
+
+        Raises:
+            ValueError: for a program that is not found, or a template that does not pass on all parameters.
+
+        Example:
+            >>> box = Support([0.0], [1.0])
+            >>> coin = Task.from_command("echo [{theta}, {seed}]", ["bias"], {"unit": box}, box)
+            >>> coin.one_by_one, coin.reasons
+            (True, ('failed', 'error', 'wrong_shape', 'timeout', 'crash', 'non_finite'))
+        """
+        simulate = HostSimulator(Command(template, names), each=True, timeout=timeout)
+        return cls(simulate, names=names, supports=supports, feasible=feasible, **others)
 
     @property
     def dim(self) -> int:
