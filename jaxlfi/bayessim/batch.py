@@ -9,7 +9,7 @@ amplifies from round to round. The same batch on the same number of devices repe
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -218,9 +218,9 @@ class BatchEngine:
         self.first = first
 
     @property
-    def examples(self) -> Mapping[str, str]:
-        """What is known of failures, by their reason: nothing, of simulations that are compiled."""
-        return {}
+    def known_failures(self) -> str:
+        """What is known of failures, for the end of an error's line: nothing, of simulations that are compiled."""
+        return ""
 
     def start(self) -> State:
         """The state before the first round."""

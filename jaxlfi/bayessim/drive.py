@@ -1,8 +1,7 @@
 """The one way through the rounds of a batch."""
 
 import time
-import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -46,23 +45,21 @@ def drive(
         began = time.perf_counter()
         state, row = engine.round(state, index)
         if index == 0:
-            require_success(row["succeeded"], row["failed"], engine.task, engine.examples)
+            require_success(row["succeeded"], row["failed"], engine.task, engine.known_failures)
         on_round(index, state, row, time.perf_counter() - began)
         if np.all(row["settled"]):
             break
     return state
 
 
-def require_success(
-    succeeded: np.ndarray, failed: np.ndarray, task: Task, examples: Mapping[str, str] = types.MappingProxyType({})
-) -> None:
+def require_success(succeeded: np.ndarray, failed: np.ndarray, task: Task, known: str = "") -> None:
     """Refuse to go on where no simulation of the first round succeeded, in any run.
 
     Args:
         succeeded: number of successes of each run.
         failed: failures by reason, of all runs or of one.
         task: for the reasons' names.
-        examples: what is known of failures, by their reason.
+        known: what is known of failures.
 
     Raises:
         SimulatorError: with the counts by reason.
@@ -71,5 +68,4 @@ def require_success(
         return
     counts = np.sum(np.atleast_2d(failed), axis=0)
     listed = ", ".join(f"{reason}: {count}" for reason, count in zip(task.reasons, counts, strict=True))
-    known = "".join(f"; {reason}: {message}" for reason, message in examples.items())
     raise SimulatorError(f"simulate: expected some valid simulations in the first round, got none ({listed}){known}")

@@ -5,7 +5,6 @@ simulator is called between (`jaxlfi.tasks.simulation.simulate_in_waves`).
 """
 
 import functools
-from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -63,9 +62,9 @@ class HostEngine(BatchEngine):
         self._last_seen: list[Discrepancy | None] = [None] * len(inputs.x)
 
     @property
-    def examples(self) -> Mapping[str, str]:
+    def known_failures(self) -> str:
         """The first message of each reason for which simulations failed."""
-        return self.journal.examples
+        return self.journal.known
 
     def compile(self, state: State, index: int = 0) -> None:
         """Compile the parts of a round ahead of their first use, while no simulator waits."""

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -23,6 +24,21 @@ CONFIGURATION_DEFAULTS = ("ok", "misspecified", "broad")
 def task_of(arguments: argparse.Namespace) -> Task:
     """The task, with simulations one by one where the arguments say how they are made."""
     return simulated_by(arguments, registry.load(arguments.task))
+
+
+def simulated_again(arguments: argparse.Namespace, folder: Path, task: Task) -> Task:
+    """The task of a folder with simulations made as the arguments say, where they were made one by one before.
+
+    Raises:
+        ValueError: where they were not.
+    """
+    given = (arguments.workers, arguments.scheduler, arguments.simulation_timeout) != (None, None, None)
+    if given and not task.one_by_one:
+        raise ValueError(
+            f"{folder}: expected none of --workers, --scheduler and --simulation-timeout for a run whose simulations "
+            "were not made one by one"
+        )
+    return simulated_by(arguments, task)
 
 
 def simulated_by(arguments: argparse.Namespace, task: Task) -> Task:

@@ -173,16 +173,10 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
         _say(console, _COMPLETE.format(folder=folder))
         return None
     plan, observed = executing.reopen(folder)
-    if plan.task.one_by_one:
-        if config["executor"] and (arguments.workers, arguments.scheduler) == (None, None):
-            arguments.workers = host_devices.processors()
-            _say(console, f"simulations: in {arguments.workers} processes on this machine")
-        plan = dataclasses.replace(plan, task=asked.simulated_by(arguments, plan.task))
-    elif (arguments.workers, arguments.scheduler, arguments.simulation_timeout) != (None, None, None):
-        raise run_store.StoreError(
-            f"{folder}: expected none of --workers, --scheduler and --simulation-timeout for a run whose simulations "
-            "are not made one by one"
-        )
+    if config.get("executor", False) and (arguments.workers, arguments.scheduler) == (None, None):
+        arguments.workers = host_devices.processors()
+        _say(console, f"simulations: in {arguments.workers} processes on this machine")
+    plan = dataclasses.replace(plan, task=asked.simulated_again(arguments, folder, plan.task))
     if changed := executing.changed_machine(config):
         _warn(console, f"begun with {', '.join(changed)}: the result may differ in rounding from an uninterrupted one")
     return folder, (plan, observed)
@@ -242,10 +236,11 @@ def diagnose(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi diagnose DIR`."""
     task = None if arguments.task is None else task_lookup.load(arguments.task)
     run = calibration.read_run(arguments.folder, task)
-    asked = arguments.reference
-    if asked is None:
-        asked = f"{calibration.POSTERIOR},{next(iter(run.task.supports))}"
-    plans = calibration.plans_of(asked, run.task, arguments.truths, arguments.draws, arguments.seed)
+    run = run.replace(task=asked.simulated_again(arguments, arguments.folder, run.task))
+    references = arguments.reference
+    if references is None:
+        references = f"{calibration.POSTERIOR},{next(iter(run.task.supports))}"
+    plans = calibration.plans_of(references, run.task, arguments.truths, arguments.draws, arguments.seed)
     reference = None
     if arguments.against is not None:
         reference = arguments.against.name, calibration.read_reference(arguments.against, run.task)

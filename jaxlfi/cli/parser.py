@@ -274,6 +274,7 @@ def _add_diagnose(commands: Commands) -> None:
     command.add_argument(
         "--out", type=Path, metavar="DIR", help="a new folder for the results (default: diagnostics in the run's)"
     )
+    _add_executor(command)
     _add_machine(command)
 
 

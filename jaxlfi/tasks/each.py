@@ -12,6 +12,8 @@ from jaxlfi.tasks.guard import REFUSED, guarded
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.worker import Answer, Request, failed
 
+LOOK = 5.0
+"""Seconds between two looks at an executor from which nothing arrives."""
 Submit = Callable[[Request], Future]
 
 
@@ -21,6 +23,7 @@ def simulate_each(
     wanted: int | None,
     journal: Journal,
     at_once: int | None = None,
+    alive: Callable[[], bool] = lambda: True,
 ) -> list[Answer]:
     """Make simulations in their order until enough have succeeded, or all are made.
 
@@ -33,6 +36,7 @@ def simulate_each(
         wanted: how many successes; None makes all.
         journal: knows those made before, and is told of those that are made.
         at_once: how many are under way at most.
+        alive: asked now and then whether more can arrive.
 
     Returns:
         The answers, of as many of the first requests as were made.
@@ -60,7 +64,7 @@ def simulate_each(
                 begun += 1
             if not pending:
                 break
-            place, future = arrived.get()
+            place, future = _next(arrived, alive)
             del pending[place]
             answers[place] = answer = _answer(future)
             journal.add(requests[place], answer)
@@ -85,6 +89,22 @@ def here(simulate: Callable[[Request], Answer]) -> Submit:
 def through(executor: Executor, payload: bytes, timeout: float | None) -> Submit:
     """Simulations through an executor, each in a process that its worker keeps (`jaxlfi.tasks.guard`)."""
     return lambda request: executor.submit(guarded, payload, request, timeout)
+
+
+def alive(executor: Executor) -> bool:
+    """Whether simulations can arrive. Dask's may never do where its scheduler was lost at the wrong moment."""
+    client = getattr(executor, "_client", None)
+    return client is None or getattr(client, "status", "running") == "running"
+
+
+def _next(arrived: queue.SimpleQueue, alive: Callable[[], bool]) -> tuple[int, Future]:
+    """The next future to arrive, and its place."""
+    while True:
+        try:
+            return arrived.get(timeout=LOOK)
+        except queue.Empty:
+            if not alive():
+                raise ExecutorError("executor: lost while it simulated (its scheduler does not answer)") from None
 
 
 def _submitted(submit: Submit, request: Request) -> Future:

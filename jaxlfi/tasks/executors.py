@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import logging
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -10,7 +9,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from jaxlfi.tasks.errors import ExecutorError
 from jaxlfi.tasks.guard import Guard, enlist
 from jaxlfi.tasks.task import Task
-from jaxlfi.tasks.worker import one_of_batch
+from jaxlfi.tasks.worker import OneOfBatch
 
 CONNECT = 10.0
 """Seconds to wait for a scheduler to answer."""
@@ -37,7 +36,7 @@ def one_by_one(task: Task, executor: Executor | None = None, timeout: float | No
         raise ValueError(f"executor: expected a concurrent.futures.Executor, got {type(executor).__name__}")
     simulate = task.simulate
     if not simulate.each:
-        simulate = dataclasses.replace(simulate, function=functools.partial(one_of_batch, simulate.function), each=True)
+        simulate = dataclasses.replace(simulate, function=OneOfBatch(simulate.function), each=True)
     changes = {"executor": executor, "timeout": timeout}
     given = {name: value for name, value in changes.items() if value is not None}
     return dataclasses.replace(task, simulate=dataclasses.replace(simulate, **given))
@@ -78,7 +77,9 @@ def scheduler(address: str) -> Iterator[Executor]:
         import distributed
     except ImportError as error:
         raise ValueError("scheduler: expected distributed to be installed: pip install 'jaxlfi[dask]'") from error
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the loss of a scheduler is said in one line
+    for name in logging.root.manager.loggerDict:  # the loss of a scheduler is said in one line
+        if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
         client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:

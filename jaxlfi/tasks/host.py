@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jaxlfi.distributions.arguments import is_concrete
-from jaxlfi.tasks.each import here, simulate_each, stacked, through
+from jaxlfi.tasks.each import alive, here, simulate_each, stacked, through
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.worker import REASONS, Answer, Request, simulated
@@ -60,8 +60,13 @@ class HostSimulator:
         """Reasons of failure besides the task's own."""
         return REASONS if self.each else ()
 
-    def __call__(self, key: jax.Array, theta: Any) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, key: jax.Array, theta: Any, journal: Journal | None = None) -> tuple[np.ndarray, np.ndarray]:
         """One simulation: its trajectory, and 0 or the code of the reason it failed for.
+
+        Args:
+            key: seeds the simulator's generator.
+            theta: in natural units, shape [D].
+            journal: learns what is known of a failure, where `each`.
 
         Raises:
             SimulatorError: if the simulator raises or gives other shapes, or inside a traced function.
@@ -69,7 +74,7 @@ class HostSimulator:
         if not is_concrete((key, theta)):
             raise SimulatorError("simulate: expected concrete arguments for a host simulator, which cannot be traced")
         if self.each:
-            (answer,) = self.some(key, np.asarray(theta)[None])
+            (answer,) = self.some(key, np.asarray(theta)[None], journal=journal)
             return answer.trajectory, np.asarray(answer.outcome)
         trajectories, outcomes = self.batch(key, np.asarray(theta)[None])
         return trajectories[0], outcomes[0]
@@ -115,7 +120,8 @@ class HostSimulator:
     def _through(
         self, executor: Executor, requests: list[Request], wanted: int | None, journal: Journal
     ) -> list[Answer]:
-        return simulate_each(through(executor, self._payload, self.timeout), requests, wanted, journal)
+        submit = through(executor, self._payload, self.timeout)
+        return simulate_each(submit, requests, wanted, journal, alive=functools.partial(alive, executor))
 
     @functools.cached_property
     def _payload(self) -> bytes:

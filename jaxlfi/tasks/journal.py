@@ -34,6 +34,11 @@ class Journal:
             request = Request(fields["words"], fields["index"], fields["theta"], trajectory.shape)
             self._known[_identity(request)] = Answer(fields["outcome"], trajectory, fields["message"])
 
+    @property
+    def known(self) -> str:
+        """What is known of failures, for the end of an error's line."""
+        return "".join(f"; {reason}: {message}" for reason, message in self.examples.items())
+
     def expect(self, wanted: int) -> None:
         """So many simulations are going to be made together."""
         self._done, self._wanted = 0, wanted

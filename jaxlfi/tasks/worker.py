@@ -5,6 +5,7 @@ process: `jaxlfi.tasks.guard` starts it, sends it the simulator and then one req
 (`jaxlfi.io.records`) for each.
 """
 
+import dataclasses
 import json
 import os
 import queue
@@ -103,14 +104,20 @@ def checked(trajectory: np.ndarray, outcome: np.ndarray, shape: Sequence[int] | 
     return Answer(max(code, 0) or int(code < 0), trajectory if shape is None else trajectory.reshape(shape))
 
 
-def one_of_batch(function: Callable[..., Any], rng: np.random.Generator, theta: np.ndarray) -> Any:
-    """One simulation by a simulator of batches, `function(rng, theta[N, D])`."""
-    result = function(rng, theta[None])
-    if isinstance(result, tuple) and len(result) == 2:
-        (trajectory,), (outcome,) = result
-        return trajectory, outcome
-    (trajectory,) = result
-    return trajectory
+@dataclasses.dataclass(frozen=True)
+class OneOfBatch:
+    """A simulator of one, made of a simulator of batches, `function(rng, theta[N, D])`."""
+
+    function: Callable[..., Any]
+
+    def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> Any:
+        """One simulation."""
+        result = self.function(rng, theta[None])
+        if isinstance(result, tuple) and len(result) == 2:
+            (trajectory,), (outcome,) = result
+            return trajectory, outcome
+        (trajectory,) = result
+        return trajectory
 
 
 def main() -> None:
