@@ -15,7 +15,7 @@ WAYS = ("error", "wrong_shape", "timeout", "crash", "non_finite")
 
 @dataclasses.dataclass(frozen=True)
 class Troubled:
-    """The Gaussian task's simulator with troubles.
+    """The Gaussian task's simulator with troubles, equal to any other: what is compiled around one serves them all.
 
     Attributes:
         rates: how often each of `WAYS` befalls a simulation.
@@ -23,9 +23,9 @@ class Troubled:
         seconds: that each takes.
     """
 
-    rates: tuple[float, ...] = (0.0,) * 5
-    folder: str = ""
-    seconds: float = 0.0
+    rates: tuple[float, ...] = dataclasses.field(default=(0.0,) * 5, compare=False)
+    folder: str = dataclasses.field(default="", compare=False)
+    seconds: float = dataclasses.field(default=0.0, compare=False)
 
     def __call__(self, rng, theta):
         """One simulation."""
