@@ -2,12 +2,14 @@
 
 import collections
 import dataclasses
+import multiprocessing
 import os
+import subprocess
 import sys
 import threading
 import time
 import types
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 
 import cloudpickle
 import jax
@@ -76,6 +78,13 @@ def test_the_same_bits_for_any_number_of_workers_and_any_order_of_arrival():
     assert_same(made(one_by_one(task, LastFirst())), here)
     with ThreadPoolExecutor(3) as executor:
         assert_same(made(one_by_one(task, executor)), here)
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as executor:
+        assert_same(made(one_by_one(task, executor)), here)
+
+
+def test_processes_for_simulations_import_no_jax():
+    script = "import sys, jaxlfi.tasks.guard, jaxlfi.tasks.command; assert not {'jax', 'flax'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
 
 
 def assert_same(a, b):
