@@ -55,7 +55,11 @@ class Guard:
             timer.start()
         record = self._ask(json.dumps(request._asdict()).encode() + b"\n")
         timer.cancel()
+        if timeout is not None:
+            timer.join()
         if record is not None:
+            if late.is_set():  # it was killed just after it had answered
+                self.stop()
             fields, trajectory = record
             return Answer(fields["outcome"], trajectory, fields["message"])
         self.stop()

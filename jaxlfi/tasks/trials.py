@@ -13,6 +13,7 @@ from jaxtyping import Array
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.summaries import one_after_another
 from jaxlfi.tasks.task import Task
+from jaxlfi.tasks.worker import Trials
 
 MAX_TRIALS = 1000
 """Trials of a task, at most: each simulation is so many."""
@@ -48,8 +49,9 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
     if trials == 1:
         return task
     if task.on_host:
-        many = _one_by_one if task.one_by_one else _on_host
-        simulate = dataclasses.replace(task.simulate, function=functools.partial(many, task.simulate.function, trials))
+        function = task.simulate.function
+        many = Trials(function, trials) if task.one_by_one else functools.partial(_on_host, function, trials)
+        simulate = dataclasses.replace(task.simulate, function=many)
     else:
         simulate = functools.partial(_in_jax, task.simulate, trials)
     return dataclasses.replace(
@@ -140,14 +142,6 @@ def _on_host(function: Callable, trials: int, rng: np.random.Generator, theta: n
     simulated = HostSimulator(function).batch(rng, np.repeat(theta, trials, axis=0))
     trajectory, outcome = (np.asarray(array).reshape(len(theta), trials, *array.shape[1:]) for array in simulated)
     return trajectory.reshape(len(theta), -1, *trajectory.shape[3:]), _first_failure(np, outcome)
-
-
-def _one_by_one(function: Callable, trials: int, rng: np.random.Generator, theta: np.ndarray):
-    """The same where simulations are made one by one: all trials of one theta, one after another."""
-    results = [function(rng, theta) for _ in range(trials)]
-    results = [result if isinstance(result, tuple) and len(result) == 2 else (result, True) for result in results]
-    outcome = _first_failure(np, np.asarray([outcome for _, outcome in results]))
-    return together([trajectory for trajectory, _ in results]), outcome
 
 
 def _first_failure(numpy: Any, outcome: Any) -> Any:

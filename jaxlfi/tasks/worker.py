@@ -79,8 +79,7 @@ def simulated(function: Callable[..., Any], request: Request) -> Answer:
     """Make one simulation by `function(rng, theta[D])`, and check what comes of it."""
     try:
         result = function(generator(request.words, request.index), np.asarray(request.theta, np.float32))
-        trajectory, outcome = result if isinstance(result, tuple) and len(result) == 2 else (result, 0)
-        trajectory, outcome = np.asarray(trajectory), np.asarray(outcome)
+        trajectory, outcome = map(np.asarray, with_outcome(result))
     except CrashError as error:
         return failed("crash", str(error))
     except (Exception, SystemExit) as error:
@@ -100,8 +99,19 @@ def checked(trajectory: np.ndarray, outcome: np.ndarray, shape: Sequence[int] | 
         )
     if outcome.shape != () or outcome.dtype.kind not in "biu":
         return failed("wrong_shape", f"expected a scalar outcome, got {outcome.dtype} of shape {list(outcome.shape)}")
+    return Answer(code_of(outcome), trajectory if shape is None else trajectory.reshape(shape))
+
+
+def with_outcome(result: Any) -> tuple[Any, Any]:
+    """What a simulator returned, with the outcome of success where it says none."""
+    return result if isinstance(result, tuple) and len(result) == 2 else (result, 0)
+
+
+def code_of(outcome: Any) -> int:
+    """An outcome as 0 or the number of the task's reason; one below 0 counts as the first."""
+    outcome = np.asarray(outcome)
     code = int(not outcome) if outcome.dtype == bool else int(outcome)
-    return Answer(max(code, 0) or int(code < 0), trajectory if shape is None else trajectory.reshape(shape))
+    return max(code, 0) or int(code < 0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,6 +128,23 @@ class OneOfBatch:
             return trajectory, outcome
         (trajectory,) = result
         return trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class Trials:
+    """A simulator of several independent trials, one after another, made of a simulator of one.
+
+    It fails where one of them fails, for the first one's reason.
+    """
+
+    function: Callable[..., Any]
+    trials: int
+
+    def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> Any:
+        """All trials of one parameter vector: their trajectories along the first axis."""
+        results = [with_outcome(self.function(rng, theta)) for _ in range(self.trials)]
+        failures = (code for _, outcome in results if (code := code_of(outcome)))
+        return np.concatenate([np.asarray(trajectory) for trajectory, _ in results]), next(failures, 0)
 
 
 def main() -> None:

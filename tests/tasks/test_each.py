@@ -23,7 +23,7 @@ from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.simulation import simulate_batch, simulate_in_waves
 from jaxlfi.tasks.trials import repeated
-from jaxlfi.tasks.worker import Request, generator, simulated
+from jaxlfi.tasks.worker import Request, Trials, generator, simulated
 from tests.small import gaussian
 from tests.troubled import WAYS, Troubled, calls
 
@@ -168,6 +168,10 @@ def test_trials_are_made_together():
     task = repeated(troubled((0.0, 0.0, 0.0, 0.0, 0.0)), 3)
     trajectories, _, failure = simulate_batch(KEY, task, THETA[:4], (6,))
     assert trajectories.shape == (4, 6) and not failure.any() and task.one_by_one
+    assert task == repeated(troubled(), 3)  # and shares its compiled programs
+    later = iter([True, 3, False])
+    _, outcome = Trials(lambda rng, theta: (theta, next(later)), 3)(None, np.zeros(2))
+    assert outcome == 3  # the first failure's
     own = generator(np.asarray(jax.random.key_data(KEY)).tolist(), 0)
     np.testing.assert_array_equal(trajectories[0, :2], Troubled()(own, np.asarray(THETA[0])).astype(np.float32))
 
