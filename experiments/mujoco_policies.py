@@ -79,13 +79,12 @@ def fitted(config: Path, box: str) -> tuple[Float[np.ndarray, " dim"], float]:
     """
     task = mujoco_task(config)
     simulator = task.simulate.function
-    noise = np.array([tomllib.loads(config.read_text())["noise"][name] for name in task.channels])
     low, high = (np.asarray(side, float) for side in vars(task.space.box_to_inference(task.supports[box])).values())
 
     def residuals(unit: np.ndarray) -> np.ndarray:
         theta = np.asarray(task.space.to_natural(low + unit * (high - low)), float)
         rows, _ = simulator.clean(theta[None])
-        return (np.where(simulator.there, rows[0] - simulator.observation, 0.0) / noise).ravel()
+        return (np.where(simulator.there, rows[0] - simulator.observation, 0.0) / simulator.noise).ravel()
 
     rng = np.random.default_rng(0)
     starts = [np.full(task.space.dim, 0.5), *rng.uniform(0.05, 0.95, (STARTS - 1, task.space.dim))]
