@@ -91,7 +91,7 @@ def recordings(path: Path, task: Task, name: str, count: int) -> dict[str, np.nd
     if path.exists() and len(files.read_arrays(path)["theta"]) >= count:
         return {key: values[:count] for key, values in files.read_arrays(path).items()}
     record, theta = script(), truths(task, count)
-    series = lambda log: np.stack([log.signals[signal] for signal in task.channels], axis=1)
+    series = lambda log: np.stack([log.signals[signal] for signal in task.simulate.function.signals], axis=1)
     observed, held_out = [], []
     for row, own in enumerate(track(theta, f"recordings of {name}")):
         truth = dict(zip(task.names, map(float, own), strict=True))

@@ -21,6 +21,9 @@ angle = { deviation = 0.01, time = 0.2 }
 
 [supports.wide]                     # another first guess, for --support wide
 "joint/hinge/damping" = [0.0001, 0.1]
+
+[policy]                            # what policies are to do (`jaxlfi.envs.mujoco.goal`); inference does not read it
+interval = 0.02
 """
 
 import tomllib
@@ -42,6 +45,7 @@ KEYS: Mapping[str, type] = {
     "initial": dict,
     "discrepancy": dict,
     "supports": dict,
+    "policy": dict,
     "name": str,
 }
 PARAMETER = ("support", "feasible", "unit", "log", "truth")
@@ -58,6 +62,32 @@ def read(path: Path, recorded: Sequence[Path] = ()) -> Task:
         ValueError: for a file that is missing, damaged or describes no task, in one line.
     """
     path = Path(path)
+    config = load(path)
+    given = [Path(one) for one in recorded] or [path.parent / str(one) for one in config.get("log", [])]
+    if not given:
+        raise ValueError(f"{path}: expected recordings, as log = [FILE], or mujoco,config={path},log=FILE; got none")
+    try:
+        return mujoco_task(
+            path.parent / config["model"],
+            parameters_of(config),
+            given,
+            config.get("measured"),
+            numbers(config, "noise"),
+            numbers(config, "initial"),
+            {name: _discrepancy(name, table) for name, table in config.get("discrepancy", {}).items()},
+            {label: _guess(label, table) for label, table in config.get("supports", {}).items()},
+            name=config.get("name", path.stem),
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def load(path: Path) -> dict[str, Any]:
+    """The tables of a file, with a model and parameters among them.
+
+    Raises:
+        ValueError: for a file that is missing or damaged, or has others.
+    """
     try:
         with path.open("rb") as file:
             config = tomllib.load(file)
@@ -71,24 +101,50 @@ def read(path: Path, recorded: Sequence[Path] = ()) -> Task:
     for name in ("model", "parameters"):
         if not config.get(name):
             raise ValueError(f"{path}: expected {name}, got none")
-    given = [Path(one) for one in recorded] or [path.parent / str(one) for one in config.get("log", [])]
-    if not given:
-        raise ValueError(f"{path}: expected recordings, as log = [FILE], or mujoco,config={path},log=FILE; got none")
-    try:
-        found = [_parameter(name, table) for name, table in config["parameters"].items()]
-        return mujoco_task(
-            path.parent / config["model"],
-            found,
-            given,
-            config.get("measured"),
-            {name: _number(value, f"noise: {name}") for name, value in config.get("noise", {}).items()},
-            {name: _number(value, f"initial: {name}") for name, value in config.get("initial", {}).items()},
-            {name: _discrepancy(name, table) for name, table in config.get("discrepancy", {}).items()},
-            {label: _guess(label, table) for label, table in config.get("supports", {}).items()},
-            name=config.get("name", path.stem),
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return config
+
+
+def parameters_of(config: Mapping[str, Any]) -> list[Parameter]:
+    """What is inferred.
+
+    Raises:
+        ValueError: for parameters without bounds, or with other keys.
+    """
+    return [_parameter(name, table) for name, table in config["parameters"].items()]
+
+
+def numbers(config: Mapping[str, Any], table: str) -> dict[str, float]:
+    """A table of numbers by name; empty where there is none.
+
+    Raises:
+        ValueError: for what is no table, or no number.
+    """
+    found = config.get(table, {})
+    if not isinstance(found, dict):
+        raise ValueError(f"{table}: expected a table of numbers, got {found!r}")
+    return {name: number(value, f"{table}: {name}") for name, value in found.items()}
+
+
+def pair(value: Any, where: str) -> tuple[float, float]:
+    """Two bounds.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError(f"{where}: expected [LOW, HIGH], got {value!r}")
+    return number(value[0], where), number(value[1], where)
+
+
+def number(value: Any, where: str) -> float:
+    """A number.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{where}: expected a number, got {value!r}")
+    return float(value)
 
 
 def _parameter(name: str, table: Any) -> Parameter:
@@ -97,36 +153,22 @@ def _parameter(name: str, table: Any) -> Parameter:
         raise ValueError(f"{where}: expected support = [LOW, HIGH], got {table!r}")
     if unknown := [key for key in table if key not in PARAMETER]:
         raise ValueError(f"{where}: expected keys among {', '.join(PARAMETER)}, got {', '.join(unknown)}")
-    bounds = {}
-    for key in ("support", "feasible"):
-        bounds[key] = _pair(table.get(key, table["support"]), f"{where}: {key}")
+    bounds = {key: pair(table.get(key, table["support"]), f"{where}: {key}") for key in ("support", "feasible")}
     log, unit, truth = table.get("log", False), table.get("unit", ""), table.get("truth")
     if not isinstance(log, bool) or not isinstance(unit, str):
         raise ValueError(f"{where}: expected log = true or false and a unit in quotes, got {log!r} and {unit!r}")
-    truth = None if truth is None else _number(truth, f"{where}: truth")
+    truth = None if truth is None else number(truth, f"{where}: truth")
     return Parameter(name, bounds["support"], bounds["feasible"], unit, log, truth)
 
 
 def _guess(label: str, table: Any) -> dict[str, tuple[float, float]]:
     if not isinstance(table, dict):
         raise ValueError(f"supports: {label}: expected bounds [LOW, HIGH] of parameters, got {table!r}")
-    return {name: _pair(pair, f"supports: {label}: {name!r}") for name, pair in table.items()}
+    return {name: pair(bounds, f"supports: {label}: {name!r}") for name, bounds in table.items()}
 
 
 def _discrepancy(name: str, table: Any) -> Discrepancy:
     where = f"discrepancy: {name}"
     if not isinstance(table, dict) or set(table) != {"deviation", "time"}:
         raise ValueError(f"{where}: expected {{ deviation = NUMBER, time = SECONDS }}, got {table!r}")
-    return Discrepancy(**{key: _number(value, f"{where}: {key}") for key, value in table.items()})
-
-
-def _pair(pair: Any, where: str) -> tuple[float, float]:
-    if not isinstance(pair, list) or len(pair) != 2:
-        raise ValueError(f"{where}: expected [LOW, HIGH], got {pair!r}")
-    return _number(pair[0], where), _number(pair[1], where)
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{where}: expected a number, got {value!r}")
-    return float(value)
+    return Discrepancy(**{key: number(value, f"{where}: {key}") for key, value in table.items()})

@@ -76,6 +76,18 @@ def effects(
     return Effects(**{what: tuple(several) for what, several in found.items()}, delay=delay)
 
 
+def built(spec: mujoco.MjSpec, does: Effects, theta: Float[np.ndarray, " dim"]) -> mujoco.MjModel:
+    """The model of a parameter vector, compiled anew.
+
+    Raises:
+        ValueError: where MuJoCo refuses it.
+    """
+    own = spec.copy()
+    for one, d in does.edits:
+        one.apply(own, float(theta[d]))
+    return own.compile()
+
+
 def initial_state(model: mujoco.MjModel, initial: Mapping[str, float]) -> Float[np.ndarray, " state"]:
     """The model's own initial state, but for some numbers by JOINT/qpos and JOINT/qvel.
 

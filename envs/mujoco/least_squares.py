@@ -9,7 +9,7 @@ point is found again with the difference that a finer one makes there (defect co
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import scipy.optimize
@@ -150,6 +150,7 @@ def best_fits(
     keep: int = 4,
     box: Support | None = None,
     observation: np.ndarray | None = None,
+    counted: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> list[Fit]:
     """Points of least squares from the best of several starts, the best first; those that are the same only once.
 
@@ -159,11 +160,12 @@ def best_fits(
         keep: how many of them are followed.
         box: that the points stay in, in natural units; by default Phi.
         observation: another recording in place of the task's own, in the same rows.
+        counted: goes through the starts that are followed, as a progress bar does.
     """
     residuals = Residuals(task, observation)
     starts = np.asarray(starts, float)
     misfits = np.mean(residuals(np.asarray(task.space.to_inference(starts))) ** 2, axis=1)
-    fits = [fit(task, starts[row], box, observation) for row in np.argsort(misfits)[:keep]]
+    fits = [fit(task, starts[row], box, observation) for row in counted(np.argsort(misfits)[:keep].tolist())]
     low, high = _bounds(task, None)
     different: list[Fit] = []
     for one in sorted(fits, key=lambda one: one.misfit):

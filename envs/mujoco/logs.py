@@ -21,15 +21,15 @@ from jaxtyping import Float
 
 from jaxlfi.io import files
 
-UNITS: Mapping[str, float] = {
-    **dict.fromkeys(
-        ("", "1", "s", "m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N m", "Nm", "N*m", "V", "A"), 1.0
-    ),
-    **{"ms": 1e-3, "us": 1e-6, "mm": 1e-3, "cm": 1e-2, "mm/s": 1e-3, "cm/s": 1e-2, "mN": 1e-3, "mN m": 1e-3},
-    **dict.fromkeys(("deg", "°", "deg/s", "°/s", "deg/s^2"), np.pi / 180),
-    **{"rpm": np.pi / 30, "g": 9.80665},
+UNITS: Mapping[str, tuple[float, str]] = {
+    **{unit: (1.0, unit) for unit in ("", "s", "m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N m", "V", "A")},
+    **{"1": (1.0, ""), "Nm": (1.0, "N m"), "N*m": (1.0, "N m"), "ms": (1e-3, "s"), "us": (1e-6, "s")},
+    **{"mm": (1e-3, "m"), "cm": (1e-2, "m"), "mm/s": (1e-3, "m/s"), "cm/s": (1e-2, "m/s")},
+    **{"mN": (1e-3, "N"), "mN m": (1e-3, "N m"), "g": (9.80665, "m/s^2"), "rpm": (np.pi / 30, "rad/s")},
+    **{"deg": (np.pi / 180, "rad"), "deg/s": (np.pi / 180, "rad/s"), "deg/s^2": (np.pi / 180, "rad/s^2")},
+    **{"°": (np.pi / 180, "rad"), "°/s": (np.pi / 180, "rad/s")},
 }
-"""What a number in each unit of a heading is in SI units and radians; "g" is the acceleration."""
+"""What a number in each unit of a heading is in SI units and radians, and in which; "g" is the acceleration."""
 HEADING = re.compile(r"\s*(?P<name>[^\[(]*(?:\[\d+\])?)\s*(?:[\[(](?P<unit>[^\])]*)[\])])?\s*")
 TIMES = ("times", "time", "t")
 
@@ -42,6 +42,7 @@ class Log:
         times: in s from the first one, increasing, shape [T].
         signals: by name, NaN where there is no sample, shape [T] each.
         name: of the file.
+        units: of signals, where they are known, in SI units and radians.
 
     Raises:
         ValueError: for what is no recording.
@@ -50,6 +51,7 @@ class Log:
     times: Float[np.ndarray, " time"]
     signals: Mapping[str, Float[np.ndarray, " time"]]
     name: str = "log"
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         times = np.asarray(self.times, float)
@@ -129,7 +131,7 @@ def _of_table(path: Path) -> Log:
         raise ValueError(f"{path}: expected a CSV file, got one that is missing or no text") from error
     if len(rows) < 3:
         raise ValueError(f"{path}: expected a line of headings and two of numbers, got {len(rows)} lines")
-    names, factors = zip(*(_heading(text, path) for text in rows[0]), strict=True)
+    names, factors, units = zip(*(_heading(text, path) for text in rows[0]), strict=True)
     if names[0].casefold() not in TIMES:
         raise ValueError(f"{path}: expected times in the first column, headed 'time [s]', got {rows[0][0]!r}")
     if len(set(names)) < len(names):
@@ -143,16 +145,17 @@ def _of_table(path: Path) -> Log:
         except ValueError as error:
             raise ValueError(f"{path}: line {number + 2}: expected numbers, got {','.join(row)[:60]!r}") from error
     table *= factors
-    return Log(table[:, 0], dict(zip(names[1:], table[:, 1:].T, strict=True)), str(path))
+    known = {name: unit for name, unit in zip(names, units, strict=True) if unit}
+    return Log(table[:, 0], dict(zip(names[1:], table[:, 1:].T, strict=True)), str(path), known)
 
 
-def _heading(text: str, path: Path) -> tuple[str, float]:
-    """A signal's name, and what its unit is in SI units."""
+def _heading(text: str, path: Path) -> tuple[str, float, str]:
+    """A signal's name, what its unit is in SI units, and in which."""
     match = HEADING.fullmatch(text)
     name, unit = (match["name"].strip(), (match["unit"] or "").strip()) if match else ("", "")
     if not name or unit not in UNITS:
         raise ValueError(f"{path}: expected a heading as 'NAME [unit]' with a unit of {', '.join(UNITS)}, got {text!r}")
-    return name, UNITS[unit]
+    return name, *UNITS[unit]
 
 
 def _of_robotics(path: Path) -> Log:

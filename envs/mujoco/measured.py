@@ -13,6 +13,17 @@ INDEXED = re.compile(r"(?P<sensor>.+)\[(?P<index>\d+)\]")
 _OF_JOINTS = {"qpos": mujoco.mjtSensor.mjSENS_JOINTPOS, "qvel": mujoco.mjtSensor.mjSENS_JOINTVEL}
 _OF_BODIES = {"pos": mujoco.mjtSensor.mjSENS_FRAMEPOS, "quat": mujoco.mjtSensor.mjSENS_FRAMEQUAT}
 
+_UNITS = {
+    "m": ("FRAMEPOS", "GEOMDIST", "RANGEFINDER"),
+    "m/s": ("FRAMELINVEL", "VELOCIMETER"),
+    "rad/s": ("FRAMEANGVEL", "GYRO", "BALLANGVEL"),
+    "m/s^2": ("ACCELEROMETER", "FRAMELINACC"),
+    "rad/s^2": ("FRAMEANGACC",),
+    "N": ("FORCE", "TOUCH"),
+    "N m": ("TORQUE",),
+}
+_UNIT = {getattr(mujoco.mjtSensor, f"mjSENS_{kind}"): unit for unit, kinds in _UNITS.items() for kind in kinds}
+
 
 def add_sensors(spec: mujoco.MjSpec, names: Sequence[str]) -> None:
     """Add sensors to a specification for signals such as "joint/hinge/qpos" and "body/puck/pos[0]".
@@ -58,6 +69,21 @@ def places(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
             raise ValueError(f"measured: expected {sensor}[0] to {sensor}[{size - 1}], got {name!r}")
         found.append(int(model.sensor(sensor).adr[0]) + index)
     return found
+
+
+def unit(model: mujoco.MjModel, name: str) -> str:
+    """The unit that a signal is measured in; "" where its sensor does not say."""
+    match = INDEXED.fullmatch(name)
+    sensor = model.sensor(name if match is None or _has(model, name) else match["sensor"])
+    kind = mujoco.mjtSensor(int(sensor.type[0]))
+    if kind in _OF_JOINTS.values():
+        hinge = model.jnt_type[int(sensor.objid[0])] == mujoco.mjtJoint.mjJNT_HINGE
+        return ("rad" if hinge else "m") + ("/s" if kind == _OF_JOINTS["qvel"] else "")
+    return _UNIT.get(kind, "")
+
+
+def _has(model: mujoco.MjModel, name: str) -> bool:
+    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name) >= 0
 
 
 def _add(spec: mujoco.MjSpec, name: str, kind, object_kind, own: str) -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import logs, noise
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
-from jaxlfi.envs.mujoco.effects import effects, initial_state
+from jaxlfi.envs.mujoco.effects import built, effects, initial_state
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -69,7 +69,7 @@ def mujoco_task(
     Raises:
         ValueError: for whatever does not fit together, in one line, before anything is simulated.
     """
-    spec = _specification(model)
+    spec = specification(model)
     several = [recorded] if isinstance(recorded, Log | str | Path) else list(recorded)
     if not several or not parameters:
         raise ValueError("expected at least one recording and one parameter, got none")
@@ -83,15 +83,10 @@ def mujoco_task(
     inferred = {name.split("/")[1] for name in names if name.startswith("sensor/") and name.endswith("/noise")}
     deviations = _deviations(episodes[0], measured, noises or {}, inferred)
     add_sensors(spec, measured)
-    compiled = _compiled(spec)
+    compiled = compile_spec(spec)
     does = effects(spec, compiled, names, [one.support for one in parameters], measured)
 
-    def build(theta: np.ndarray) -> mujoco.MjModel:
-        own = spec.copy()
-        for one, d in does.edits:
-            one.apply(own, float(theta[d]))
-        return own.compile()
-
+    build = functools.partial(built, spec, does)
     starts = [initial_state(compiled, initial or {})] * len(episodes)
     if unknown := [name for name in discrepancies or {} if name not in measured]:
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
@@ -127,7 +122,8 @@ def task_of(
         observation=simulator.observation,
         summary=summary,
         failures=FAILURES,
-        channels=measured,
+        channels=[f"{name} [{unit}]" if unit else name for name, unit in zip(measured, simulator.units, strict=True)],
+        record_label="time [s]" if len(simulator.times) == 1 else None,
         times=simulator.times[0] if len(simulator.times) == 1 else None,
         **others,
     )
@@ -141,7 +137,12 @@ def _guessed(parameters: Sequence[Parameter], label: str, bounds: Mapping[str, t
     return [dataclasses.replace(one, support=bounds.get(one.name, one.support)) for one in parameters]
 
 
-def _specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
+def specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
+    """A model's specification: of an MJCF file, its text, or a copy of the one that is given.
+
+    Raises:
+        ValueError: where there is none, in one line.
+    """
     if isinstance(model, mujoco.MjSpec):
         return model.copy()
     text = str(model)
@@ -155,7 +156,12 @@ def _specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
         raise ValueError(f"model: {' '.join(str(error).split()).removeprefix('model: ')}") from error
 
 
-def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The model of a specification.
+
+    Raises:
+        ValueError: where MuJoCo refuses it, in one line.
+    """
     try:
         return spec.compile()
     except ValueError as error:

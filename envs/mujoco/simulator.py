@@ -33,6 +33,8 @@ class Simulator:
         times: of the rows of each episode, in s.
         observation: what was recorded, episodes one after another, shape [sum T, C]; 0 where there is no sample.
         there: whether there is a sample, shape [sum T, C].
+        signals: that are measured, C of them.
+        units: of the signals; "" where the sensor does not say.
         noise: standard deviation of each signal's noise, shape [C]; 0 where it is inferred.
     """
 
@@ -65,8 +67,9 @@ class Simulator:
             ValueError: for recordings that do not fit the model, in one line.
         """
         self._model, self._build, self._does = model, build, does
-        self._logs, self._signals, self._starts = tuple(logs), tuple(signals), tuple(starts)
+        self._logs, self.signals, self._starts = tuple(logs), tuple(signals), tuple(starts)
         self._places = measured.places(model, signals)
+        self.units = tuple(measured.unit(model, name) for name in signals)
         self.noise = np.array([noise[name] for name in signals])
         self._discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
         self._actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
@@ -117,14 +120,17 @@ class Simulator:
                 f"{log.name}: expected a control for each actuator of the model, got none of {', '.join(missing)} "
                 f"among {known}"
             )
-        if missing := [name for name in self._signals if name not in log.signals]:
+        if missing := [name for name in self.signals if name not in log.signals]:
             raise ValueError(f"{log.name}: expected signals {', '.join(missing)}, got {known}")
+        for name, unit in zip(self.signals, self.units, strict=True):
+            if unit and log.units.get(name, unit) != unit:
+                raise ValueError(f"{log.name}: {name}: expected {unit} as the sensor, got {log.units[name]}")
         if log.times[-1] < self._model.opt.timestep:
             raise ValueError(
                 f"{log.name}: expected more than a step of the model, {self._model.opt.timestep:g} s, "
                 f"got {log.times[-1]:g} s"
             )
-        return np.flatnonzero(np.isfinite([log.signals[name] for name in self._signals]).any(axis=0))
+        return np.flatnonzero(np.isfinite([log.signals[name] for name in self.signals]).any(axis=0))
 
     def __call__(
         self, rng: np.random.Generator, theta: Float[np.ndarray, "n dim"]

@@ -97,9 +97,7 @@ def finger() -> Reality:
 EXAMPLES: Mapping[str, Callable[[], Reality]] = {"furuta": furuta, "arm": arm, "puck": puck, "finger": finger}
 
 
-def recorded(
-    name: str, truth: Mapping[str, float] | None = None, seed: int | None = 0, backwards: bool = False
-) -> Log:
+def recorded(name: str, truth: Mapping[str, float] | None = None, seed: int | None = 0, backwards: bool = False) -> Log:
     """A recording of an example.
 
     Args:

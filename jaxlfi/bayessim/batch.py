@@ -217,6 +217,11 @@ class BatchEngine:
         self.inputs = self.place(inputs)
         self.first = first
 
+    @property
+    def known_failures(self) -> str:
+        """What is known of failures, for the end of an error's line: nothing, of simulations that are compiled."""
+        return ""
+
     def start(self) -> State:
         """The state before the first round."""
         first = None if self.first is None else len(self.first.theta)

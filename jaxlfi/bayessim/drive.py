@@ -45,20 +45,21 @@ def drive(
         began = time.perf_counter()
         state, row = engine.round(state, index)
         if index == 0:
-            require_success(row["succeeded"], row["failed"], engine.task)
+            require_success(row["succeeded"], row["failed"], engine.task, engine.known_failures)
         on_round(index, state, row, time.perf_counter() - began)
         if np.all(row["settled"]):
             break
     return state
 
 
-def require_success(succeeded: np.ndarray, failed: np.ndarray, task: Task) -> None:
+def require_success(succeeded: np.ndarray, failed: np.ndarray, task: Task, known: str = "") -> None:
     """Refuse to go on where no simulation of the first round succeeded, in any run.
 
     Args:
         succeeded: number of successes of each run.
         failed: failures by reason, of all runs or of one.
         task: for the reasons' names.
+        known: what is known of failures.
 
     Raises:
         SimulatorError: with the counts by reason.
@@ -67,4 +68,4 @@ def require_success(succeeded: np.ndarray, failed: np.ndarray, task: Task) -> No
         return
     counts = np.sum(np.atleast_2d(failed), axis=0)
     listed = ", ".join(f"{reason}: {count}" for reason, count in zip(task.reasons, counts, strict=True))
-    raise SimulatorError(f"simulate: expected some valid simulations in the first round, got none ({listed})")
+    raise SimulatorError(f"simulate: expected some valid simulations in the first round, got none ({listed}){known}")

@@ -17,24 +17,54 @@ from jaxlfi.bayessim.programs import compiled, program
 from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
+from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.simulation import Simulations, simulate_batch, simulate_in_waves
 from jaxlfi.tasks.task import Task
 
 
-def engine_for(task: Task, settings: Settings, inputs: RunInputs, first: Simulations | None = None) -> BatchEngine:
-    """The engine that steps a batch: one compiled program, or rounds around a host simulator."""
-    return (HostEngine if task.on_host else BatchEngine)(task, settings, inputs, first=first)
+def engine_for(
+    task: Task,
+    settings: Settings,
+    inputs: RunInputs,
+    first: Simulations | None = None,
+    journal: Journal | None = None,
+) -> BatchEngine:
+    """The engine that steps a batch: one compiled program, or rounds around a host simulator.
+
+    Args:
+        task: the task.
+        settings: the same for all runs.
+        inputs: stacked.
+        first: simulations that take the place of the first round's, the same for all runs.
+        journal: of simulations that are made one by one.
+    """
+    if task.on_host:
+        return HostEngine(task, settings, inputs, first, journal)
+    return BatchEngine(task, settings, inputs, first=first)
 
 
 class HostEngine(BatchEngine):
     """Steps the runs of a batch by one round each, simulating them one after another on the host."""
 
-    def __init__(self, task: Task, settings: Settings, inputs: RunInputs, first: Simulations | None = None):
-        """Prepare, without compiling; see `BatchEngine`."""
+    def __init__(
+        self,
+        task: Task,
+        settings: Settings,
+        inputs: RunInputs,
+        first: Simulations | None = None,
+        journal: Journal | None = None,
+    ):
+        """Prepare, without compiling; see `BatchEngine` and `engine_for`."""
         super().__init__(task, settings, inputs, devices=jax.local_devices()[:1], first=first)
+        self.journal = journal or Journal()
         part = lambda one, *axes: program(functools.partial(one, task), self.mesh, (None, 0, 0, None, *axes))
         self._propose_many, self._update_many = part(propose_one), part(update_one, 0)
         self._last_seen: list[Discrepancy | None] = [None] * len(inputs.x)
+
+    @property
+    def known_failures(self) -> str:
+        """The first message of each reason for which simulations failed."""
+        return self.journal.known
 
     def compile(self, state: State, index: int = 0) -> None:
         """Compile the parts of a round ahead of their first use, while no simulator waits."""
@@ -64,7 +94,7 @@ class HostEngine(BatchEngine):
         shape, wanted = self.inputs.observed.shape[1:], self.settings.simulations_per_round
         return _stacked(
             [
-                self._nothing(own) if over else simulate_in_waves(key, self.task, own, wanted, shape)
+                self._nothing(own) if over else simulate_in_waves(key, self.task, own, wanted, shape, self.journal)
                 for key, own, over in zip(keys, theta, settled, strict=True)
             ]
         )
@@ -89,7 +119,7 @@ class HostEngine(BatchEngine):
     def _discrepancy(self, key: jax.Array, theta: jax.Array, observed: jax.Array) -> Discrepancy:
         if not self.settings.predictive:
             return not_simulated(self.task, theta, observed, self.inputs.x.shape[-1])
-        simulated = simulate_batch(key, self.task, theta, observed.shape)
+        simulated = simulate_batch(key, self.task, theta, observed.shape, journal=self.journal)
         return compared(self.task, theta, *map(jnp.asarray, simulated), observed)
 
 

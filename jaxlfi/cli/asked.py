@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -11,11 +12,49 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import registry as estimators
 from jaxlfi.heuristics import Heuristic, paired
 from jaxlfi.heuristics import registry as heuristics
+from jaxlfi.tasks import registry
+from jaxlfi.tasks.executors import one_by_one, scheduler, workers
 from jaxlfi.tasks.observation import read_for
 from jaxlfi.tasks.task import Task
 
 CONFIGURATION_DEFAULTS = ("ok", "misspecified", "broad")
 """Supports that are compared by default, where the task has them."""
+
+
+def task_of(arguments: argparse.Namespace) -> Task:
+    """The task, with simulations one by one where the arguments say how they are made."""
+    return simulated_by(arguments, registry.load(arguments.task))
+
+
+def simulated_again(arguments: argparse.Namespace, folder: Path, task: Task) -> Task:
+    """The task of a folder with simulations made as the arguments say, where they were made one by one before.
+
+    Raises:
+        ValueError: where they were not.
+    """
+    given = (arguments.workers, arguments.scheduler, arguments.simulation_timeout) != (None, None, None)
+    if given and not task.one_by_one:
+        raise ValueError(
+            f"{folder}: expected none of --workers, --scheduler and --simulation-timeout for a run whose simulations "
+            "were not made one by one"
+        )
+    return simulated_by(arguments, task)
+
+
+def simulated_by(arguments: argparse.Namespace, task: Task) -> Task:
+    """The task with simulations made as the arguments say; what makes them ends with `arguments.closing`."""
+    count, address, timeout = arguments.workers, arguments.scheduler, arguments.simulation_timeout
+    if count is not None and address is not None:
+        raise ValueError("workers, scheduler: expected one of them, got both")
+    if count is None and address is None and timeout is None:
+        return task
+    one_by_one(task)  # refuses a task of JAX before anything is started
+    executor = None
+    if count is not None:
+        executor = arguments.closing.enter_context(workers(count))
+    elif address is not None:
+        executor = arguments.closing.enter_context(scheduler(address))
+    return one_by_one(task, executor, timeout)
 
 
 def default_configurations(task: Task) -> list[str]:

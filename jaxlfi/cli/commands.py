@@ -2,6 +2,7 @@
 
 import argparse
 import csv
+import dataclasses
 import io
 import shutil
 from pathlib import Path
@@ -19,6 +20,7 @@ from jaxlfi.cli import asked, summaries, train
 from jaxlfi.distributions.truncation import TRIES
 from jaxlfi.heuristics import registry as heuristics
 from jaxlfi.io import files as atomic
+from jaxlfi.io import host_devices
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import export
@@ -31,7 +33,7 @@ from jaxlfi.studies.calibration.widths import sentence
 from jaxlfi.studies.grid import Work
 from jaxlfi.tasks import priors
 from jaxlfi.tasks import registry as task_lookup
-from jaxlfi.tasks.host import SimulatorError
+from jaxlfi.tasks.errors import ExecutorError, SimulatorError
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.task import Task
 
@@ -78,7 +80,7 @@ def _describe_task(task: Task, console: Console) -> None:
 
 def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi infer`."""
-    task = task_lookup.load(arguments.task)
+    task = asked.task_of(arguments)
     settings = asked.build_settings(arguments, task)
     first = None
     if arguments.simulations is None:
@@ -98,7 +100,7 @@ def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
 
 def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi compare`."""
-    task = task_lookup.load(arguments.task)
+    task = asked.task_of(arguments)
     settings = asked.build_settings(arguments, task, all_rounds)
     configurations = arguments.configurations or asked.default_configurations(task)
     if len(set(configurations)) < len(configurations):
@@ -170,10 +172,14 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
         executing.clean(folder)
         _say(console, _COMPLETE.format(folder=folder))
         return None
-    plan = executing.reopen(folder)
+    plan, observed = executing.reopen(folder)
+    if config.get("executor", False) and (arguments.workers, arguments.scheduler) == (None, None):
+        arguments.workers = host_devices.processors()
+        _say(console, f"simulations: in {arguments.workers} processes on this machine")
+    plan = dataclasses.replace(plan, task=asked.simulated_again(arguments, folder, plan.task))
     if changed := executing.changed_machine(config):
         _warn(console, f"begun with {', '.join(changed)}: the result may differ in rounding from an uninterrupted one")
-    return folder, plan
+    return folder, (plan, observed)
 
 
 _COMPLETE = "{folder} is complete: nothing to resume. Its pictures: jaxlfi report {folder}"
@@ -230,10 +236,11 @@ def diagnose(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi diagnose DIR`."""
     task = None if arguments.task is None else task_lookup.load(arguments.task)
     run = calibration.read_run(arguments.folder, task)
-    asked = arguments.reference
-    if asked is None:
-        asked = f"{calibration.POSTERIOR},{next(iter(run.task.supports))}"
-    plans = calibration.plans_of(asked, run.task, arguments.truths, arguments.draws, arguments.seed)
+    run = run.replace(task=asked.simulated_again(arguments, arguments.folder, run.task))
+    references = arguments.reference
+    if references is None:
+        references = f"{calibration.POSTERIOR},{next(iter(run.task.supports))}"
+    plans = calibration.plans_of(references, run.task, arguments.truths, arguments.draws, arguments.seed)
     reference = None
     if arguments.against is not None:
         reference = arguments.against.name, calibration.read_reference(arguments.against, run.task)
@@ -266,7 +273,9 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     try:
         with RoundProgress(console, plan.settings.rounds, done, label) as progress:
             on_round = lambda index, row: progress.advance()
-            runs = executing.execute(plan, observed, folder, on_round, progress.compiled)
+            runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated)
+    except ExecutorError:
+        raise  # the simulator is not to blame: the folder can be gone on from, with the simulations it has
     except Exception:
         if arguments.command != "resume" and not executing.rounds_done(folder):
             shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from
@@ -281,6 +290,11 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     _say(console, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")
     if not arguments.no_figures:
         draw(folder, console)
+
+
+def advice(error: Exception, prepared: Prepared) -> str:
+    """What to do about an error of a run, for the end of its line."""
+    return f"; continue with: jaxlfi resume {prepared[0]}" if isinstance(error, ExecutorError) else ""
 
 
 def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: Console) -> None:

@@ -8,6 +8,7 @@ before jax starts can be set after the arguments are known.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -217,6 +218,7 @@ def _add_resume(commands: Commands) -> None:
         description="Go on with a run that was stopped or killed.",
     )
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
+    _add_executor(command)
     _add_machine(command)
 
 
@@ -272,6 +274,7 @@ def _add_diagnose(commands: Commands) -> None:
     command.add_argument(
         "--out", type=Path, metavar="DIR", help="a new folder for the results (default: diagnostics in the run's)"
     )
+    _add_executor(command)
     _add_machine(command)
 
 
@@ -379,6 +382,7 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
     )
     _add_machine(command)
     if networks:
+        _add_executor(command)
         command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
 
     rounds = command.add_argument_group("rounds (default: the preset's)")
@@ -398,6 +402,19 @@ def _add_machine(command: argparse.ArgumentParser) -> None:
     command.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
     command.add_argument("--debug", action="store_true", help="show where an error came from")
     command.add_argument("--no-cache", action="store_true", help="compile anew, without the cache of compiled programs")
+
+
+def _add_executor(command: argparse.ArgumentParser) -> None:
+    """Where simulations of a host simulator are made."""
+    where = command.add_argument_group("host simulators: simulations one by one")
+    where.add_argument("--workers", type=int, metavar="N", help="in so many processes on this machine")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="on a Dask cluster, by its scheduler's address")
+    where.add_argument(
+        "--simulation-timeout",
+        type=float,
+        metavar="SECONDS",
+        help="give a simulation up after so long (default: never; resume: as the run was begun)",
+    )
 
 
 def prepare_jax(arguments: argparse.Namespace) -> None:
@@ -479,15 +496,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         from jaxlfi.cli import commands
 
         console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
-        try:
-            prepared = commands.COMMANDS[arguments.command](arguments, console)
-        except (ValueError, OSError) as error:
-            return _refuse(error, getattr(arguments, "debug", False))
-        if prepared is not None:
+        with contextlib.ExitStack() as closing:
+            arguments.closing = closing
             try:
-                commands.run(*prepared, arguments, console)
-            except commands.EXPECTED as error:
+                prepared = commands.COMMANDS[arguments.command](arguments, console)
+            except (ValueError, OSError) as error:
                 return _refuse(error, getattr(arguments, "debug", False))
+            if prepared is not None:
+                try:
+                    commands.run(*prepared, arguments, console)
+                except commands.EXPECTED as error:
+                    return _refuse(error, getattr(arguments, "debug", False), commands.advice(error, prepared))
     except KeyboardInterrupt:
         advice = f"; continue with: jaxlfi resume {prepared[0]}" if prepared else ""
         if arguments.command == "diagnose":
@@ -497,10 +516,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _refuse(error: Exception, debug: bool = False) -> int:
-    """Report an error in one line, and where it came from on request."""
+def _refuse(error: Exception, debug: bool = False, advice: str = "") -> int:
+    """Report an error in one line with what to do about it, and where it came from on request."""
     if debug:
         traceback.print_exception(error)
     text = " ".join(str(error).split()) or type(error).__name__
-    print(f"jaxlfi: error: {text}", file=sys.stderr)
+    print(f"jaxlfi: error: {text}{advice}", file=sys.stderr)
     return 2

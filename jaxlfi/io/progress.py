@@ -13,6 +13,9 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+EVERY_BAR, EVERY_LINE = 0.5, 10.0
+"""Seconds between two numbers of simulations, in a bar and in lines."""
+
 
 class RoundProgress:
     """Shows how many rounds are done; a context manager.
@@ -34,7 +37,7 @@ class RoundProgress:
         """
         self._console, self._rounds, self._first, self._done = console, rounds, done, done
         self._label, self._unit = label, unit
-        self._began = time.monotonic()
+        self._began = self._shown = time.monotonic()
         columns = (
             TextColumn("{task.description}", markup=False),
             BarColumn(),
@@ -68,11 +71,24 @@ class RoundProgress:
     def compiled(self, seconds: float) -> None:
         """Say how long compiling took; the estimate of the time left starts now."""
         self._console.print(f"compiled in {seconds:.1f} s")
-        self._began = time.monotonic()
+        self._began = self._shown = time.monotonic()
+
+    def simulated(self, done: int, wanted: int) -> None:
+        """So many simulations have arrived of those wanted; said now and then, where they are slow."""
+        now = time.monotonic()
+        if now - self._shown < (EVERY_BAR if self._bar else EVERY_LINE):
+            return
+        self._shown = now
+        words = f"simulation {done}, {wanted} wanted"
+        if self._bar:
+            self._bar.update(self._task, description=f"{self._label}, {words}")
+        else:
+            self._console.print(f"{self._unit} {self._done + 1}: {words}, {now - self._began:.0f} s elapsed")
 
     def advance(self, rounds: int = 1, more: str = "") -> None:
         """So many more rounds are done; `more` is said with it."""
         self._done += rounds
+        self._shown = time.monotonic()
         if self._bar:
             self._bar.update(self._task, advance=rounds, description=f"{self._label}{more}")
             return

@@ -4,7 +4,8 @@ A folder of .npz files, each replaced as a whole: `start.npz` with the observati
 where they were given), `round_000.npz` and so on
 with what each round did, and `state.npz` with the last state, which says how many rounds are done. Only the
 state is rewritten, so that a round costs the same early and late. A round that was written but that the state
-does not count yet is done again, to the same end.
+does not count yet is done again, to the same end. `simulations.bin` holds simulations that were made one by one for a
+round that is not done.
 """
 
 import shutil
@@ -66,6 +67,11 @@ class Checkpoint:
         leaves = trees.to_arrays(state)
         done = {_DONE: np.asarray(index + 1)}
         atomic.write_arrays(self.folder / "state.npz", leaves | done | final, compress=False, durable=True)
+
+    @property
+    def simulations(self) -> Path:
+        """The file of the simulations of a round that is not done (`jaxlfi.tasks.journal`)."""
+        return self.folder / "simulations.bin"
 
     def rounds_done(self) -> int:
         """How many rounds the state has behind it."""

@@ -1,5 +1,6 @@
 """A batch of runs from its plan to finished runs: in memory, or in a folder that can be resumed at any moment."""
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +26,8 @@ from jaxlfi.runs.checkpoint import Checkpoint
 from jaxlfi.runs.folder import COMPARE, RUN, RUNS, StoreError
 from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks import priors, registry
+from jaxlfi.tasks.executors import one_by_one
+from jaxlfi.tasks.journal import Journal, OnSimulation
 from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.summaries import layout
@@ -143,6 +146,7 @@ def execute(
     folder: Path | None = None,
     on_round: Callable[[int, dict[str, np.ndarray]], Any] = lambda index, row: None,
     on_compiled: Callable[[float], Any] = lambda seconds: None,
+    on_simulation: OnSimulation = lambda done, wanted: None,
 ) -> list[Run]:
     """Run the rounds that are not done yet.
 
@@ -152,6 +156,7 @@ def execute(
         folder: made by `begin`, finished or not; None to keep everything in memory.
         on_round: called as each round ends, with its index and its record.
         on_compiled: called with the seconds that compiling took.
+        on_simulation: called for each simulation of those that are made one by one.
 
     Returns:
         The finished runs, on the host.
@@ -161,8 +166,9 @@ def execute(
         SimulatorError: for a simulator that breaks its contract or fails always.
     """
     inputs, places = stack_inputs(plan.specs, observed.trajectory, observed.x)
-    engine = engine_for(plan.task, plan.settings, inputs, observed.first)
     checkpoint = None if folder is None else Checkpoint(folder)
+    journal = Journal(None if checkpoint is None else checkpoint.simulations, on_simulation)
+    engine = engine_for(plan.task, plan.settings, inputs, observed.first, journal)
     done = 0 if checkpoint is None else checkpoint.rounds_done()
     rows, seconds, final = ([], [], {}) if checkpoint is None else checkpoint.read_rounds(done)
     if folder is not None:
@@ -173,6 +179,7 @@ def execute(
         seconds.append(elapsed / len(plan.specs))
         if checkpoint is not None:
             checkpoint.write_round(index, engine.fetch(state), row, seconds[-1])
+            journal.clear()
         kept, final = apart(row)
         rows.append(kept)
         if folder is not None:
@@ -182,7 +189,8 @@ def execute(
         on_round(index, row)
 
     last = done if rows and np.all(rows[-1]["settled"]) else plan.settings.rounds
-    state = drive(engine, _state(engine, checkpoint, done), range(done, last), keep, on_compiled)
+    with contextlib.closing(journal):
+        state = drive(engine, _state(engine, checkpoint, done), range(done, last), keep, on_compiled)
     state = engine.fetch(state)
     return [
         _run(plan, spec, jax.tree.map(lambda leaf, i=i: leaf[i], state), observed, i, rows, seconds, final, places[i])
@@ -243,6 +251,7 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed) -> None:
         "status": "running",
         "devices": min(jax.local_device_count(), len(plan.specs)),
         "keep_network": plan.keep_network,
+        "executor": plan.task.one_by_one and plan.task.simulate.executor is not None,
         "runs": [
             {"folder": name} | {field: run[field] for field in OWN}
             for name, run in zip(plan.folders(), runs, strict=True)
@@ -288,6 +297,9 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
             keep_network=config["keep_network"],
         )
         labels = config["names"]
+        if config.get("one_by_one", False):
+            timeout = config["simulation_timeout"]
+            plan = dataclasses.replace(plan, task=one_by_one(plan.task, timeout=timeout))
     except (KeyError, TypeError, AttributeError) as error:
         raise StoreError(f"config.json: expected a complete description of the run, got: {error!r}") from error
     if list(plan.task.space.labels) != labels:

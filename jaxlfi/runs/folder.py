@@ -291,6 +291,8 @@ def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) 
         "heuristic": describe.heuristic_to_json(spec.heuristic),
         "preset": origin.preset,
         "given_simulations": origin.given_simulations,
+        "one_by_one": task.one_by_one,
+        "simulation_timeout": task.simulate.timeout if task.one_by_one else None,
         "settings": describe.settings_to_json(settings),
         "seed": spec.seed,
         "widths": expected_widths(settings, spec.heuristic),

@@ -3,6 +3,7 @@
 import functools
 import warnings as python_warnings
 from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from jaxlfi.runs import folder as folders
 from jaxlfi.runs.execute import BatchPlan
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Origin, Run, SupportWarning
+from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.observation import observe, trials_of
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.priors import require_mass
@@ -53,13 +55,15 @@ def infer(
     progress: bool = False,
     callback: Callback | None = None,
     out: str | Path | None = None,
+    executor: Executor | None = None,
+    simulation_timeout: float | None = None,
 ) -> Run:
     """Infer a task's parameters from one observed trajectory, adapting the support (Algorithm 1).
 
     The same numbers as `jaxlfi infer` gives for the seed that the key was made from. Compiled on first use for a task
     and the static part of `settings`; further calls reuse the program. It can be traced: jitted, and vmapped over keys,
     observations, supports, and the leaves of `heuristic` and `settings`. A traced run is one scan over its rounds, and
-    takes neither a host simulator nor the last four arguments.
+    takes neither a host simulator nor the last six arguments.
 
     Args:
         key: consumed.
@@ -79,6 +83,10 @@ def infer(
         callback: called as each round ends.
         out: a new folder to keep the run in as it goes on. Where it holds the same run, unfinished or not, the run goes
             on from there, to the same result.
+        executor: makes the simulations of a host simulator one by one, each with a generator of its own: any
+            `concurrent.futures.Executor`. One that fails, crashes or hangs is counted by its reason. The result is the
+            same for any executor.
+        simulation_timeout: seconds after which a simulation of a host simulator is given up.
 
     Returns:
         The run: `run.posterior`, `run.belief.support`, `run.warnings`, `run.save(folder)`.
@@ -86,6 +94,7 @@ def infer(
     Raises:
         ValueError: for a support, observation or settings that do not fit the task.
         SimulatorError: for a simulator that breaks its contract or fails always.
+        ExecutorError: where the executor is lost.
 
     Example:
         >>> from jaxlfi.envs.gaussian_linear import task  # doctest: +SKIP
@@ -100,6 +109,8 @@ def infer(
     registry.check(heuristic, task.dim)
     heuristic = paired(heuristic, getattr(settings.estimator, "warm_start", True))  # what it is, is checked later
     learnt = getattr(settings.estimator, "embedding", "none") == "trials"  # what it is, is checked later
+    if executor is not None or simulation_timeout is not None:
+        task = one_by_one(task, executor, simulation_timeout)
     task, observation = trials_of(task, observation, "all" if learnt else "moments")
     if not is_concrete((key, observation, support, heuristic, settings)):
         if task.on_host or simulations is not None or progress or callback is not None or out is not None:
@@ -151,7 +162,7 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
             if callback is not None:
                 callback(index, executing.run_row(row, 0, None))
 
-        (run,) = executing.execute(plan, observed, out, each, bar.compiled)
+        (run,) = executing.execute(plan, observed, out, each, bar.compiled, bar.simulated)
     if out is not None:
         executing.finish(out, plan, [run])
     return run
@@ -166,6 +177,9 @@ def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
         "seed",
     )  # fmt: skip
     other = [name for name in compared if config.get(name) != wanted[name]]
+    # Folders of earlier versions lack these two.
+    added = {"one_by_one": False, "simulation_timeout": None}
+    other += [name for name, before in added.items() if config.get(name, before) != wanted[name]]
     priors = [np.asarray(described.get(PRIOR), float) for described in (config, wanted)]
     if PRIOR in config and "prior" not in other and not np.allclose(*priors, rtol=1e-3, atol=1e-3, equal_nan=True):
         other.append("prior")

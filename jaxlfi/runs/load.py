@@ -24,6 +24,7 @@ from jaxlfi.runs import folder as folders
 from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks import registry
+from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.task import Task
 
 LABELS = ("reasons", "names")
@@ -111,6 +112,8 @@ def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space
             f"{folder}: expected the task as it was when the run was made, with parameters {list(space.labels)}, "
             f"got {list(task.space.labels)}"
         )
+    if task is not None and config.get("one_by_one", False):
+        return one_by_one(task, timeout=config["simulation_timeout"])
     return task
 
 

@@ -1,17 +1,21 @@
 """Host simulators: plain Python or NumPy, called outside of compiled programs."""
 
 import dataclasses
+import functools
+import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import Any
 
+import cloudpickle
 import jax
 import numpy as np
 
 from jaxlfi.distributions.arguments import is_concrete
-
-
-class SimulatorError(ValueError):
-    """A simulator that breaks its contract, or fails always."""
+from jaxlfi.tasks.each import alive, here, simulate_each, stacked, through
+from jaxlfi.tasks.errors import SimulatorError
+from jaxlfi.tasks.journal import Journal
+from jaxlfi.tasks.worker import REASONS, Answer, Request, simulated
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +28,14 @@ class HostSimulator:
     Attributes:
         function: `function(rng, theta[N, D]) -> trajectories [N, ...]` or `-> (trajectories, outcomes [N])`, with a
             `numpy.random.Generator` and N parameter vectors in natural units; outcomes as in `jaxlfi.Task`.
+        each: whether it makes one simulation instead, `function(rng, theta[D]) -> trajectory` or `-> (trajectory,
+            outcome)`. Each then has a generator of its own, and one that raises, gives another shape, takes too long
+            or ends its process is a failure for that reason (`REASONS`), and no end of the run.
+        timeout: seconds after which a simulation is given up, where `each`; None waits for ever.
+        executor: what makes the simulations, where `each`; None makes them one after another. It changes no result.
+
+    Raises:
+        ValueError: for a timeout or an executor of a simulator of batches, and a timeout that is not positive.
 
     Example:
         >>> simulator = HostSimulator(lambda rng, theta: theta + rng.normal(size=theta.shape))
@@ -33,17 +45,94 @@ class HostSimulator:
     """
 
     function: Callable[..., Any]
+    each: bool = False
+    timeout: float | None = None
+    executor: Executor | None = dataclasses.field(default=None, compare=False, repr=False)
 
-    def __call__(self, key: jax.Array, theta: Any) -> tuple[np.ndarray, np.ndarray]:
+    def __post_init__(self):
+        if not self.each and (self.timeout is not None or self.executor is not None):
+            raise ValueError("each: expected True where there is a timeout or an executor, got False")
+        if self.timeout is not None and not (self.timeout > 0 and math.isfinite(self.timeout)):
+            raise ValueError(f"timeout: expected a number of seconds above 0, got {self.timeout!r}")
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Reasons of failure besides the task's own."""
+        return REASONS if self.each else ()
+
+    def __call__(self, key: jax.Array, theta: Any, journal: Journal | None = None) -> tuple[np.ndarray, np.ndarray]:
         """One simulation: its trajectory, and 0 or the code of the reason it failed for.
+
+        Args:
+            key: seeds the simulator's generator.
+            theta: in natural units, shape [D].
+            journal: learns what is known of a failure, where `each`.
 
         Raises:
             SimulatorError: if the simulator raises or gives other shapes, or inside a traced function.
         """
         if not is_concrete((key, theta)):
             raise SimulatorError("simulate: expected concrete arguments for a host simulator, which cannot be traced")
+        if self.each:
+            (answer,) = self.some(key, np.asarray(theta)[None], journal=journal)
+            return answer.trajectory, np.asarray(answer.outcome)
         trajectories, outcomes = self.batch(key, np.asarray(theta)[None])
         return trajectories[0], outcomes[0]
+
+    def some(
+        self,
+        key: jax.Array,
+        theta: np.ndarray,
+        shape: Sequence[int] | None = None,
+        rows: Sequence[int] | None = None,
+        wanted: int | None = None,
+        journal: Journal | None = None,
+    ) -> list[Answer]:
+        """Simulate parameter vectors one by one, where `each`, until enough have succeeded (`simulate_each`).
+
+        Args:
+            key: with its row, seeds the generator of a simulation.
+            theta: in natural units, shape [A, D].
+            shape: of a trajectory; None where it is not known yet.
+            rows: which of them, in their order; all by default.
+            wanted: how many successes; by default all are simulated.
+            journal: knows those made before, and keeps those that are made.
+
+        Returns:
+            The answers for the first of the rows, as many as were made.
+
+        Raises:
+            ExecutorError: where the executor is lost.
+            SimulatorError: where its workers cannot load the simulator.
+        """
+        rows = range(len(theta)) if rows is None else rows
+        words, numbers = np.asarray(jax.random.key_data(key)).tolist(), np.asarray(theta, np.float32).tolist()
+        shape = None if shape is None else list(shape)
+        requests = [Request(words, int(row), numbers[row], shape) for row in rows]
+        journal = journal or Journal()
+        if self.executor is not None:
+            return self._through(self.executor, requests, wanted, journal)
+        if self.timeout is None:
+            return simulate_each(here(lambda request: simulated(self.function, request)), requests, wanted, journal, 1)
+        with ThreadPoolExecutor(1) as executor:  # what hangs can only be ended in a process of its own
+            return self._through(executor, requests, wanted, journal)
+
+    def _through(
+        self, executor: Executor, requests: list[Request], wanted: int | None, journal: Journal
+    ) -> list[Answer]:
+        submit = through(executor, self._payload, self.timeout)
+        return simulate_each(submit, requests, wanted, journal, alive=functools.partial(alive, executor))
+
+    @functools.cached_property
+    def _payload(self) -> bytes:
+        """The function as it is sent to other processes."""
+        try:
+            return cloudpickle.dumps(self.function)
+        except Exception as error:
+            raise SimulatorError(
+                "simulate: expected a function that can be sent to another process, "
+                f"got {type(error).__name__}: {error}"
+            ) from error
 
     def batch(
         self, key: jax.Array | np.random.Generator, theta: np.ndarray, shape: Sequence[int] | None = None
@@ -61,6 +150,10 @@ class HostSimulator:
         Raises:
             SimulatorError: if the simulator raises, or gives other shapes.
         """
+        if self.each:
+            if shape is None:
+                raise SimulatorError("simulate: expected a known shape of trajectories, got none")
+            return stacked(self.some(key, theta, shape), shape)
         rng = key if isinstance(key, np.random.Generator) else numpy_generator(key)
         try:
             result = self.function(rng, theta)

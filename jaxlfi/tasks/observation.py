@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi.tasks.host import SimulatorError
+from jaxlfi.tasks.errors import SimulatorError
+from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.simulation import trajectory_and_outcome, with_outcome
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.trials import repeated, together
@@ -107,11 +108,14 @@ def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
     """
     if task.truth is None:
         raise ValueError("observation: expected one, as the task has neither an observation nor a known truth")
+    journal = Journal()
     for attempt in range(TRIES):
-        trajectory, failure = _at_truth(jax.random.fold_in(key, attempt), task)
+        trajectory, failure = _at_truth(jax.random.fold_in(key, attempt), task, journal)
         if failure == 0:
             return np.asarray(trajectory)
-    raise SimulatorError(f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries")
+    raise SimulatorError(
+        f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries{journal.known}"
+    )
 
 
 def trace_observation(key: jax.Array, task: Task) -> jax.Array:
@@ -121,11 +125,11 @@ def trace_observation(key: jax.Array, task: Task) -> jax.Array:
     return trajectory_and_outcome(task, jax.random.fold_in(key, 0), task.inference.truth)[0]
 
 
-def _at_truth(key: jax.Array, task: Task):
+def _at_truth(key: jax.Array, task: Task, journal: Journal):
     truth = task.inference.truth
     if not task.on_host:
         return _simulate_jit(task, key, truth)
-    trajectory, outcome = task.simulate(key, np.asarray(task.space.to_natural(truth)))
+    trajectory, outcome = task.simulate(key, np.asarray(task.space.to_natural(truth)), journal)
     return with_outcome(task, jnp.asarray(trajectory), jnp.asarray(outcome))
 
 

@@ -9,7 +9,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlfi.tasks.each import stacked
 from jaxlfi.tasks.host import numpy_generator
+from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.task import Task
 
 
@@ -61,8 +63,11 @@ def trajectory_and_outcome(
 def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, Int[Array, ""]]:
     """Turn what a simulator says of one trajectory into a failure code; non-finite numbers are a failure too."""
     failure = jnp.where(outcome, 0, 1) if outcome.dtype == bool else outcome
+    # The simulator's own reasons, from -1 downwards, come after the task's (`HostSimulator.reasons`).
+    own, others = len(task.failures), len(task.reasons) - len(task.failures) - 1
     # A code that stands for no reason is still a failure, and must be counted as one.
-    failure = jnp.where((failure < 0) | (failure > len(task.failures)), 1, failure)
+    failure = jnp.where((failure < -others) | (failure > own), 1, failure)
+    failure = jnp.where(failure < 0, own - failure, failure)
     finite = jnp.all(jnp.isfinite(trajectory))
     failure = jnp.where((failure == 0) & ~finite, len(task.reasons), failure).astype(jnp.int32)
     return trajectory.astype(jnp.float32), failure
@@ -115,6 +120,7 @@ def simulate_batch(
     theta: Float[Array, "n dim"],
     shape: Sequence[int],
     wanted: Bool[np.ndarray, " n"] | None = None,
+    journal: Journal | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Simulate every row of theta outside of compiled programs, by a simulator in JAX or on the host.
 
@@ -124,6 +130,7 @@ def simulate_batch(
         theta: in inference space, shape [N, D].
         shape: of a trajectory.
         wanted: rows that are needed, shape [N]; all by default. A simulator on the host is called for these only.
+        journal: of simulations that are made one by one.
 
     Returns:
         Trajectories [N, ...], summaries [N, S] (zero where failed) and failure codes [N], 0 for success.
@@ -134,10 +141,17 @@ def simulate_batch(
     if task.on_host:
         rows = np.ones(len(theta), bool) if wanted is None else wanted
         trajectories, outcomes = np.zeros((len(theta), *shape), np.float32), np.ones(len(theta), int)
-        natural = np.asarray(task.space.to_natural(theta))[rows]
-        trajectories[rows], outcomes[rows] = task.simulate.batch(key, natural, shape)
+        natural = np.asarray(task.space.to_natural(theta))
+        trajectories[rows], outcomes[rows] = _on_host(task, key, natural, shape, rows, journal)
         return jax.device_get(summarised_batch(task, trajectories, outcomes))
     return jax.device_get(_simulate_batch(task, jax.random.split(key, len(theta)), theta))
+
+
+def _on_host(task: Task, key: jax.Array, natural: np.ndarray, shape: Sequence[int], rows: np.ndarray, journal):
+    """Trajectories and outcomes of some rows of parameters in natural units."""
+    if not task.simulate.each:
+        return task.simulate.batch(key, natural[rows], shape)
+    return stacked(task.simulate.some(key, natural, shape, np.flatnonzero(rows), journal=journal), shape)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -156,29 +170,41 @@ def _with_summary(task: Task, trajectory: Array, failure: Array):
 
 
 def simulate_in_waves(
-    key: jax.Array, task: Task, theta: Float[Array, "attempts dim"], wanted: int, shape: Sequence[int]
+    key: jax.Array,
+    task: Task,
+    theta: Float[Array, "attempts dim"],
+    wanted: int,
+    shape: Sequence[int],
+    journal: Journal | None = None,
 ) -> Simulations:
     """Simulate on the host, in the order of theta, until enough have succeeded or all are spent.
 
     The simulator is called for as many parameter vectors as are wanted, then for as many as failed, and so on: nothing
-    is simulated that is not needed.
+    is simulated that is not needed. Simulations that are made one by one are begun as others fail; only summaries that
+    are not finite ask for another wave.
 
     Args:
-        key: seeds the simulator's generator.
+        key: seeds the simulator's generator, or with its place that of each simulation.
         task: one whose simulator runs on the host.
         theta: proposals in inference space, shape [A, D].
         wanted: how many successes.
         shape: of a trajectory.
+        journal: of simulations that are made one by one.
     """
     natural = np.asarray(task.space.to_natural(theta))
-    budget = len(natural)
+    budget, each = len(natural), task.simulate.each
     trajectories = np.zeros((budget, *shape), np.float32)
     outcomes = np.full(budget, 1)  # what was not attempted is no success
-    rng = numpy_generator(key)
+    rng = None if each else numpy_generator(key)
     done, successes = 0, 0
     while done < budget and successes < wanted:
-        wave = slice(done, min(budget, done + wanted - successes))
-        trajectories[wave], outcomes[wave] = task.simulate.batch(rng, natural[wave], shape)
+        if each:
+            answers = task.simulate.some(key, natural, shape, range(done, budget), wanted - successes, journal)
+            wave = slice(done, done + len(answers))
+            trajectories[wave], outcomes[wave] = stacked(answers, shape)
+        else:
+            wave = slice(done, min(budget, done + wanted - successes))
+            trajectories[wave], outcomes[wave] = task.simulate.batch(rng, natural[wave], shape)
         _, x, failure = summarised_batch(task, trajectories, outcomes)
         done = wave.stop
         successes = int(np.sum(np.asarray(failure)[:done] == 0))

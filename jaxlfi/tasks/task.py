@@ -15,6 +15,7 @@ import numpy as np
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support, check_within
 from jaxlfi.tasks import priors, summaries
+from jaxlfi.tasks.command import Command
 from jaxlfi.tasks.host import HostSimulator
 
 Simulate = Callable[..., Any]
@@ -122,6 +123,8 @@ class Task:
         store("units", tuple(self.units) if self.units is not None else ("",) * len(names))
         if not callable(self.simulate):
             raise ValueError(f"simulate: expected a function, got {type(self.simulate).__name__}")
+        if clash := set(self.failures) & set(self.simulate.reasons if self.on_host else ()):
+            raise ValueError(f"failures: expected other names than those of every simulator, got {sorted(clash)}")
         if len(self.units) != len(names):
             raise ValueError(f"units: expected one for each of the {len(names)} parameters, got {len(self.units)}")
         if len(set(names)) != len(names) or not names:
@@ -147,6 +150,40 @@ class Task:
         if self.prior is not None:
             priors.check_prior(self.prior, len(names))
         is_natural(self.prior_space)
+
+    @classmethod
+    def from_command(
+        cls,
+        template: str,
+        names: Sequence[str],
+        supports: Mapping[str, Support],
+        feasible: Support,
+        *,
+        timeout: float | None = None,
+        **others: Any,
+    ) -> "Task":
+        """The task of a simulator that is a program, in any language (`jaxlfi.tasks.command.Command`).
+
+        Args:
+            template: its command, such as "./sim --theta {theta} --seed {seed}". It writes a trajectory to standard
+                output as .npy or JSON.
+            names: one name for each parameter.
+            supports: boxes Theta_0 by name.
+            feasible: Phi.
+            timeout: seconds after which a simulation is given up; None waits for ever.
+            others: more fields of the task.
+
+        Raises:
+            ValueError: for a program that is not found, or a template that does not pass on all parameters.
+
+        Example:
+            >>> box = Support([0.0], [1.0])
+            >>> coin = Task.from_command("echo [{theta}, {seed}]", ["bias"], {"unit": box}, box)
+            >>> coin.one_by_one, coin.reasons
+            (True, ('failed', 'error', 'wrong_shape', 'timeout', 'crash', 'non_finite'))
+        """
+        simulate = HostSimulator(Command(template, names), each=True, timeout=timeout)
+        return cls(simulate, names=names, supports=supports, feasible=feasible, **others)
 
     @property
     def dim(self) -> int:
@@ -177,8 +214,13 @@ class Task:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """All reasons of failure, in the order of their codes from 1: the task's own, then "non_finite"."""
-        return (*self.failures, "non_finite")
+        """All reasons of failure, in the order of their codes from 1: the task's own, its simulator's, "non_finite"."""
+        return (*self.failures, *(self.simulate.reasons if self.on_host else ()), "non_finite")
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether its simulations are made one by one on the host, each with a generator of its own."""
+        return self.on_host and self.simulate.each
 
     def named_summaries(self, count: int) -> tuple[str, ...]:
         """Names of the summary's `count` numbers.

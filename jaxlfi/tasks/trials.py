@@ -13,6 +13,7 @@ from jaxtyping import Array
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.summaries import one_after_another
 from jaxlfi.tasks.task import Task
+from jaxlfi.tasks.worker import Trials
 
 MAX_TRIALS = 1000
 """Trials of a task, at most: each simulation is so many."""
@@ -48,7 +49,9 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
     if trials == 1:
         return task
     if task.on_host:
-        simulate = HostSimulator(functools.partial(_on_host, task.simulate.function, trials))
+        function = task.simulate.function
+        many = Trials(function, trials) if task.one_by_one else functools.partial(_on_host, function, trials)
+        simulate = dataclasses.replace(task.simulate, function=many)
     else:
         simulate = functools.partial(_in_jax, task.simulate, trials)
     return dataclasses.replace(

@@ -21,6 +21,7 @@ from jaxlfi import infer
 from jaxlfi.cli import domains as words_of
 from jaxlfi.cli import evaluate as evaluating
 from jaxlfi.cli import train as command
+from jaxlfi.distributions.support import Support
 from jaxlfi.io import files
 from jaxlfi.rl import domains, training
 from jaxlfi.rl.evaluation import cross_evaluate
@@ -279,6 +280,13 @@ def test_a_posterior_in_other_units_is_no_domain():
         ValueError, match=r"domain: expected a posterior in units \['', 'm'\], .*, got one in \['', 'mm'"
     ):
         domains.check_belief(LINE, LINE.space, LINE.feasible, ("", "mm"))
+
+
+def test_bounds_that_were_logarithms_may_be_rounded():
+    rounded = Support([0.25 * (1 - 1e-6), -2.0], [4.0 * (1 + 1e-6), 2.0])
+    domains.check_belief(LINE, LINE.space, rounded)
+    with pytest.raises(ValueError, match="inside the feasible domain Phi"):
+        domains.check_belief(LINE, LINE.space, Support([0.249, -2.0], [4.0, 2.0]))
 
 
 def test_the_posterior_of_a_run_is_a_domain(tmp_path, capsys):

@@ -225,6 +225,7 @@ ASKED = {
     },
     "on_host": {
         "jaxlfi.tasks.task": "declares it",
+        "jaxlfi.tasks.executors": "refuses one that JAX compiles",
         "jaxlfi.tasks.simulation": "calls a host simulator for many parameters at once",
         "jaxlfi.tasks.observation": "asks it for shapes, which JAX's simulators tell without being run",
         "jaxlfi.tasks.trials": "repeats it by one call for all trials",
@@ -286,8 +287,10 @@ def test_who_may_import_which_library(path):
         "tensorboardX": ("jaxlfi.rl.tensorboard",),
         "pyarrow": ("jaxlfi.io.lerobot",),
         "mcap": ("jaxlfi.io.mcap",),
+        "distributed": ("jaxlfi.tasks.executors",),
+        "cloudpickle": ("jaxlfi.tasks.host", "jaxlfi.tasks.worker"),  # from a run to the processes that it starts
     }
-    forbidden = dict.fromkeys(("pickle", "cloudpickle", "dill", "joblib"), ())
+    forbidden = dict.fromkeys(("pickle", "dill", "joblib"), ())
     for library, packages in (allowed | forbidden).items():
         if not any(within(name_of(path), package) for package in packages):
             assert not {name for name in imported(path) if within(name, library)}, library

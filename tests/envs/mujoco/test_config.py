@@ -52,7 +52,8 @@ def folder(tmp_path):
 def test_a_file_says_all_of_it(folder):
     task = registry.load(f"mujoco,config={folder / 'arm.toml'}")
     assert task.name == "arm" and task.names == ("joint/elbow/damping", "control/delay")
-    assert task.units == ("N m s/rad", "") and task.log == ("joint/elbow/damping",) and task.channels == ("angle",)
+    assert task.units == ("N m s/rad", "") and task.log == ("joint/elbow/damping",)
+    assert task.channels == ("angle [rad]",) and task.record_label == "time [s]"
     np.testing.assert_allclose(task.truth, [0.03, 0])
     np.testing.assert_allclose(task.feasible.high, [1, 0.1])
     np.testing.assert_allclose(task.observation[:, 0], recorded().signals["angle"], atol=1e-6)
@@ -107,3 +108,45 @@ def test_files_that_describe_no_task_are_one_line(folder, capsys, old, new, expe
     out = folder / "run"
     assert cli.main(["infer", f"mujoco,config={path}", "--out", str(out)]) == 2
     assert "Traceback" not in capsys.readouterr().err and not out.exists()
+
+
+def test_other_first_guesses_and_what_the_model_gets_wrong(folder):
+    (folder / "arm.toml").write_text(
+        CONFIG
+        + '[supports.wide]\n"joint/elbow/damping" = [0.001, 0.9]\n'
+        + "[discrepancy]\nangle = { deviation = 0.5, time = 0.2 }\n"
+    )
+    task = registry.load(f"mujoco,config={folder / 'arm.toml'}")
+    np.testing.assert_allclose(task.supports["wide"].low, [0.001, 0])
+    np.testing.assert_allclose(task.supports["wide"].high, [0.9, 0.1])
+    theta = np.tile([0.03, 0.0], (400, 1))
+    noisy, _ = task.simulate.function(np.random.default_rng(0), theta)
+    clean, _ = task.simulate.function.clean(theta[:1])
+    error = noisy[:, :, 0] - clean[:, :, 0]
+    # A standard deviation of 0.5 within four sigma, and neighbours that persist: exp(-0.02 / 0.2) = 0.905.
+    assert error[:, 50].std() == pytest.approx(np.hypot(0.5, 0.002), rel=4 / np.sqrt(800))
+    assert np.corrcoef(error[:, 50], error[:, 51])[0, 1] == pytest.approx(np.exp(-0.1), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[supports.wide]\n"joint/elbow/dampin" = [0.1, 0.2]', "expected some of .*, got joint/elbow/dampin$"),
+        ('[supports.wide]\n"joint/elbow/damping" = [0.1, 7]', "expected bounds within feasible"),
+        ('[supports]\nwide = 3', r"supports: wide: expected bounds \[LOW, HIGH\] of parameters, got 3"),
+        ("[discrepancy]\nangl = { deviation = 1, time = 1 }", "discrepancy: expected some of angle, got angl"),
+        ("[discrepancy]\nangle = 0.1", r"discrepancy: angle: expected { deviation = NUMBER, time = SECONDS }, got 0.1"),
+        ("[discrepancy]\nangle = { deviation = 1, time = 0 }", "a correlation time above 0 s, got 1 and 0"),
+    ],
+)  # fmt: skip
+def test_guesses_and_discrepancies_that_do_not_fit(folder, text, message):
+    (folder / "arm.toml").write_text(CONFIG + text)
+    with pytest.raises(ValueError, match=message):
+        read(folder / "arm.toml")
+
+
+def test_units_that_contradict_the_sensor(folder):
+    text = (folder / "swing.csv").read_text().replace("angle [deg]", "angle [mm]")
+    (folder / "swing.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"swing.csv: angle: expected rad as the sensor, got m"):
+        read(folder / "arm.toml")

@@ -169,7 +169,8 @@ def test_models_that_are_none(model):
 def test_the_task_says_what_it_is():
     task = mujoco_task(ARM, [DAMPING, Parameter("control/delay", (0.0, 0.1), unit="s")], recorded(), noises=QUIET)
     assert task.name == "arm" and task.names == ("joint/elbow/damping", "control/delay")
-    assert task.units == ("N m s/rad", "s") and task.log == ("joint/elbow/damping",) and task.channels == tuple(SIGNALS)
+    assert task.units == ("N m s/rad", "s") and task.log == ("joint/elbow/damping",)
+    assert task.simulate.function.signals == tuple(SIGNALS)
     np.testing.assert_allclose([task.feasible.low, task.feasible.high], [[0.001, 0], [1.0, 0.1]], rtol=1e-6)
     np.testing.assert_allclose([task.supports["initial"].low[0], task.supports["initial"].high[0]], [0.01, 0.2])
     assert task.observation.shape == (101, 4) and task.truth is None

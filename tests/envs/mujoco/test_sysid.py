@@ -52,7 +52,8 @@ def test_the_same_bounds_recordings_and_simulations():
         units={"length": "m"}, noise=QUIET,
     )  # fmt: skip
     assert task.name == "arm" and task.names == ("damping[0]", "damping[1]", "length")
-    assert task.units == ("", "", "m") and task.log == ("damping[0]", "damping[1]") and task.channels == NAMES
+    assert task.units == ("", "", "m") and task.log == ("damping[0]", "damping[1]")
+    assert task.simulate.function.signals == NAMES
     np.testing.assert_allclose(task.supports["initial"].low, [0.01, 0.001, 0.3], rtol=1e-6)
     np.testing.assert_allclose(task.feasible.high, [0.5, 1.0, 0.5], rtol=1e-6)
     rows, outcome = task.simulate.function.clean([[0.08, 0.03, 0.4], [0.3, 0.03, 0.4]])

@@ -1,0 +1,127 @@
+"""The command `jaxlfi mujoco fit`, whose arguments `jaxlfi.envs.mujoco.cli` parses."""
+
+import argparse
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import jaxlfi
+from jaxlfi import plot
+from jaxlfi.envs.mujoco import config, least_squares
+from jaxlfi.envs.mujoco.least_squares import Fit
+from jaxlfi.io import files
+from jaxlfi.io.progress import RoundProgress
+from jaxlfi.runs.folder import environment
+from jaxlfi.tasks.task import Task
+
+ALIKE = 0.95
+"""Correlation from which on two parameters are said not to be told apart."""
+AS_GOOD = 1.1
+"""Points whose misfit is within this factor of the best one's explain the recording as well."""
+DRAWS = 1000
+
+
+def fit(arguments: argparse.Namespace) -> None:
+    """Points of least squares: from draws of a run's posterior, or from draws of Phi.
+
+    Raises:
+        ValueError: for a run of another kind of task, and a folder that is there already.
+    """
+    source, out = Path(arguments.source), arguments.out
+    if out is not None and out.exists():
+        raise ValueError(f"--out: expected a new folder, got {out}")
+    run = None if source.is_file() else jaxlfi.load(source)
+    task = config.read(source) if run is None else run.task
+    if task is None:
+        raise ValueError(f"{source}: expected a run whose task can be found, got one whose task cannot")
+    starts = _over_feasible(task, arguments.starts) if run is None else np.asarray(run.draws(arguments.starts))
+    observation = None if run is None else np.asarray(run.observed)
+    console = Console()
+
+    def counted(rows: Sequence[int]) -> Iterator[int]:
+        with RoundProgress(console, len(rows), 0, task.name, "point") as progress:
+            for row in rows:
+                yield row
+                progress.advance()
+
+    fits = least_squares.best_fits(task, starts, arguments.keep, observation=observation, counted=counted)
+    for number, one in enumerate(fits):
+        console.print(_table(task, one, f"point {number + 1} of {len(fits)}"))
+    for line in said(task, fits):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    if out is not None:
+        out.mkdir(parents=True)
+        files.write_json(out / "fit.json", {"points": [_plain(task, one) for one in fits], **environment()})
+        sets = {"points of least squares": np.concatenate([_drawn(task, one) for one in _as_good(fits)])}
+        if run is not None:
+            sets = {"posterior": np.asarray(run.draws(DRAWS)), **sets}
+        names = [name.replace("/", "/ ") for name in task.names]  # which may be broken at spaces
+        log = [name for name, own in zip(names, task.space.log, strict=True) if own]
+        truth = None if task.truth is None else np.asarray(task.truth)
+        plot.pairs(sets, names=names, units=task.units, log=log, truth=truth, path=out / "pairs.png", dpi=150)
+        console.print(f"results: {out}", markup=False, highlight=False)
+
+
+def said(task: Task, fits: Sequence[Fit]) -> list[str]:
+    """What the points say, in sentences, and what the file of the task may have of it."""
+    best, lines = fits[0], []
+    if len(_as_good(fits)) > 1:
+        lines.append(f"{len(_as_good(fits))} points explain the recording as well: it does not tell which is right.")
+    for name, bound in zip(task.names, best.at_bound, strict=True):
+        if bound:
+            lines.append(f"{name} ended on a bound of Phi: widen Phi if it can be.")
+    deviation = np.sqrt(np.maximum(np.diagonal(best.covariance), 1e-300))
+    correlation = best.covariance / np.outer(deviation, deviation)
+    for d, other in zip(*np.triu_indices(len(deviation), 1), strict=True):
+        if abs(correlation[d, other]) > ALIKE:
+            both = f"{task.names[d]} and {task.names[other]}"
+            lines.append(f"{both} are hardly told apart: correlation {correlation[d, other]:.3f}.")
+    lines.append(
+        f"Residuals are {best.misfit:.2f} times the noise; of a model without error they would be 1. "
+        f"The integrator's own error is {best.defect:.2f} times the noise, and is taken off."
+    )
+    lines.append("What the model gets wrong, for the file of the task:\n\n[discrepancy]")
+    for name, one in zip(task.simulate.function.signals, best.discrepancies, strict=True):
+        lines.append(f'"{name}" = {{ deviation = {one.deviation:.2g}, time = {one.time:.2g} }}')
+    return lines
+
+
+def _as_good(fits: Sequence[Fit]) -> list[Fit]:
+    return [one for one in fits if one.misfit <= AS_GOOD * fits[0].misfit]
+
+
+def _over_feasible(task: Task, count: int) -> np.ndarray:
+    """Draws of Phi, uniform in inference space; in natural units, shape [count, D]."""
+    low, high = np.asarray(task.inference.feasible.low), np.asarray(task.inference.feasible.high)
+    return np.asarray(task.space.to_natural(np.random.default_rng(0).uniform(low, high, (count, len(low)))))
+
+
+def _drawn(task: Task, one: Fit) -> np.ndarray:
+    """Draws of the normal distribution that a point's covariance stands for, within Phi; in natural units."""
+    centre = np.asarray(task.space.to_inference(one.theta), float)
+    draws = np.random.default_rng(0).multivariate_normal(centre, one.covariance, DRAWS, method="eigh")
+    inside = np.asarray(task.inference.feasible.contains(draws))
+    return np.asarray(task.space.to_natural(draws[inside] if inside.sum() > 1 else draws))
+
+
+def _plain(task: Task, one: Fit) -> dict:
+    found = dataclasses.asdict(one)
+    return {"names": list(task.names)} | {
+        key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in found.items()
+    }
+
+
+def _table(task: Task, one: Fit, title: str) -> Table:
+    table = Table(title=f"{title}: misfit {one.misfit:.3g}, {one.simulations} simulations in all")
+    for heading in ("parameter", "unit", "value", "90 % interval", ""):
+        table.add_column(heading)
+    units = task.units or [""] * task.dim
+    for name, unit, value, (low, high), bound in zip(
+        task.names, units, one.theta, one.interval, one.at_bound, strict=True
+    ):
+        table.add_row(name, unit, f"{value:.4g}", f"{low:.4g} to {high:.4g}", "on a bound" if bound else "")
+    return table

@@ -1,0 +1,262 @@
+"""A MuJoCo model to train policies on: the parameters that were inferred are those of its episodes.
+
+The physics are MJX's, the models MuJoCo's own (`jaxlfi.envs.mujoco.mjx_models`). A posterior of `jaxlfi infer
+mujoco,config=FILE` is a domain of `jaxlfi train mujoco,config=FILE`, with the same names, units and logarithms.
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.envs.mujoco import config as tables
+from jaxlfi.envs.mujoco import goal as goals
+from jaxlfi.envs.mujoco.effects import STATE, built, effects, initial_state, state_place
+from jaxlfi.envs.mujoco.goal import Goal, Reading
+from jaxlfi.envs.mujoco.measured import add_sensors
+from jaxlfi.envs.mujoco.mjx_models import Models, mjx
+from jaxlfi.envs.mujoco.model_task import compile_spec, specification
+from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.rl.environment import EnvState
+
+LARGEST = 1e10
+"""What positions and velocities of a stable simulation stay below, as in MuJoCo itself."""
+
+
+@struct.dataclass
+class Inner:
+    """A model's state, and what lasts for an episode.
+
+    Attributes:
+        qpos: positions.
+        qvel: velocities.
+        act: activations of actuators.
+        warmstart: accelerations that the solver begins with.
+        controls: the last ones, the latest at the end, shape [B, A].
+        numbers: of the model, that depend on its parameters (`Models`).
+        theta: in natural units, shape [D].
+        refused: whether MuJoCo refuses the model.
+        key: of noise to come.
+    """
+
+    qpos: Float[Array, "*batch nq"]
+    qvel: Float[Array, "*batch nv"]
+    act: Float[Array, "*batch na"]
+    warmstart: Float[Array, "*batch nv"]
+    controls: Float[Array, "*batch before act"]
+    numbers: Float[Array, "*batch numbers"]
+    theta: Float[Array, "*batch dim"]
+    refused: Bool[Array, "*batch"]
+    key: jax.Array
+
+
+class MujocoEnvironment:
+    """Episodes of a model whose parameters are those of an inference task; see `mujoco_environment`.
+
+    Attributes:
+        models: MJX models of parameters.
+        reading: what the policy sees, may do and is rewarded for.
+    """
+
+    def __init__(
+        self,
+        model: str | Path | mujoco.MjSpec,
+        parameters: Sequence[Parameter],
+        goal: Goal,
+        noises: Mapping[str, float] | None = None,
+        initial: Mapping[str, float] | None = None,
+        name: str | None = None,
+    ):
+        """An environment.
+
+        Args:
+            model: an MJCF file, its text, or a specification.
+            parameters: those that were inferred, in this order.
+            goal: what policies are to do.
+            noises: standard deviations of the observed signals' noise; 0 of others.
+            initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
+            name: of the environment; by default the model's.
+
+        Raises:
+            ValueError: for whatever does not fit together, or MJX cannot simulate, in one line.
+        """
+        if not parameters:
+            raise ValueError("parameters: expected at least one, got none")
+        spec = specification(model)
+        self.name = name or spec.modelname or "mujoco"
+        self.space = Space(tuple(one.name for one in parameters), tuple(one.log for one in parameters))
+        self.units = tuple(one.unit for one in parameters)
+        support = _box([one.support for one in parameters])
+        self.feasible = _box([one.feasible or one.support for one in parameters])
+        self.supports: Mapping[str, Support] = {"initial": support, "feasible": self.feasible}
+        centre = self.space.box_to_inference(support).centre
+        self.nominal = tuple(float(number) for number in np.asarray(self.space.to_natural(np.asarray(centre))))
+
+        signals = [*goal.signals, *_only_inferred(self.space.names, goal.signals)]
+        add_sensors(spec, signals)
+        compiled = compile_spec(spec)
+        self._does = effects(spec, compiled, self.space.names, [one.support for one in parameters], signals)
+        self.reading = Reading(compiled, goal)
+        self.observations, self.actions, self.steps = self.reading.observations, self.reading.actions, goal.steps
+        self.models = Models(
+            functools.partial(built, spec, self._does), self.space.names, np.asarray(self.nominal), self.feasible
+        )
+        self._check(compiled, goal)
+
+        start = initial_state(compiled, initial or {})
+        if mujoco.mj_stateSize(compiled, STATE) != 1 + compiled.nq + compiled.nv + compiled.na:
+            raise ValueError("model: expected states of positions, velocities and activations, got one of more")
+        self._start, self._cuts = start[1:], (compiled.nq, compiled.nq + compiled.nv)
+        self._drawn = [
+            (state_place(compiled, key, f"initial/{key}") - 1, bounds) for key, bounds in goal.initial.items()
+        ]
+        self._timestep = compiled.opt.timestep
+        self._substeps = round(goal.interval / self._timestep)
+        self._data = mjx.make_data(self.models.base)
+        self._accelerations = bool(np.any(compiled.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC))
+        self._noise = np.array([(noises or {}).get(name, 0.0) for name in goal.signals])
+        longest = 0.0 if self._does.delay is None else float(self.feasible.high[self._does.delay])
+        self._before = int(np.ceil(longest / goal.interval - 1e-6)) + 1
+        low, high = (np.asarray(self.actions.centre) + sign * np.asarray(self.actions.scale) for sign in (-1, 1))
+        self._rest = np.tile(np.clip(np.zeros_like(low), low, high), (self._before, 1)).astype(np.float32)
+
+    def reset(self, key: jax.Array, theta: Float[Array, " dim"]) -> EnvState:
+        """The start of an episode with these parameters."""
+        key_start, key_noise, key = jax.random.split(key, 3)
+        start = jnp.asarray(self._start, jnp.float32)
+        for place, d in self._does.starts:
+            start = start.at[place - 1].set(theta[d])
+        for (place, (low, high)), one in zip(
+            self._drawn, jax.random.split(key_start, max(len(self._drawn), 1)), strict=False
+        ):
+            start = start.at[place].set(jax.random.uniform(one, minval=low, maxval=high))
+        qpos, qvel, act = jnp.split(start, self._cuts)
+        numbers, refused = self.models.numbers(theta)
+        inner = Inner(qpos, qvel, act, jnp.zeros_like(qvel), jnp.asarray(self._rest), numbers, theta, refused, key)
+        values = self._values(*self._loaded(inner, inner.controls[-1]))
+        no = jnp.asarray(False)
+        seen, reward = self._seen(key_noise, theta, values), jnp.asarray(0.0, jnp.float32)  # not of a weak type
+        return EnvState(inner, seen, reward, no, no, self._facts(values, no))
+
+    def step(self, state: EnvState, action: Float[Array, " act"]) -> EnvState:
+        """One control interval. Where the simulation becomes unstable the episode ends, as it was seen last."""
+        before = state.inner
+        key, key_noise = jax.random.split(before.key)
+        controls = jnp.concatenate([before.controls[1:], action[None]])
+        model, data = self._loaded(before, action)
+
+        def substep(data, index):
+            return mjx.step(model, data.replace(ctrl=self._control(controls, before.theta, index))), None
+
+        data, _ = jax.lax.scan(substep, data, jnp.arange(self._substeps))
+        # MuJoCo's sensors are those of the state before a step: of the state after it they are read besides.
+        values = self._values(model, data)
+        numbers = jnp.concatenate([data.qpos, data.qvel, values])
+        failed = before.refused | ~jnp.all(jnp.isfinite(numbers) & (jnp.abs(numbers) < LARGEST))
+        after = before.replace(
+            qpos=data.qpos, qvel=data.qvel, act=data.act, warmstart=data.qacc_warmstart, controls=controls, key=key
+        )
+        return EnvState(
+            inner=after,
+            observation=jnp.where(failed, state.observation, self._seen(key_noise, before.theta, values)),
+            reward=jnp.where(failed, 0.0, self.reading.reward(values, action)),
+            terminated=jnp.asarray(False),
+            truncated=failed,
+            facts=self._facts(values, failed),
+        )
+
+    def _check(self, compiled: mujoco.MjModel, goal: Goal) -> None:
+        if compiled.nplugin:
+            raise ValueError("model: MJX cannot simulate it: it has plugins")
+        if "opt.timestep" in self.models.varied:
+            raise ValueError("parameters: expected numbers other than the model's time step, got option/timestep")
+        ratio = goal.interval / compiled.opt.timestep
+        if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:
+            raise ValueError(
+                f"policy: interval: expected a multiple of the model's time step, {compiled.opt.timestep:g} s, "
+                f"got {goal.interval:g} s"
+            )
+
+    def _loaded(self, inner: Inner, control: Float[Array, " act"]) -> tuple[mjx.Model, mjx.Data]:
+        """The model and its data in this state."""
+        data = self._data.replace(
+            qpos=inner.qpos, qvel=inner.qvel, act=inner.act, qacc_warmstart=inner.warmstart, ctrl=control
+        )
+        return self.models.model(inner.numbers), data
+
+    def _control(self, controls: Float[Array, "before act"], theta: Array, index: Array) -> Float[Array, " act"]:
+        """What acts in a substep: with a delay, a control that was given before."""
+        if self._does.delay is None:
+            return controls[-1]
+        since = (index * self._timestep - theta[self._does.delay]) / self.reading.goal.interval
+        return controls[jnp.clip(self._before - 1 + jnp.floor(since + 1e-5).astype(int), 0, self._before - 1)]
+
+    def _values(self, model: mjx.Model, data: mjx.Data) -> Float[Array, " signals"]:
+        """Signals of this state; what accelerations would need is left out where no sensor measures any."""
+        if self._accelerations:
+            data = mjx.sensor_acc(model, mjx.forward(model, data))  # which forward leaves out without constraints
+        else:
+            data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
+            data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
+        return data.sensordata[self.reading.places]
+
+    def _seen(self, key: jax.Array, theta: Float[Array, " dim"], values: Float[Array, " signals"]) -> Array:
+        """An observation: with offsets and noise of the sensors."""
+        deviation, count = jnp.asarray(self._noise, jnp.float32), len(self._noise)
+        for signal, d in self._does.deviations:
+            deviation = deviation.at[signal].set(theta[d]) if signal < count else deviation
+        for signal, d in self._does.biases:
+            values = values.at[signal].add(theta[d]) if signal < count else values
+        return self.reading.seen(values + deviation * jax.random.normal(key, values.shape))
+
+    def _facts(self, values: Float[Array, " signals"], failed: Array) -> dict[str, Array]:
+        """How far the episode's last state is from its targets, and whether it failed."""
+        return {f"{name} off": jnp.abs(off) for name, off in self.reading.off(values).items()} | {"failed": failed}
+
+
+def environment(config: Path | None = None) -> MujocoEnvironment:
+    """The environment that a TOML file describes, in which the inference task is described, too.
+
+    Args:
+        config: the file, with a table `policy` (`jaxlfi.envs.mujoco.goal`).
+
+    Raises:
+        ValueError: for whatever does not fit together, in one line.
+    """
+    if config is None:
+        raise ValueError("config: expected a TOML file that describes a task, as mujoco,config=arm.toml; got none")
+    table = tables.load(config)
+    if "policy" not in table:
+        raise ValueError(f"{config}: expected a table [policy] that says what policies are to do, got none")
+    try:
+        goal = goals.of_table(table["policy"])
+        noises = {name: value for name, value in tables.numbers(table, "noise").items() if name in goal.signals}
+        return MujocoEnvironment(
+            config.parent / table["model"],
+            tables.parameters_of(table),
+            goal,
+            noises,
+            tables.numbers(table, "initial"),
+            table.get("name", config.stem),
+        )
+    except ValueError as error:
+        raise ValueError(f"{config}: {error}") from error
+
+
+def _only_inferred(names: Sequence[str], signals: Sequence[str]) -> list[str]:
+    """Signals whose sensors' offset or noise was inferred, which policies do not see."""
+    own = [name.partition("/")[2].rpartition("/")[0] for name in names if name.startswith("sensor/")]
+    return list(dict.fromkeys(signal for signal in own if signal not in signals))
+
+
+def _box(bounds: Sequence[tuple[float, float]]) -> Support:
+    low, high = np.asarray(bounds, np.float32).T
+    return Support(low, high)

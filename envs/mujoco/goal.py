@@ -1,0 +1,236 @@
+"""What a policy is to do with a model: what it sees, where signals shall be, and what its controls cost.
+
+[policy]
+interval = 0.02                     # s between two controls
+duration = 4.0                      # s of an episode
+observed = ["arm angle", "joint/arm/qvel"]      # sensors, and joints and bodies as under `measured`
+scales = { "joint/arm/qvel" = 5.0 } # what is a large number of a signal; 1 by default
+limits = { motor = [-0.05, 0.05] }  # of the actuators; by default their ctrlrange
+costs = { motor = 0.02 }            # of a control at its limit for a second; half as large ones cost a quarter
+
+[policy.targets."arm angle"]
+value = 0.0
+weight = 1.0                        # what a difference of 1 costs a second; of half that, a quarter
+
+[policy.initial]                    # drawn anew for each episode, uniformly; else as for inference
+"arm/qpos" = [-1.0, 1.0]
+
+Positions of hinges without a range are angles: a policy sees their cosine and sine, and a difference d from a target
+costs 2 (1 - cos d), which is d squared while it is small.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlfi.envs.mujoco import config as tables
+from jaxlfi.envs.mujoco import measured
+from jaxlfi.rl.environment import Signals
+
+KEYS = ("interval", "duration", "observed", "scales", "limits", "costs", "targets", "initial")
+Reward = Callable[[Mapping[str, Array], Mapping[str, Array]], Array]
+"""From signals and controls by name, each one number, to the reward of a control interval."""
+_JOINTS = {
+    int(mujoco.mjtSensor.mjSENS_JOINTPOS): ("rad", "m"),
+    int(mujoco.mjtSensor.mjSENS_JOINTVEL): ("rad/s", "m/s"),
+}
+"""Units of sensors of hinges and slides."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Goal:
+    """What a policy is to do; see above.
+
+    Attributes:
+        observed: signals that a policy sees.
+        interval: between two controls, in s.
+        duration: of an episode, in s.
+        targets: value and weight by signal.
+        costs: by actuator.
+        limits: by actuator.
+        scales: by signal.
+        initial: bounds by JOINT/qpos and JOINT/qvel.
+        reward: in place of targets and costs, in JAX.
+
+    Raises:
+        ValueError: for intervals and weights that are not positive, and a goal without a target or a reward.
+    """
+
+    observed: Sequence[str]
+    interval: float
+    duration: float
+    targets: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    costs: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    limits: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    scales: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    initial: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    reward: Reward | None = None
+
+    def __post_init__(self):
+        if not self.observed or len(set(self.observed)) < len(self.observed):
+            raise ValueError(f"observed: expected at least one signal, each once, got {list(self.observed)}")
+        if not 0 < self.interval <= self.duration:
+            raise ValueError(
+                f"interval: expected one of more than 0 s, and at most the duration, got {self.interval:g} s "
+                f"and {self.duration:g} s"
+            )
+        if not self.targets and self.reward is None:
+            raise ValueError("targets: expected at least one, or a reward; got none")
+        weights = {f"targets: {name}": weight for name, (_, weight) in self.targets.items()}
+        costs = {f"costs: {name}": cost for name, cost in self.costs.items()}
+        for name, number in (weights | costs).items():
+            if not number >= 0:
+                raise ValueError(f"{name}: expected a weight of at least 0, got {number:g}")
+        for name, (low, high) in self.initial.items():
+            if not low <= high:
+                raise ValueError(f"initial: {name}: expected LOW up to HIGH, got {[low, high]}")
+        if unknown := [name for name in self.scales if name not in self.observed]:
+            raise ValueError(f"scales: expected signals that are observed, got {', '.join(unknown)}")
+
+    @property
+    def steps(self) -> int:
+        """Controls in an episode."""
+        return round(self.duration / self.interval)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """What is observed, and what has a target besides."""
+        return (*self.observed, *(name for name in self.targets if name not in self.observed))
+
+
+def of_table(table: Mapping[str, Any]) -> Goal:
+    """The goal that the table `policy` of a file describes.
+
+    Raises:
+        ValueError: for other keys, and values that are no such numbers.
+    """
+    if unknown := [key for key in table if key not in KEYS]:
+        raise ValueError(f"policy: expected keys among {', '.join(KEYS)}, got {', '.join(unknown)}")
+    if missing := [key for key in ("interval", "duration", "observed", "targets") if key not in table]:
+        raise ValueError(f"policy: expected {', '.join(missing)}, got none")
+    if not isinstance(table["observed"], list) or not all(isinstance(one, str) for one in table["observed"]):
+        raise ValueError(f"policy: observed: expected names of signals, got {table['observed']!r}")
+    for key in ("targets", "limits", "initial"):
+        if not isinstance(table.get(key, {}), dict):
+            raise ValueError(f"policy: {key}: expected a table, got {table[key]!r}")
+    targets = {}
+    for name, target in table["targets"].items():
+        if not isinstance(target, dict) or set(target) - {"value", "weight"} or "value" not in target:
+            raise ValueError(f"policy: targets: {name}: expected value and weight, got {target!r}")
+        where = f"policy: targets: {name}"
+        targets[name] = tuple(tables.number(target.get(key, 1.0), f"{where}: {key}") for key in ("value", "weight"))
+    bounds = {
+        key: {name: tables.pair(value, f"policy: {key}: {name}") for name, value in table.get(key, {}).items()}
+        for key in ("limits", "initial")
+    }
+    plain = {key: tables.numbers(table, key) for key in ("costs", "scales")}
+    times = {key: tables.number(table[key], f"policy: {key}") for key in ("interval", "duration")}
+    try:
+        return Goal(tuple(table["observed"]), targets=targets, **times, **bounds, **plain)
+    except ValueError as error:
+        raise ValueError(f"policy: {error}") from error
+
+
+class Reading:
+    """A goal in terms of a model's sensors and actuators. Works on JAX's arrays and on NumPy's.
+
+    Attributes:
+        goal: what is read for.
+        places: of its signals among the sensor data, S of them.
+        observations: of a policy.
+        actions: of a policy: the controls.
+    """
+
+    def __init__(self, model: mujoco.MjModel, goal: Goal):
+        """Look up signals and actuators.
+
+        Args:
+            model: with a sensor for each signal.
+            goal: of the policy.
+
+        Raises:
+            ValueError: for names that the model does not have, and actuators without limits, in one line.
+        """
+        self.goal = goal
+        self.places = np.asarray(measured.places(model, goal.signals))
+        self._owners = [_owner(model, place) for place in self.places]
+        names, units, scales = [], [], []
+        for name, (unit, turning) in zip(goal.observed, self._owners, strict=False):
+            names += [f"cos {name}", f"sin {name}"] if turning else [name]
+            units += ["", ""] if turning else [unit]
+            scales += [1.0, 1.0] if turning else [goal.scales.get(name, 1.0)]
+        self.observations = Signals(tuple(names), tuple(units), (0.0,) * len(names), tuple(scales))
+        self._actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
+        limits = np.array([_limits(model, i, name, goal) for i, name in enumerate(self._actuators)]).reshape(-1, 2)
+        if not len(limits):
+            raise ValueError("policy: expected a model with actuators, got one without")
+        for key in ("limits", "costs"):
+            if unknown := [name for name in getattr(goal, key) if name not in self._actuators]:
+                raise ValueError(
+                    f"policy: {key}: expected actuators of the model ({', '.join(self._actuators)}), "
+                    f"got {', '.join(unknown)}"
+                )
+        centre, scale = limits.mean(axis=1), (limits[:, 1] - limits[:, 0]) / 2
+        blank = ("",) * len(limits)
+        self.actions = Signals(tuple(self._actuators), blank, tuple(centre.tolist()), tuple(scale.tolist()))
+
+    def seen(self, values: Float[Array | np.ndarray, " signals"], xp: Any = jnp) -> Float[Array | np.ndarray, " obs"]:
+        """What a policy sees of signals."""
+        parts = []
+        for place in range(len(self.goal.observed)):
+            value, turning = values[place], self._owners[place][1]
+            parts += [xp.cos(value), xp.sin(value)] if turning else [value]
+        return xp.stack(parts)
+
+    def reward(self, values: Float[Array | np.ndarray, " signals"], control: Float[Array | np.ndarray, " act"], xp=jnp):
+        """The reward of a control interval, at whose end signals have these values."""
+        goal = self.goal
+        if goal.reward is not None:
+            signals = {name: values[place] for place, name in enumerate(goal.signals)}
+            return goal.reward(signals, {name: control[i] for i, name in enumerate(self._actuators)})
+        cost = 0.0
+        for name, off in self.off(values, xp).items():
+            turning = self._owners[goal.signals.index(name)][1]
+            cost += goal.targets[name][1] * (2 * (1 - xp.cos(off)) if turning else off**2)
+        for i, name in enumerate(self._actuators):
+            share = (control[i] - self.actions.centre[i]) / self.actions.scale[i]
+            cost += goal.costs.get(name, 0.0) * share**2
+        return -goal.interval * cost
+
+    def off(self, values: Float[Array | np.ndarray, " signals"], xp: Any = jnp) -> dict[str, Any]:
+        """How far signals are from their targets, of angles the shorter way round."""
+        found = {}
+        for name, (target, _) in self.goal.targets.items():
+            place = self.goal.signals.index(name)
+            difference = values[place] - target
+            turning = self._owners[place][1]
+            found[name] = xp.arctan2(xp.sin(difference), xp.cos(difference)) if turning else difference
+        return found
+
+
+def _owner(model: mujoco.MjModel, place: int) -> tuple[str, bool]:
+    """Unit of a number of the sensor data, and whether it is an angle without a range."""
+    sensor = int(np.searchsorted(model.sensor_adr, place, side="right") - 1)
+    kind, joint = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
+    if kind not in _JOINTS:
+        return "", False
+    hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+    position = kind == int(mujoco.mjtSensor.mjSENS_JOINTPOS)
+    return _JOINTS[kind][0 if hinge else 1], bool(hinge and position and not model.jnt_limited[joint])
+
+
+def _limits(model: mujoco.MjModel, i: int, name: str, goal: Goal) -> tuple[float, float]:
+    if name in goal.limits:
+        low, high = goal.limits[name]
+    elif model.actuator_ctrllimited[i]:
+        low, high = model.actuator_ctrlrange[i]
+    else:
+        raise ValueError(f"policy: limits: expected those of {name}, whose actuator has no ctrlrange; got none")
+    if not low < high:
+        raise ValueError(f"policy: limits: {name}: expected LOW below HIGH, got {[float(low), float(high)]}")
+    return float(low), float(high)

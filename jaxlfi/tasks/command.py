@@ -1,0 +1,129 @@
+"""A simulator that is a program, in any language: parameters on its command line, a trajectory on standard output."""
+
+import dataclasses
+import io
+import json
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxlfi.tasks.worker import CrashError
+
+THETA, SEED = "theta", "seed"
+SEEDS = 2**31
+"""Seeds are whole numbers below this: they fit into an int of C."""
+_FIELD = re.compile(r"\{([^{}]*)\}")
+_NPY = b"\x93NUMPY"
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """One simulation by a program, as the function of a `jaxlfi.HostSimulator` with `each`.
+
+    No shell reads the command: its words are made once, and a value can be no more than a part of a word.
+
+    Attributes:
+        template: a line such as "./sim --theta {theta} --seed {seed}". "{theta}" as a word of its own becomes one word
+            for each parameter, within a word they are joined by commas; "{NAME}" is the parameter of that name, and
+            "{seed}" a whole number from 0 to 2^31 - 1, another one for each simulation.
+        names: of the parameters.
+
+    The program writes a trajectory to its standard output and ends with exit status 0: an array as .npy, or JSON, a
+    list of numbers (of lists of numbers) or {"trajectory": [...], "outcome": 0}, with an outcome as in `jaxlfi.Task`.
+
+    Raises:
+        ValueError: for a program that is not found, an unknown field, or a parameter that is not passed on.
+
+    Example:
+        >>> command = Command("echo [{theta}, {seed}]", names=("stiffness",))
+        >>> command(np.random.default_rng(0), np.array([2.5], np.float32)).shape
+        (2,)
+    """
+
+    template: str
+    names: Sequence[str]
+
+    def __post_init__(self):
+        object.__setattr__(self, "names", tuple(self.names))
+        try:
+            words = shlex.split(self.template)
+        except ValueError as error:
+            raise ValueError(f"command: expected words as in a shell, got {self.template!r}: {error}") from error
+        if not words or shutil.which(words[0]) is None:
+            raise ValueError(f"command: expected a program that can be run first, got {self.template!r}")
+        if Path(words[0]).parent != Path():  # a place, and no name to be looked up: it has to hold in other folders
+            words[0] = str(Path(words[0]).absolute())
+        used = {field for word in words for field in _FIELD.findall(word)}
+        known = {THETA, SEED, *self.names}
+        missing = () if THETA in used else [name for name in self.names if name not in used]
+        if missing or used - known:
+            raise ValueError(
+                f"command: expected {{theta}} or each of {list(self.names)} in braces, and {{seed}} where it is "
+                f"random, got {self.template!r}"
+            )
+        object.__setattr__(self, "_words", tuple(words))
+
+    def words(self, theta: np.ndarray, seed: int) -> list[str]:
+        """The words of one simulation's command."""
+        numbers = [f"{value:.9g}" for value in np.asarray(theta).tolist()]  # digits enough for single precision
+        values = {THETA: ",".join(numbers), SEED: str(seed)} | dict(zip(self.names, numbers, strict=True))
+        filled = []
+        for word in self._words:
+            filled += numbers if word == f"{{{THETA}}}" else [_FIELD.sub(lambda field: values[field[1]], word)]
+        return filled
+
+    def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> Any:
+        """Run the program, and read what it writes.
+
+        Raises:
+            CrashError: where a signal ends it.
+            RuntimeError: where its exit status is not 0.
+            ValueError: for an output that is neither .npy nor JSON.
+        """
+        words = self.words(theta, int(rng.integers(SEEDS)))
+        done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+        said = (done.stderr.decode(errors="replace").strip().splitlines() or ["nothing on standard error"])[-1]
+        if done.returncode < 0:
+            raise CrashError(f"{Path(words[0]).name}: ended by {_signal(-done.returncode)}: {said}")
+        if done.returncode > 0:
+            raise RuntimeError(f"{Path(words[0]).name}: exit status {done.returncode}: {said}")
+        return read(done.stdout)
+
+
+def read(output: bytes) -> Any:
+    """A trajectory, or a trajectory and its outcome, from what a program wrote.
+
+    Raises:
+        ValueError: for anything but .npy and JSON.
+
+    Example:
+        >>> read(b"[[0.5, 1.0], [0.6, 1.1]]").shape
+        (2, 2)
+    """
+    if output.startswith(_NPY):
+        return np.load(io.BytesIO(output), allow_pickle=False)
+    try:
+        value = json.loads(output)
+        if isinstance(value, dict):
+            return np.asarray(value["trajectory"]), value.get("outcome", 0)
+        return np.asarray(value)
+    except (ValueError, KeyError) as error:
+        start = output[:60].decode(errors="replace")
+        raise ValueError(
+            'standard output: expected .npy, or JSON: a list of numbers, or {"trajectory": [...], "outcome": 0}, '
+            f"got {start!r}"
+        ) from error
+
+
+def _signal(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

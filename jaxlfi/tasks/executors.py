@@ -1,0 +1,93 @@
+"""Simulations through executors: processes on this machine, a Dask cluster, or any `concurrent.futures.Executor`."""
+
+import contextlib
+import dataclasses
+import logging
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+
+from jaxlfi.tasks.errors import ExecutorError
+from jaxlfi.tasks.guard import Guard, enlist
+from jaxlfi.tasks.task import Task
+from jaxlfi.tasks.worker import OneOfBatch
+
+CONNECT = 10.0
+"""Seconds to wait for a scheduler to answer."""
+
+
+def one_by_one(task: Task, executor: Executor | None = None, timeout: float | None = None) -> Task:
+    """The task with simulations that are made one by one, each with a generator of its own.
+
+    A simulator of batches is called for batches of one.
+
+    Args:
+        task: with a simulator on the host.
+        executor: what makes them; None leaves it as it is.
+        timeout: seconds after which one is given up; None leaves it as it is.
+
+    Raises:
+        ValueError: for a task whose simulator JAX compiles, or an executor that is none.
+    """
+    if not task.on_host:
+        raise ValueError(
+            f"executor: expected a task with a host simulator, got {task.name}, whose simulations JAX compiles"
+        )
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise ValueError(f"executor: expected a concurrent.futures.Executor, got {type(executor).__name__}")
+    simulate = task.simulate
+    if not simulate.each:
+        simulate = dataclasses.replace(simulate, function=OneOfBatch(simulate.function), each=True)
+    changes = {"executor": executor, "timeout": timeout}
+    given = {name: value for name, value in changes.items() if value is not None}
+    return dataclasses.replace(task, simulate=dataclasses.replace(simulate, **given))
+
+
+@contextlib.contextmanager
+def workers(count: int) -> Iterator[Executor]:
+    """Processes on this machine, which end with the context, in the midst of simulations too.
+
+    Raises:
+        ValueError: for less than one.
+    """
+    if count < 1:
+        raise ValueError(f"workers: expected at least 1, got {count}")
+    guards: list[Guard] = []
+    executor = ThreadPoolExecutor(count, "simulations", initializer=enlist, initargs=(guards,))
+    try:
+        yield executor
+    finally:
+        executor.shutdown(wait=False, cancel_futures=True)
+        for guard in tuple(guards):
+            guard.end()
+        executor.shutdown()
+
+
+@contextlib.contextmanager
+def scheduler(address: str) -> Iterator[Executor]:
+    """The workers of a Dask cluster that is there already; it stays when the context ends.
+
+    Args:
+        address: of its scheduler, as "tcp://127.0.0.1:8786".
+
+    Raises:
+        ValueError: where `distributed` is not installed.
+        ExecutorError: where no scheduler answers.
+    """
+    try:
+        import distributed
+    except ImportError as error:
+        raise ValueError("scheduler: expected distributed to be installed: pip install 'jaxlfi[dask]'") from error
+    for name in logging.root.manager.loggerDict:  # the loss of a scheduler is said in one line
+        if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    try:
+        client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise ExecutorError(
+            f"scheduler: expected a Dask scheduler at {address}, got {type(error).__name__}: {error}"
+        ) from error
+    try:
+        yield client.get_executor()
+    finally:
+        with contextlib.suppress(Exception):  # a scheduler that is lost cannot be told
+            client.close(timeout=1)

@@ -1,0 +1,86 @@
+"""Finished simulations of a round that is not finished, kept as they arrive."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from jaxlfi.io import records
+from jaxlfi.tasks.worker import REASONS, Answer, Request
+
+OnSimulation = Callable[[int, int], object]
+"""Called as a simulation arrives, with how many have arrived of those that are made together, and how many succeed."""
+
+
+class Journal:
+    """Simulations by their key, index and parameters, kept in a file or not at all.
+
+    Attributes:
+        examples: the first message of each reason of failure.
+    """
+
+    def __init__(self, path: Path | None = None, on_simulation: OnSimulation = lambda done, wanted: None):
+        """Read what is there.
+
+        Args:
+            path: of the file, which need not exist; None keeps nothing.
+            on_simulation: called for every simulation.
+        """
+        self.examples: dict[str, str] = {}
+        self._path, self._on_simulation = path, on_simulation
+        self._known: dict[tuple, Answer] = {}
+        self._done, self._wanted, self._file = 0, 0, None
+        if path is None or not path.exists():
+            return
+        for fields, trajectory in records.whole(path):
+            request = Request(fields["words"], fields["index"], fields["theta"], trajectory.shape)
+            self._known[_identity(request)] = Answer(fields["outcome"], trajectory, fields["message"])
+
+    @property
+    def known(self) -> str:
+        """What is known of failures, for the end of an error's line."""
+        return "".join(f"; {reason}: {message}" for reason, message in self.examples.items())
+
+    def expect(self, wanted: int) -> None:
+        """So many simulations are going to be made together."""
+        self._done, self._wanted = 0, wanted
+
+    def find(self, request: Request) -> Answer | None:
+        """What came of a simulation that was made before."""
+        answer = self._known.get(_identity(request))
+        if answer is not None and answer.outcome >= 0 and answer.trajectory.shape != tuple(request.shape or ()):
+            return None
+        if answer is not None:
+            self._count(answer)
+        return answer
+
+    def add(self, request: Request, answer: Answer) -> None:
+        """Keep what came of a simulation."""
+        if self._path is not None:
+            fields = {name: list(getattr(request, name)) for name in ("words", "theta")}
+            fields |= {"index": request.index, "outcome": answer.outcome, "message": answer.message}
+            self._file = self._file or self._path.open("ab")
+            self._file.write(records.encoded(fields, answer.trajectory))
+            self._file.flush()
+        self._count(answer)
+
+    def clear(self) -> None:
+        """Forget all: the round that they were made for is kept as a whole."""
+        self.close()
+        self._known.clear()
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _count(self, answer: Answer) -> None:
+        self._done += 1
+        if answer.outcome < 0:
+            self.examples.setdefault(REASONS[-1 - answer.outcome], answer.message)
+        self._on_simulation(self._done, self._wanted)
+
+
+def _identity(request: Request) -> tuple:
+    return (*request.words, request.index, *request.theta)

@@ -1,0 +1,185 @@
+"""One simulation, in whatever process it is made: its generator, its call, and how it failed.
+
+It needs NumPy and no JAX, so that a process that simulates is started at once. `main` is such a
+process: `jaxlfi.tasks.guard` starts it, sends it the simulator and then one request a line, and reads one record
+(`jaxlfi.io.records`) for each.
+"""
+
+import dataclasses
+import json
+import os
+import queue
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, BinaryIO, NamedTuple
+
+import cloudpickle
+import numpy as np
+
+from jaxlfi.io import records
+
+REASONS = ("error", "wrong_shape", "timeout", "crash")
+"""Why a simulation that is made by itself can fail, besides the task's own reasons."""
+NOTHING = np.zeros(0)
+LONGEST_MESSAGE = 300
+"""Characters that are kept of an error's text."""
+
+
+class Answer(NamedTuple):
+    """What came of one simulation.
+
+    Attributes:
+        outcome: 0 for success, i for the task's i-th reason, -i for the i-th of `REASONS`.
+        trajectory: empty where the outcome is negative.
+        message: what is known of a failure.
+    """
+
+    outcome: int
+    trajectory: np.ndarray = NOTHING
+    message: str = ""
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether there is a trajectory, of finite numbers."""
+        return self.outcome == 0 and bool(np.isfinite(self.trajectory).all())
+
+
+class Request(NamedTuple):
+    """One simulation to be made.
+
+    Attributes:
+        words: of the key of all simulations that it is one of.
+        index: which of them it is.
+        theta: in natural units, D numbers.
+        shape: of its trajectory, or None where it is not known yet.
+    """
+
+    words: Sequence[int]
+    index: int
+    theta: Sequence[float]
+    shape: Sequence[int] | None
+
+
+class CrashError(RuntimeError):
+    """A simulation whose own process was ended by a signal."""
+
+
+def failed(reason: str, message: str = "") -> Answer:
+    """A failure for one of `REASONS`."""
+    return Answer(-1 - REASONS.index(reason), message=" ".join(message.split())[:LONGEST_MESSAGE])
+
+
+def generator(words: Sequence[int], index: int) -> np.random.Generator:
+    """The generator of one simulation of many: its own, whichever process makes it, and when."""
+    return np.random.default_rng(np.random.SeedSequence(list(words), spawn_key=(index,)))
+
+
+def simulated(function: Callable[..., Any], request: Request) -> Answer:
+    """Make one simulation by `function(rng, theta[D])`, and check what comes of it."""
+    try:
+        result = function(generator(request.words, request.index), np.asarray(request.theta, np.float32))
+        trajectory, outcome = map(np.asarray, with_outcome(result))
+    except CrashError as error:
+        return failed("crash", str(error))
+    except (Exception, SystemExit) as error:
+        return failed("error", f"{type(error).__name__}: {error}")
+    return checked(trajectory, outcome, request.shape)
+
+
+def checked(trajectory: np.ndarray, outcome: np.ndarray, shape: Sequence[int] | None) -> Answer:
+    """The answer of a simulator, or the failure "wrong_shape". Axes of length one are added or dropped."""
+    wanted = "[T] or [T, C]" if shape is None else list(shape)
+    long = lambda lengths: [length for length in lengths if length != 1]
+    fits = trajectory.ndim >= 1 and (shape is None or long(trajectory.shape) == long(shape))
+    if not fits or trajectory.dtype.kind not in records.KINDS:
+        return failed(
+            "wrong_shape",
+            f"expected numbers of shape {wanted}, got {trajectory.dtype} of shape {list(trajectory.shape)}",
+        )
+    if outcome.shape != () or outcome.dtype.kind not in "biu":
+        return failed("wrong_shape", f"expected a scalar outcome, got {outcome.dtype} of shape {list(outcome.shape)}")
+    return Answer(code_of(outcome), trajectory if shape is None else trajectory.reshape(shape))
+
+
+def with_outcome(result: Any) -> tuple[Any, Any]:
+    """What a simulator returned, with the outcome of success where it says none."""
+    return result if isinstance(result, tuple) and len(result) == 2 else (result, 0)
+
+
+def code_of(outcome: Any) -> int:
+    """An outcome as 0 or the number of the task's reason; one below 0 counts as the first."""
+    outcome = np.asarray(outcome)
+    code = int(not outcome) if outcome.dtype == bool else int(outcome)
+    return max(code, 0) or int(code < 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class OneOfBatch:
+    """A simulator of one, made of a simulator of batches, `function(rng, theta[N, D])`."""
+
+    function: Callable[..., Any]
+
+    def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> Any:
+        """One simulation."""
+        result = self.function(rng, theta[None])
+        if isinstance(result, tuple) and len(result) == 2:
+            (trajectory,), (outcome,) = result
+            return trajectory, outcome
+        (trajectory,) = result
+        return trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class Trials:
+    """A simulator of several independent trials, one after another, made of a simulator of one.
+
+    It fails where one of them fails, for the first one's reason.
+    """
+
+    function: Callable[..., Any]
+    trials: int
+
+    def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> Any:
+        """All trials of one parameter vector: their trajectories along the first axis."""
+        results = [with_outcome(self.function(rng, theta)) for _ in range(self.trials)]
+        failures = (code for _, outcome in results if (code := code_of(outcome)))
+        return np.concatenate([np.asarray(trajectory) for trajectory, _ in results]), next(failures, 0)
+
+
+def main() -> None:
+    """Serve the process that started this one, until it closes the pipe or ends."""
+    requests, answers = _streams()
+    try:
+        function = cloudpickle.loads(requests.read(int(requests.readline())))
+    except Exception as error:  # whatever the simulator's module raises when it is imported
+        _send(answers, {"refused": f"{type(error).__name__}: {error}"})
+        return
+    _send(answers, {"refused": None})
+    inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_receive, args=(requests, inbox), daemon=True).start()
+    while True:
+        answer = simulated(function, Request(**json.loads(inbox.get())))
+        _send(answers, {"outcome": answer.outcome, "message": answer.message}, answer.trajectory)
+
+
+def _streams() -> tuple[BinaryIO, BinaryIO]:
+    """The pipes from and to the other process; what a simulator prints goes to standard error instead."""
+    requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    with open(os.devnull) as nothing:
+        os.dup2(nothing.fileno(), 0)
+    os.dup2(2, 1)
+    sys.stdout = sys.stderr
+    return requests, answers
+
+
+def _receive(requests: BinaryIO, inbox: queue.SimpleQueue) -> None:
+    """Pass requests on; at their end, end the process, whatever it is doing: nobody waits for it."""
+    for line in requests:
+        inbox.put(line)
+    os._exit(0)
+
+
+def _send(answers: BinaryIO, fields: dict[str, Any], trajectory: np.ndarray = NOTHING) -> None:
+    answers.write(records.encoded(fields, trajectory))
+    answers.flush()

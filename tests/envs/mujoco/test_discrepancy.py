@@ -1,0 +1,47 @@
+"""Ornstein-Uhlenbeck discrepancies: their draws, and what residuals say of them."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+from jaxlfi.envs.mujoco.discrepancy import Discrepancy, estimated
+
+PROCESS = Discrepancy(0.3, 0.25)
+TIMES = np.cumsum(np.random.default_rng(3).uniform(0.01, 0.2, 40))
+"""At unequal intervals."""
+
+
+def test_draws_have_the_covariance_of_the_process():
+    draws = PROCESS.draws(np.random.default_rng(0), 40_000, TIMES)
+    assert draws.shape == (40_000, 40)
+    np.testing.assert_allclose(np.cov(draws.T), PROCESS.covariance(TIMES), atol=5 * 0.3**2 * np.sqrt(2 / 40_000))
+    closed_form = [[0.09, 0.09 * np.exp(-(TIMES[7] - TIMES[2]) / 0.25)]]
+    np.testing.assert_allclose(PROCESS.covariance(TIMES)[2:3, [2, 7]], closed_form)
+
+
+def test_the_process_is_read_off_residuals():
+    """Three long episodes with white noise: of fourteen correlation times each, a fifth of error is three sigma."""
+    rng, times = np.random.default_rng(1), 0.01 * np.arange(1000)
+    residuals = PROCESS.draws(rng, 9, times) + 0.1 * rng.standard_normal((9, 1000))
+    found = estimated(list(residuals), [times] * 9, 0.1)
+    assert found.deviation == pytest.approx(0.3, rel=0.2) and found.time == pytest.approx(0.25, rel=0.3)
+
+
+def test_missing_samples_are_left_out():
+    rng, times = np.random.default_rng(2), 0.01 * np.arange(3000)
+    residuals = PROCESS.draws(rng, 4, times)
+    holes = np.where(rng.random(residuals.shape) < 0.3, np.nan, residuals)
+    whole, some = (estimated(list(rows), [times] * 4, 0.0) for rows in (residuals, holes))
+    assert some.deviation == pytest.approx(whole.deviation, rel=0.1) and some.time == pytest.approx(whole.time, rel=0.2)
+
+
+def test_white_noise_is_no_discrepancy():
+    noise = 0.1 * np.random.default_rng(4).standard_normal(5000)
+    assert estimated([noise], [0.01 * np.arange(5000)], 0.1).deviation < 0.03
+
+
+@pytest.mark.parametrize(("deviation", "time"), [(-1.0, 1.0), (1.0, 0.0), (np.nan, 1.0), (1.0, np.inf)])
+def test_what_is_no_process(deviation, time):
+    with pytest.raises(ValueError, match="expected a standard deviation of at least 0 and a correlation time above 0"):
+        Discrepancy(deviation, time)

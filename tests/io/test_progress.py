@@ -1,0 +1,29 @@
+"""Progress in lines: rounds, and simulations where they are slow."""
+
+import io
+
+from rich.console import Console
+
+from jaxlfi.io import progress
+from jaxlfi.io.progress import RoundProgress
+
+
+def test_slow_simulations_are_told_now_and_then(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    file = io.StringIO()
+    with RoundProgress(Console(file=file, width=120), 2, 0, "arm: 1 run") as bar:
+        now[0] = 30.0
+        bar.compiled(30.0)
+        for done in range(1, 31):  # one a second
+            now[0] += 1
+            bar.simulated(done, 25)
+        bar.advance()
+        now[0] += 5
+        bar.simulated(1, 25)
+    assert file.getvalue().splitlines()[2:] == [
+        "round 1: simulation 10, 25 wanted, 10 s elapsed",
+        "round 1: simulation 20, 25 wanted, 20 s elapsed",
+        "round 1: simulation 30, 25 wanted, 30 s elapsed",
+        "round 1 of 2, 30 s elapsed, about 30 s left",
+    ]
