@@ -21,9 +21,7 @@ COLUMNS = 3
 """Pictures side by side on a sheet."""
 PIXELS = 100
 """Of a film in an inch."""
-SMOOTH = 2
-"""How many times larger what is written on pictures is drawn first."""
-RECORDED = {"color": "black", "linewidth": 1.1}
+RECORDED = {"color": "black", "linewidth": 0.8}
 LATER = 0.25
 """Opacity of traces after a film's moment."""
 LEVELS = 255
@@ -42,7 +40,7 @@ class Traces:
         colour: of the simulated ones, RGB from 0 to 1.
         title: of the film.
         label: what the simulated ones are.
-        solid: whether pictures show the recorded pose.
+        posed: whether pictures show the recorded pose.
     """
 
     names: Sequence[str]
@@ -52,10 +50,10 @@ class Traces:
     colour: tuple[float, float, float]
     title: str
     label: str
-    solid: bool
+    posed: bool
 
     @property
-    def shown(self) -> int:
+    def drawn(self) -> int:
         """How many signals are drawn."""
         return min(len(self.names), MOST)
 
@@ -69,19 +67,18 @@ class Strip:
 
     def __init__(self, traces: Traces, width: int, height: int):
         """Draw it, in pixels."""
-        self.height = height
         with style.context():
             figure = style.new_figure(width / PIXELS, height / PIXELS)
             figure.set_dpi(PIXELS)
-            panels = figure.subplots(traces.shown, 1, sharex=True, squeeze=False)[:, 0]
+            panels = figure.subplots(traces.drawn, 1, sharex=True, squeeze=False)[:, 0]
             _draw(panels, traces)
             figure.canvas.draw()
             self._picture = np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
-        height = len(self._picture)
-        self.height, self._boxes = height, []
+        self.height, self._boxes = len(self._picture), []
         for axes in panels:
             (left, low), (right, high) = axes.transAxes.transform([(0, 0), (1, 1)])
-            self._boxes.append((round(left), round(height - high), round(right), round(height - low)))
+            top, bottom = self.height - high, self.height - low
+            self._boxes.append((round(left), round(top), round(right), round(bottom)))
         self._place = lambda time: panels[0].transData.transform((time, 0))[0]
 
     def at(self, time: float) -> UInt8[np.ndarray, "height width 3"]:
@@ -107,10 +104,11 @@ class Captions:
         image = Image.fromarray(picture)
         draw, size, traces = ImageDraw.Draw(image), self._size, self._traces
         colour = tuple(round(255 * part) for part in traces.colour)
-        lines = [("black", "recorded" if traces.solid else "recorded (below)"), (colour, traces.label)]
+        lines = [("white", "recorded" if traces.posed else "recorded: below"), (colour, traces.label)]
         for row, (ink, words) in enumerate(lines):
             top = size * (0.6 + 1.5 * row)
-            draw.rounded_rectangle((0.7 * size, top, 1.7 * size, top + size), radius=size / 4, fill=ink)
+            box, edge = (0.7 * size, top, 1.7 * size, top + size), "black" if ink == "white" else ink
+            draw.rounded_rectangle(box, radius=size / 4, fill=ink, outline=edge, width=max(size // 8, 1))
             self._write(draw, (2.1 * size, top + size / 2), words, "lm")
         self._write(draw, (image.width - 0.7 * size, 1.1 * size), text, "rm")
         return np.asarray(image)
@@ -121,24 +119,25 @@ class Captions:
         )
 
 
-def save_film(path: Path, pictures: Iterable[UInt8[np.ndarray, "height width 3"]], interval: float) -> Path:
+def save_film(
+    path: Path,
+    pictures: Iterable[UInt8[np.ndarray, "height width 3"]],
+    like: Sequence[UInt8[np.ndarray, "height width 3"]],
+    interval: float,
+) -> Path:
     """Write an animated gif that repeats.
 
     Args:
         path: of the .gif file.
-        pictures: of one size.
+        pictures: of one size; of each only 256 colours are kept in memory.
+        like: some of them, whose colours are those of the film.
         interval: between pictures, in s; the format resolves hundredths.
     """
-    images = [Image.fromarray(picture) for picture in pictures]
-    # One palette for all, that of moments put together, without dithering: pixels that do not change do not flicker.
-    some = images[:: max(len(images) // 8, 1)]
-    together = np.concatenate([np.asarray(image) for image in some])
-    palette = Image.fromarray(together).quantize(LEVELS, method=Image.Quantize.MEDIANCUT)
-    frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    content = io.BytesIO()
-    frames[0].save(
-        content, "GIF", save_all=True, append_images=frames[1:], duration=round(1000 * interval), loop=0, optimize=False
-    )
+    # One palette for all, and no dithering: pixels that do not change do not flicker.
+    palette = Image.fromarray(np.concatenate(like)).quantize(LEVELS, method=Image.Quantize.MEDIANCUT)
+    frames = (Image.fromarray(one).quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures)
+    content, duration = io.BytesIO(), round(1000 * interval)
+    next(frames).save(content, "GIF", save_all=True, append_images=frames, duration=duration, loop=0, optimize=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     files.write_bytes(path, content.getvalue())
     return path
@@ -157,17 +156,17 @@ def save_sheet(
     """
     rows = -(-len(pictures) // COLUMNS)
     high, wide, _ = pictures[0].shape
-    above, below = rows * style.TEXT_WIDTH / COLUMNS * high / wide, 0.45 + 0.75 * traces.shown
+    above, below = rows * style.TEXT_WIDTH / COLUMNS * high / wide, 0.45 + 0.75 * traces.drawn
     with style.context():
         figure = style.new_figure(style.TEXT_WIDTH, above + below + 0.3)
         upper, lower = figure.subfigures(2, 1, height_ratios=[above + 0.3, below])
         for axes, picture, moment in zip(upper.subplots(rows, COLUMNS).ravel(), pictures, moments, strict=False):
             axes.imshow(picture, interpolation="antialiased")
             axes.set(xticks=[], yticks=[])
-            axes.set_title(f"{moment:.2f} s", y=0.9, fontsize=7)
+            axes.set_title(f"{moment:.2f} s", y=0.9)
             for side in axes.spines.values():
                 side.set_edgecolor("#DDDDDD")
-        panels = lower.subplots(traces.shown, 1, sharex=True, squeeze=False)[:, 0]
+        panels = lower.subplots(traces.drawn, 1, sharex=True, squeeze=False)[:, 0]
         _draw(panels, traces)
         for axes in panels:
             for moment in moments:
@@ -185,9 +184,9 @@ def _draw(panels: Sequence[Axes], traces: Traces) -> None:
     opacity = max(0.9 / np.sqrt(len(traces.simulated)), 0.12)
     for c, axes in enumerate(panels):
         there = np.isfinite(traces.recorded[:, c])
-        axes.plot(traces.times[there], traces.recorded[there, c], **RECORDED)
         for own in traces.simulated:
-            axes.plot(traces.times[there], own[there, c], color=traces.colour, linewidth=1.0, alpha=opacity)
+            axes.plot(traces.times[there], own[there, c], color=traces.colour, linewidth=1.6, alpha=opacity)
+        axes.plot(traces.times[there], traces.recorded[there, c], **RECORDED)
         axes.set_ylabel(style.plain(traces.names[c]), rotation=0, ha="right", va="center")
         style.round_ticks(axes.yaxis, 3)
         axes.grid(True)

@@ -1,4 +1,4 @@
-"""Positions of a model's joints over time: as they were recorded, where the recording measures all of them."""
+"""Positions of a model's joints as they were recorded, where the recording measures them."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxlfi.envs.mujoco.measured import places
 
 _SIZES = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}
-"""Numbers of the positions of joints that have more than one."""
+"""Numbers of the positions of joints that have more than one; the last four are a quaternion."""
 _OF_JOINTS = (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_BALLQUAT)
 _OF_BODIES = {mujoco.mjtSensor.mjSENS_FRAMEPOS: 0, mujoco.mjtSensor.mjSENS_FRAMEQUAT: 3}
 """Where a free joint has what sensors of its body's frame measure."""
@@ -24,21 +24,20 @@ def measured_positions(model: mujoco.MjModel, signals: Sequence[str]) -> dict[in
         model: with a sensor for each signal.
         signals: that are measured.
     """
-    sensors = np.searchsorted(model.sensor_adr, places(model, signals), side="right") - 1
     found = {}
-    for number, (sensor, place) in enumerate(zip(sensors, places(model, signals), strict=True)):
-        first, own = _first_position(model, int(sensor)), place - model.sensor_adr[sensor]
+    for number, place in enumerate(places(model, signals)):
+        sensor = int(np.searchsorted(model.sensor_adr, place, side="right")) - 1
+        first = _first_position(model, sensor)
         if first is not None:
-            found[first + int(own)] = number
+            found[first + place - int(model.sensor_adr[sensor])] = number
     return found
 
 
 def unmeasured_joints(model: mujoco.MjModel, signals: Sequence[str]) -> list[str]:
     """Names of the joints whose position, or a part of it, is not measured."""
     known = measured_positions(model, signals)
-    own = lambda joint: range(joint.qposadr[0], joint.qposadr[0] + _SIZES.get(mujoco.mjtJoint(joint.type[0]), 1))
     joints = [model.joint(i) for i in range(model.njnt)]
-    return [joint.name or f"joint[{joint.id}]" for joint in joints if any(place not in known for place in own(joint))]
+    return [joint.name or f"joint[{joint.id}]" for joint in joints if not known.keys() >= set(_positions(joint))]
 
 
 def recorded_positions(
@@ -47,25 +46,36 @@ def recorded_positions(
     times: Float[np.ndarray, " rows"],
     rows: Float[np.ndarray, "rows signals"],
     when: Float[np.ndarray, " frames"],
-) -> Float[np.ndarray, "frames qpos"] | None:
-    """Positions of all joints, linear between samples; None where a joint is not measured.
+) -> Float[np.ndarray, "frames qpos"]:
+    """Positions of all joints, linear between samples.
 
     Args:
-        model: with a sensor for each signal.
+        model: whose joints are all measured, with a sensor for each signal.
         signals: that are measured.
         times: of the rows, in s.
-        rows: what was recorded, NaN where there is no sample.
+        rows: what was recorded, NaN where there is no sample; at least one of each signal.
         when: times of the positions, in s.
     """
-    if unmeasured_joints(model, signals):
-        return None
-    positions = np.empty((len(when), model.nq))
-    for place, signal in measured_positions(model, signals).items():
-        there = np.isfinite(rows[:, signal])
-        positions[:, place] = np.interp(when, times[there], rows[there, signal])
+    numbers = measured_positions(model, signals)
+    samples = np.empty((len(times), model.nq))
+    for place, number in numbers.items():
+        there = np.isfinite(rows[:, number])
+        samples[:, place] = np.interp(times, times[there], rows[there, number])
+    for i in range(model.njnt):
+        if len(own := _positions(model.joint(i))) > 1:
+            # A quaternion and its negative are the same turn, and between the two there is none.
+            flips = np.sum(samples[1:, own[-4:]] * samples[:-1, own[-4:]], axis=1) < 0
+            samples[1:, own[-4:]] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+    positions = np.stack([np.interp(when, times, column) for column in samples.T], axis=1)
     for qpos in positions:
         mujoco.mj_normalizeQuat(model, qpos)
     return positions
+
+
+def _positions(joint) -> range:
+    """Places of a joint in `qpos`."""
+    first = int(joint.qposadr[0])
+    return range(first, first + _SIZES.get(mujoco.mjtJoint(joint.type[0]), 1))
 
 
 def _first_position(model: mujoco.MjModel, sensor: int) -> int | None:

@@ -1,60 +1,66 @@
-"""Pictures of several poses of a model at once: one solid, others as translucent ghosts, by MuJoCo's renderer."""
+"""Pictures of a model's recorded motion and of simulations of it as ghosts, by MuJoCo's renderer."""
 
 import copy
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, UInt8
+import scipy.ndimage
+from jaxtyping import Bool, Float, UInt8
 
 from jaxlfi.envs import opengl
 from jaxlfi.envs.mujoco.parameters import near
 
-Pose = tuple[mujoco.MjModel, np.ndarray]
-"""A model and the positions of its joints."""
 GHOST = (0.11, 0.47, 0.85)
 """Colour of ghosts."""
-OPAQUE = 0.9
+OPAQUE = 0.75
 """Opacity of all ghosts together where they agree."""
-MARGIN = 1.12
+MARGIN = 1.08
 """How much larger than the motion a picture is."""
 PLANAR = 0.02
 """Extent of a motion along one direction, as a share of its largest extent, below which it is seen from there."""
+POSES = 250
+"""Of each motion that a view is fitted to, at most."""
+_CORNERS = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(8, 3)
 _DEFAULT = (90.0, -45.0)
 """Azimuth and elevation of the view of models that name none."""
+_STILL, _ALL = mujoco.mjtCatBit.mjCAT_STATIC.value, mujoco.mjtCatBit.mjCAT_ALL.value
 
 
 class Stage:
-    """A fixed view that holds a whole motion; use it in `with`, or close it.
-
-    Attributes:
-        scene: what the last picture shows.
-    """
+    """A view that holds a whole motion; use it in `with`, or close it."""
 
     def __init__(
-        self, motions: Sequence[tuple[mujoco.MjModel, np.ndarray]], width: int, height: int, camera: str | None = None
+        self,
+        models: Sequence[mujoco.MjModel],
+        simulated: Float[np.ndarray, "n frames qpos"],
+        recorded: Float[np.ndarray, "frames qpos"] | None,
+        width: int,
+        height: int,
+        camera: str | None = None,
     ):
         """Make a context of OpenGL.
 
         Args:
-            motions: models of the same sizes, and positions of their joints over time, shape [T, nq] each.
+            models: of the N simulations, of the same sizes.
+            simulated: positions of their joints, shape [N, F, nq].
+            recorded: those that were recorded, shape [F, nq]; None where they are not known.
             width: of the pictures, in pixels.
             height: of the pictures, in pixels.
-            camera: of the model, by name; by default a view that shows all of the motions.
+            camera: of the model, by name; by default a view that shows all of the motion.
 
         Raises:
             ValueError: for a camera that the model does not have.
             RuntimeError: where neither EGL nor OSMesa can be had.
         """
-        self._model = lit(motions[0][0])
-        self._size = width, height
+        self._models, self._simulated, self._recorded = [lit(model) for model in models], simulated, recorded
+        self._model, self._size = self._models[0], (width, height)
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
-        self._plain = not (self._model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any()
+        motions = list(zip(models, simulated, strict=True)) + ([] if recorded is None else [(models[0], recorded)])
         self._camera = named(self._model, camera) if camera else fitted(motions, width / height)
-        self._data = mujoco.MjData(self._model)
-        self._option, self._hand = mujoco.MjvOption(), mujoco.MjvPerturb()
-        own = self._model.ngeom + self._model.nsite + 4 * self._model.nwrap + 10 * self._model.ntendon
-        self.scene = mujoco.MjvScene(self._model, maxgeom=100 + own * (len(motions) + 1))
+        # The view of a camera that a body carries is that of the recorded pose for ghosts, too.
+        self._data, self._viewed = mujoco.MjData(self._model), mujoco.MjData(self._model)
+        self._scene = mujoco.MjvScene(self._model, maxgeom=10_000 + self._model.ngeom)
         self._gl = opengl.context(width, height)
         self._gl.make_current()
         self._made = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -73,57 +79,69 @@ class Stage:
         self._made.free()
         self._gl.free()
 
-    def picture(
-        self, solid: Float[np.ndarray, " qpos"] | None, ghosts: Sequence[Pose]
-    ) -> UInt8[np.ndarray, "height width 3"]:
-        """What does not move and one pose as they are, others in one colour, translucent.
+    def picture(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
+        """The recorded pose as it looks, with a dark outline; before it the simulated ones, translucent.
 
-        Args:
-            solid: of the model of the first motion; None draws only what does not move.
-            ghosts: of which only what moves is drawn.
+        Ghosts are drawn one at a time and laid over one another here: together they would hide one another, and the
+        recorded pose, by chance wherever they are at the same depth.
         """
-        kinds = mujoco.mjtCatBit.mjCAT_STATIC if solid is None else mujoco.mjtCatBit.mjCAT_ALL
-        place(self._model, self._data, self._model.qpos0 if solid is None else solid)
-        option, hand = self._option, self._hand
-        mujoco.mjv_updateScene(self._model, self._data, option, hand, self._camera, kinds.value, self.scene)
-        opacity = 1 - (1 - OPAQUE) ** (1 / max(len(ghosts), 1))
-        for own, positions in ghosts:
-            first = self.scene.ngeom
-            place(own, self._data, positions)
-            dynamic = mujoco.mjtCatBit.mjCAT_DYNAMIC.value
-            mujoco.mjv_addGeoms(own, self._data, option, hand, dynamic, self.scene)
-            for geom in self.scene.geoms[first : self.scene.ngeom]:
-                geom.rgba[:], geom.matid, geom.transparent = (*GHOST, opacity * geom.rgba[3]), -1, 1
-                geom.emission, geom.specular, geom.reflectance = 0.3, 0.1, 0.0
-        if self._plain:
+        solid = self._model.qpos0 if self._recorded is None else self._recorded[frame]
+        place(self._model, self._viewed, solid)
+        still = self._drawn(self._model, solid, _STILL)
+        picture = still if self._recorded is None else self._drawn(self._model, solid, _ALL)
+        outlined = _differ(picture, still)
+        colour, count = np.zeros(still.shape, np.float32), np.zeros((*still.shape[:2], 1), np.float32)
+        for model, positions in zip(self._models, self._simulated, strict=True):
+            ghost = self._drawn(model, positions[frame], _ALL, GHOST)
+            there = _differ(ghost, still)[..., None]
+            colour += there * ghost
+            count += there
+        opacity = 1 - (1 - OPAQUE) ** (count / len(self._models))
+        picture = (1 - opacity) * picture + opacity * colour / np.maximum(count, 1)
+        thickness = max(round(min(self._size) / 300), 1)
+        inside = scipy.ndimage.binary_erosion(outlined, iterations=thickness, border_value=1)
+        picture[outlined & ~inside] *= 0.2
+        return picture.round().astype(np.uint8)
+
+    def _drawn(
+        self, model: mujoco.MjModel, positions: np.ndarray, kinds: int, colour: tuple[float, ...] | None = None
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """One pose of a model: what is still, or all of it, with what moves in a colour."""
+        scene, option, width, height = self._scene, mujoco.MjvOption(), *self._size
+        place(model, self._data, positions)
+        mujoco.mjv_updateScene(model, self._data, option, None, self._camera, kinds, scene)
+        mujoco.mjv_updateCamera(self._model, self._viewed, self._camera, scene)
+        # What differs from the still picture is the pose, and not its shadow or mirror image.
+        scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        for geom in scene.geoms[: scene.ngeom] if colour else ():
+            if geom.category == mujoco.mjtCatBit.mjCAT_DYNAMIC:
+                geom.rgba[:3], geom.matid, geom.emission, geom.specular = colour, -1, 0.3, 0.1
+        if not (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any():
             self._add_backdrop()
-        return self._drawn()
+        pixels, area = np.empty((height, width, 3), np.uint8), mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(area, scene, self._made)
+        mujoco.mjr_readPixels(pixels, None, area, self._made)
+        return pixels[::-1].copy()
 
     def _add_backdrop(self) -> None:
         """Something white behind everything, where a model without a sky has black."""
-        eye = self.scene.camera[0]
+        eye = self._scene.camera[0]
         forward, up = np.asarray(eye.forward, float), np.asarray(eye.up, float)
         far = 0.9 * self._model.vis.map.zfar * self._model.stat.extent
         side = 4 * far * max(self._size[0] / self._size[1], 1.0)
         turn = np.stack([np.cross(up, -forward), up, -forward], axis=1)
-        geom = self.scene.geoms[self.scene.ngeom]
-        mujoco.mjv_initGeom(
-            geom,
-            mujoco.mjtGeom.mjGEOM_PLANE,
-            np.array([side, side, 1.0]),
-            np.asarray(eye.pos, float) + far * forward,
-            turn.ravel(),
-            np.ones(4, np.float32),
-        )
+        where = np.asarray(eye.pos, float) + far * forward
+        geom = self._scene.geoms[self._scene.ngeom]
+        plane, size, white = mujoco.mjtGeom.mjGEOM_PLANE, np.array([side, side, 1.0]), np.ones(4, np.float32)
+        mujoco.mjv_initGeom(geom, plane, size, where, turn.ravel(), white)
         geom.emission, geom.specular, geom.reflectance = 1.0, 0.0, 0.0
-        self.scene.ngeom += 1
+        self._scene.ngeom += 1
 
-    def _drawn(self) -> np.ndarray:
-        width, height = self._size
-        pixels, area = np.empty((height, width, 3), np.uint8), mujoco.MjrRect(0, 0, width, height)
-        mujoco.mjr_render(area, self.scene, self._made)
-        mujoco.mjr_readPixels(pixels, None, area, self._made)
-        return pixels[::-1].copy()
+
+def _differ(one: np.ndarray, other: np.ndarray) -> Bool[np.ndarray, "height width"]:
+    """Which pixels of two pictures do; several times as quick as `any` over so short an axis."""
+    red, green, blue = np.moveaxis(one != other, -1, 0)
+    return red | green | blue
 
 
 def lit(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -157,49 +175,50 @@ def named(model: mujoco.MjModel, camera: str) -> mujoco.MjvCamera:
 
 
 def fitted(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]], aspect: float) -> mujoco.MjvCamera:
-    """A view that shows all of some motions, and what is fixed among them.
+    """A view that shows all of some motions, and what stands still among them.
 
     Args:
         motions: models of the same sizes, and positions of their joints over time, shape [T, nq] each.
         aspect: width of the picture by its height.
     """
     model = motions[0][0]
-    moving, centres, radii = _places(motions)
+    centres, corners = _places(motions)
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FREE
-    view.azimuth, view.elevation = _direction(model, centres[moving])
+    view.azimuth, view.elevation = _direction(model, centres)
     azimuth, elevation = np.deg2rad([view.azimuth, view.elevation])
     forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
     across = np.stack([right, np.cross(right, forward)])
-    ahead, sideways = centres @ forward, centres @ across.T
-    ends = (sideways - radii[:, None]).min(axis=0), (sideways + radii[:, None]).max(axis=0)
-    middle = (ends[0] + ends[1]) / 2
-    depth = (ahead.min() + ahead.max()) / 2
-    half = np.deg2rad(model.vis.global_.fovy) / 2
-    slopes = np.tan(half) * np.array([aspect, 1.0])
-    # Each sphere lies between four planes through the eye.
-    reach = (np.abs(sideways - middle) + radii[:, None] * np.sqrt(1 + slopes**2)) * MARGIN / slopes
-    view.distance = float((reach - (ahead - depth)[:, None]).max())
+    ahead, sideways = corners @ forward, corners @ across.T
+    middle, depth = (sideways.min(axis=0) + sideways.max(axis=0)) / 2, (ahead.min() + ahead.max()) / 2
+    slopes = np.tan(np.deg2rad(model.vis.global_.fovy) / 2) * np.array([aspect, 1.0])
+    # Each corner lies between four planes through the eye.
+    view.distance = float((np.abs(sideways - middle) * MARGIN / slopes - (ahead - depth)[:, None]).max())
     view.lookat[:] = middle @ across + depth * forward
     return view
 
 
-def _places(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spheres about all geoms over time: which of them move, their centres and radii."""
+def _places(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of what moves over time, and corners of boxes about it, and about what stands still near it; [n, 3]."""
     model = motions[0][0]
-    moves = model.body_weldid[model.geom_bodyid] != 0
-    data, centres = mujoco.MjData(model), []
+    data, places, turns = mujoco.MjData(model), [], []
     for own, positions in motions:
-        for qpos in positions:
+        for qpos in positions[:: -(-len(positions) // POSES)]:
             place(own, data, qpos)
-            centres.append(data.geom_xpos.copy())
-    found, radii = np.array(centres), model.geom_rbound
-    extent = np.ptp(found[:, moves], axis=(0, 1)).max() + 2 * radii[moves].max() if moves.any() else np.inf
-    seen = moves | ((radii > 0) & (radii < extent))
-    count = len(found)
-    flat = found[:, seen].reshape(-1, 3)
-    return np.tile(moves[seen], count), flat, np.tile(radii[seen], count)
+            places.append(data.geom_xpos.copy())
+            turns.append(data.geom_xmat.reshape(-1, 3, 3).copy())
+    local = model.geom_aabb[:, None, :3] + _CORNERS * model.geom_aabb[:, None, 3:]
+    corners = np.array(places)[:, :, None] + np.einsum("tgij,gkj->tgki", np.array(turns), local)
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    if not moves.any():
+        raise ValueError("model: expected a geom that moves, got none: there is nothing to film")
+    low, high = corners[:, moves].min(axis=(0, 1, 2)), corners[:, moves].max(axis=(0, 1, 2))
+    reach = (high - low).max() / 2
+    still = corners[0, (model.geom_rbound > 0) & ~moves].reshape(-1, 8, 3)  # planes have no bounds
+    still = still[((still > low - reach) & (still < high + reach)).all(axis=(1, 2))]
+    shown = np.concatenate([corners[:, moves].reshape(-1, 3), still.reshape(-1, 3)])
+    return np.array(places)[:, moves].reshape(-1, 3), shown
 
 
 def _direction(model: mujoco.MjModel, centres: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
