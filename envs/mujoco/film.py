@@ -13,8 +13,9 @@ from rich.progress import track
 
 import jaxlfi
 from jaxlfi.envs.mujoco import figures, scene
+from jaxlfi.envs.mujoco.commands import task_of
 from jaxlfi.envs.mujoco.poses import recorded_positions, unmeasured_joints
-from jaxlfi.envs.mujoco.simulator import Simulator
+from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.runs.run import Run
 
 INTERVAL = 0.04
@@ -63,17 +64,21 @@ def motion(run: Run, draws: int = 12, slower: float = 1.0, episode: int = 0) -> 
         ValueError: for runs of other tasks, an episode that is not there, films that are too short or too long, and
             draws that all fail.
     """
-    simulator = _simulator(run)
+    task = task_of(run)
+    simulator = simulator_of(task)
+    if run.observed.shape != simulator.observation.shape:
+        expected, got = list(simulator.observation.shape), list(run.observed.shape)
+        raise ValueError(f"run: expected one of the task's own recording, of shape {expected}, got {got}")
     if not 0 <= episode < len(simulator.times):
         raise ValueError(f"episode: expected one of 0 to {len(simulator.times) - 1}, got {episode}")
     times = simulator.times[episode]
-    frames = times[-1] * slower / INTERVAL + 1
-    if not 2 - 1e-6 <= frames <= LONGEST:
+    low, high = (INTERVAL * count / times[-1] for count in (1, LONGEST - 1))
+    if not low <= slower <= high:
         raise ValueError(
-            f"slower: expected a number that makes a film of 2 to {LONGEST} frames, {INTERVAL:g} s each, of a "
-            f"recording of {times[-1]:g} s; got {slower:g}"
+            f"slower: expected {low:.2g} to {high:.2g}, as the recording takes {times[-1]:g} s and a film has 2 to "
+            f"{LONGEST} frames; got {slower:g}"
         )
-    when = INTERVAL / slower * np.arange(int(frames + 1e-6))
+    when = INTERVAL / slower * np.arange(int(times[-1] * slower / INTERVAL + 1e-6) + 1)
     theta = np.asarray(run.draws(draws), float)
     clean, outcome = simulator.clean(theta)
     good = outcome == 0
@@ -95,12 +100,12 @@ def motion(run: Run, draws: int = 12, slower: float = 1.0, episode: int = 0) -> 
         unmeasured=unmeasured,
         failed=int((~good).sum()),
         traces=figures.Traces(
-            names=run.task.channels,
+            names=task.channels,
             times=times,
             recorded=recorded,
             simulated=clean[good][:, rows],
             colour=scene.GHOST,
-            title=run.task.name,
+            title=task.name,
             label=f"{good.sum()} draws of the posterior",
             posed=not unmeasured,
         ),
@@ -178,17 +183,3 @@ def film(arguments: argparse.Namespace) -> None:
     if shown.failed:
         print(f"{shown.failed} of {arguments.draws} simulations failed and are not drawn")
     print(f"film of {len(shown.times)} frames: {out}\n{min(MOMENTS, len(shown.times))} of them: {sheet}")
-
-
-def _simulator(run: Run) -> Simulator:
-    if run.task is None:
-        raise ValueError("run: expected one whose task can be found, got one whose task cannot")
-    simulator = getattr(run.task.simulate, "function", None)
-    if not isinstance(simulator, Simulator):
-        raise ValueError(f"run: expected one of a MuJoCo model, got one of {run.task.name}")
-    if run.observed.shape != simulator.observation.shape:
-        raise ValueError(
-            f"run: expected one of the task's own recording, of shape {list(simulator.observation.shape)}, "
-            f"got {list(run.observed.shape)}"
-        )
-    return simulator

@@ -13,7 +13,7 @@ from jaxlfi.envs.mujoco.parameters import near
 
 GHOST = (0.11, 0.47, 0.85)
 """Colour of ghosts."""
-OPAQUE = 0.75
+OPAQUE = 0.9
 """Opacity of all ghosts together where they agree."""
 MARGIN = 1.08
 """How much larger than the motion a picture is."""
@@ -167,6 +167,8 @@ def named(model: mujoco.MjModel, camera: str) -> mujoco.MjvCamera:
         ValueError: for one that it does not have.
     """
     known = [model.camera(i).name for i in range(model.ncam)]
+    if not any(known):
+        raise ValueError(f"camera: expected none, as those of the model have no names; got {camera!r}")
     if camera not in known:
         raise ValueError(f"camera: expected one {near(camera, known)}, got {camera!r}")
     view = mujoco.MjvCamera()

@@ -16,6 +16,8 @@ from jaxlfi.envs.mujoco.effects import Effects
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.quiet import quietly
 from jaxlfi.io.host_devices import processors
+from jaxlfi.tasks.task import Task
+from jaxlfi.tasks.worker import OneOfBatch
 
 CHUNK = 128
 """Models that are rolled out in one call, which bounds the memory of their states."""
@@ -228,6 +230,20 @@ class Simulator:
             return self._build(theta)
         except ValueError:
             return None
+
+
+def simulator_of(task: Task) -> Simulator:
+    """The simulator of a task.
+
+    Raises:
+        ValueError: for a task that is not of a MuJoCo model.
+    """
+    function = getattr(task.simulate, "function", None)
+    if isinstance(function, OneOfBatch):  # of a run whose simulations were made one by one, as --workers makes them
+        function = function.function
+    if not isinstance(function, Simulator):
+        raise ValueError(f"task: expected one of a MuJoCo model, got {task.name}")
+    return function
 
 
 def _between(grid: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.mjx")
 pytest.importorskip("brax")
 
+import chex
 import jax
 import jax.numpy as jnp
 from envs_mujoco import ARM
