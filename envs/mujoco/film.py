@@ -89,14 +89,12 @@ def motion(run: Run, draws: int = 12, slower: float = 1.0, episode: int = 0) -> 
     first = sum(len(own) for own in simulator.times[:episode])
     rows = slice(first, first + len(times))
     recorded = np.where(simulator.there, np.asarray(run.observed, float), np.nan)[rows]
-    sampled = np.isfinite(recorded).any(axis=0)
-    signals = [name for name, there in zip(simulator.signals, sampled, strict=True) if there]
-    unmeasured = unmeasured_joints(models[0], signals)
+    unmeasured = unmeasured_joints(models[0], simulator.signals)
     return Motion(
         times=when,
         models=models,
         simulated=states[:, steps, 1 : 1 + models[0].nq],
-        recorded=None if unmeasured else recorded_positions(models[0], signals, times, recorded[:, sampled], when),
+        recorded=None if unmeasured else recorded_positions(models[0], simulator.signals, times, recorded, when),
         unmeasured=unmeasured,
         failed=int((~good).sum()),
         traces=figures.Traces(

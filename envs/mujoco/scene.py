@@ -184,10 +184,10 @@ def fitted(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]], aspect: float) 
         aspect: width of the picture by its height.
     """
     model = motions[0][0]
-    centres, corners = _places(motions)
+    moved, corners = _places(motions)
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FREE
-    view.azimuth, view.elevation = _direction(model, centres)
+    view.azimuth, view.elevation = _direction(model, moved)
     azimuth, elevation = np.deg2rad([view.azimuth, view.elevation])
     forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
@@ -202,7 +202,7 @@ def fitted(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]], aspect: float) 
 
 
 def _places(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Centres of what moves over time, and corners of boxes about it, and about what stands still near it; [n, 3]."""
+    """How far geoms are from their mean places over time, and corners of boxes about them and what is near; [n, 3]."""
     model = motions[0][0]
     data, places, turns = mujoco.MjData(model), [], []
     for own, positions in motions:
@@ -220,15 +220,17 @@ def _places(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]]) -> tuple[np.nd
     still = corners[0, (model.geom_rbound > 0) & ~moves].reshape(-1, 8, 3)  # planes have no bounds
     still = still[((still > low - reach) & (still < high + reach)).all(axis=(1, 2))]
     shown = np.concatenate([corners[:, moves].reshape(-1, 3), still.reshape(-1, 3)])
-    return np.array(places)[:, moves].reshape(-1, 3), shown
+    moved = np.array(places)[:, moves] - np.mean(places, axis=0)[moves]
+    return moved.reshape(-1, 3), shown
 
 
-def _direction(model: mujoco.MjModel, centres: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
+def _direction(model: mujoco.MjModel, moved: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
     """Azimuth and elevation of a view: the model's own, or from the side of a motion in a plane."""
     own = float(model.vis.global_.azimuth), float(model.vis.global_.elevation)
-    if own != _DEFAULT or len(centres) < 2:
+    if own != _DEFAULT:
         return own
-    _, spread, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
+    spread, axes = np.linalg.eigh(moved.T @ moved)
+    spread, axes = np.sqrt(np.maximum(spread[::-1], 0.0)), axes.T[::-1]
     if spread[1] <= PLANAR * spread[0]:  # along a line
         normal = np.cross(axes[0], [0.0, 0.0, 1.0]) if abs(axes[0, 2]) < 0.7 else np.array([0.0, 1.0, 0.0])
     elif spread[2] <= PLANAR * spread[0]:
@@ -237,6 +239,6 @@ def _direction(model: mujoco.MjModel, centres: Float[np.ndarray, "n 3"]) -> tupl
         return 120.0, -25.0
     if abs(normal[2]) > 0.7:
         return 90.0, -55.0
-    # From the side that has x to the right, or else y.
-    azimuth = 180.0 - np.rad2deg(np.arctan2(-normal[1], normal[0])) % 180.0
-    return float(azimuth), -12.0
+    # From the side that has x to the right, or else y, whatever rounding makes of a normal along an axis.
+    normal = -normal if normal[1] < 0.1 * normal[0] else normal
+    return float(np.rad2deg(np.arctan2(normal[1], normal[0]))), -12.0
