@@ -12,7 +12,7 @@ mujoco = pytest.importorskip("mujoco")
 from envs_mujoco import ARM, driven, recorded
 from PIL import Image
 
-from jaxlfi.envs import opengl
+from jaxlfi.envs import gaussian_linear, opengl
 from jaxlfi.envs.mujoco import figures, film, scene
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
@@ -142,7 +142,12 @@ def test_films_that_cannot_be(arguments, expected):
         film.motion(run_of(log_of(MEASURED)), 1, **arguments)
 
 
-def test_a_run_of_other_rows():
+def test_runs_of_other_tasks_and_rows():
+    with pytest.raises(ValueError, match="task: expected one of a MuJoCo model, got gaussian_linear"):
+        film.motion(SimpleNamespace(task=gaussian_linear.task()))
+    gone = SimpleNamespace(task=None, origin=SimpleNamespace(reference=None))
+    with pytest.raises(ValueError, match="expected to find its task, which was made in Python"):
+        film.motion(gone)
     with pytest.raises(ValueError, match=r"of shape \[101, 2\], got \[7, 2\]"):
         film.motion(run_of(log_of(MEASURED), observed=np.zeros((7, 2))), 1)
 
