@@ -24,6 +24,8 @@ PIXELS = 100
 RECORDED = {"color": "black", "linewidth": 0.8}
 LATER = 0.25
 """Opacity of traces after a film's moment."""
+CURSOR = (197, 43, 33)
+"""Colour of a film's moment among the traces."""
 LEVELS = 255
 """Colours of a film."""
 
@@ -76,18 +78,17 @@ class Strip:
             self._picture = np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
         self.height, self._boxes = len(self._picture), []
         for axes in panels:
-            (left, low), (right, high) = axes.transAxes.transform([(0, 0), (1, 1)])
-            top, bottom = self.height - high, self.height - low
-            self._boxes.append((round(left), round(top), round(right), round(bottom)))
+            (_, low), (right, high) = axes.transAxes.transform([(0, 0), (1, 1)])
+            self._boxes.append((round(self.height - high), round(self.height - low), round(right)))
         self._place = lambda time: panels[0].transData.transform((time, 0))[0]
 
     def at(self, time: float) -> UInt8[np.ndarray, "height width 3"]:
         """The picture at a moment, with what comes later paler."""
         picture, x = self._picture.copy(), round(float(self._place(time)))
-        for left, top, right, bottom in self._boxes:
-            later = picture[top + 1 : bottom, max(x, left) + 1 : right]
+        for top, bottom, right in self._boxes:
+            later = picture[top + 1 : bottom, x + 1 : right]
             later[:] = (255 - LATER * (255 - later.astype(float))).round()
-            picture[top + 1 : bottom, x - (x >= right) : x + 1 + (x <= left)] = (197, 43, 33)
+            picture[top + 1 : bottom, x] = CURSOR
         return picture
 
 
@@ -170,7 +171,7 @@ def save_sheet(
         _draw(panels, traces)
         for axes in panels:
             for moment in moments:
-                axes.axvline(moment, color="#C52B21", linewidth=0.7, linestyle=(0, (3, 2)))
+                axes.axvline(moment, color=np.array(CURSOR) / 255, linewidth=0.7, linestyle=(0, (3, 2)))
         handles = [
             Line2D([], [], **RECORDED, label="recorded"),
             Line2D([], [], color=traces.colour, label=traces.label),

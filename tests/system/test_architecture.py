@@ -279,7 +279,7 @@ def test_who_may_import_which_library(path):
     """Plots are drawn by modules called figures, physics is MuJoCo's, policies are Brax's; experiments may do all."""
     allowed = {
         "matplotlib": ("jaxlfi.figures", f"{ENVS}.whip.figures", f"{ENVS}.mujoco.figures", "experiments"),
-        "mujoco": (f"{ENVS}.whip", f"{ENVS}.mujoco", "experiments"),
+        "mujoco": (f"{ENVS}.whip", f"{ENVS}.mujoco", f"{ENVS}.opengl", "experiments"),
         "gymnasium": (f"{ENVS}.whip", "experiments"),
         "stable_baselines3": ("experiments",),
         "brax": ("jaxlfi.rl",),
