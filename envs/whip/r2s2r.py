@@ -94,11 +94,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _loop(arguments: argparse.Namespace) -> None:
     require_mujoco()
     _begin(arguments)
-    policies = _round_and_round(arguments)
-    _deploy(arguments, policies)
     from jaxlfi.envs.whip.r2s2r_page import write
+    from jaxlfi.io.locks import locked
 
-    print(f"wrote {write(arguments, policies)}")
+    with locked(arguments.out):
+        policies = _round_and_round(arguments)
+        _deploy(arguments, policies)
+        print(f"wrote {write(arguments, policies)}")
 
 
 # ------------------------------------------------------------------------------------------------------------ stages

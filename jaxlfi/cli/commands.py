@@ -21,6 +21,7 @@ from jaxlfi.distributions.truncation import TRIES
 from jaxlfi.heuristics import registry as heuristics
 from jaxlfi.io import files as atomic
 from jaxlfi.io import host_devices
+from jaxlfi.io.locks import locked
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import export
@@ -129,6 +130,7 @@ def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, fir
                 console, f"only {mass:.2g} of the prior lies in {name}: {missed:.0%} of its draws are uniform instead"
             )
     executing.begin(arguments.out, plan, observed)
+    arguments.closing.enter_context(locked(arguments.out))
     return arguments.out, (plan, observed)
 
 
@@ -156,12 +158,16 @@ def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
     observation = asked.observation_of(arguments, task)
     run_store.refuse_occupied(arguments.out)
     _say(console, f"{task.name}: compiling for {plan.size} runs")
-    return arguments.out, grid.begin(arguments.out, plan, observation, arguments.runs_per_chunk)
+    work = grid.begin(arguments.out, plan, observation, arguments.runs_per_chunk)
+    arguments.closing.enter_context(locked(arguments.out))
+    return arguments.out, work
 
 
 def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     """Prepare `jaxlfi resume`: nothing is left to do where the run is complete."""
     folder = arguments.folder
+    if folder.is_dir():
+        arguments.closing.enter_context(locked(folder))
     if grid.is_grid(folder):
         return _resume_grid(folder, console)
     if train.is_training(folder):

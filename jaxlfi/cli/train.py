@@ -89,6 +89,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from rich.console import Console
 
     from jaxlfi.io import compile_cache
+    from jaxlfi.io.locks import locked
 
     compile_cache.enable()
     plan = _plan(arguments)
@@ -97,7 +98,8 @@ def _train(arguments: argparse.Namespace) -> None:
     training.begin(plan, arguments.out)
     try:
         console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
-        run(arguments.out, plan.environment, console, not arguments.no_figures)
+        with locked(arguments.out):
+            run(arguments.out, plan.environment, console, not arguments.no_figures)
     except Exception:
         if not (training.updates_done(arguments.out) or training.finished(arguments.out)):
             shutil.rmtree(arguments.out)  # made by this very command, and there is nothing in it to go on from
