@@ -100,6 +100,8 @@ def _train(arguments: argparse.Namespace) -> None:
         console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
         with locked(arguments.out):
             run(arguments.out, plan.environment, console, not arguments.no_figures)
+    except OSError:
+        raise  # as of a full disk, or of another process that goes on with it: the folder is not to be lost
     except Exception:
         if not (training.updates_done(arguments.out) or training.finished(arguments.out)):
             shutil.rmtree(arguments.out)  # made by this very command, and there is nothing in it to go on from
@@ -175,6 +177,7 @@ def resume(out: Path, console: "Console", figures: bool) -> None:
 
     config = training.read_config(out)
     if training.finished(out):
+        training.clean(out)
         if figures and not (out / "curves.png").exists():  # it was stopped while it drew them
             draw(out, console)
         console.print(f"{out} is complete: nothing to resume", markup=False)

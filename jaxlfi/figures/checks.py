@@ -14,6 +14,7 @@ from jaxlfi.figures.history import read_arrays, robust_sd
 from jaxlfi.figures.page import Picture
 from jaxlfi.figures.predictive import QUANTILES
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
+from jaxlfi.io import files
 
 REACH = 8.0
 """Standard deviations beyond which a summary is drawn at the edge of the panel."""
@@ -45,7 +46,7 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
                 pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
     text = page.render_diagnostics(found, pictures)
     index = folder / "report.html"
-    index.write_text(text, encoding="utf-8")
+    files.write_bytes(index, text.encode())
     return [index, *(picture.path for picture in pictures)]
 
 

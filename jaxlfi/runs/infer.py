@@ -147,6 +147,7 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
         config = folders.read_config(out)
         _require_same(out, config, plan)
         if config.get("status", "finished") == "finished":
+            executing.clean(out)
             run = load(out, plan.task)
             _require_observation(out, run.observed, observed.trajectory[0])
             if observed.first is not None or run.origin.given_simulations:
