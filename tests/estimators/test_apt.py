@@ -48,6 +48,7 @@ def test_the_atomic_loss_needs_no_correction_for_its_proposals():
         assert 1.5 < np.trace(covariance) < 2.8
 
 
+@pytest.mark.slow
 def test_a_prior_of_the_tasks_own_is_the_posteriors():
     """A Gaussian prior, whose posterior is Gaussian, from proposals that are far from it in the later rounds."""
     prior_scale = np.array([0.5, 0.8], np.float32)

@@ -126,6 +126,7 @@ def assert_same_results(out, again):
     assert (out / "table.csv").read_text() == (again / "table.csv").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("nth", "midway", "updates"), [(3, False, 3), (4, True, 3), (6, True, 4), (9, False, 4), (11, True, 4)]
 )
@@ -188,6 +189,7 @@ def test_the_command_trains_what_the_library_does(finished, tmp_path, capsys):
     assert picture.startswith(b"\x89PNG") and len(picture) > 5000
 
 
+@pytest.mark.slow
 def test_the_command_is_resumed(tmp_path, capsys, monkeypatch):
     from jaxlfi.cli import parser
 
@@ -302,6 +304,7 @@ def test_bounds_that_were_logarithms_may_be_rounded():
         domains.check_belief(LINE, LINE.space, Support([0.249, -2.0], [4.0, 2.0]))
 
 
+@pytest.mark.slow
 def test_the_posterior_of_a_run_is_a_domain(tmp_path, capsys):
     """A run's mixture, clipped to Phi; the posterior of other parameters is refused."""
 

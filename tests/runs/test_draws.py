@@ -129,6 +129,7 @@ def test_the_draws_have_the_density_that_log_prob_says(ways, space):
     assert np.isneginf(np.asarray(run.posterior.log_prob(jnp.asarray(outside), space=space))).all()
 
 
+@pytest.mark.slow
 def test_the_mean_and_the_maximum_are_those_of_the_draws(ways):
     run, draws = ways
     posterior, theta = run.posterior, draws["infer"]

@@ -110,6 +110,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_posteriors_are_called_what_they_are(case, pretend, tmp_path, capsys):
     how, expected, widths = CASES[case]
@@ -417,6 +418,7 @@ def on_host():
     return dataclasses.replace(gaussian(), simulate=jaxlfi.HostSimulator(simulate))
 
 
+@pytest.mark.slow
 def test_a_run_of_a_host_simulator_is_repeated(folder, tmp_path):
     out = tmp_path / "out"
     asked = (

@@ -278,8 +278,8 @@ def test_the_keys_of_a_run_are_split_in_one_module(path):
 def test_who_may_import_which_library(path):
     """Plots are drawn by modules called figures, physics is MuJoCo's, policies are Brax's; experiments may do all."""
     allowed = {
-        "matplotlib": ("jaxlfi.figures", f"{ENVS}.whip.figures", "experiments"),
-        "mujoco": (f"{ENVS}.whip", f"{ENVS}.mujoco", "experiments"),
+        "matplotlib": ("jaxlfi.figures", f"{ENVS}.whip.figures", f"{ENVS}.mujoco.figures", "experiments"),
+        "mujoco": (f"{ENVS}.whip", f"{ENVS}.mujoco", f"{ENVS}.opengl", "experiments"),
         "gymnasium": (f"{ENVS}.whip", "experiments"),
         "stable_baselines3": ("experiments",),
         "brax": ("jaxlfi.rl",),

@@ -52,6 +52,7 @@ def transported(features, others, there, here):
     return features
 
 
+@pytest.mark.slow
 def test_it_paints_from_the_transported_features():
     first, second = masks(3)[:2] / 255, masks(3)[1:] / 255
     bound = SMALL.bind(params())
