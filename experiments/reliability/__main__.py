@@ -2,13 +2,13 @@
 
     python -m experiments.reliability --kills 100
 
-Each trial starts a command, kills it by SIGKILL, and goes on by `jaxlfi resume` (or by the same command, where nothing had
-been begun), which is killed again; after three kills it goes on to its end, and its folder is compared bit by bit with that
-of an undisturbed run by a fresh process. The first kill is in a window of writing (`injection`) that no other trial has, the
-others are at moments drawn uniformly over the time that an undisturbed run takes; where a process has come to its end
-before, there is no such kill. After these, `--every-window` kills the commands that it names once before, midway and after
-each of their windows. What was done is kept in kills.csv as each trial ends; with the same `--out`, an experiment that was
-stopped goes on.
+Each trial starts a command, kills it by SIGKILL, and goes on by `jaxlfi resume` (or by the same command, where nothing
+had been begun), which is killed again; after three kills it goes on to its end, and its folder is compared bit by bit
+with that of an undisturbed run by a fresh process. The first kill is in a window of writing (`injection`) that no other
+trial has, the others are at moments drawn uniformly over the time that an undisturbed run takes; where a process has
+come to its end before, there is no such kill. After these, `--every-window` kills the commands that it names once
+before, midway and after each of their windows. What was done is kept in kills.csv as each trial ends; with the same
+`--out`, an experiment that was stopped goes on.
 
 The adversities need root, for small file systems in memory. Everything needs Linux.
 """
@@ -16,7 +16,6 @@ The adversities need root, for small file systems in memory. Everything needs Li
 import argparse
 import collections
 import csv
-import json
 import os
 import shutil
 import subprocess
@@ -48,7 +47,7 @@ AT_A_MOMENT, IN_A_WINDOW = "at a moment", "in a window"
 OFF_ROUTE = ("infer", "grid", "train")
 """Commands that meet the adversities; `compare` and a run on a cluster keep their folders as `infer` does."""
 COLUMNS = (
-    "command", "trial", "kill", "of", "how", "second", "window", "operation", "file", "moment", "begun", "result", "beside",
+    "command", "trial", "kill", "of", "how", "second", "window", "operation", "file", "moment", "result", "beside",
 )  # fmt: skip
 
 
@@ -62,8 +61,7 @@ class Undisturbed:
         self.folder = fresh / "run"
         if not self.folder.exists():
             fresh.mkdir(parents=True, exist_ok=True)
-            words = [sys.executable, "-c", "import sys; from jaxlfi.cli.parser import main; sys.exit(main())"]
-            env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+            words, env = [sys.executable, "-m", "jaxlfi"], os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
             subprocess.run([*words, *command.start], cwd=fresh, check=True, stdout=subprocess.DEVNULL, env=env)
         trial = root / f"{command.name}-forked"
         shutil.rmtree(trial, ignore_errors=True)
@@ -76,21 +74,7 @@ class Undisturbed:
 
     def compared(self, folder: Path) -> list[str]:
         """What differs from it in a folder."""
-        found = differences(folder, self.folder)
-        return [one for one in found if "config.json" not in one or not _only_command_line(folder, self.folder)]
-
-
-def _only_command_line(folder: Path, reference: Path) -> bool:
-    """Whether descriptions differ in the name of the program alone, which is -c in a process of its own."""
-    for path in reference.rglob("config.json"):
-        there = json.loads(path.read_text())
-        here = json.loads((folder / path.relative_to(reference)).read_text())
-        for one in (here, there):
-            for name in ("started", "seconds", "command_line"):
-                one.pop(name, None)
-        if here != there:
-            return False
-    return True
+        return differences(folder, self.folder)
 
 
 def trial(
@@ -111,7 +95,7 @@ def trial(
         ended = Running(folder, words, blow=blow).wait(second)
         if not ended.killed:  # it came to its end before
             break
-        rows.append(_row(undisturbed, ended, kill, begun, second, blow))
+        rows.append(_row(command, ended, kill, begun, blow))
     if ended.killed:
         return rows, "killed at the end"
     if ended.status:
@@ -119,20 +103,15 @@ def trial(
     return rows, "; ".join(undisturbed.compared(folder / "run"))
 
 
-def _row(undisturbed: Undisturbed, ended: Ended, kill: int, begun: bool, second: float | None, blow: Blow | None) -> dict:
-    at = ended.windows[blow.window] if blow is not None else None
-    return {
-        "command": undisturbed.command.name,
-        "kill": kill,
-        "of": "resume" if begun else "start",
-        "how": AT_A_MOMENT if blow is None else IN_A_WINDOW,
-        "second": "" if second is None else f"{ended.seconds:.3f}",
-        "window": "" if blow is None else blow.window,
-        "operation": "" if at is None else at.operation,
-        "file": "" if at is None else "/".join("new" if part.startswith(".run-") else part for part in at.path.split("/")),
-        "moment": "" if blow is None else blow.moment,
-        "begun": int(begun),
-    }
+def _row(command: Command, ended: Ended, kill: int, begun: bool, blow: Blow | None) -> dict[str, object]:
+    """One kill, as kills.csv has it."""
+    shared = {"command": command.name, "kill": kill, "of": "resume" if begun else "start"}
+    if blow is None:
+        return shared | {"how": AT_A_MOMENT, "second": f"{ended.seconds:.3f}"}
+    at = ended.windows[blow.window]
+    file = "/".join("new" if part.startswith(".run-") else part for part in at.path.split("/"))
+    window = {"window": blow.window, "operation": at.operation, "file": file, "moment": blow.moment}
+    return shared | {"how": IN_A_WINDOW} | window
 
 
 def kills(
@@ -223,9 +202,9 @@ def main() -> None:
     """Run what is missing, and count."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=100, help="at a moment; half as many are in windows besides")
-    parser.add_argument("--every-window", nargs="*", default=[], metavar="COMMAND", help="commands killed in each window")
+    parser.add_argument("--every-window", nargs="*", default=[], metavar="COMMAND", help="killed in each window, too")
     parser.add_argument("--commands", nargs="+", default=["infer", "compare", "grid", "train", "dask"])
-    parser.add_argument("--adversities", nargs="*", default=OFF_ROUTE, metavar="COMMAND", help="commands that meet them")
+    parser.add_argument("--adversities", nargs="*", default=OFF_ROUTE, metavar="COMMAND", help="those that meet them")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, default=Path("runs/reliability"), help="folders of the trials")
     parser.add_argument("--out", type=Path, default=Path("experiments/results/reliability"))
