@@ -3,10 +3,10 @@
 import dataclasses
 
 FAST = (
-    "--estimator mdn --hidden 16 --activation tanh --normaliser zscore --learning-rate 1e-3 --steps 100 --batch-size 20 "
-    "--validation 0 --patience 0 --ensemble-size 1 --components 2 --prune 0 --weight-decay 0 --clip-norm inf "
-    "--schedule constant --no-warm-start --correction none --restriction clip --inflation 1 --rounds 2 --min-rounds 0 "
-    "--simulations-per-round 20 --simulation-budget 25 --no-figures"
+    "--estimator mdn --hidden 16 --activation tanh --normaliser zscore --learning-rate 1e-3 --steps 100 "
+    "--batch-size 20 --validation 0 --patience 0 --ensemble-size 1 --components 2 --prune 0 --weight-decay 0 "
+    "--clip-norm inf --schedule constant --no-warm-start --correction none --restriction clip --inflation 1 "
+    "--rounds 2 --min-rounds 0 --simulations-per-round 20 --simulation-budget 25 --no-figures"
 ).split()
 """Two rounds of 20 simulations."""
 CART = (

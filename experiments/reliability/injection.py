@@ -1,8 +1,9 @@
 """What is done to a process from within: it is killed or stopped at a window of writing, or its clock goes wrong.
 
 A window is one call that changes a file or a folder: a write to an open file, `os.replace`, `os.rename`, `os.fsync`,
-`os.truncate`, `os.mkdir`, `os.rmdir`, `os.unlink`. They are numbered from 0 in the order in which a process makes them below
-one folder. All of this is wrapped around Python's own functions in the process under test; the library knows none of it.
+`os.truncate`, `os.mkdir`, `os.rmdir`, `os.unlink`. They are numbered from 0 in the order in which a process makes them
+below one folder. All of this is wrapped around Python's own functions in the process under test; the library knows none
+of it.
 """
 
 import contextlib

@@ -69,7 +69,7 @@ class Running:
                 os.dup2(os.open(self._notes / name, os.O_WRONLY), number)
             sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
             os.chdir(folder)
-            sys.argv = ["jaxlfi", *words]
+            sys.argv = ["__main__.py", *words]  # as of `python -m jaxlfi`
             signal.signal(signal.SIGINT, signal.default_int_handler)
             injection.Watch(folder, self._notes / "windows", blow).install()
             if clock:

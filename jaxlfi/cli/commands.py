@@ -308,7 +308,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
 def advice(error: Exception, prepared: Prepared) -> str:
     """What to do about an error of a run, for the end of its line."""
     from_outside = isinstance(error, ExecutorError | OSError)  # a lost cluster, a full disk
-    return f"; continue with: jaxlfi resume {prepared[0]}" if from_outside else ""
+    return f"; continue with: jaxlfi resume {prepared[0]}" if from_outside and prepared[0].exists() else ""
 
 
 def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: Console) -> None:

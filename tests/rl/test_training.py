@@ -206,6 +206,7 @@ def test_the_command_is_resumed(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(training, "_write_checkpoint", original)
     assert parser.main(["resume", str(out), "--no-figures", "--no-cache"]) == 0
     assert training.finished(out)
+    (out / "checkpoint.npz").touch()  # as it was killed after its table was written
     returns = files.read_arrays(out / "curves.npz")["value"][:, 0]
     steps = 40 * np.arange(1, 5)
     np.testing.assert_allclose(
@@ -216,6 +217,18 @@ def test_the_command_is_resumed(tmp_path, capsys, monkeypatch):
         printed = capsys.readouterr().out
         assert "complete: nothing to resume" in printed and ("learning curves: " in printed) == drawn
         assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
+        assert not (out / "checkpoint.npz").exists()
+
+
+def test_a_full_disk_is_one_line_and_the_folder_is_kept(tmp_path, capsys, monkeypatch):
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(training, "resumed", full)
+    out = tmp_path / "run"
+    assert run("--domain", "median", "--out", out) == 2
+    expected = f"jaxlfi train: error: [Errno 28] No space left on device; continue with: jaxlfi resume {out}\n"
+    assert capsys.readouterr().err == expected and training.read_config(out)
 
 
 @pytest.mark.parametrize(("values", "expected"), [([[np.nan], [np.nan]], ""), ([[1.0], [np.nan]], ", return 1.00")])
