@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine
+from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.tasks.host import SimulatorError
 from jaxlfi.tasks.task import Task
 
@@ -16,7 +17,7 @@ OnRound = Callable[[int, State, dict[str, np.ndarray], float], Any]
 
 
 def drive(
-    engine: BatchEngine,
+    engine: BatchEngine | SharedEngine,
     state: State,
     rounds: range,
     on_round: OnRound,

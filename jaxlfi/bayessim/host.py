@@ -16,7 +16,9 @@ from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_draws, propose_o
 from jaxlfi.bayessim.programs import compiled, program
 from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
+from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
+from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.simulation import Simulations, simulate_batch, simulate_in_waves
 from jaxlfi.tasks.task import Task
@@ -28,8 +30,9 @@ def engine_for(
     inputs: RunInputs,
     first: Simulations | None = None,
     journal: Journal | None = None,
-) -> BatchEngine:
-    """The engine that steps a batch: one compiled program, or rounds around a host simulator.
+    processes: Processes = ALONE,
+) -> BatchEngine | SharedEngine:
+    """The engine that steps a batch: one compiled program, in several processes too, or rounds around a host simulator.
 
     Args:
         task: the task.
@@ -37,7 +40,17 @@ def engine_for(
         inputs: stacked.
         first: simulations that take the place of the first round's, the same for all runs.
         journal: of simulations that are made one by one.
+        processes: that share the runs out among them.
+
+    Raises:
+        ValueError: for a host simulator in several processes.
     """
+    if processes.count > 1:
+        if task.on_host:
+            raise ValueError(
+                "processes: expected a simulator in JAX; simulations of others are spread by --workers or --scheduler"
+            )
+        return SharedEngine(task, settings, inputs, processes, first)
     if task.on_host:
         return HostEngine(task, settings, inputs, first, journal)
     return BatchEngine(task, settings, inputs, first=first)

@@ -8,7 +8,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
@@ -23,6 +22,7 @@ from jaxlfi.heuristics import registry as heuristics
 from jaxlfi.io import files as atomic
 from jaxlfi.io import host_devices
 from jaxlfi.io.locks import locked
+from jaxlfi.io.processes import Processes
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import export
@@ -122,22 +122,25 @@ def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
 
 def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, first: Any) -> Prepared:
     """The folder of a plan, after everything was checked."""
-    run_store.refuse_occupied(arguments.out)
-    observed = executing.prepare(plan, asked.observation_of(arguments, plan.task), first)
+    processes = arguments.joined
+    if processes.writes:
+        run_store.refuse_occupied(arguments.out)
+    observed = executing.prepare(plan, asked.observation_of(arguments, plan.task), first, processes)
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
         if (mass := priors.require_mass(plan.task.inference.prior, box, name)) < priors.LOW_INSIDE:
             missed = (1 - mass) ** TRIES
             _warn(
                 console, f"only {mass:.2g} of the prior lies in {name}: {missed:.0%} of its draws are uniform instead"
             )
-    executing.begin(arguments.out, plan, observed)
-    _hold(arguments, arguments.out)
+    if processes.writes:
+        executing.begin(arguments.out, plan, observed, processes)
+        _hold(arguments, arguments.out)
     return arguments.out, (plan, observed)
 
 
 def _hold(arguments: argparse.Namespace, folder: Path) -> None:
-    """Keep other processes out of a folder until the command ends, but those that `jax.distributed` has joined."""
-    if jax.process_index() == 0:
+    """Keep other processes out of a folder until the command ends, but those that it works in."""
+    if arguments.joined.writes:
         arguments.closing.enter_context(locked(folder))
 
 
@@ -163,9 +166,10 @@ def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
         support_name=name,
     )
     observation = asked.observation_of(arguments, task)
-    run_store.refuse_occupied(arguments.out)
+    if arguments.joined.writes:
+        run_store.refuse_occupied(arguments.out)
     _say(console, f"{task.name}: compiling for {plan.size} runs")
-    work = grid.begin(arguments.out, plan, observation, arguments.runs_per_chunk)
+    work = grid.begin(arguments.out, plan, observation, arguments.runs_per_chunk, arguments.joined)
     _hold(arguments, arguments.out)
     return arguments.out, work
 
@@ -176,13 +180,14 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     if folder.is_dir():
         _hold(arguments, folder)
     if grid.is_grid(folder):
-        return _resume_grid(folder, console)
+        return _resume_grid(folder, arguments.joined, console)
     if train.is_training(folder):
         train.resume(folder, console, not arguments.no_figures)
         return None
     config = run_store.read_config(folder)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
-        executing.clean(folder)
+        if arguments.joined.writes:
+            executing.clean(folder)
         _say(console, _COMPLETE.format(folder=folder))
         return None
     plan, observed = executing.reopen(folder)
@@ -190,7 +195,7 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
         arguments.workers = host_devices.processors()
         _say(console, f"simulations: in {arguments.workers} processes on this machine")
     plan = dataclasses.replace(plan, task=asked.simulated_again(arguments, folder, plan.task))
-    if changed := executing.changed_machine(config):
+    if changed := executing.changed_machine(config, arguments.joined):
         _warn(console, f"begun with {', '.join(changed)}: the result may differ in rounding from an uninterrupted one")
     return folder, (plan, observed)
 
@@ -198,12 +203,12 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
 _COMPLETE = "{folder} is complete: nothing to resume. Its pictures: jaxlfi report {folder}"
 
 
-def _resume_grid(folder: Path, console: Console) -> Prepared | None:
+def _resume_grid(folder: Path, processes: Processes, console: Console) -> Prepared | None:
     config = grid.read_config(folder)
     if config.get("status") == "finished":
         _say(console, _COMPLETE.format(folder=folder))
         return None
-    if changed := executing.changed_machine(config):
+    if changed := executing.changed_machine(config, processes):
         _warn(console, f"begun with {', '.join(changed)}: results differ by rounding")
     return folder, grid.reopen(folder)
 
@@ -280,19 +285,21 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
         _run_grid(folder, work, arguments, console)
         return
     plan, observed = work
-    count = len(plan.specs)
+    processes, count = arguments.joined, len(plan.specs)
     label = f"{plan.task.name}: {count} {'run' if count == 1 else 'runs in a batch'}"
-    done = executing.rounds_done(folder)
+    done = executing.rounds_done(folder) if processes.writes else 0
     try:
         with RoundProgress(console, plan.settings.rounds, done, label) as progress:
             on_round = lambda index, row: progress.advance()
-            runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated)
+            runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated, processes)
     except (ExecutorError, OSError):
         raise  # the simulator is not to blame: the folder can be gone on from, with the simulations it has
     except Exception:
-        if arguments.command != "resume" and not executing.rounds_done(folder):
+        if processes.writes and arguments.command != "resume" and not executing.rounds_done(folder):
             shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from
         raise
+    if not processes.writes:
+        return
     executing.finish(folder, plan, runs)
     console.print(summaries.summary_table(plan, runs))
     for warning in summaries.warnings(plan, runs):
@@ -313,13 +320,16 @@ def advice(error: Exception, prepared: Prepared) -> str:
 
 def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: Console) -> None:
     try:
-        arrays = grid.advance(folder, work, console)
+        arrays = grid.advance(folder, work, console, arguments.joined)
     except OSError:
         raise  # as of a full disk: the folder can be gone on from
     except Exception:
-        if arguments.command != "resume" and not (folder / "chunks").exists():
+        made = arguments.joined.writes and arguments.command != "resume"
+        if made and not (folder / "chunks").exists():
             shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from
         raise
+    if not arguments.joined.writes:
+        return
     console.print(summaries.marginal_table(work.grid, arrays))
     _say(console, f"table: {folder / 'table.csv'}")
     if not arguments.no_figures:

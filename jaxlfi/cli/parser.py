@@ -22,7 +22,7 @@ from typing import NoReturn
 
 import jaxlfi
 from jaxlfi import flags, source_fields
-from jaxlfi.cli import help_texts
+from jaxlfi.cli import help_texts, joined
 from jaxlfi.fields import Declared
 
 Commands = argparse._SubParsersAction  # argparse has no public name for it
@@ -219,6 +219,7 @@ def _add_resume(commands: Commands) -> None:
     )
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
     _add_executor(command)
+    joined.add_flags(command)
     _add_machine(command)
 
 
@@ -381,6 +382,7 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         "(default: the task's own, or one simulated at the known truth)",
     )
     _add_machine(command)
+    joined.add_flags(command)
     if networks:
         _add_executor(command)
         command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
@@ -418,21 +420,26 @@ def _add_executor(command: argparse.ArgumentParser) -> None:
 
 
 def prepare_jax(arguments: argparse.Namespace) -> None:
-    """Set what must be set before jax starts.
+    """Set what must be set before jax starts, and join the other processes of the command (`arguments.joined`).
 
     On CPU jax sees one device, and runs of small networks do not fill it: with as many devices as cores, each takes
     its part of a batch. A single run stays on one device, whose matrix products then use all cores.
+
+    Raises:
+        ValueError: where the other processes cannot be joined.
     """
     from jaxlfi.io import host_devices
 
-    runs = _runs(arguments)
-    if runs > 1:
-        # The same batch on the same number of devices repeats bit for bit.
-        host_devices.divide(_recorded(arguments).get("devices") or min(host_devices.processors(), runs))
     if not getattr(arguments, "no_cache", True):
         from jaxlfi.io import compile_cache
 
         compile_cache.enable()
+    arguments.joined = joined.join(arguments)
+    runs, processes = _runs(arguments), arguments.joined.count
+    if runs > 1:
+        # The same batch on the same number of devices repeats bit for bit.
+        devices = _recorded(arguments).get("devices") or min(host_devices.processors() * processes, runs)
+        host_devices.divide(math.ceil(devices / processes))
 
 
 TYPICAL_CONFIGURATIONS = 6
@@ -479,6 +486,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     if words and (foreign := foreign_commands().get(words[0])):
         return foreign.load()(words[1:])
+    if joined.asked(words):
+        return joined.work(lambda: _main(words), lambda: _advice(words), "jaxlfi", "--debug" in words)
+    return _main(words)
+
+
+def _main(words: Sequence[str]) -> int:
+    """Do what the words ask for; returns the exit status."""
     try:
         arguments = parse(words)
     except ValueError as error:
@@ -488,14 +502,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     if len(getattr(arguments, "observation", None) or ()) > 1 and ",trials=" not in arguments.task:
         learnt = arguments.settings.get("embedding") == "trials" and ",pooling=" not in arguments.task
         arguments.task = f"{arguments.task},trials={len(arguments.observation)}{',pooling=all' * learnt}"
-    prepare_jax(arguments)
+    try:
+        prepare_jax(arguments)
+    except ValueError as error:
+        return _refuse(error, getattr(arguments, "debug", False))
     prepared = None
     try:
         from rich.console import Console
 
         from jaxlfi.cli import commands
 
-        console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
+        quiet = not arguments.joined.writes
+        console = Console(quiet=quiet) if sys.stdout.isatty() else Console(width=FILE_WIDTH, quiet=quiet)
         with contextlib.ExitStack() as closing:
             arguments.closing = closing
             try:
@@ -507,6 +525,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                     commands.run(*prepared, arguments, console)
                 except commands.EXPECTED as error:
                     return _refuse(error, getattr(arguments, "debug", False), commands.advice(error, prepared))
+            arguments.joined.leave()
     except KeyboardInterrupt:
         advice = f"; continue with: jaxlfi resume {prepared[0]}" if prepared else ""
         if arguments.command == "diagnose":
@@ -514,6 +533,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"jaxlfi: interrupted{advice}", file=sys.stderr)
         return 130
     return 0
+
+
+def _advice(words: Sequence[str]) -> str:
+    """What to do where a process of several was lost."""
+    arguments, _ = parser(Families.of(words)).parse_known_args(words)
+    folder = arguments.folder if arguments.command == "resume" else arguments.out
+    return f"; continue with: jaxlfi resume {folder}" if (folder / "config.json").exists() else ""
 
 
 def _refuse(error: Exception, debug: bool = False, advice: str = "") -> int:

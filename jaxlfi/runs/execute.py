@@ -19,7 +19,9 @@ from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.memory import budget, state_bytes
 from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
+from jaxlfi.bayessim.shared import SharedEngine, devices_used
 from jaxlfi.io import files as atomic
+from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import Checkpoint
@@ -91,13 +93,16 @@ class Observed:
     first: Simulations | None = None
 
 
-def prepare(plan: BatchPlan, observation: Any = None, first: Simulations | None = None) -> Observed:
+def prepare(
+    plan: BatchPlan, observation: Any = None, first: Simulations | None = None, processes: Processes = ALONE
+) -> Observed:
     """Check all there is to check, and observe.
 
     Args:
         plan: what to run.
         observation: a trajectory for all runs; by default the task's, or one simulated at the truth for each seed.
         first: simulations that take the place of the first round's.
+        processes: that share the runs out among them; all observe what the one that writes does.
 
     Raises:
         ValueError: for anything that does not fit.
@@ -111,16 +116,17 @@ def prepare(plan: BatchPlan, observation: Any = None, first: Simulations | None 
     seeds = dict.fromkeys(spec.seed for spec in plan.specs)
     by_seed = {seed: observe(run_keys(key_of(seed)).observe, plan.task, observation) for seed in seeds}
     observed, x = (np.stack([np.asarray(by_seed[spec.seed][i]) for spec in plan.specs]) for i in range(2))
+    observed, x = processes.agreed((observed, x))
     plan.settings.estimator.check_for(plan.task.dim, x.shape[1])
     plan.settings.estimator.reading(layout(plan.task.summary, observed.shape[1:], x.shape[1]))
     if first is not None and first.x.shape[1] != x.shape[1]:
         raise ValueError(f"simulations: expected summaries of length {x.shape[1]}, got {first.x.shape[1]}")
     given = Observed(observed, x, first)
-    _require_memory(plan, given)
+    _require_memory(plan, given, processes)
     return given
 
 
-def _require_memory(plan: BatchPlan, given: Observed) -> None:
+def _require_memory(plan: BatchPlan, given: Observed, processes: Processes) -> None:
     """Refuse a batch whose states alone would not fit into the memory.
 
     Raises:
@@ -131,7 +137,7 @@ def _require_memory(plan: BatchPlan, given: Observed) -> None:
     first = None if given.first is None else len(given.first.theta)
     one = jax.tree.map(lambda leaf: leaf[0], inputs)
     state = jax.eval_shape(functools.partial(start_one, plan.task, first), plan.settings, one)
-    needed, free = len(plan.specs) * state_bytes(state), budget() * jax.local_device_count()
+    needed, free = len(plan.specs) * state_bytes(state), budget() * jax.local_device_count() * processes.count
     if needed > free:
         raise ValueError(
             f"settings: expected runs that fit into the memory, got {len(plan.specs)} of "
@@ -147,6 +153,7 @@ def execute(
     on_round: Callable[[int, dict[str, np.ndarray]], Any] = lambda index, row: None,
     on_compiled: Callable[[float], Any] = lambda seconds: None,
     on_simulation: OnSimulation = lambda done, wanted: None,
+    processes: Processes = ALONE,
 ) -> list[Run]:
     """Run the rounds that are not done yet.
 
@@ -157,28 +164,32 @@ def execute(
         on_round: called as each round ends, with its index and its record.
         on_compiled: called with the seconds that compiling took.
         on_simulation: called for each simulation of those that are made one by one.
+        processes: that share the runs out among them. Only the one that writes needs the folder.
 
     Returns:
-        The finished runs, on the host.
+        The finished runs, on the host; none where nothing is written.
 
     Raises:
         CheckpointError: for a damaged checkpoint.
         SimulatorError: for a simulator that breaks its contract or fails always.
     """
     inputs, places = stack_inputs(plan.specs, observed.trajectory, observed.x)
-    checkpoint = None if folder is None else Checkpoint(folder)
+    checkpoint = None if folder is None or not processes.writes else Checkpoint(folder)
     journal = Journal(None if checkpoint is None else checkpoint.simulations, on_simulation)
-    engine = engine_for(plan.task, plan.settings, inputs, observed.first, journal)
+    engine = engine_for(plan.task, plan.settings, inputs, observed.first, journal, processes)
     done = 0 if checkpoint is None else checkpoint.rounds_done()
     rows, seconds, final = ([], [], {}) if checkpoint is None else checkpoint.read_rounds(done)
-    if folder is not None:
+    if checkpoint is not None:
         _complete_ledgers(folder, plan, rows, seconds, places)
 
     def keep(index: int, state: State, row: dict[str, np.ndarray], elapsed: float) -> None:
         nonlocal final
+        whole = None if folder is None else engine.fetch(state)
+        if not processes.writes:
+            return
         seconds.append(elapsed / len(plan.specs))
         if checkpoint is not None:
-            checkpoint.write_round(index, engine.fetch(state), row, seconds[-1])
+            checkpoint.write_round(index, whole, row, seconds[-1])
             journal.clear()
         kept, final = apart(row)
         rows.append(kept)
@@ -189,19 +200,25 @@ def execute(
         on_round(index, row)
 
     last = done if rows and np.all(rows[-1]["settled"]) else plan.settings.rounds
+    done, last = map(int, processes.agreed((np.asarray(done), np.asarray(last))))
     with contextlib.closing(journal):
         state = drive(engine, _state(engine, checkpoint, done), range(done, last), keep, on_compiled)
     state = engine.fetch(state)
+    if not processes.writes:
+        return []
     return [
         _run(plan, spec, jax.tree.map(lambda leaf, i=i: leaf[i], state), observed, i, rows, seconds, final, places[i])
         for i, spec in enumerate(plan.specs)
     ]
 
 
-def _state(engine: BatchEngine, checkpoint: Checkpoint | None, done: int) -> State:
-    """The state after the rounds that are done."""
+def _state(engine: BatchEngine | SharedEngine, checkpoint: Checkpoint | None, done: int) -> State:
+    """The state after the rounds that are done; without a checkpoint, that of the process that has it."""
     state = engine.start()
-    return engine.place(checkpoint.read_state(engine.fetch(state))) if done else state
+    if not done:
+        return state
+    like = engine.fetch(state)
+    return engine.place(like if checkpoint is None else checkpoint.read_state(like))
 
 
 def _run(plan, spec, state, observed, index, rows, seconds, final, place) -> Run:
@@ -233,13 +250,14 @@ def run_row(row: Mapping[str, np.ndarray], index: int, place: int | None) -> dic
     return own_evidence({name: value[index] for name, value in row.items()}, place)
 
 
-def begin(folder: Path, plan: BatchPlan, observed: Observed) -> None:
+def begin(folder: Path, plan: BatchPlan, observed: Observed, processes: Processes = ALONE) -> None:
     """Bring the plan's folder into being; nothing is written before everything was checked.
 
     Args:
         folder: new or empty.
         plan: what to run.
         observed: of `prepare`.
+        processes: that share the runs out among them.
 
     Raises:
         StoreError: where something is there already.
@@ -249,7 +267,7 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed) -> None:
     ]
     status = {
         "status": "running",
-        "devices": min(jax.local_device_count(), len(plan.specs)),
+        "devices": _devices(len(plan.specs), processes),
         "keep_network": plan.keep_network,
         "executor": plan.task.one_by_one and plan.task.simulate.executor is not None,
         "runs": [
@@ -310,15 +328,20 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
     return plan, Observed(*Checkpoint(folder).read_start())
 
 
-def changed_machine(config: Mapping[str, Any]) -> list[str]:
+def _devices(runs: int, processes: Processes) -> int:
+    """How many devices a batch is spread over."""
+    return min(devices_used(runs, processes) * processes.count, runs)
+
+
+def changed_machine(config: Mapping[str, Any], processes: Processes = ALONE) -> list[str]:
     """In words, which versions or how many devices are others than when a folder was begun: bits depend on both."""
     recorded = config.get("versions", {})
     now = folders.versions()
     changed = [name for name in VERSIONS if recorded.get(name) not in (None, now[name])]
     words = [f"{name} {recorded[name]}, now {now[name]}" for name in changed]
-    runs, here = config.get("runs"), jax.local_device_count()
+    runs, here = config.get("runs"), jax.local_device_count() * processes.count
     if isinstance(runs, list):
-        here = min(here, len(runs))
+        here = _devices(len(runs), processes)
     return words + [f"{then} devices, now {here}" for then in [config.get("devices")] if then not in (None, here)]
 
 

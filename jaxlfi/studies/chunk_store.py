@@ -1,12 +1,13 @@
 """A resumable store of a study's results, chunk by chunk."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from jaxlfi.io import files as atomic
+from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.runs.folder import StoreError
 
 LABELS = ("fingerprint", "seconds")
@@ -79,18 +80,20 @@ class ChunkStore:
     def compute(
         self,
         one: Callable[[range], tuple[Mapping[str, np.ndarray], float]],
-        own: Sequence[int] | None = None,
+        processes: Processes = ALONE,
     ) -> None:
         """Compute the chunks that are not there yet, in their order.
 
         Args:
             one: from a chunk's items to its results, and the seconds they took.
-            own: chunks that this process is to compute; all by default.
+            processes: that compute each chunk together; the one that writes looks which are there.
         """
-        done = set(self.done())
+        done = processes.agreed(np.asarray(self.done() if processes.writes else [], int))
         for index, items in enumerate(self.chunks):
-            if index not in done and (own is None or index in own):
-                self.write(index, *one(items))
+            if index not in done:
+                results = one(items)
+                if processes.writes:
+                    self.write(index, *results)
 
     def results(self) -> tuple[dict[str, np.ndarray], float]:
         """The results of all items, and the seconds of all chunks together."""

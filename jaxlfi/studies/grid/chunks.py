@@ -14,6 +14,8 @@ from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.memory import FRACTION, PROGRAM_PER_STATE, budget, even_length, state_bytes
 from jaxlfi.bayessim.record import theta_error, trajectory_error
+from jaxlfi.bayessim.shared import SharedEngine
+from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.studies.grid.grid import Grid, grid_runs, observations
 
 MEASURES = (
@@ -54,7 +56,9 @@ def chunk_inputs(work: Work, places: range) -> RunInputs:
     return inputs
 
 
-def prepare(grid: Grid, observation: Any = None, runs_per_chunk: int | None = None) -> Work:
+def prepare(
+    grid: Grid, observation: Any = None, runs_per_chunk: int | None = None, processes: Processes = ALONE
+) -> Work:
     """Choose the chunks' length and compile; nothing is written.
 
     Args:
@@ -62,6 +66,7 @@ def prepare(grid: Grid, observation: Any = None, runs_per_chunk: int | None = No
         observation: see `observations`.
         runs_per_chunk: by default as many as the memory at hand has room for, on a CPU at most `RUNS_PER_CORE` for
             each device.
+        processes: that share a chunk's runs out among them.
 
     Raises:
         ValueError: for a length below 1, or one that the memory at hand has no room for.
@@ -69,7 +74,7 @@ def prepare(grid: Grid, observation: Any = None, runs_per_chunk: int | None = No
     if runs_per_chunk is not None and runs_per_chunk < 1:
         raise ValueError(f"runs_per_chunk: expected at least 1, got {runs_per_chunk}")
     observed, x = observations(grid, observation)
-    free, devices = budget(), jax.local_device_count()
+    free, devices = budget(), jax.local_device_count() * processes.count
     estimate = PROGRAM_PER_STATE * run_bytes(Work(grid, observed, x, 1))
     most = free * devices / estimate
     if jax.default_backend() == "cpu":
@@ -80,7 +85,7 @@ def prepare(grid: Grid, observation: Any = None, runs_per_chunk: int | None = No
         raise _too_many(wanted, wanted * estimate / devices, free, runs_per_chunk)
     while True:
         work = Work(grid, observed, x, wanted if runs_per_chunk else even_length(grid.size, wanted, devices))
-        needed = program_bytes(_engine(work, range(grid.size)))
+        needed = program_bytes(_engine(work, range(grid.size), processes))
         if needed <= free:
             return work
         if runs_per_chunk or work.length == 1:
@@ -103,7 +108,7 @@ def run_bytes(work: Work) -> int:
     return state_bytes((state, inputs.observed, inputs.x))
 
 
-def program_bytes(engine: BatchEngine) -> int:
+def program_bytes(engine: BatchEngine | SharedEngine) -> int:
     """Compile, and return how many bytes a round needs on each device; 0 where the compiler does not say."""
     program = engine.compile(engine.start())
     sizes = None if program is None else program.memory_analysis()
@@ -114,8 +119,8 @@ def program_bytes(engine: BatchEngine) -> int:
     )
 
 
-def _engine(work: Work, places: range) -> BatchEngine:
-    return engine_for(work.grid.task, work.grid.settings, chunk_inputs(work, places))
+def _engine(work: Work, places: range, processes: Processes) -> BatchEngine | SharedEngine:
+    return engine_for(work.grid.task, work.grid.settings, chunk_inputs(work, places), processes=processes)
 
 
 def run_chunk(
@@ -123,6 +128,7 @@ def run_chunk(
     places: range,
     on_round: Callable[[], Any] = lambda: None,
     on_compiled: Callable[[float], Any] = lambda seconds: None,
+    processes: Processes = ALONE,
 ) -> tuple[dict[str, np.ndarray], float]:
     """Run one chunk.
 
@@ -131,16 +137,20 @@ def run_chunk(
         places: of the chunk's runs.
         on_round: called as each round ends.
         on_compiled: called with the seconds that compiling took, by the first chunk of a process.
+        processes: that share the runs out among them.
 
     Returns:
-        `MEASURES` of its runs, with those that fill it up, and the seconds they took.
+        `MEASURES` of its runs, with those that fill it up, and the seconds they took; no measures where nothing is
+        written.
 
     Raises:
         SimulatorError: if no simulation of the first round succeeded.
     """
-    engine, records = _engine(work, places), []
+    engine, records = _engine(work, places, processes), []
 
     def keep(index, state, row, seconds):
+        if not processes.writes:
+            return
         records.append({name: row[name] for name in ("attempted", "succeeded")})
         records[0]["last"] = row
         on_round()
@@ -151,6 +161,8 @@ def run_chunk(
     seconds = time.perf_counter() - began - sum(compiled)
     if sum(compiled) > 1.0:  # later chunks find the program
         on_compiled(sum(compiled))
+    if not processes.writes:
+        return {}, seconds
     attempted, succeeded = (sum(record[name] for record in records) for name in ("attempted", "succeeded"))
     return last_round(records[0]["last"]) | {"success_rate": succeeded / attempted}, seconds
 

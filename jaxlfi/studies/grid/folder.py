@@ -6,8 +6,8 @@
     grid.npz               arrays with leading axes [axis..., seed]
     table.csv              one line a combination and seed
 
-Where several processes were joined by `jax.distributed` they share the chunks out among them, each on its own
-devices, and meet at the end; the folder must be one that all of them see.
+Where several processes were joined (`jaxlfi.io.processes`) they share the runs of every chunk out among them, and the
+first writes.
 """
 
 import csv
@@ -21,12 +21,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.experimental import multihost_utils
 from rich.console import Console
 
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.io import files as atomic
 from jaxlfi.io import serialise
+from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as run_store
@@ -34,7 +34,7 @@ from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.run import Origin
 from jaxlfi.studies.chunk_store import ChunkStore
 from jaxlfi.studies.grid.chunks import MEASURES, Work, arranged, prepare, run_chunk
-from jaxlfi.studies.grid.grid import Axis, Grid, combinations, hyperparameters
+from jaxlfi.studies.grid.grid import Axis, Grid, combinations, hyperparameters, observations
 from jaxlfi.tasks import registry as tasks
 
 GRID = "jaxlfi-grid"
@@ -86,7 +86,13 @@ def _digest(*parts) -> str:
     return whole.hexdigest()[:32]
 
 
-def begin(folder: Path, grid: Grid, observation: Any = None, runs_per_chunk: int | None = None) -> Work:
+def begin(
+    folder: Path,
+    grid: Grid,
+    observation: Any = None,
+    runs_per_chunk: int | None = None,
+    processes: Processes = ALONE,
+) -> Work:
     """Check all there is to check, compile, then bring the folder into being; nothing is written before.
 
     Args:
@@ -94,19 +100,22 @@ def begin(folder: Path, grid: Grid, observation: Any = None, runs_per_chunk: int
         grid: what to run.
         observation: see `observations`.
         runs_per_chunk: see `prepare`.
+        processes: that share a chunk's runs out among them.
 
     Raises:
         ValueError: for anything that does not fit.
     """
-    if jax.process_index() == 0:
+    if processes.writes:
         run_store.refuse_occupied(folder)
-        work = prepare(grid, observation, runs_per_chunk)
-        create(folder, work)
-    _meet("begun")
-    return work if jax.process_index() == 0 else reopen(folder)
+        work = prepare(grid, observation, runs_per_chunk, processes)
+        create(folder, work, processes)
+    else:
+        work = Work(grid, *observations(grid, observation), length=0)
+    observed, x, length = processes.agreed((work.observed, work.x, np.asarray(work.length)))
+    return Work(grid, observed, x, int(length))
 
 
-def create(folder: Path, work: Work) -> None:
+def create(folder: Path, work: Work, processes: Processes = ALONE) -> None:
     """Bring the folder of a prepared work into being."""
 
     def fill(staging: Path) -> None:
@@ -118,7 +127,7 @@ def create(folder: Path, work: Work) -> None:
         | run_store.environment()
         | {
             "status": "running",
-            "devices": jax.local_device_count(),
+            "devices": jax.local_device_count() * processes.count,
             "runs": work.grid.size,
             "fingerprint": fingerprint(work),
         },
@@ -186,33 +195,33 @@ def store_of(folder: Path, work: Work) -> ChunkStore:
     return ChunkStore(folder / "chunks", work.grid.size, work.length, fingerprint(work), MEASURES)
 
 
-def advance(folder: Path, work: Work, console: Console) -> dict[str, np.ndarray]:
+def advance(folder: Path, work: Work, console: Console, processes: Processes = ALONE) -> dict[str, np.ndarray]:
     """Compute the chunks that are not there yet, then write the results.
 
     Args:
         folder: made by `begin`, finished or not.
         work: the folder's.
         console: for progress.
+        processes: that share a chunk's runs out among them. Only the one that writes needs the folder.
 
     Returns:
-        The arrays of grid.npz.
+        The arrays of grid.npz; none where nothing is written.
 
     Raises:
         StoreError: for a damaged chunk, before anything is computed.
         SimulatorError: for a simulator that fails always.
     """
     store, rounds = store_of(folder, work), work.grid.settings.rounds
-    own = range(jax.process_index(), len(store.chunks), jax.process_count())
-    done = [index for index in store.done() if index in own]
+    done = len(store.done()) if processes.writes else 0
     label = f"{work.grid.task.name}: {work.grid.size} runs in {len(store.chunks)} chunks of {work.length}"
-    with RoundProgress(console, rounds * len(own), rounds * len(done), label) as progress:
-        store.compute(lambda places: run_chunk(work, places, progress.advance, progress.compiled), own)
-    _meet("chunks done")
+    with RoundProgress(console, rounds * len(store.chunks), rounds * done, label) as progress:
+        chunk = lambda places: run_chunk(work, places, progress.advance, progress.compiled, processes)
+        store.compute(chunk, processes)
+    if not processes.writes:
+        return {}
     results, seconds = store.results()
     arrays = arranged(work.grid, results)
-    if jax.process_index() == 0:
-        finish(folder, work.grid, arrays, seconds)
-    _meet("finished")
+    finish(folder, work.grid, arrays, seconds)
     return arrays
 
 
@@ -235,9 +244,3 @@ def table(grid: Grid, arrays: Mapping[str, np.ndarray]) -> str:
     for (values, seed), *results in zip(places, *columns, strict=True):
         writer.writerow([*values.values(), seed, *("" if value != value else value for value in results)])
     return text.getvalue()
-
-
-def _meet(name: str) -> None:
-    """Wait for the other processes, where there are some."""
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(f"jaxlfi grid: {name}")

@@ -1,0 +1,174 @@
+"""Processes that work on one command together, on one host or several, joined by `jax.distributed`.
+
+Each computes its own part on its own devices. Arrays go between them through the key-value store of jax's coordination
+service, which runs in process 0: no collectives, and no other port than the coordinator's. The same service notices
+within `LOST` seconds that a process has died, and ends the others.
+"""
+
+import contextlib
+import dataclasses
+import io
+import itertools
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+AUTO = "auto"
+"""In place of a coordinator's address: as Slurm, Open MPI or Kubernetes says."""
+CONNECT, LOST = 120, 15
+"""Seconds that processes may start apart, and after which a silent one counts as lost."""
+SECOND = 1000
+"""In the store's milliseconds."""
+PIECE = 2**24
+"""Bytes in a message, at most."""
+
+
+class ProcessLostError(OSError):
+    """Another process has ended."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Processes:
+    """All processes of a command, as one of them sees them. What they exchange they call in the same order.
+
+    Attributes:
+        index: of this one; process 0 writes.
+        count: how many there are.
+    """
+
+    index: int = 0
+    count: int = 1
+    _calls: Iterator[int] = dataclasses.field(default_factory=itertools.count, repr=False, compare=False)
+
+    @property
+    def writes(self) -> bool:
+        """Whether this is the one that prints and writes."""
+        return self.index == 0
+
+    def gathered(self, tree: Any) -> Any:
+        """Arrays of all processes, joined along their leading axes, at the one that writes; elsewhere its own."""
+        call = next(self._calls)
+        if not self.writes:
+            _send(f"{call}/{self.index}", _leaves(tree))
+            return tree
+        parts = [_leaves(tree), *(_receive(f"{call}/{other}") for other in range(1, self.count))]
+        return _like(tree, [np.concatenate(leaves) for leaves in zip(*parts, strict=True)])
+
+    def dealt(self, trees: list[Any]) -> Any:
+        """The part that the process that writes has for this one.
+
+        Args:
+            trees: of each process, arrays of one structure; elsewhere than at the one that writes, only it counts.
+        """
+        call = next(self._calls)
+        if not self.writes:
+            return _like(trees[0], _receive(f"{call}/{self.index}"))
+        for other in range(1, self.count):
+            _send(f"{call}/{other}", _leaves(trees[other]))
+        return trees[0]
+
+    def agreed(self, tree: Any) -> Any:
+        """The arrays of the process that writes, in all processes."""
+        return self.dealt([tree] * self.count) if self.count > 1 else tree
+
+    def leave(self) -> None:
+        """Come to the end together: the others wait until all is written."""
+        if self.count > 1:
+            import jax
+
+            self.agreed(np.zeros(()))
+            jax.distributed.shutdown()
+
+
+ALONE = Processes()
+"""A command in a process of its own."""
+
+
+def join(coordinator: str, index: int | None = None, count: int | None = None) -> Processes:
+    """Join the other processes of this command; call it before jax sees its devices.
+
+    Args:
+        coordinator: "HOST:PORT", where process 0 listens; or `AUTO`.
+        index: of this process, from 0; None for `AUTO`.
+        count: of all processes; None for `AUTO`.
+
+    Raises:
+        ValueError: where they cannot be joined.
+    """
+    import jax
+
+    if jax.distributed.is_initialized():
+        return Processes(_state().process_id, _state().num_processes)
+    by_hand = {"coordinator_address": coordinator, "num_processes": count, "process_id": index}
+    if coordinator != AUTO:
+        by_hand["cluster_detection_method"] = "deactivate"
+    try:
+        jax.distributed.initialize(
+            **({} if coordinator == AUTO else by_hand),
+            initialization_timeout=CONNECT,
+            heartbeat_timeout_seconds=LOST,
+        )
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"coordinator: expected to join the other processes at {coordinator}, got: {error}") from error
+    return Processes(_state().process_id, _state().num_processes)
+
+
+def _state() -> Any:
+    """What jax knows of the processes: nothing public gives the store, or their number before devices are made."""
+    from jax._src import distributed
+
+    return distributed.global_state
+
+
+def _send(name: str, leaves: list[np.ndarray]) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, *leaves)
+    content = buffer.getvalue()
+    with _lost():
+        for place, first in enumerate(range(0, len(content), PIECE)):
+            _state().client.key_value_set_bytes(f"jaxlfi/{name}/{place}", content[first : first + PIECE])
+        _state().client.key_value_set(f"jaxlfi/{name}", str(place + 1))
+
+
+def _receive(name: str) -> list[np.ndarray]:
+    client = _state().client
+    with _lost():
+        pieces = _awaited(client, f"jaxlfi/{name}")
+        content = b"".join(client.blocking_key_value_get_bytes(f"jaxlfi/{name}/{i}", SECOND) for i in range(pieces))
+        client.key_value_delete(f"jaxlfi/{name}")  # with its pieces
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return [arrays[f"arr_{place}"] for place in range(len(arrays.files))]
+
+
+def _awaited(client: Any, name: str) -> int:
+    """A number, when it is there; an interruption is heard every second."""
+    while True:
+        try:
+            return int(client.blocking_key_value_get(name, SECOND))
+        except RuntimeError as error:
+            if "DEADLINE_EXCEEDED" not in str(error):
+                raise
+
+
+@contextlib.contextmanager
+def _lost() -> Iterator[None]:
+    """Turn the store's errors into one that says why; jax, which ends this process then, comes before it."""
+    try:
+        yield
+    except RuntimeError as error:
+        time.sleep(LOST)
+        raise ProcessLostError("another process of this command was lost") from error
+
+
+def _leaves(tree: Any) -> list[np.ndarray]:
+    import jax
+
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def _like(tree: Any, leaves: list[np.ndarray]) -> Any:
+    import jax
+
+    return jax.tree.unflatten(jax.tree.structure(tree), leaves)
