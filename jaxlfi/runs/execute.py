@@ -268,6 +268,7 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed, processes: Processe
     status = {
         "status": "running",
         "devices": _devices(len(plan.specs), processes),
+        "processes": processes.count,
         "keep_network": plan.keep_network,
         "executor": plan.task.one_by_one and plan.task.simulate.executor is not None,
         "runs": [
@@ -334,15 +335,18 @@ def _devices(runs: int, processes: Processes) -> int:
 
 
 def changed_machine(config: Mapping[str, Any], processes: Processes = ALONE) -> list[str]:
-    """In words, which versions or how many devices are others than when a folder was begun: bits depend on both."""
+    """In words, what is other than when a folder was begun, of what bits depend on: versions, devices, processes."""
     recorded = config.get("versions", {})
     now = folders.versions()
     changed = [name for name in VERSIONS if recorded.get(name) not in (None, now[name])]
     words = [f"{name} {recorded[name]}, now {now[name]}" for name in changed]
-    runs, here = config.get("runs"), jax.local_device_count() * processes.count
+    runs, devices = config.get("runs"), jax.local_device_count() * processes.count
     if isinstance(runs, list):
-        here = _devices(len(runs), processes)
-    return words + [f"{then} devices, now {here}" for then in [config.get("devices")] if then not in (None, here)]
+        devices = _devices(len(runs), processes)
+    for name, here in (("devices", devices), ("processes", processes.count)):
+        if config.get(name) not in (None, here):
+            words.append(f"{config[name]} {name}, now {here}")
+    return words
 
 
 def _spec(description: dict[str, Any]) -> RunSpec:

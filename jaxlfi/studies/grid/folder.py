@@ -128,6 +128,7 @@ def create(folder: Path, work: Work, processes: Processes = ALONE) -> None:
         | {
             "status": "running",
             "devices": jax.local_device_count() * processes.count,
+            "processes": processes.count,
             "runs": work.grid.size,
             "fingerprint": fingerprint(work),
         },

@@ -1,0 +1,122 @@
+"""Commands in several processes, joined by jax.distributed over the loopback."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from jaxlfi.io import files as atomic
+from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401
+
+ROUNDS = 12
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    """What was compiled once is not compiled again."""
+    return os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("cache"))}
+
+
+def started(environment, count, *words) -> list[subprocess.Popen]:
+    """A command in so many processes."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        joined = ["--coordinator", f"127.0.0.1:{free.getsockname()[1]}", "--processes", str(count)]
+    return [
+        subprocess.Popen(
+            [sys.executable, "-m", "jaxlfi", *map(str, words), *joined, "--process-id", str(index)],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for index in range(count)
+    ]
+
+
+def done(processes) -> str:
+    """Wait for their end: the first one speaks, and none of the others."""
+    said = [process.communicate(timeout=150) for process in processes]
+    assert [process.returncode for process in processes] == [0] * len(processes), said
+    assert [text for _, text in said] == [""] * len(said)
+    assert [text for text, _ in said[1:]] == [""] * len(said[1:])
+    return said[0][0]
+
+
+def arrays(folder):
+    """All arrays of a folder but the seconds, by file and name."""
+    return {
+        (str(path.relative_to(folder)), name): value
+        for path in sorted(folder.rglob("*.npz"))
+        for name, value in atomic.read_arrays(path).items()
+        if name != "seconds"
+    }
+
+
+def test_a_run_whose_process_was_lost_goes_on_in_as_many_processes_or_one(environment, tmp_path):
+    """To the same bits in as many, up to rounding in another number."""
+    words = ["infer", TASK, "--support", "ok", "--seeds", 3, *FLAGS, "--rounds", ROUNDS, "--out"]
+    whole, lost, alone = tmp_path / "whole", tmp_path / "lost", tmp_path / "alone"
+    processes = started(environment, 2, *words, lost)
+    deadline = time.monotonic() + 120
+    while not (lost / "checkpoint" / "state.npz").exists():
+        assert time.monotonic() < deadline and all(process.poll() is None for process in processes)
+        time.sleep(0.01)
+    processes[1].kill()
+    began = time.monotonic()
+    uninterrupted = started(environment, 2, *words, whole)
+    _, errors = processes[0].communicate(timeout=60)
+    assert time.monotonic() - began < 30
+    assert errors == f"jaxlfi: error: another process of this command was lost; continue with: jaxlfi resume {lost}\n"
+    assert processes[0].returncode == 2
+    assert f"{ROUNDS} of {ROUNDS} rounds" in done(uninterrupted)
+    shutil.copytree(lost, alone)
+
+    assert "warning" not in done(started(environment, 2, "resume", lost, "--no-figures"))
+    expected, resumed = arrays(whole), arrays(lost)
+    assert expected.keys() == resumed.keys()
+    for name, value in expected.items():
+        np.testing.assert_array_equal(value, resumed[name], err_msg=str(name))
+    ledgers = [(folder / "seed_002" / "ledger.jsonl").read_text().splitlines() for folder in (whole, lost)]
+    assert len(ledgers[0]) == len(ledgers[1]) == ROUNDS
+    config = json.loads((lost / "config.json").read_text())
+    assert (config["status"], config["devices"], config["processes"]) == ("finished", 3, 2)
+
+    assert command("resume", alone, "--no-figures") == 0
+    for name, value in arrays(alone).items():
+        if name[0].endswith("posterior.npz") and name[1] in ("support_low", "support_high", "means"):
+            np.testing.assert_allclose(value, expected[name], rtol=5e-3, atol=5e-3, err_msg=str(name))
+
+
+def test_four_processes_give_what_one_gives(environment, tmp_path):
+    """A grid, whose last chunk is filled up."""
+    words = ["grid", TASK, "--support", "misspecified", "--seeds", 5, *FLAGS, "--vary", "expansion=0.1"]
+    words += ["--runs-per-chunk", 4, "--out"]
+    said = done(started(environment, 4, *words, tmp_path / "four"))
+    assert "5 runs in 2 chunks of 4" in said
+    assert command(*words, tmp_path / "one") == 0
+    four, one = (atomic.read_arrays(tmp_path / name / "grid.npz") for name in ("four", "one"))
+    for name, value in one.items():
+        if value.dtype.kind == "f":
+            np.testing.assert_allclose(four[name], value, rtol=5e-3, atol=5e-3, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("flags", "line"),
+    [
+        (["--coordinator", "127.0.0.1:1"], "coordinator: expected --coordinator auto, or"),
+        (["--coordinator", "here", "--processes", "2", "--process-id", "0"], "coordinator: expected HOST:PORT, got"),
+        (["--coordinator", "a:1", "--processes", "2", "--process-id", "2"], "process_id: expected a number from 0 to"),
+        (["--coordinator", "auto", "--processes", "2"], "coordinator: expected --coordinator auto, or"),
+    ],
+)
+def test_flags_that_do_not_fit_are_refused(tmp_path, flags, line):
+    words = ["infer", TASK, *flags, "--out", str(tmp_path / "out")]
+    ended = subprocess.run([sys.executable, "-m", "jaxlfi", *words], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1) and line in ended.stderr
