@@ -465,7 +465,7 @@ def _recorded(arguments: argparse.Namespace) -> dict:
         return {}
     try:
         config = json.loads(path.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return config if isinstance(config, dict) else {}
 

@@ -162,7 +162,7 @@ def is_training(out: Path) -> bool:
     """Whether a folder is that of trainings; it may be damaged."""
     try:
         config = json.loads((out / "config.json").read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
     return isinstance(config, dict) and config.get("format") == "jaxlfi-training"
 

@@ -1,6 +1,5 @@
 """Checks: the observation among simulations from the posterior; all pictures of diagnostics, and a page of them."""
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from jaxlfi.figures.history import read_arrays, robust_sd
 from jaxlfi.figures.page import Picture
 from jaxlfi.figures.predictive import QUANTILES
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
+from jaxlfi.io import files
 
 REACH = 8.0
 """Standard deviations beyond which a summary is drawn at the edge of the panel."""
@@ -51,10 +51,10 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
 
 def _read(path: Path) -> Mapping[str, Any]:
     try:
-        found = json.loads(path.read_text())
+        found = files.read_json(path)
         if "widths" not in found or "checks" not in found:
             raise ValueError("no verdicts")
-    except (OSError, ValueError, TypeError) as error:
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: expected the results of diagnostics, but they cannot be read ({error})") from error
     return found
 

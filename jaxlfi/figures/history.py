@@ -1,8 +1,6 @@
 """History: the saved arrays of one inference run, as the figures use them."""
 
 import dataclasses
-import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxlfi.figures import density, statistics
+from jaxlfi.io import files
 
 REQUIRED = (
     "theta",
@@ -159,9 +158,8 @@ class History:
     def measured_widths(self) -> str | None:
         """In words, what diagnostics in the run's folder found of its widths; None where there are none, or others."""
         try:
-            found = json.loads((self.folder / "diagnostics" / "diagnostics.json").read_text())
-            return str(found["line"])
-        except (OSError, ValueError, KeyError, TypeError):
+            return str(files.read_json(self.folder / "diagnostics" / "diagnostics.json")["line"])
+        except (ValueError, KeyError, TypeError):
             return None
 
     @property
@@ -250,10 +248,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     path = folder / "config.json"
     if not path.is_file():
         raise ValueError(f"{folder}: expected a folder with config.json, as `jaxlfi infer --out` writes, found none")
-    try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: expected JSON, but it cannot be read ({_one_line(error)})") from error
+    config = files.read_json(path)
     if not isinstance(config, dict) or not isinstance(config.get("format"), str):
         raise ValueError(f"{path}: expected a JSON object with a 'format' that starts with 'jaxlfi-'")
     return config
@@ -267,13 +262,7 @@ def read_arrays(path: Path, required: tuple[str, ...] = ()) -> dict[str, np.ndar
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected the file, found none (has the run ended a round?)")
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-        raise ValueError(
-            f"{path}: expected an npz file of arrays, but it cannot be read ({_one_line(error)})"
-        ) from error
+    arrays = files.read_arrays(path)
     if missing := [name for name in required if name not in arrays]:
         raise ValueError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
     return arrays
@@ -292,9 +281,6 @@ def robust_sd(x: np.ndarray) -> np.ndarray:
 def _arrays_if_there(path: Path) -> dict[str, np.ndarray]:
     return read_arrays(path) if path.exists() else {}
 
-
-def _one_line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlfi.io import files
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.simulation import trajectory_and_outcome, with_outcome
@@ -194,7 +195,8 @@ def read(path: str | Path) -> np.ndarray:
     try:
         return readers[path.suffix.lower()](path)
     except Exception as error:  # zipfile, numpy and the operating system each have their own
-        raise ValueError(f"observation: cannot read {str(path)!r}: {_first_line(error)}") from error
+        text = files.first_line(error)
+        raise ValueError(f"observation: expected a readable file, got {str(path)!r}: {text}") from error
 
 
 def read_for(task: Task, *paths: str | Path) -> np.ndarray:
@@ -231,10 +233,10 @@ def _read_csv(path: Path) -> np.ndarray:
 
 
 def _read_npz(path: Path) -> np.ndarray:
-    with np.load(path, allow_pickle=False) as arrays:
-        if "trajectory" not in arrays and len(arrays.files) != 1:
-            raise ValueError(f"expected an array called 'trajectory', got {arrays.files}")
-        array = arrays["trajectory" if "trajectory" in arrays else arrays.files[0]]
+    arrays = files.read_arrays(path)
+    if "trajectory" not in arrays and len(arrays) != 1:
+        raise ValueError(f"expected an array called 'trajectory', got {list(arrays)}")
+    array = arrays.get("trajectory", next(iter(arrays.values())))
     if array.dtype.kind not in "biuf":
         raise ValueError(f"expected real numbers, got an array of type {array.dtype}")
     return np.asarray(array, np.float32)
@@ -254,7 +256,3 @@ def _is_number(cell: str) -> bool:
 
 def _shape(array) -> str:
     return str(getattr(array, "shape", type(array).__name__))
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]

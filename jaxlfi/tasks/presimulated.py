@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.distributions.support import Support
+from jaxlfi.io import files
 from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.simulation import Simulations, summarised_batch
 from jaxlfi.tasks.task import Task
@@ -26,10 +27,9 @@ def read_simulations(path: str | Path) -> dict[str, np.ndarray]:
         ValueError: for a file that cannot be read.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except Exception as error:  # zipfile, numpy and the operating system each have their own
-        raise ValueError(f"simulations: cannot read {str(path)!r}: {str(error).splitlines()[0]}") from error
+        return files.read_arrays(Path(path))
+    except ValueError as error:
+        raise ValueError(f"simulations: {error}") from error
 
 
 def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None = None) -> tuple[Simulations, Support]:
