@@ -269,7 +269,10 @@ def checked(described: Any, where: str) -> dict[str, Any]:
 
 
 def _array(name: str, value: Any, kind: type) -> np.ndarray:
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name}: expected an array of {kind.__name__}s, got {value!r}") from error
     if array.dtype.kind not in {bool: "b", float: "fiu"}[kind]:
         raise ValueError(f"{name}: expected an array of {kind.__name__}s, got {array.dtype}")
     array = array.astype(kind)

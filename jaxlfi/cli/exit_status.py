@@ -5,6 +5,14 @@ import traceback
 from collections.abc import Callable
 
 
+def one_line(error: Exception) -> str:
+    """What an error of bad input says, in one line; of the operating system's, what was expected instead."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    if not isinstance(error, OSError) or "expected" in text:
+        return text
+    return f"expected a file or folder that can be used, got {text}"
+
+
 def exit_status(program: str, work: Callable[[], None], debug: bool = False, advice: Callable[[], str] = str) -> int:
     """Do a command's work.
 
@@ -22,7 +30,7 @@ def exit_status(program: str, work: Callable[[], None], debug: bool = False, adv
     except (ValueError, OSError, ImportError) as error:
         if debug:
             traceback.print_exception(error)
-        print(f"{program}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{program}: error: {one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"{program}: interrupted{advice()}", file=sys.stderr)

@@ -23,6 +23,7 @@ from typing import NoReturn
 import jaxlfi
 from jaxlfi import flags, source_fields
 from jaxlfi.cli import help_texts
+from jaxlfi.cli.exit_status import one_line
 from jaxlfi.fields import Declared
 
 Commands = argparse._SubParsersAction  # argparse has no public name for it
@@ -41,7 +42,7 @@ class OneLineParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """One line on stderr, and exit status 2."""
-        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+        self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -520,6 +521,5 @@ def _refuse(error: Exception, debug: bool = False, advice: str = "") -> int:
     """Report an error in one line with what to do about it, and where it came from on request."""
     if debug:
         traceback.print_exception(error)
-    text = " ".join(str(error).split()) or type(error).__name__
-    print(f"jaxlfi: error: {text}{advice}", file=sys.stderr)
+    print(f"jaxlfi: error: {one_line(error)}{advice}", file=sys.stderr)
     return 2

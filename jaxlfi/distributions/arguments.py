@@ -19,8 +19,8 @@ def require_key(key: Any, name: str = "key") -> jax.Array:
     return key
 
 
-def require_count(value: Any, name: str, least: int = 1) -> int:
-    """Refuse what is no whole number of at least `least`.
+def require_count(value: Any, name: str, least: int = 1, most: int | None = None) -> int:
+    """Refuse what is no whole number of at least `least`, and at most `most`.
 
     Raises:
         ValueError: naming the argument.
@@ -29,8 +29,9 @@ def require_count(value: Any, name: str, least: int = 1) -> int:
         count = operator.index(value)
     except TypeError:
         count = None
-    if count is None or isinstance(value, bool) or count < least:
-        raise ValueError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+    if count is None or isinstance(value, bool) or count < least or (most is not None and count > most):
+        limits = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name}: expected a whole number {limits}, got {value!r}")
     return count
 
 

@@ -25,6 +25,9 @@ REQUIRED = (
 )
 """Arrays of history.npz that a run must have to be drawn."""
 
+TEXTS = ("axes", "channels", "names", "parameters", "reasons", "record_label", "summaries", "units")
+"""Arrays of texts, in any file."""
+
 
 @dataclasses.dataclass(frozen=True)
 class History:
@@ -263,6 +266,8 @@ def read_arrays(path: Path, required: tuple[str, ...] = ()) -> dict[str, np.ndar
     if not path.is_file():
         raise ValueError(f"{path}: expected the file, found none (has the run ended a round?)")
     arrays = files.read_arrays(path)
+    if texts := [name for name, array in arrays.items() if array.dtype.kind in "SU" and name not in TEXTS]:
+        raise ValueError(f"{path}: expected numbers, got texts as {', '.join(texts)}")
     if missing := [name for name in required if name not in arrays]:
         raise ValueError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
     return arrays
@@ -339,7 +344,9 @@ def _rows(array: np.ndarray | None, columns: int) -> np.ndarray | None:
 
 def _x_scale(dataset: Mapping[str, np.ndarray], obs: int) -> np.ndarray | None:
     """Standard deviations of the summaries of the first round that has any."""
-    if not {"x", "round"} <= dataset.keys() or not len(dataset["x"]) or dataset["x"].shape[1:] != (obs,):
+    if not {"x", "round"} <= dataset.keys() or not dataset["round"].size:
+        return None
+    if dataset["x"].shape != (dataset["round"].size, obs):
         return None
     return robust_sd(dataset["x"][dataset["round"] == dataset["round"].min()])
 
@@ -382,7 +389,10 @@ def _texts(first: Any, second: Any, length: int, default: str) -> tuple[str, ...
 
 def _limits(config: Mapping[str, Any], side: str, dim: int) -> np.ndarray | None:
     limits = config.get(f"feasible_{side}")
-    array = np.asarray([] if limits is None else limits, float)
+    try:
+        array = np.asarray([] if limits is None else limits, float)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"feasible_{side}: expected {dim} numbers in config.json, got {limits!r}") from error
     return array if array.shape == (dim,) else None
 
 

@@ -66,7 +66,7 @@ def _written(folder: Path, makers: Mapping[str, Callable], loaded, render: Calla
             pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
     text = render(pictures)
     index = folder / "report.html"
-    index.write_text(text, encoding="utf-8")
+    index.write_text(text, encoding="utf-8", errors="replace")
     return [index, *(picture.path for picture in pictures)]
 
 

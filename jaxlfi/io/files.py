@@ -15,6 +15,8 @@ from jaxlfi.io.serialise import json_safe
 
 LARGE, DENSE = 2**30, 100
 """Bytes of arrays that any file may unpack to, and to how many times its own size a larger one may."""
+KINDS = "biufSU"
+"""Of arrays that files may hold: booleans, integers, reals and texts."""
 SEAL = "seal"
 """Name of the array that tells whether the others are as they were written."""
 
@@ -98,11 +100,16 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         with zipfile.ZipFile(path) as archive:
             unpacked, packed = sum(member.file_size for member in archive.infolist()), path.stat().st_size
         if unpacked <= max(LARGE, DENSE * packed):
-            with np.load(path, allow_pickle=False) as arrays:
-                return {name: arrays[name] for name in arrays.files}
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
     except Exception as error:  # zipfile, zlib, numpy and the operating system each have their own for a damaged file
         raise ValueError(f"{path}: expected a whole .npz file, got a missing or damaged one") from error
-    raise ValueError(f"{path}: expected arrays, got {packed} bytes that unpack to {unpacked / 2**30:.3g} GiB")
+    if unpacked > max(LARGE, DENSE * packed):
+        raise ValueError(f"{path}: expected arrays, got {packed} bytes that unpack to {unpacked / 2**30:.3g} GiB")
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in KINDS:
+            raise ValueError(f"{path}: expected numbers or texts, got {getattr(array, 'dtype', 'none')} as {name}")
+    return arrays
 
 
 def write_sealed(path: Path, arrays: Mapping[str, Any]) -> None:

@@ -99,7 +99,7 @@ def made_of(kind: type, name: str, values: Any, load: Load) -> Any:
     try:
         return kind(**{field: _decoded(value, load) for field, value in values.items()})
     except TypeError as error:
-        raise ValueError(f"{name}: cannot be made of its description: {error}") from error
+        raise ValueError(f"{name}: expected the description of one, got another: {error}") from error
 
 
 def _encoded(value: Any, name_of: NameOf) -> Any:

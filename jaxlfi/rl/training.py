@@ -178,6 +178,15 @@ def read_config(out: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(config, dict) or (config.get("format"), config.get("version")) != (FORMAT, VERSION):
         raise StoreError(f"expected the folder of a training of this version, got {str(out)!r}")
+    try:
+        settings_of(config)
+        domains, seeds = zip(*((one["domain"], one["seed"]) for one in config["trainings"]), strict=True)
+        texts = all(isinstance(text, str) for text in (*domains, config["environment_name"]))
+        if not texts or not all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds):
+            raise ValueError("names or seeds that are none")
+        config["environment"], config["versions"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise StoreError(f"{out / 'config.json'}: expected a whole description of a training, got: {error}") from error
     return config
 
 

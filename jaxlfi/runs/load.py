@@ -107,7 +107,7 @@ def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space
             task = registry.load(config["task"])
         except ValueError:  # the posterior can be used without it
             return None
-    if task is not None and (task.space != space or list(task.units) != list(config.get("units", task.units))):
+    if task is not None and (task.space != space or list(task.units) != list(config.get("units") or task.units)):
         raise StoreError(
             f"{folder}: expected the task as it was when the run was made, with parameters {list(space.labels)}, "
             f"got {list(task.space.labels)}"
@@ -140,7 +140,11 @@ def _belief(path: Path, space: Space) -> Belief:
 
 def _dataset(path: Path, settings: Settings) -> Dataset:
     arrays = _arrays(path, ("theta", "x", "round", "weight"))
-    size = len(arrays["theta"])
+    size = arrays["round"].size
+    for name, axes in {"theta": 2, "x": 2, "round": 1, "weight": 1}.items():
+        array = arrays[name]
+        if array.ndim != axes or len(array) != size or array.dtype.kind not in "biuf":
+            raise StoreError(f"{path}: expected {size} rows of numbers as {name}, got {list(array.shape)}")
     first = int(np.sum(arrays["round"] == 0))
     room = max(first, settings.simulations_per_round) + (settings.rounds - 1) * settings.simulations_per_round
     filled = {
