@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=500, metavar="N", help="how many (default: 500)")
     parser.add_argument("--first", type=int, default=0, metavar="N", help="number of the first (default: 0)")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of all cases (default: 0)")
+    parser.add_argument("--seconds", type=float, default=float("inf"), metavar="S", help="stop after so long")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder: fuzzing.json, cases.csv")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="a new folder for the files of the last case")
     arguments = parser.parse_args()
@@ -52,6 +53,8 @@ def main() -> None:
         numbers = range(arguments.first, arguments.first + arguments.cases)
         for one in fuzz(root, arguments.seed, track(numbers, "cases", console=console)):
             every.append(one)
+            if time.monotonic() - began > arguments.seconds:
+                break
             if one.finding:
                 words = " ".join(one.case.words)[:300]
                 line = f"{one.number} {one.result.outcome}: {one.case.what[:200]}: {words!r}: {one.result.text}"

@@ -40,7 +40,7 @@ ERROR = re.compile(r"jaxlfi[\w -]*: error: (?P<text>.+)\n")
 """All that a refused command leaves on stderr."""
 NAMED = re.compile(
     r"expected|cannot load|\(choose from |: invalid \w+ value: |unrecognized arguments: |arguments are required: "
-    r"|ignored explicit argument|not allowed with argument|argument is required|ambiguous option"
+    r"|ignored explicit argument|not allowed with argument|arguments? [-, \w]+ is required|ambiguous option"
 )
 """What a line says that names what was expected: by the library, or by argparse."""
 SILENT = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
@@ -197,7 +197,8 @@ def allowed(words: tuple[str, ...], here: Path) -> list[str]:
     given += [word.removeprefix("--out=") for word in words if word.startswith("--out=")]
     if words[:2] == ("whip", "convert"):
         given += words[-1:]
-    given += [f"{here}/own/run"] * (words[:1] and words[0] in OWN)
+    if words and words[0] in OWN:
+        given.append("own/run")
     return [os.path.normpath(here / name.replace("\0", "")) for name in given]
 
 

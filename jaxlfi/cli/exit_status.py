@@ -6,11 +6,10 @@ from collections.abc import Callable
 
 
 def one_line(error: Exception) -> str:
-    """What an error of bad input says, in one line; of the operating system's, what was expected instead."""
+    """What an error of bad input says, in one line; where a path caused it, what was expected instead."""
     text = " ".join(str(error).split()) or type(error).__name__
-    if not isinstance(error, OSError) or "expected" in text:
-        return text
-    return f"expected a file or folder that can be used, got {text}"
+    of_path = isinstance(error, OSError) or text == "embedded null byte"
+    return f"expected a file or folder that can be used, got {text}" if of_path and "expected" not in text else text
 
 
 def exit_status(program: str, work: Callable[[], None], debug: bool = False, advice: Callable[[], str] = str) -> int:

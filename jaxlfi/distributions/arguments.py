@@ -35,6 +35,22 @@ def require_count(value: Any, name: str, least: int = 1, most: int | None = None
     return count
 
 
+def require_texts(value: Any, name: str) -> tuple[str, ...]:
+    """Refuse what is no sequence of texts.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    try:
+        texts = () if isinstance(value, str) else tuple(value)
+    except TypeError:
+        texts = (None,)
+    if isinstance(value, str) or not all(isinstance(text, str) for text in texts):
+        what = "the string " * isinstance(value, str)
+        raise ValueError(f"{name}: expected a sequence of names, got {what}{value!r}")
+    return texts
+
+
 def is_concrete(tree: Any) -> bool:
     """Whether no leaf of a pytree is being traced."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))

@@ -306,6 +306,10 @@ def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{path}: expected {name} of shape {shape}, got {arrays[name].shape}")
+    for name in ("proposal", "support"):
+        low, high = arrays[f"{name}_low"], arrays[f"{name}_high"]
+        if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+            raise ValueError(f"{path}: expected finite bounds with {name}_low below {name}_high, got others")
     for name, shape in {
         "sample_theta_error": (rounds, None, dim),
         "sample_trajectory_error": (rounds, None),

@@ -323,6 +323,8 @@ def changed_machine(config: Mapping[str, Any]) -> list[str]:
 
 
 def _spec(description: dict[str, Any]) -> RunSpec:
+    if type(description["seed"]) is not int:
+        raise StoreError(f"config.json: expected a whole number as the seed of a run, got {description['seed']!r}")
     return RunSpec(
         configuration=description["configuration"],
         support_name=description["support"]["name"],

@@ -80,7 +80,10 @@ def _summaries(task: Task, arrays: Mapping[str, Any], rows: int) -> tuple[jax.Ar
     if ("x" in arrays) == ("trajectory" in arrays):
         raise ValueError("simulations: expected either 'trajectory' or 'x' (summaries), got both or neither")
     if "trajectory" in arrays:
-        trajectory = np.asarray(arrays["trajectory"], np.float32)
+        trajectory = np.asarray(arrays["trajectory"])
+        if trajectory.dtype.kind not in "biuf":
+            raise ValueError(f"simulations: expected trajectories of numbers, got {trajectory.dtype}")
+        trajectory = trajectory.astype(np.float32)
         if trajectory.ndim < 2 or len(trajectory) != rows:
             raise ValueError(f"simulations: expected {rows} trajectories, got shape {list(trajectory.shape)}")
         if not task.on_host and trajectory.shape[1:] != (shape := simulator_shapes(task).trajectory):

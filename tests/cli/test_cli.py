@@ -104,7 +104,7 @@ BAD = {
     "seeds": (["infer", TASK, "--seeds", "0"], "seeds: expected at least 1"),
     "hyperparameter length": (["infer", TASK, "--expansion", "1", "2", "3"], "expansion: expected one finite number or 2"),  # noqa: E501
     "foreign hyperparameter": (["infer", TASK, "--proximity", "0.3"], "proximity: expected a hyperparameter of edge"),
-    "no file": (["infer", TASK, "--observation", "nothing.csv"], "cannot read 'nothing.csv'"),
+    "no file": (["infer", TASK, "--observation", "nothing.csv"], "expected a readable file, got 'nothing.csv'"),
     "no format": (["infer", TASK, "--observation", "x.txt"], "expected a .csv or .npz"),
     "configuration": (["compare", TASK, "--configurations", "ok+x"], "expected support+heuristic"),
     "configurations": (["compare", TASK, "--configurations", "ok", "ok"], "expected distinct ones"),
