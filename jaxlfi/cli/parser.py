@@ -18,7 +18,7 @@ import traceback
 from collections.abc import Mapping, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import jaxlfi
 from jaxlfi import flags, source_fields
@@ -43,6 +43,13 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """One line on stderr, and exit status 2."""
         self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        """The values of a flag; argparse takes the value of `--flag=--` for none, and no value for a right one."""
+        values = super()._get_values(action, arg_strings)
+        if values == [] and action.option_strings and action.nargs in (None, "+"):
+            raise argparse.ArgumentError(action, "expected at least one argument")
+        return values
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from jaxlfi.rl.environment import Environment
 
 PRESETS = ("quick", "paper")
+MAX_SEEDS = 1000
+"""Trainings of a domain side by side."""
 SETTINGS = "jaxlfi.rl.settings:PPO"
 """The class whose fields are the settings of a training."""
 
@@ -198,8 +200,8 @@ def check_seeds(first: int, count: int, name: str) -> None:
 
 
 def _plan(arguments: argparse.Namespace) -> Any:
-    if arguments.seeds < 1:
-        raise ValueError(f"seeds: expected at least 1, got {arguments.seeds}")
+    if not 1 <= arguments.seeds <= MAX_SEEDS:
+        raise ValueError(f"seeds: expected from 1 to {MAX_SEEDS}, got {arguments.seeds}")
     check_seeds(arguments.first_seed, arguments.seeds, "first_seed")
     from jaxlfi.rl import registry
     from jaxlfi.rl.settings import PRESETS as SETTINGS_OF

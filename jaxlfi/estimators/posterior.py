@@ -73,7 +73,10 @@ class Posterior:
         Raises:
             ValueError: for another number of parameters.
         """
-        theta = jnp.asarray(theta, jnp.float32)
+        try:
+            theta = jnp.asarray(theta, jnp.float32)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise ValueError(f"theta: expected numbers of shape [..., {self.space.dim}], got {theta!r}") from error
         if theta.ndim == 0 or theta.shape[-1] != self.space.dim:
             raise ValueError(f"theta: expected shape [..., {self.space.dim}], got {list(theta.shape)}")
         return _log_prob(self, theta, is_natural(space))

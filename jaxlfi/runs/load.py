@@ -131,10 +131,16 @@ def _prior(folder: Path, config: dict[str, Any], task: Task | None, settings: Se
 
 def _belief(path: Path, space: Space) -> Belief:
     names = ("logits", "means", "scale_tril", "support_low", "support_high")
-    logits, means, scale_tril, low, high = (jnp.asarray(_arrays(path, names)[name]) for name in names)
-    components, dim = len(logits), space.dim
-    if means.shape != (components, dim) or scale_tril.shape != (components, dim, dim) or low.shape != (dim,):
-        raise StoreError(f"{path}: expected a mixture over {dim} parameters, got means of shape {list(means.shape)}")
+    arrays = _arrays(path, names)
+    components, dim = arrays["logits"].size, space.dim
+    shapes = (components,), (components, dim), (components, dim, dim), (dim,), (dim,)
+    for name, shape in zip(names, shapes, strict=True):
+        array = arrays[name]
+        if array.shape != shape or array.dtype.kind not in "biuf" or np.isnan(array).any():
+            raise StoreError(f"{path}: expected numbers {name} of shape {list(shape)}, got others")
+    logits, means, scale_tril, low, high = (jnp.asarray(arrays[name]) for name in names)
+    if not (low < high).all():
+        raise StoreError(f"{path}: expected support_low below support_high, got others")
     return Belief(GaussianMixture(logits, means, scale_tril), Support(low, high), jnp.asarray(True))
 
 
