@@ -6,10 +6,10 @@ OUT ?= runs/demo
 # Worker processes of the tests: one more than two cores, as some tests wait for processes that they start.
 WORKERS ?= 3
 
-.PHONY: demo test lint docs bench clean help
+.PHONY: demo test test-all lint docs bench clean help
 
 help:  ## what there is to make
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
 # Python compiles what it imports; all that is installed would take longer than the installation.
 $(VENV)/.installed: pyproject.toml setup.py constraints.txt
@@ -21,8 +21,13 @@ demo: $(VENV)/.installed  ## the main job: supports and heuristics compared on L
 	$(BIN)/jaxlfi compare lotka_volterra --preset quick --seeds 6 --out $(OUT)
 
 # What the tests of a file share is made once, as one process runs them all; files in the order of tests/conftest.py.
-test: $(VENV)/.installed  ## all tests
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+
+test: $(VENV)/.installed  ## all tests but slow ones
+	$(PYTEST) -m "not slow"
+
+test-all: $(VENV)/.installed  ## all tests
+	$(PYTEST)
 
 lint: $(VENV)/.installed  ## style
 	$(BIN)/ruff check .

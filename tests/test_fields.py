@@ -487,6 +487,7 @@ def test_name_of_a_class_leads_back_to_it():
     assert plugins.named("class", plugins.name_of("jaxlfi.heuristics", jaxlfi.Support)) is jaxlfi.Support
 
 
+@pytest.mark.slow
 def test_a_run_with_a_choice_is_saved_and_says_what_it_was_run_with(tmp_path):
     rule = Choice(1, (Edge(), Matched(Mode(expansion=np.array([0.1, 0.3], np.float32))), Truncate()))
     settings = small.settings(rounds=1, predictive=False)

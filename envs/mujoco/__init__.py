@@ -17,12 +17,21 @@ def task(config: Path | None = None, log: tuple[Path, ...] = ()):
         ImportError: where MuJoCo is not installed, with what to install.
         ValueError: for whatever does not fit together, in one line.
     """
-    try:
-        import mujoco  # noqa: F401
-    except ImportError as error:
-        raise ImportError("tasks of MuJoCo models need MuJoCo: pip install 'jaxlfi[mujoco]'") from error
+    require_mujoco()
     if config is None:
         raise ValueError("config: expected a TOML file that describes a task, as mujoco,config=arm.toml; got none")
     from jaxlfi.envs.mujoco.config import read
 
     return read(config, log)
+
+
+def require_mujoco() -> None:
+    """Check that MuJoCo is there.
+
+    Raises:
+        ImportError: where it is not, with what to install.
+    """
+    try:
+        import mujoco  # noqa: F401
+    except ImportError as error:
+        raise ImportError("tasks of MuJoCo models need MuJoCo: pip install 'jaxlfi[mujoco]'") from error

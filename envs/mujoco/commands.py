@@ -13,9 +13,11 @@ import jaxlfi
 from jaxlfi import plot
 from jaxlfi.envs.mujoco import config, least_squares
 from jaxlfi.envs.mujoco.least_squares import Fit
+from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.io import files
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs.folder import environment
+from jaxlfi.runs.run import Run
 from jaxlfi.tasks.task import Task
 
 ALIKE = 0.95
@@ -34,10 +36,10 @@ def fit(arguments: argparse.Namespace) -> None:
     source, out = Path(arguments.source), arguments.out
     if out is not None and out.exists():
         raise ValueError(f"--out: expected a new folder, got {out}")
+    if not source.exists():
+        raise ValueError(f"{source}: expected the folder of a run, or a TOML file that describes a task; got neither")
     run = None if source.is_file() else jaxlfi.load(source)
-    task = config.read(source) if run is None else run.task
-    if task is None:
-        raise ValueError(f"{source}: expected a run whose task can be found, got one whose task cannot")
+    task = config.read(source) if run is None else task_of(run)
     starts = _over_feasible(task, arguments.starts) if run is None else np.asarray(run.draws(arguments.starts))
     observation = None if run is None else np.asarray(run.observed)
     console = Console()
@@ -63,7 +65,21 @@ def fit(arguments: argparse.Namespace) -> None:
         log = [name for name, own in zip(names, task.space.log, strict=True) if own]
         truth = None if task.truth is None else np.asarray(task.truth)
         plot.pairs(sets, names=names, units=task.units, log=log, truth=truth, path=out / "pairs.png", dpi=150)
-        console.print(f"results: {out}", markup=False, highlight=False)
+        console.print(f"results: {out}", markup=False, highlight=False, soft_wrap=True)
+
+
+def task_of(run: Run) -> Task:
+    """A run's task.
+
+    Raises:
+        ValueError: where it cannot be found.
+    """
+    if run.task is None:
+        raise ValueError(
+            f"run: expected to find its task, {run.origin.reference or 'which was made in Python'}: "
+            "where paths are relative, go to the folder that the run was made in"
+        )
+    return run.task
 
 
 def said(task: Task, fits: Sequence[Fit]) -> list[str]:
@@ -85,7 +101,7 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
         f"The integrator's own error is {best.defect:.2f} times the noise, and is taken off."
     )
     lines.append("What the model gets wrong, for the file of the task:\n\n[discrepancy]")
-    for name, one in zip(task.simulate.function.signals, best.discrepancies, strict=True):
+    for name, one in zip(simulator_of(task).signals, best.discrepancies, strict=True):
         lines.append(f'"{name}" = {{ deviation = {one.deviation:.2g}, time = {one.time:.2g} }}')
     return lines
 

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy, estimated
-from jaxlfi.envs.mujoco.simulator import Simulator
+from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.tasks.task import Task
 
 STEP = 1e-4
@@ -73,9 +73,7 @@ class Residuals:
         Raises:
             ValueError: for a task of another kind.
         """
-        simulator = getattr(task.simulate, "function", None)
-        if not isinstance(simulator, Simulator):
-            raise ValueError(f"task: expected one of a MuJoCo model, got {task.name}")
+        simulator = simulator_of(task)
         self._log, self.simulator, self.simulations = np.asarray(task.space.log), simulator, 0
         self.observed = np.asarray(simulator.observation if observation is None else observation, float)
         there = simulator.there

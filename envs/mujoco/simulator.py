@@ -16,6 +16,8 @@ from jaxlfi.envs.mujoco.effects import Effects
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.quiet import quietly
 from jaxlfi.io.host_devices import processors
+from jaxlfi.tasks.task import Task
+from jaxlfi.tasks.worker import OneOfBatch
 
 CHUNK = 128
 """Models that are rolled out in one call, which bounds the memory of their states."""
@@ -160,6 +162,23 @@ class Simulator:
         rows[outcome != 0] = 0.0
         return rows, outcome
 
+    def states(
+        self, theta: Float[np.ndarray, "n dim"], episode: int = 0
+    ) -> tuple[list[mujoco.MjModel], Float[np.ndarray, " steps"], Float[np.ndarray, "n steps state"]]:
+        """Models of parameter vectors, times of their steps in an episode, and their states (`effects.STATE`) then.
+
+        States of simulations that become unstable begin anew, as `clean` counts them.
+
+        Raises:
+            ValueError: for models that MuJoCo refuses.
+        """
+        theta = np.asarray(theta, float)
+        models, grid = [self._build(row) for row in theta], self._grid(self.times[episode])
+        start, controls = self._start(episode, theta), self._controls(self._logs[episode], theta, grid)
+        with _LOCK, quietly():
+            states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self._model), start, controls)
+        return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
+
     def _rolled(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         models = [self._made(row) for row in theta]
         outcome = np.array([0 if model else REFUSED for model in models])
@@ -171,23 +190,27 @@ class Simulator:
             self._pool = mujoco.rollout.Rollout(nthread=self._threads)
         data = [mujoco.MjData(self._model) for _ in range(self._threads)]
         begin = 0
-        for log, times, own in zip(self._logs, self.times, self._starts, strict=True):
-            start = np.tile(own, (len(good), 1))
-            for place, d in self._does.starts:
-                start[:, place] = theta[good, d]
-            grid = self._grid(times)
+        for episode, (log, times) in enumerate(zip(self._logs, self.times, strict=True)):
+            start, grid = self._start(episode, theta[good]), self._grid(times)
             states, sensors = self._pool.rollout(
                 [models[row] for row in good], data, start, self._controls(log, theta[good], grid)
             )
             # MuJoCo begins anew where a simulation has become unstable, and its clock with it.
             step = self._model.opt.timestep
-            stopped = np.abs(states[:, -1, 0] - own[0] - len(grid) * step) > step / 2
+            stopped = np.abs(states[:, -1, 0] - start[:, 0] - len(grid) * step) > step / 2
             values = sensors[:, :, self._places]
             stopped |= ~np.isfinite(values).all(axis=(1, 2)) | ~np.isfinite(states[:, -1]).all(axis=1)
             outcome[good[stopped]] = UNSTABLE
             rows[good, begin : begin + len(times)] = _between(grid, values, times)
             begin += len(times)
         return rows, outcome
+
+    def _start(self, episode: int, theta: np.ndarray) -> np.ndarray:
+        """States that an episode begins in, one for each parameter vector."""
+        start = np.tile(self._starts[episode], (len(theta), 1))
+        for place, d in self._does.starts:
+            start[:, place] = theta[:, d]
+        return start
 
     def _grid(self, times: np.ndarray) -> np.ndarray:
         """Times of the model's steps that reach beyond an episode's last measurement."""
@@ -207,6 +230,20 @@ class Simulator:
             return self._build(theta)
         except ValueError:
             return None
+
+
+def simulator_of(task: Task) -> Simulator:
+    """The simulator of a task.
+
+    Raises:
+        ValueError: for a task that is not of a MuJoCo model.
+    """
+    function = getattr(task.simulate, "function", None)
+    if isinstance(function, OneOfBatch):  # of a run whose simulations were made one by one, as --workers makes them
+        function = function.function
+    if not isinstance(function, Simulator):
+        raise ValueError(f"task: expected one of a MuJoCo model, got {task.name}")
+    return function
 
 
 def _between(grid: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:

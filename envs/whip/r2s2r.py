@@ -82,23 +82,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         0; 2 for bad input; 130 where it was interrupted.
     """
     arguments = parser().parse_args(argv)
-    go_on = "; the same command goes on from here"
+    go_on = lambda: "; the same command goes on from here" if (arguments.out / "config.json").exists() else ""
     try:
-        return exit_status("jaxlfi r2s2r", lambda: _loop(arguments), arguments.debug, lambda: go_on)
+        return exit_status("jaxlfi r2s2r", lambda: _loop(arguments), arguments.debug, go_on)
     except StageError as stage:  # which has said why
         if stage.status == 130:
-            print(f"jaxlfi r2s2r: interrupted{go_on}", file=sys.stderr)
+            print(f"jaxlfi r2s2r: interrupted{go_on()}", file=sys.stderr)
         return stage.status
 
 
 def _loop(arguments: argparse.Namespace) -> None:
     require_mujoco()
     _begin(arguments)
-    policies = _round_and_round(arguments)
-    _deploy(arguments, policies)
     from jaxlfi.envs.whip.r2s2r_page import write
+    from jaxlfi.io.locks import locked
 
-    print(f"wrote {write(arguments, policies)}")
+    with locked(arguments.out):
+        policies = _round_and_round(arguments)
+        _deploy(arguments, policies)
+        print(f"wrote {write(arguments, policies)}")
 
 
 # ------------------------------------------------------------------------------------------------------------ stages
@@ -167,7 +169,7 @@ def _round_and_round(arguments: argparse.Namespace) -> list[Path]:
 
 
 def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
-    if not (out / "table.csv").exists():
+    if not (out / "curves.png").exists():  # the last of its files
         steps = [] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)]
         preset = ["--preset", arguments.preset, "--first-seed", str(arguments.seed)]
         begun = (out / "config.json").exists()
@@ -211,11 +213,13 @@ def _rollout(arguments: argparse.Namespace, policy: Path, path: Path, iteration:
 
 
 def _infer(arguments: argparse.Namespace, rollouts: Sequence[Path], out: Path) -> Path:
-    if not (out / "posterior.npz").exists():
+    if not (out / "report.html").exists():  # the last of its files
         words = ["infer", _whip(arguments), "--object", *map(str, rollouts), "--heuristic", arguments.heuristic]
         words += ["--preset", arguments.preset, "--first-seed", str(arguments.seed), "--out", str(out)]
         begun = (out / "config.json").exists()
         _command(command_line.main, ["resume", str(out)] if begun else words, f"what {arguments.object} may be")
+        if not (out / "report.html").exists():  # it was stopped while it drew its pictures
+            _command(command_line.main, ["report", str(out)], "its pictures")
     return out
 
 

@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
@@ -21,6 +22,7 @@ from jaxlfi.distributions.truncation import TRIES
 from jaxlfi.heuristics import registry as heuristics
 from jaxlfi.io import files as atomic
 from jaxlfi.io import host_devices
+from jaxlfi.io.locks import locked
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import export
@@ -38,8 +40,8 @@ from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.task import Task
 
 Prepared = tuple[Path, tuple[BatchPlan, Observed] | Work]
-EXPECTED = (SimulatorError, CheckpointError, run_store.StoreError)
-"""Errors that the input of a run causes; they are reported in one line."""
+EXPECTED = (SimulatorError, CheckpointError, run_store.StoreError, OSError)
+"""Errors that the input of a run causes, and the disk; they are reported in one line."""
 LOW_MASS = 0.01
 """Mass of the posterior inside its support below which `jaxlfi sample` warns."""
 DIAGNOSTICS = "diagnostics"
@@ -129,7 +131,14 @@ def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, fir
                 console, f"only {mass:.2g} of the prior lies in {name}: {missed:.0%} of its draws are uniform instead"
             )
     executing.begin(arguments.out, plan, observed)
+    _hold(arguments, arguments.out)
     return arguments.out, (plan, observed)
+
+
+def _hold(arguments: argparse.Namespace, folder: Path) -> None:
+    """Keep other processes out of a folder until the command ends, but those that `jax.distributed` has joined."""
+    if jax.process_index() == 0:
+        arguments.closing.enter_context(locked(folder))
 
 
 def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
@@ -156,12 +165,16 @@ def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
     observation = asked.observation_of(arguments, task)
     run_store.refuse_occupied(arguments.out)
     _say(console, f"{task.name}: compiling for {plan.size} runs")
-    return arguments.out, grid.begin(arguments.out, plan, observation, arguments.runs_per_chunk)
+    work = grid.begin(arguments.out, plan, observation, arguments.runs_per_chunk)
+    _hold(arguments, arguments.out)
+    return arguments.out, work
 
 
 def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     """Prepare `jaxlfi resume`: nothing is left to do where the run is complete."""
     folder = arguments.folder
+    if folder.is_dir():
+        _hold(arguments, folder)
     if grid.is_grid(folder):
         return _resume_grid(folder, console)
     if train.is_training(folder):
@@ -274,7 +287,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
         with RoundProgress(console, plan.settings.rounds, done, label) as progress:
             on_round = lambda index, row: progress.advance()
             runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated)
-    except ExecutorError:
+    except (ExecutorError, OSError):
         raise  # the simulator is not to blame: the folder can be gone on from, with the simulations it has
     except Exception:
         if arguments.command != "resume" and not executing.rounds_done(folder):
@@ -294,12 +307,15 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
 
 def advice(error: Exception, prepared: Prepared) -> str:
     """What to do about an error of a run, for the end of its line."""
-    return f"; continue with: jaxlfi resume {prepared[0]}" if isinstance(error, ExecutorError) else ""
+    from_outside = isinstance(error, ExecutorError | OSError)  # a lost cluster, a full disk
+    return f"; continue with: jaxlfi resume {prepared[0]}" if from_outside and prepared[0].exists() else ""
 
 
 def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: Console) -> None:
     try:
         arrays = grid.advance(folder, work, console)
+    except OSError:
+        raise  # as of a full disk: the folder can be gone on from
     except Exception:
         if arguments.command != "resume" and not (folder / "chunks").exists():
             shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from

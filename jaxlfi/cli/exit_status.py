@@ -19,7 +19,7 @@ def exit_status(program: str, work: Callable[[], None], debug: bool = False, adv
         program: its name, for errors.
         work: raises ValueError, OSError or ImportError for bad input.
         debug: show where an error came from.
-        advice: what to say after "interrupted"; asked when it is.
+        advice: what to say after "interrupted", and of a failing disk; asked then.
 
     Returns:
         0; 2 for bad input; 130 where it was interrupted.
@@ -29,7 +29,8 @@ def exit_status(program: str, work: Callable[[], None], debug: bool = False, adv
     except (ValueError, OSError, ImportError) as error:
         if debug:
             traceback.print_exception(error)
-        print(f"{program}: error: {one_line(error)}", file=sys.stderr)
+        go_on = advice() if isinstance(error, OSError) and not isinstance(error, BlockingIOError) else ""
+        print(f"{program}: error: {one_line(error)}{go_on}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"{program}: interrupted{advice()}", file=sys.stderr)

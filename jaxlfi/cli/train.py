@@ -91,6 +91,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from rich.console import Console
 
     from jaxlfi.io import compile_cache
+    from jaxlfi.io.locks import locked
 
     compile_cache.enable()
     plan = _plan(arguments)
@@ -99,7 +100,10 @@ def _train(arguments: argparse.Namespace) -> None:
     training.begin(plan, arguments.out)
     try:
         console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
-        run(arguments.out, plan.environment, console, not arguments.no_figures)
+        with locked(arguments.out):
+            run(arguments.out, plan.environment, console, not arguments.no_figures)
+    except OSError:
+        raise  # as of a full disk, or of another process that goes on with it: the folder is not to be lost
     except Exception:
         if not (training.updates_done(arguments.out) or training.finished(arguments.out)):
             shutil.rmtree(arguments.out)  # made by this very command, and there is nothing in it to go on from
@@ -175,6 +179,7 @@ def resume(out: Path, console: "Console", figures: bool) -> None:
 
     config = training.read_config(out)
     if training.finished(out):
+        training.clean(out)
         if figures and not (out / "curves.png").exists():  # it was stopped while it drew them
             draw(out, console)
         console.print(f"{out} is complete: nothing to resume", markup=False)

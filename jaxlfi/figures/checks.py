@@ -45,7 +45,7 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
                 pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
     text = page.render_diagnostics(found, pictures)
     index = folder / "report.html"
-    index.write_text(text, encoding="utf-8", errors="replace")
+    files.write_bytes(index, text.encode(errors="replace"))
     return [index, *(picture.path for picture in pictures)]
 
 

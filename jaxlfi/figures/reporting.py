@@ -25,6 +25,7 @@ from jaxlfi.figures.collection import Collection, Runs, open_collection, represe
 from jaxlfi.figures.history import History, read_config
 from jaxlfi.figures.page import Picture
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
+from jaxlfi.io import files
 
 COLUMNS = ("ok", "misspecified", "broad", "misspecified+edge")
 """The configurations to show side by side, where there are more than `MAX_COLUMNS`."""
@@ -66,7 +67,7 @@ def _written(folder: Path, makers: Mapping[str, Callable], loaded, render: Calla
             pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
     text = render(pictures)
     index = folder / "report.html"
-    index.write_text(text, encoding="utf-8", errors="replace")
+    files.write_bytes(index, text.encode(errors="replace"))
     return [index, *(picture.path for picture in pictures)]
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import io
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,6 +17,8 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.colors import BoundaryNorm, Colormap, LinearSegmentedColormap, ListedColormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+
+from jaxlfi.io import files
 
 COLUMN_WIDTH = 3.5
 """Width of a paper's column in inches."""
@@ -301,6 +304,8 @@ def new_figure(width: float, height: float) -> Figure:
 
 def save(figure: Figure, path: Path, dpi: float) -> Path:
     """Write a figure as png and return the path."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=dpi)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dpi)
+    files.write_bytes(path, content.getvalue())
     return path

@@ -1,5 +1,6 @@
 """Writing files so that a reader, or a process killed at any moment, only ever leaves or sees whole ones."""
 
+import contextlib
 import io
 import json
 import os
@@ -22,7 +23,7 @@ SEAL = "seal"
 
 
 def write_bytes(path: Path, content: bytes, durable: bool = False) -> None:
-    """Write a temporary file in the same folder, then move it into place.
+    """Write a temporary file in the same folder, then move it into place; nothing of it is left where that fails.
 
     Args:
         path: where to.
@@ -30,12 +31,29 @@ def write_bytes(path: Path, content: bytes, durable: bool = False) -> None:
         durable: wait until it is on the disk, so that it also outlives a loss of power.
     """
     part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        file.write(content)
-        if durable:
-            file.flush()
-            os.fsync(file.fileno())
-    part.replace(path)
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:  # a full disk is not made fuller
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
+    if durable:
+        flush(path.parent)
+
+
+def flush(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk, where the file system can say so."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def write_json(path: Path, value: Any) -> None:

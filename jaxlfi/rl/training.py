@@ -7,6 +7,7 @@ DOMAIN/seed_000/policy.npz ...         the policies (`jaxlfi.rl.policy`)
 DOMAIN/seed_000/events...              where they were asked for (`jaxlfi.rl.tensorboard`)
 """
 
+import contextlib
 import csv
 import dataclasses
 import functools
@@ -160,7 +161,7 @@ def resumed(out: Path, environment: Environment, on_chunk: Callable[[int, Mappin
     outcomes = {name: np.asarray(value) for name, value in outcomes.items()}
     result = Result(names, curves, outcomes, state)
     _write_result(out, environment, config, result)
-    checkpoint.unlink()
+    clean(out)
     return result
 
 
@@ -198,6 +199,12 @@ def settings_of(config: Mapping[str, Any]) -> PPO:
 def updates_done(out: Path) -> int:
     """Updates that the checkpoint of a training has behind it."""
     return int(_read(out / "checkpoint.npz")["done"]) if (out / "checkpoint.npz").exists() else 0
+
+
+def clean(out: Path) -> None:
+    """Remove from the folder of finished trainings what only an unfinished one needs, where it can be written."""
+    with contextlib.suppress(OSError):
+        (out / "checkpoint.npz").unlink(missing_ok=True)
 
 
 def finished(out: Path) -> bool:
@@ -249,8 +256,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _write_result(out: Path, environment: Environment, config: Mapping[str, Any], result: Result) -> None:
-    files.write_arrays(out / "curves.npz", dict(result.curves))
-    files.write_arrays(out / "outcomes.npz", dict(result.outcomes))
+    files.write_arrays(out / "curves.npz", dict(result.curves), durable=True)
+    files.write_arrays(out / "outcomes.npz", dict(result.outcomes), durable=True)
     facts = [name for name in result.outcomes if name not in NOT_FACTS]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -263,4 +270,4 @@ def _write_result(out: Path, environment: Environment, config: Mapping[str, Any]
         ppo.as_file(environment, params, **recorded).save(folder / "policy.npz")
         means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]
         writer.writerow([domain, seed, *(f"{mean:.4f}" for mean in means)])
-    files.write_bytes(out / "table.csv", text.getvalue().encode())
+    files.write_bytes(out / "table.csv", text.getvalue().encode(), durable=True)

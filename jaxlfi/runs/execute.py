@@ -352,6 +352,7 @@ def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
     """Write every run's results and a comparison's table, and then that the folder is complete."""
     for run, name in zip(runs, plan.folders(), strict=True):
         folders.write_run(folder / name, run, plan.keep_network)
+        atomic.flush(folder / name / "ledger.jsonl")  # the checkpoint, which could complete it, is going to be removed
     if plan.kind == COMPARE:
         lines = results(plan, runs)
         order = list(dict.fromkeys(line["configuration"] for line in lines))

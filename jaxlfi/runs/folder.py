@@ -220,12 +220,14 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
             "log": np.asarray(run.space.log),
             "names": labels,
         },
+        durable=True,
     )
     dataset = jax.device_get(run.dataset)
     rows = slice(int(dataset.size))
     columns = {name: getattr(dataset, name)[rows] for name in ("theta", "x", "round", "weight")}
-    atomic.write_arrays(folder / "dataset.npz", columns | {"names": labels})
-    atomic.write_arrays(folder / "history.npz", history | {"reasons": np.asarray(task.reasons), "names": labels})
+    atomic.write_arrays(folder / "dataset.npz", columns | {"names": labels}, durable=True)
+    kept = history | {"reasons": np.asarray(task.reasons), "names": labels}
+    atomic.write_arrays(folder / "history.npz", kept, durable=True)
     unknown = np.full(task.dim, np.nan, np.float32)
     atomic.write_arrays(
         folder / "observation.npz",
@@ -240,9 +242,10 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
             "times": np.arange(len(run.observed)) if task.times is None else task.times,
             "record_label": np.asarray(task.record_label or ("record" if task.times is None else "time")),
         },
+        durable=True,
     )
     if keep_network or run.amortised or not run.settings.estimator.closed_form:
-        atomic.write_arrays(folder / "network.npz", trees.named_leaves(run.network))
+        atomic.write_arrays(folder / "network.npz", trees.named_leaves(run.network), durable=True)
 
 
 def save(run: "Run", folder: Path) -> Path:
@@ -267,7 +270,7 @@ def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     writer.writeheader()
     for line in lines:
         writer.writerow({name: "" if value != value else value for name, value in line.items()})
-    atomic.write_bytes(path, text.getvalue().encode())
+    atomic.write_bytes(path, text.getvalue().encode(), durable=True)
 
 
 def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) -> dict[str, Any]:

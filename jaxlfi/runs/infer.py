@@ -23,10 +23,11 @@ from jaxlfi.distributions.space import SpaceName
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.heuristics import Edge, Heuristic, paired, registry
+from jaxlfi.io.locks import locked
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import folder as folders
-from jaxlfi.runs.execute import BatchPlan
+from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Origin, Run, SupportWarning
 from jaxlfi.tasks.executors import one_by_one
@@ -138,12 +139,15 @@ def infer(
 def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Callback | None, out: Path | None) -> Run:
     """A batch of one run, in memory or in a folder."""
     observed = executing.prepare(plan, observation, first)
-    if out is not None:
-        if not (out / "config.json").exists():
-            executing.begin(out, plan, observed)
+    if out is None:
+        return _executed(plan, observed, progress, callback, None)
+    if not (out / "config.json").exists():
+        executing.begin(out, plan, observed)
+    with locked(out):
         config = folders.read_config(out)
         _require_same(out, config, plan)
         if config.get("status", "finished") == "finished":
+            executing.clean(out)
             run = load(out, plan.task)
             _require_observation(out, run.observed, observed.trajectory[0])
             if observed.first is not None or run.origin.given_simulations:
@@ -153,7 +157,13 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
         _, recorded = executing.reopen(out, plan.task)
         _require_observation(out, recorded.trajectory[0], observed.trajectory[0])
         _require_simulations(out, _kept(recorded.first), _kept(observed.first))
-        observed = recorded
+        run = _executed(plan, recorded, progress, callback, out)
+        executing.finish(out, plan, [run])
+        return run
+
+
+def _executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Callback | None, out: Path | None) -> Run:
+    """The run of a batch of one, with a progress bar."""
     console = Console(quiet=not progress)
     with RoundProgress(console, plan.settings.rounds, 0, f"{plan.task.name}: 1 run") as bar:
 
@@ -163,8 +173,6 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
                 callback(index, executing.run_row(row, 0, None))
 
         (run,) = executing.execute(plan, observed, out, each, bar.compiled, bar.simulated)
-    if out is not None:
-        executing.finish(out, plan, [run])
     return run
 
 

@@ -56,7 +56,7 @@ class ChunkStore:
         count = len(self.chunks[index])
         results = {name: np.asarray(arrays[name])[:count] for name in self.names}
         label = {"fingerprint": np.asarray(self.fingerprint), "seconds": np.asarray(seconds)}
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(exist_ok=True)  # in a folder that was moved away meanwhile, nothing is begun
         atomic.write_arrays(self.path(index), results | label, durable=True)
 
     def read(self, index: int) -> dict[str, np.ndarray]:

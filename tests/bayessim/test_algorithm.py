@@ -142,6 +142,7 @@ def sequential():
     return infer(settings, ("misspecified",) * 2 + ("ok",) * 5, 1, (0, 1) + (0,) * 5)
 
 
+@pytest.mark.slow
 def test_without_correction_the_mean_is_right_and_the_covariance_too_small(sequential):
     """Pooled proposals count the data again: a p~ like the posterior halves the covariance.
 
@@ -236,6 +237,7 @@ def test_run_is_a_loop_of_steps():
     chex.assert_trees_all_close(first(), (jax.device_get(state), expected), rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_vmap_is_a_loop_over_seeds_thresholds_and_learning_rates():
     seeds, rates, thresholds = (0, 7), (1e-2, 2e-3), (0.005, 0.9)
 

@@ -125,6 +125,7 @@ np.savez(sys.argv[1], *map(np.asarray, jax.tree.leaves(state)))
 """
 
 
+@pytest.mark.slow
 def test_two_devices_give_what_one_gives(stepped, tmp_path):
     """Five runs on two devices: one of them is padding."""
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"

@@ -86,6 +86,7 @@ def test_runs_end_one_by_one_and_stay_as_they_are(together):
         assert not np.any(rows["low_shift"][rounds:, run])
 
 
+@pytest.mark.slow
 def test_a_run_by_itself_makes_the_same_rounds(together):
     state, rows = together
     run = jaxlfi.infer(
@@ -96,6 +97,7 @@ def test_a_run_by_itself_makes_the_same_rounds(together):
     np.testing.assert_allclose(run.history["means"], rows["means"][:rounds, 2], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_traced_run_makes_the_same_rounds(together):
     state, rows = together
     infer = lambda key: jaxlfi.infer(
@@ -108,6 +110,7 @@ def test_a_traced_run_makes_the_same_rounds(together):
     np.testing.assert_allclose(runs.belief.mixture.means, rows["means"][-1, :2], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_host_simulator_is_not_called_for_runs_at_their_end(whole_runs):  # noqa: F811 - the fixture
     counting = Counting()
     task = dataclasses.replace(gaussian(), simulate=HostSimulator(counting))
@@ -120,6 +123,7 @@ def test_a_host_simulator_is_not_called_for_runs_at_their_end(whole_runs):  # no
     assert np.all(np.isfinite(rows["sample_trajectory_error"]))  # of runs at their end, as was seen before
 
 
+@pytest.mark.slow
 def test_a_run_that_settled_before_it_was_killed_resumes_to_the_same_bits(tmp_path, whole_runs):  # noqa: F811
     rule = Edge()
     spec = RunSpec("misspecified+edge", "misspecified", gaussian().support("misspecified"), rule, 2)

@@ -48,6 +48,7 @@ def test_the_posterior_is_the_exact_one():
     np.testing.assert_allclose(np.sqrt(np.diag(run.mixture.covariance)), deviation, rtol=0.4)
 
 
+@pytest.mark.slow
 def test_it_is_deterministic_and_leaves_the_same_files(tmp_path):
     arguments = ["infer", REFERENCE, "--support", "misspecified"]
     for name in ("a", "b"):

@@ -113,6 +113,7 @@ def test_proposals_are_so_many_times_as_wide(restriction, key):
     assert abs(np.corrcoef(theta.T)[0, 1] - correlation) < 0.03
 
 
+@pytest.mark.slow
 def test_a_round_keeps_what_it_drew_from(key):
     """Corrections divide by it."""
     task, wide = gaussian(), settings(inflation=2.0, restriction="reject", correction="importance")

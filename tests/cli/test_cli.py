@@ -321,6 +321,7 @@ def test_npz_files_that_cannot_be_an_observation(tmp_path, capsys):
         assert "cannot read" in error_line(capsys, *arguments)
 
 
+@pytest.mark.slow
 def test_a_simulator_that_breaks_its_contract_leaves_nothing(tmp_path, capsys):
     for name, expected in (("wrong_shape", "expected numbers of shape"), ("failing", "got none (failed: 25")):
         task = f"tests.cli.test_cli:{name}"

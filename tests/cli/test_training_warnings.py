@@ -40,6 +40,7 @@ def test_each_configuration_without_a_simulation_to_begin_with_is_named():
     assert warning.startswith("wrong: all simulations of the first round failed in 2 of 3 runs")
 
 
+@pytest.mark.slow
 def test_training_that_diverges_is_warned_of(tmp_path, capsys):
     """By steps of a million; the run ends all the same."""
     out = tmp_path / "run"

@@ -184,6 +184,7 @@ def test_conditioning_is_the_same_compiled_and_not(case):
     np.testing.assert_allclose(eager.mixture.covariance, case.posterior.mixture.covariance, atol=0.05)
 
 
+@pytest.mark.slow
 def test_conditioning_can_be_mapped_over_observations(case):
     x = jnp.stack([X, -X])
     both = jax.jit(jax.vmap(lambda x: case.network.condition(x, BOX).log_prob(BOX.centre, space="inference")))(x)

@@ -24,6 +24,7 @@ def samples(shift: float, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     return (units * first).astype(np.float32), (units * (scale * second + [0, shift])).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [0.0, 1.0, 3.0])
 def test_shifted_gaussians_are_distinguished_as_well_as_can_be(shift):
     """The best accuracy is Phi(d / 2); three standard errors of 800 rows, and what a trained classifier loses."""

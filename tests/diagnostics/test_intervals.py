@@ -75,6 +75,7 @@ def test_faults_are_called_by_name(scale, shift, verdict):
         np.testing.assert_allclose(np.mean([one.held[1].value for one in found]), inside, atol=0.03)
 
 
+@pytest.mark.slow
 def test_calibrated_posteriors_are_rarely_called_wrong():
     """None of 4 parameters, with a probability of 94 % at least; most are honest with 100 truths, few with 40."""
     found = {count: [check_intervals(*case(seed, 1.0, 0.0, count, 4)) for seed in range(50)] for count in (40, 100)}

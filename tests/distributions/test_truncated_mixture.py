@@ -123,6 +123,7 @@ def test_the_mirrored_mixture_in_the_mirrored_box_is_mirrored(key):
         assert stats.ks_2samp(draws[:, d], 2 * centre - draws[:, d]).pvalue < 1e-6
 
 
+@pytest.mark.slow
 def test_it_agrees_with_rejection_where_much_is_inside(key):
     """Ten dimensions, half of the mass inside."""
     mixture = GaussianMixture(jnp.zeros(1), jnp.full((1, 10), 0.5), jnp.eye(10)[None])

@@ -46,49 +46,58 @@ def near_exact(exact, draws) -> None:
     np.testing.assert_array_less(np.std(draws, axis=0), 2.5 * sd)
 
 
+@pytest.mark.slow
 def test_an_own_simulator_is_inferred_from_a_wrong_guess(capsys):
     draws = ran("own_simulator")
     np.testing.assert_array_less(far(draws, [6.0, 0.5]), 3.0)
     assert "stiffness" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_host_simulator_is_inferred(capsys):
     draws = ran("host_simulator")
     np.testing.assert_array_less(far(draws, [0.5, 0.2]), 3.0)
     assert "without an outbreak" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_own_heuristic_finds_the_exact_posterior():
     exact, draws = ran("own_heuristic")
     sd = np.sqrt(np.diag(exact.covariance))
     np.testing.assert_array_less(np.abs(np.mean(draws, axis=0) - exact.mean) / sd, 2.0)
 
 
+@pytest.mark.slow
 def test_an_own_estimator_finds_the_exact_posterior():
     near_exact(*ran("own_estimator"))
 
 
+@pytest.mark.slow
 def test_a_prior_over_logarithms_gives_the_posterior_on_a_grid():
     mean, sd, draws = ran("prior_and_log")
     np.testing.assert_array_less(np.abs(np.mean(draws, axis=0) - mean) / sd, 1.5)
     np.testing.assert_array_less(np.std(draws, axis=0) / sd, 2.5)
 
 
+@pytest.mark.slow
 def test_an_amortised_posterior_holds_the_truths():
     held = ran("amortised")
     assert np.all(held > 0.8)
 
 
+@pytest.mark.slow
 def test_a_raw_series_is_enough():
     draws = ran("raw_series")
     np.testing.assert_array_less(far(draws, [4.0, 0.3]), 3.0)
     np.testing.assert_array_less(draws.std(axis=0), [0.4, 0.1])  # a quarter of the prior's
 
 
+@pytest.mark.slow
 def test_simulations_made_before_give_the_exact_posterior():
     near_exact(*ran("presimulated"))
 
 
+@pytest.mark.slow
 def test_a_loaded_run_is_the_same_and_arviz_summarises_it():
     pytest.importorskip("arviz")
     run, loaded, summary = ran("loaded_run_in_arviz")

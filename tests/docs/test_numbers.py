@@ -429,3 +429,47 @@ def test_learnt_vision(name):
     with (RESULTS / "vision" / f"{name}.csv").open(newline="") as file:
         for row in csv.reader(file):
             assert f"| {' | '.join(row)} |".replace("|  |", "| |") in README
+
+
+def test_mujoco_models():
+    for line in (RESULTS / "mujoco-sysid/table.md").read_text().splitlines():
+        assert " ".join(line.split()) in README
+    names = {"posterior": "posterior of EDGE", "uniform": "uniform over Theta_0"}
+    names |= {
+        "fit": "least squares within Theta_0",
+        "fit-phi": "least squares within Phi",
+        "truth": "the true parameters",
+    }
+    for domain, name in names.items():
+        values = column("mujoco-policies", "return", domain=domain)
+        each = ", ".join(f"{value:.3f}" for value in values)
+        assert f"| {name} | {values.mean():.3f} | {each} |" in README
+    found = arrays("mujoco-policies/episodes")
+    ahead = (found["return/posterior"] - found["return/uniform"]).mean(axis=1)
+    first, second, third = (f"{value:.3f}" for value in ahead)
+    assert f"{ahead.mean():.3f} ahead of the uniform distribution ({first}, {second} and {third} by seed" in README
+    positive = {}
+    for run in ("right-edge", "wrong-edge", "wrong-apt"):
+        positive[run] = (arrays(f"mujoco-sysid/puck-{run}")["draws"][..., 2] > 0).mean(axis=1)
+    share = lambda run: f"{100 * positive[run].min():.0f} to {100 * positive[run].max():.0f} %"
+    assert f"with {share('right-edge')} of draws in one" in README
+    assert f"one is lost in {np.sum(np.abs(positive['wrong-edge'] - 0.5) > 0.45)} of 5 recordings" in README
+    assert f"both in all five ({share('wrong-apt')})" in README
+
+
+def test_what_survives():
+    found = {}
+    for name in ("kills", "adversities"):
+        with (RESULTS / f"reliability/{name}.csv").open(newline="") as file:
+            found[name] = list(csv.DictReader(file))
+    kills = found["kills"]
+    assert f"{len({row['trial'] for row in kills})} trials with {len(kills)} kills" in README
+    assert f"{len(found['adversities'])} other adversities" in README
+    assert all(row["result"] == "same bits" for row in kills)
+    names = {name: f"`{name}`" for name in ("infer", "compare", "grid", "train")} | {
+        "dask": "`infer` on a Dask cluster"
+    }
+    for name, words in names.items():
+        how = [row["how"] for row in kills if row["command"] == name]
+        line = rf"\| {re.escape(words)} \| \d+ \| {how.count('in a window')} \| {how.count('at a moment')} \| all \|"
+        assert re.search(line, README), line

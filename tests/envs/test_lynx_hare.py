@@ -53,12 +53,14 @@ def posteriors():
     return samples.mean(axis=1), support
 
 
+@pytest.mark.slow
 def test_a_fixed_support_misses_the_reference(posteriors):
     means, support = posteriors
     assert support.high[0, DEATH] == np.float32(-0.8)
     assert (REFERENCE[DEATH] - means[0, DEATH]) / REFERENCE_SD[DEATH] > 2.5
 
 
+@pytest.mark.slow
 def test_edge_finds_the_reference(posteriors):
     """Every log-rate within 3 of the reference posterior's standard deviations.
 

@@ -73,6 +73,7 @@ def perturbed(name: str) -> Posterior:
     return conditioned(jax.random.key(0), jax.random.key(1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", ["inference", "natural"])
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_the_density_of_a_network_is_that_of_its_draws(name, space):

@@ -136,6 +136,7 @@ def vibrations() -> tuple[np.ndarray, np.ndarray]:
     return frequency.astype(np.float32), (3.0 * clean + 0.3 * draw.normal(size=clean.shape)).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_a_frequency_is_found_that_no_number_of_the_series_shows_by_itself(vibrations):
     theta, x = vibrations
     design = np.column_stack([np.ones(500), x[:500]])

@@ -136,6 +136,7 @@ def test_loss_reaches_the_entropy_of_the_conditional(learnt):
 # ----------------------------------------------------------------------------------------- which rows count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("junk", [1e6, np.nan])
 def test_rows_that_are_not_filled_change_nothing_bit_for_bit(junk):
     dirty = dataclasses.replace(DATA, theta=DATA.theta.at[SIZE:].set(junk), x=DATA.x.at[SIZE:].set(junk))
@@ -257,6 +258,7 @@ def test_the_weights_of_the_best_epoch_are_taken(overfitted):
     np.testing.assert_allclose(again.validation_loss[:, 0], info.validation_loss.min(axis=1), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_patience_stops_after_so_many_epochs_without_a_better_one(overfitted):
     start_, _, everything = overfitted
     network, info = fitted(PATIENT, network=start_)
@@ -362,6 +364,7 @@ def test_an_infinite_loss_moves_nothing():
 # -------------------------------------------------------------------------------- start, ensemble, batching
 
 
+@pytest.mark.slow
 def test_a_warm_start_continues_and_a_cold_one_does_not():
     fast = change(SMALL, learning_rate=2e-2)
     first, trained = fitted(fast)

@@ -136,6 +136,7 @@ def test_autoregressive_outputs_depend_on_the_dimensions_before_them():
         assert (np.diagonal(jacobian) > 0).all()
 
 
+@pytest.mark.slow
 def test_couplings_change_some_dimensions_by_the_others():
     module = NSF(4, transforms=3, hidden=8, blocks=0)
     flow = jitted(module.apply, perturbed(module), X)

@@ -13,6 +13,8 @@ from jaxlfi.estimators.base import untrained
 from jaxlfi.estimators.likelihood_estimators import MixtureLikelihood
 from jaxlfi.estimators.training import fit
 
+pytestmark = pytest.mark.slow
+
 ESTIMATOR = MixtureLikelihood(
     hidden=(32, 32), components=2, ensemble_size=2, learning_rate=3e-3, epochs=0, steps=800, validation=0.1,
     schedule="cosine", warm_start=False,

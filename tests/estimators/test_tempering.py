@@ -85,6 +85,7 @@ def test_a_likelihood_that_is_next_to_a_point_is_reached():
     np.testing.assert_allclose(found.theta.std(0) / scale, 1, atol=0.3)
 
 
+@pytest.mark.slow
 def test_a_likelihood_that_is_not_finite_ends():
     """An observation that no network has an answer to: draws stay in the box."""
     nowhere = gaussians([[jnp.nan, 0.0]] * 2, [[1.0, 1.0]] * 2)

@@ -22,6 +22,7 @@ def test_every_row_has_the_same_budget():
         assert settings.rounds == (1 if "one round" in row.what else 2)
 
 
+@pytest.mark.slow
 def test_a_row_is_run():
     """With tails, in one round: all of the budget, the support that Phi allows, and errors that add up."""
     arrays = baselines.run_row(baselines.ROWS["tails-0.2-static"], gaussian(), SETTINGS, seeds=2)

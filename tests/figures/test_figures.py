@@ -688,6 +688,7 @@ EVERYTHING = ["samples", "efficiency", "curves", "discrepancy", "support", "loss
 EVERYTHING += ["predictive", "pairs", "polars", "seeds"]
 
 
+@pytest.mark.slow
 def test_report_of_a_comparison(compared):
     paths = report(compared.folder, dpi=40)
     assert names_of(paths) == ["report.html", *(f"{name}.png" for name in EVERYTHING)]
@@ -814,6 +815,7 @@ def without_trajectories(folder: Path, saved: bool) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_report_of_a_run_whose_posterior_was_not_simulated(tmp_path):
     expected = [name for name in EVERYTHING if name not in ("predictive", "seeds")]
     folder = without_trajectories(write_run(tmp_path / "run", dim=3, rounds=2, epochs=1), saved=True)

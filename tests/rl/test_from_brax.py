@@ -114,6 +114,7 @@ def test_theta_reaches_the_model_and_the_original_is_left_alone(slider):
     np.testing.assert_array_equal(slider.env.mjx_model.body_mass, before)
 
 
+@pytest.mark.slow
 def test_the_unchanged_model_is_the_environment_itself(pendulum):
     key, action = jax.random.key(2), jnp.array([0.3])
     reset, step = jax.jit(pendulum.reset), jax.jit(pendulum.step)
@@ -127,6 +128,7 @@ def test_the_unchanged_model_is_the_environment_itself(pendulum):
     assert np.abs(heavy.observation - after.observation).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pendulum", "slider"])
 def test_they_are_trained_on(name, request):
     environment = request.getfixturevalue(name)

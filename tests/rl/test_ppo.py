@@ -72,6 +72,7 @@ class NotEvaluated(envs.Env):
     observation_size, action_size, backend = 2, 1, "none"
 
 
+@pytest.mark.slow
 def test_it_makes_the_updates_of_brax(domain):
     settings = SETTINGS.replace(adam_epsilon=1e-8, entropy=0.02)
     _, (_, policy, value), _ = brax_ppo.train(
@@ -140,6 +141,7 @@ def test_it_learns(domain):
     assert made.losses["total_loss"].shape == (settings.updates,)
 
 
+@pytest.mark.slow
 def test_two_trainings_in_one_are_the_trainings_and_a_stop_changes_nothing(train, domain):
     start = ppo.init(jax.random.key(0), LINE, SETTINGS, domain)
     whole, made = train(start, 4)

@@ -126,6 +126,7 @@ def assert_same_results(out, again):
     assert (out / "table.csv").read_text() == (again / "table.csv").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("nth", "midway", "updates"), [(3, False, 3), (4, True, 3), (6, True, 4), (9, False, 4), (11, True, 4)]
 )
@@ -188,6 +189,7 @@ def test_the_command_trains_what_the_library_does(finished, tmp_path, capsys):
     assert picture.startswith(b"\x89PNG") and len(picture) > 5000
 
 
+@pytest.mark.slow
 def test_the_command_is_resumed(tmp_path, capsys, monkeypatch):
     from jaxlfi.cli import parser
 
@@ -204,6 +206,7 @@ def test_the_command_is_resumed(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(training, "_write_checkpoint", original)
     assert parser.main(["resume", str(out), "--no-figures", "--no-cache"]) == 0
     assert training.finished(out)
+    (out / "checkpoint.npz").touch()  # as it was killed after its table was written
     returns = files.read_arrays(out / "curves.npz")["value"][:, 0]
     steps = 40 * np.arange(1, 5)
     np.testing.assert_allclose(
@@ -214,6 +217,18 @@ def test_the_command_is_resumed(tmp_path, capsys, monkeypatch):
         printed = capsys.readouterr().out
         assert "complete: nothing to resume" in printed and ("learning curves: " in printed) == drawn
         assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
+        assert not (out / "checkpoint.npz").exists()
+
+
+def test_a_full_disk_is_one_line_and_the_folder_is_kept(tmp_path, capsys, monkeypatch):
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(training, "resumed", full)
+    out = tmp_path / "run"
+    assert run("--domain", "median", "--out", out) == 2
+    expected = f"jaxlfi train: error: [Errno 28] No space left on device; continue with: jaxlfi resume {out}\n"
+    assert capsys.readouterr().err == expected and training.read_config(out)
 
 
 @pytest.mark.parametrize(("values", "expected"), [([[np.nan], [np.nan]], ""), ([[1.0], [np.nan]], ", return 1.00")])
@@ -289,6 +304,7 @@ def test_bounds_that_were_logarithms_may_be_rounded():
         domains.check_belief(LINE, LINE.space, Support([0.249, -2.0], [4.0, 2.0]))
 
 
+@pytest.mark.slow
 def test_the_posterior_of_a_run_is_a_domain(tmp_path, capsys):
     """A run's mixture, clipped to Phi; the posterior of other parameters is refused."""
 

@@ -61,7 +61,10 @@ def _sampled(run, path, seed: int) -> np.ndarray:
     return np.stack([posterior[name].values.ravel() for name in ("first", "second")], axis=1)
 
 
-@pytest.fixture(scope="module", params=ESTIMATORS)
+FLOWS = [pytest.param(name, marks=pytest.mark.slow) for name in ESTIMATORS if name != "mdn"]
+
+
+@pytest.fixture(scope="module", params=["mdn", *FLOWS])
 def ways(request, tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
     """A run, and draws of its posterior in every way."""
     folder = tmp_path_factory.mktemp("draws") / "run"
@@ -129,6 +132,7 @@ def test_the_draws_have_the_density_that_log_prob_says(ways, space):
     assert np.isneginf(np.asarray(run.posterior.log_prob(jnp.asarray(outside), space=space))).all()
 
 
+@pytest.mark.slow
 def test_the_mean_and_the_maximum_are_those_of_the_draws(ways):
     run, draws = ways
     posterior, theta = run.posterior, draws["infer"]

@@ -38,6 +38,7 @@ def die(index, row):
     raise Killed
 
 
+@pytest.mark.slow
 def test_a_run_on_a_raw_series_goes_on_to_the_same_bits_and_is_loaded_without_its_task(tmp_path):
     key = jax.random.key(4)
     infer = lambda **more: jaxlfi.infer(key, TASK, heuristic=jaxlfi.Fixed(), settings=SERIES, **more)
@@ -114,6 +115,7 @@ def test_all_trials_summaries_lie_one_after_another(key):
     assert registry.load("gaussian_linear,trials=3,pooling=all") == repeated(registry.load("gaussian_linear"), 3, "all")
 
 
+@pytest.mark.slow
 def test_the_posterior_of_four_trials_is_found_without_a_word_on_how_to_pool_them():
     trials = np.array([[1.3, -0.2], [0.6, -0.9], [0.9, -0.6], [1.1, 0.1]], np.float32)
     network = settings().estimator.replace(

@@ -51,6 +51,7 @@ def whole(tmp_path_factory):
     return results(root / "run"), calls(root / "calls"), root / "run"
 
 
+@pytest.mark.slow
 def test_infer_takes_an_executor_and_gives_the_same_run_without():
     infer = lambda **how: jaxlfi.infer(jax.random.key(0), task(), settings=SETTINGS, simulation_timeout=30.0, **how)
     alone = infer()
@@ -129,6 +130,7 @@ def drain(process):
     threading.Thread(target=lambda: list(process.stderr), daemon=True).start()
 
 
+@pytest.mark.slow
 def test_a_run_on_a_dask_cluster_survives_the_loss_of_its_scheduler(whole, cluster, tmp_path, capsys):
     (host, address), out, folder = cluster, tmp_path / "run", tmp_path / "calls"
     words = arguments(folder)

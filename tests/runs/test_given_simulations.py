@@ -47,6 +47,7 @@ TRAINED = ONE.replace(
 """Trained well; 600 pairs are one program."""
 
 
+@pytest.mark.slow
 def test_one_round_of_given_simulations_simulates_nothing():
     run = jaxlfi.infer(jax.random.key(0), host_task(), simulations=pairs(60), settings=ONE)
     assert int(run.dataset.size) == 60 and run.history["attempted"].tolist() == [60]
@@ -61,6 +62,7 @@ def test_one_round_of_given_simulations_simulates_nothing():
         jaxlfi.infer(jax.random.key(0), host_task(), simulations=pairs(60), settings=settings(rounds=2))
 
 
+@pytest.mark.slow
 def test_their_posterior_is_the_exact_one():
     given = pairs(600) | {"low": BOX[0], "high": BOX[1]}
     run = jaxlfi.infer(jax.random.key(1), host_task(), simulations=given, settings=TRAINED, heuristic=jaxlfi.Fixed())
@@ -127,6 +129,7 @@ def test_later_rounds_simulate_as_ever(tmp_path):
         np.testing.assert_array_equal(getattr(loaded.dataset, name)[:73], getattr(run.dataset, name)[:73])
 
 
+@pytest.mark.slow
 def test_a_file_of_simulations_enters_by_the_command_line(tmp_path):
     given = pairs(60)
     np.savez(tmp_path / "simulations.npz", **given)

@@ -69,6 +69,7 @@ def compilations():
     jax.monitoring.unregister_event_duration_listener(listener)
 
 
+@pytest.mark.slow
 def test_an_equal_task_made_anew_compiles_nothing(compilations):
     programs.forget()
     infer(0, gaussian_linear.task())
@@ -316,6 +317,7 @@ def test_a_fixed_support_that_is_wrong_warns():
     assert all("--heuristic" not in text and "heuristic=jaxlfi.Edge()" in text for text in run.warnings)
 
 
+@pytest.mark.slow
 def test_a_support_that_grows_warns_of_the_bounds_of_phi_alone():
     """Edge cannot move them, and moves all others."""
     run = infer(settings=ONE, heuristic=Edge())
@@ -332,6 +334,7 @@ def test_a_support_that_grows_warns_of_the_bounds_of_phi_alone():
     assert len(outside.replace(heuristic=Fixed()).warnings) == 2
 
 
+@pytest.mark.slow
 def test_mode_pairs_components_as_on_the_command_line(tmp_path):
     """Networks that start anew number their components as they like."""
     flags = ("--support", "misspecified", "--heuristic", "mode", *FLAGS, "--out", tmp_path / "cli")

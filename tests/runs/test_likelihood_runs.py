@@ -11,6 +11,8 @@ import jaxlfi
 from jaxlfi.runs.folder import StoreError
 from tests.small import gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
+pytestmark = pytest.mark.slow
+
 OBSERVED = np.array([0.8, -0.6], np.float32)
 SETTINGS = settings(
     estimator=jaxlfi.MixtureLikelihood(

@@ -114,6 +114,7 @@ np.savez(sys.argv[2], draws=draws, means=run.mixture.means, task=run.task.name, 
 """
 
 
+@pytest.mark.slow
 def test_a_fresh_process_loads_a_run_of_a_comparison(compared, tmp_path):
     for configuration in ("misspecified", "misspecified+edge"):
         folder = compared / configuration / "seed_000"

@@ -17,6 +17,7 @@ ARGUMENTS = ("infer", TASK, "--support", "misspecified", *FLAGS, "--seeds", "2",
 """One program for all tests; what is killed has two runs, and so two of some files."""
 
 
+@pytest.mark.slow
 def test_a_run_killed_at_any_write_resumes_to_the_same_bits(tmp_path, monkeypatch):
     assert command(*ARGUMENTS, tmp_path / "whole") == 0
     created, killed = 0, 0

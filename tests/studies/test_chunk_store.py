@@ -148,3 +148,13 @@ def test_other_files_of_the_folder_are_left_alone(complete):
     complete.compute(squares)
     assert (complete.folder / "notes.txt").read_text() == "mine"
     np.testing.assert_array_equal(complete.results()[0]["place"], np.arange(10))
+
+
+def test_a_study_whose_folder_was_moved_away_is_not_begun_anew(tmp_path):
+    (tmp_path / "here").mkdir()
+    one = store(tmp_path / "here")
+    one.write(0, *squares(one.chunks[0]))
+    (tmp_path / "here").rename(tmp_path / "there")
+    with pytest.raises(FileNotFoundError):
+        one.write(1, *squares(one.chunks[1]))
+    assert not (tmp_path / "here").exists() and store(tmp_path / "there").done() == [0]

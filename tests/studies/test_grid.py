@@ -156,6 +156,7 @@ def test_a_run_does_not_depend_on_its_chunk(finished):
         np.testing.assert_array_equal(np.swapaxes(again[name], 0, 1)[:, :, ::-1], arrays[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_one_chunk_gives_what_several_give(finished):
     """Another length is another program: equal to what training makes of rounding."""
     _, _, arrays = finished
@@ -298,6 +299,7 @@ def test_a_simulator_that_always_fails_is_refused(finished, monkeypatch):
         study.run_chunk(work, range(LENGTH))
 
 
+@pytest.mark.slow
 def test_a_grid_of_a_host_simulator(whole_runs):  # noqa: F811 - the fixture
     def simulate(rng, theta):
         return theta @ gaussian_linear.MIXING.T + gaussian_linear.NOISE * rng.normal(size=theta.shape)
@@ -426,6 +428,7 @@ def start(script: str, *arguments, devices: int) -> subprocess.Popen:
     )
 
 
+@pytest.mark.slow
 def test_two_devices_give_what_one_gives(finished, tmp_path):
     """Through the command line; chunks of five on two devices: one run of each chunk is padding."""
     vary = [f"{axis.name}={','.join(map(str, axis.values))}" for axis in AXES]
@@ -456,6 +459,7 @@ study.advance(folder, work, Console())
 """
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_chunks(finished, tmp_path):
     """Joined by jax.distributed over the loopback; each chunk is the same program as in one process."""
     folder, _, _ = finished

@@ -24,6 +24,8 @@ import pytest
 
 import jaxlfi
 
+pytestmark = pytest.mark.slow
+
 CHECKOUT = Path(jaxlfi.__file__).parents[1]
 
 PYPROJECT = """

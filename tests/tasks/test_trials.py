@@ -137,6 +137,7 @@ def test_the_posterior_of_four_trials_in_closed_form(key):
     assert run.observed.shape == (8,) and run.task == repeated(gaussian(), 4)
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_several_files_and_the_run_is_loaded_again(tmp_path):
     for number in range(2):
         np.savez(tmp_path / f"{number}.npz", trajectory=np.array([0.5 + number, -0.5]))

@@ -3,9 +3,7 @@
 It needs EGL or OSMesa, libraries of the system.
 """
 
-import contextlib
 import itertools
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -14,6 +12,7 @@ import jax
 import mujoco
 import numpy as np
 
+from jaxlfi.envs import opengl
 from jaxlfi.envs.whip.frames import Frames
 from jaxlfi.envs.whip.rig import HAND, SECTION
 from jaxlfi.envs.whip.vision.camera import Camera
@@ -99,7 +98,7 @@ class _Stage:
         self._size = size
         self._model = mujoco.MjModel.from_xml_string(XML)
         self._data = mujoco.MjData(self._model)
-        self._gl = _context(size)
+        self._gl = opengl.context(size, size)
         self._gl.make_current()
         self._made = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._made)
@@ -177,39 +176,6 @@ class _Stage:
         self._model.tex_data[start : start + bitmap.size] = bitmap.ravel()
         mujoco.mjr_uploadTexture(self._model, self._made, texture.id)
         self._covers[name] = covers
-
-
-def _context(size: int):
-    """A context of OpenGL without a display: EGL's, or OSMesa's, which draws in memory."""
-    wanted = os.environ.get("MUJOCO_GL", "").lower()
-    reasons = []
-    for kind in (wanted,) if wanted in ("egl", "osmesa") else ("egl", "osmesa"):
-        with _platform(kind):
-            try:
-                if kind == "egl":
-                    from mujoco.egl import GLContext
-                else:
-                    from mujoco.osmesa import GLContext
-                return GLContext(size, size)
-            except Exception as error:  # of whatever is missing: a library, a driver, a device
-                reasons.append(f"{kind}: {str(error).splitlines()[0] if str(error) else type(error).__name__}")
-    raise RuntimeError(
-        f"MuJoCo's renderer needs EGL or OSMesa (on Debian: apt install libosmesa6), got {'; '.join(reasons)}"
-    )
-
-
-@contextlib.contextmanager
-def _platform(kind: str) -> Iterator[None]:
-    """PyOpenGL reads once, when it is first imported, which of its platforms to use."""
-    before = os.environ.get("PYOPENGL_PLATFORM")
-    os.environ["PYOPENGL_PLATFORM"] = kind
-    try:
-        yield
-    finally:
-        if before is None:
-            os.environ.pop("PYOPENGL_PLATFORM")
-        else:
-            os.environ["PYOPENGL_PLATFORM"] = before
 
 
 def _boxes(

@@ -61,7 +61,8 @@ def begin(out: Path, run: Run, plans: Sequence[CalibrationPlan]) -> dict[str, An
                 f"{', '.join(changed)}: take another folder by --out, or remove that one"
             )
         return found
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    # A kill while plan.json is written leaves plan.json.part.
+    if out.exists() and (not out.is_dir() or any(path.suffix != ".part" for path in out.iterdir())):
         raise StoreError(f"out: expected a new or empty folder, got {str(out)!r} which holds something")
     out.mkdir(parents=True, exist_ok=True)
     found = wanted | {"chunk_length": chunk_length(run, plans[0]), "devices": jax.local_device_count()}

@@ -218,8 +218,8 @@ def advance(folder: Path, work: Work, console: Console) -> dict[str, np.ndarray]
 
 def finish(folder: Path, grid: Grid, arrays: Mapping[str, np.ndarray], seconds: float) -> None:
     """Write the results, and then that the grid is complete."""
-    atomic.write_arrays(folder / "grid.npz", arrays)
-    atomic.write_bytes(folder / "table.csv", table(grid, arrays).encode())
+    atomic.write_arrays(folder / "grid.npz", arrays, durable=True)
+    atomic.write_bytes(folder / "table.csv", table(grid, arrays).encode(), durable=True)
     config = read_config(folder)
     atomic.write_json(folder / "config.json", config | {"status": "finished", "seconds": round(seconds, 3)})
 

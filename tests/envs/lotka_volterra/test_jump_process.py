@@ -152,6 +152,7 @@ class TestDistribution:
             assert stats.chisquare(counts, count * probabilities).pvalue > 1e-3, i
         assert (trajectory[..., 1 - species] == populations[1 - species]).all()
 
+    @pytest.mark.slow
     def test_waiting_time_is_independent_of_the_reaction(self):
         """One predator, one prey: who dies first is a fair coin, whenever it is."""
         count, rate, interval = 8192, 0.5, 0.02
@@ -328,6 +329,7 @@ class TestBatching:
         assert trajectory.shape == (3, 4, 151, 2)
         assert (trajectory[2, 2] == prior_batch[0][2]).all()
 
+    @pytest.mark.slow
     def test_scan_inside_vmap(self, prior_batch):
         keys, log_rates = prior_arguments()
 

@@ -9,6 +9,7 @@ mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.mjx")
 pytest.importorskip("brax")
 
+import chex
 import jax
 import jax.numpy as jnp
 from envs_mujoco import ARM
@@ -126,6 +127,7 @@ def test_numbers_that_mujoco_derives_are_in_the_model(arm):
     assert not refused.any()
 
 
+@pytest.mark.slow
 def test_one_episode_is_as_in_a_batch(arm, compiled):
     reset, step = compiled
     keys = jax.random.split(jax.random.key(1), 3)
@@ -167,6 +169,7 @@ def test_it_is_an_environment(arm):
 PLAIN = Goal(("angle",), INTERVAL, 0.1, {"angle": (0.4, 1.0)}, limits={"motor": (-1.0, 1.0)})
 
 
+@pytest.mark.slow
 def test_first_states_are_drawn_and_noise_is_added():
     spread = Goal(
         ("angle", "joint/shoulder/qpos"),
@@ -198,6 +201,7 @@ SLIDE = """
 """
 
 
+@pytest.mark.slow
 def test_a_policy_is_trained_on_it():
     env = MujocoEnvironment(SLIDE, [Parameter("joint/rail/damping", (0.1, 2.0))], PLAIN)
     settings = PPO(environments=4, unroll=5, segments=2, minibatches=4, epochs=2, total_steps=80, hidden=(8,))

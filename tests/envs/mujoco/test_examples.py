@@ -62,6 +62,7 @@ def test_a_damping_that_the_first_guess_leaves_out_is_found():
     np.testing.assert_array_less(np.abs(error), [0.4, 0.3, 0.1])
 
 
+@pytest.mark.slow
 def test_an_arm_of_a_posterior_and_a_point():
     """A heavier payload than the first guess allows; from the posterior's draws, least squares ends within 3 %."""
     task = example("arm")

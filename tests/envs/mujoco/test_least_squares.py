@@ -75,6 +75,7 @@ def test_derivatives_are_those_of_single_simulations():
     assert residuals.simulations == 4
 
 
+@pytest.mark.slow
 def test_points_scatter_as_their_covariances_say(monkeypatch):
     monkeypatch.setattr(least_squares, "CORRECTIONS", 0)
     fits = [fit(task(seed), [0.1, 1.3]) for seed in range(24)]

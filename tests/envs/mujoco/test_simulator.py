@@ -3,15 +3,17 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
+mujoco = pytest.importorskip("mujoco")
 
 import jax
-from envs_mujoco import ARM, recorded
+from envs_mujoco import ARM, driven, recorded
 
+from jaxlfi.envs import gaussian_linear
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
-from jaxlfi.envs.mujoco.simulator import CHUNK, REFUSED, UNSTABLE
+from jaxlfi.envs.mujoco.simulator import CHUNK, REFUSED, UNSTABLE, simulator_of
+from jaxlfi.tasks.executors import one_by_one
 
 DAMPING = Parameter("joint/elbow/damping", (0.01, 0.2), (0.001, 1.0), "N m s/rad", log=True)
 QUIET = {"angle": 0.0, **{f"velocity[{i}]": 0.0 for i in range(3)}}
@@ -46,6 +48,32 @@ def test_every_kind_of_parameter_acts():
     rows, _ = own.clean([[-0.5, 0.012, 0.25], [0.0, 0.0, 0.0]])
     np.testing.assert_allclose(rows[0] - [0, 0, 0.25, 0], matrix(bent), atol=1e-10)
     np.testing.assert_allclose(rows[1], matrix(recorded(start=(0.3, 0.0))), atol=1e-10)
+
+
+def test_states_are_those_of_the_loop():
+    """Of the second episode, at the times of the model's steps."""
+    parameters = [DAMPING, Parameter("initial/elbow/qpos", (-1.0, 1.0)), Parameter("control/delay", (0.0, 0.1))]
+    own = simulator(parameters, [recorded(count=40), recorded(interval=0.04, count=12)])
+    theta = [[0.03, 0.2, 0.0], [0.11, -0.3, 0.012]]
+    models, grid, states = own.states(theta, 1)
+    np.testing.assert_allclose(grid, 0.004 * np.arange(111))
+    for (damping, start, delay), model, found in zip(theta, models, states, strict=True):
+        assert model.dof_damping[1] == damping
+        plain = mujoco.MjModel.from_xml_string(ARM)
+        plain.dof_damping[1] = damping
+        data = mujoco.MjData(plain)
+        data.qpos[1] = start
+        for step, state in enumerate(found):
+            np.testing.assert_allclose(state, [data.time, *data.qpos, *data.qvel], atol=1e-9)
+            data.ctrl[0] = driven(0.04 * (max(step - round(delay / 0.004), 0) // 10))
+            mujoco.mj_step(plain, data)
+
+
+def test_the_simulator_of_a_task_whose_simulations_are_made_one_by_one():
+    task = mujoco_task(ARM, [DAMPING], recorded(), noises=QUIET)
+    assert simulator_of(one_by_one(task)) is simulator_of(task) is task.simulate.function
+    with pytest.raises(ValueError, match="task: expected one of a MuJoCo model, got gaussian_linear"):
+        simulator_of(gaussian_linear.task())
 
 
 def test_a_bias_is_of_its_signal():

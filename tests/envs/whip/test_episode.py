@@ -271,6 +271,7 @@ def trajectory(engine, camera, parameters, actions):
     return rollout.trajectory(jax.random.key(0), engine, CLEAN, camera, parameters, actions)
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_the_states_before_each_action():
     """Of an episode with the same actions, whose cubes fall."""
     parameters = median(length=0.3, young=5e3)

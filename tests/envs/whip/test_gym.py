@@ -109,6 +109,7 @@ def test_the_initial_domain_is_the_initial_support():
     np.testing.assert_allclose((drawn.std(0)) / (high - low), 12**-0.5, atol=0.03)
 
 
+@pytest.mark.slow
 def test_a_vector_is_single_ones_which_begin_anew(key):
     """Two of three leave the workspace, at times of their own, and then ignore an action."""
     many = WhipVector(3, initial_domain, "transporter", ENGINE)
@@ -139,6 +140,7 @@ def test_a_vector_is_single_ones_which_begin_anew(key):
     assert ended.sum(0).tolist() == [3, 2, 1] and ended[15, 2]
 
 
+@pytest.mark.slow
 def test_a_vector_begins_anew_in_the_same_step_if_asked_to():
     """As above; the last observation and what it says of the old scene are in the info."""
     many = WhipVector(3, initial_domain, "transporter", ENGINE, autoreset_mode="SameStep")
@@ -168,6 +170,7 @@ def test_a_vector_begins_anew_in_the_same_step_if_asked_to():
     assert ended == [4, 2, 1]
 
 
+@pytest.mark.slow
 def test_nuisances_are_drawn_for_given_lengths_and_moduli():
     """Every episode of a scene has its length and modulus, and a stack that stands elsewhere."""
     lengths, moduli = np.array([0.2, 0.3]), np.array([1e4, 4e4])

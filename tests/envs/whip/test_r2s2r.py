@@ -35,14 +35,20 @@ def stages(monkeypatch):
             if kind in stopped:
                 stopped.clear()
                 return 130
-            if "posterior" in out.name:
+            if words[0] == "report":
+                (out / "report.html").write_text("")
+            elif "posterior" in out.name:
                 files.write_arrays(out / "posterior.npz", {})
+                if "undrawn" in stopped:
+                    return 0
+                (out / "report.html").write_text("")
             elif kind == "deploy":
                 (out / "table.csv").write_text("policy,return\n")
             else:
-                (out / "domain/seed_000").mkdir(parents=True)
+                (out / "domain/seed_000").mkdir(parents=True, exist_ok=True)
                 a_policy(out / "domain/seed_000/policy.npz")
-                (out / "table.csv").write_text("")
+                for name in ("table.csv", "curves.png"):
+                    (out / name).write_text("")
             return 0
 
         return run
@@ -121,6 +127,19 @@ def test_it_goes_on_where_it_was_stopped(stages, tmp_path, kind, again, capsys):
     assert r2s2r.main(words) == 0
     assert ran[before][1] == again and ran[before - 1][0] == kind
     assert [words[0] for words in ran][-2:] == ["deploy", "page"]
+
+
+def test_a_stage_is_complete_with_its_last_file(stages, tmp_path):
+    """A kill between the results of a stage and its pictures leaves the rest of it to be done."""
+    ran, stopped = stages
+    out, words = tmp_path / "loop", ["--object", "dlo-1", "--out", str(tmp_path / "loop")]
+    assert r2s2r.main(words) == 0
+    (out / "policy_0" / "curves.png").unlink()
+    (out / "iteration_1/posterior" / "report.html").unlink()
+    ran.clear()
+    stopped.append("undrawn")  # a run that is complete is not drawn by resuming it
+    assert r2s2r.main(words) == 0
+    assert [words[1] for words in ran[:3]] == ["resume", "resume", "report"] and len(ran) == 4
 
 
 def test_stages_are_replaced_by_files(stages, tmp_path, monkeypatch):

@@ -138,6 +138,7 @@ def test_length_and_stiffness_are_inferred(problem):
     assert length < 5 and stiffness < 0.3
 
 
+@pytest.mark.slow
 def test_a_run_from_the_command_line(tmp_path, capsys):
     flags = "--rounds 1 --simulations-per-round 6 --simulation-budget 7 --steps 20 --ensemble-size 1".split()
     flags += "--hidden 8 --seeds 2 --validation 0 --patience 0 --prune 0".split()

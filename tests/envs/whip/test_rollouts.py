@@ -68,6 +68,7 @@ def test_a_simulation_is_those_of_the_single_rollouts_with_keys_of_their_own(pai
     np.testing.assert_allclose(shift.mean(axis=0), [-1 / 60, 1 / 30], atol=0.01)
 
 
+@pytest.mark.slow
 def test_eager_is_jit_and_a_batch_is_its_simulations(pair, key):
     theta = jnp.array([[230.0, 8e3], [280.0, 3e4]])
     keys = jax.random.split(key, 2)
@@ -185,6 +186,7 @@ def test_what_is_refused(folder, tmp_path):
         whip_task(NATIVE, MASK, NUISANCES["fixed"], jnp.zeros(16))
 
 
+@pytest.mark.slow
 def test_a_run_of_two_recordings_is_loaded_again_by_its_reference(folder, tmp_path, capsys):
     flags = "--rounds 1 --simulations-per-round 6 --simulation-budget 7 --steps 20 --ensemble-size 1".split()
     flags += "--hidden 8 --seeds 1 --validation 0 --patience 0 --prune 0".split()

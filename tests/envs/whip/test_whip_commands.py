@@ -51,6 +51,7 @@ def whip_file(tmp_path):
     return tmp_path / "whip.npz"
 
 
+@pytest.mark.slow
 def test_a_rollout_is_drawn_and_saved(tmp_path, whip_file, capsys):
     out = tmp_path / "new" / "folder"
     assert run("render", "--policy", whip_file, "--detector", "transporter", "--seed", 3, "--out", out) == 0

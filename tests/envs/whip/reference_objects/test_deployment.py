@@ -72,6 +72,7 @@ def test_a_whole_episode_is_a_recording_to_infer_from(whole):
     np.testing.assert_allclose(whole.frames.gripper[::10], whole.recording.gripper, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_an_episode_ends_at_its_end_and_repeats(whole):
     again = deployment.deploy(KEY, objects.load("dlo-3"), lambda observation: TOWARDS)
     assert again.recording is None and len(again.actions) == again.steps == whole.steps

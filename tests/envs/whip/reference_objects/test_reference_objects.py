@@ -214,6 +214,7 @@ def test_a_simulation_that_breaks_down_says_so(rig, tmp_path, monkeypatch, veloc
 # -------------------------------------------------------------------------------------------------- recordings
 
 
+@pytest.mark.slow
 def test_a_recording_is_what_the_rig_does_and_its_images_show(rig):
     """Physics made again now; keypoints found in a few images, as recorded and near the truth."""
     recording = read(objects.FILE.parent / "dlo-1.npz")

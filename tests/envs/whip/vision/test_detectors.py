@@ -56,6 +56,7 @@ def picture(step: int) -> np.ndarray:
 learnt = functools.cache(lambda: detectors.pick("learnt"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [0, 7, 12])
 def test_what_is_learnt_finds_the_keypoints(step):
     keypoints, seen = learnt()(picture(step), grip(step))
@@ -64,6 +65,7 @@ def test_what_is_learnt_finds_the_keypoints(step):
     assert np.median(off[:4]) < 2.5 and off.max() < 6  # pixels; the middle of a cube is not that of its face
 
 
+@pytest.mark.slow
 def test_the_transporter_finds_points_of_the_dlo_in_their_order():
     arcs = []
     for step in (0, 5, 9, 13):
@@ -148,6 +150,7 @@ def test_a_mask_is_made_smaller_by_shares():
 # ------------------------------------------------------------------------------------------------- a camera
 
 
+@pytest.mark.slow
 def test_a_photographer_sees_one_scene_with_one_look(key):
     rgb = []
     photographer = Photographer(jax.random.clone(key), RayCaster(), learnt())

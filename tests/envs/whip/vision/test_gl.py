@@ -167,6 +167,7 @@ def away():
     return frame.replace(gripper=jnp.array([9.0, 0.36]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_table_has_the_chequers_of_the_look(renderer, axis):
     """Their colours and their size change with it."""

@@ -257,6 +257,7 @@ def whole(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [1, 5], ids=["first batch", "second batch"])
 def test_a_set_that_was_interrupted_is_that_made_in_one_go(whole, tmp_path, after):
     def interrupt(count):
@@ -281,6 +282,7 @@ def test_a_set_that_was_interrupted_is_that_made_in_one_go(whole, tmp_path, afte
     assert content(folder) == content(whole)
 
 
+@pytest.mark.slow
 def test_a_picture_does_not_depend_on_how_many_there_are(whole, tmp_path):
     folder = tmp_path / "set"
     making.make(Asked(3, SIX.seed, "raycast", sharp=False), folder, pick("auto"))
@@ -291,6 +293,7 @@ def test_a_picture_does_not_depend_on_how_many_there_are(whole, tmp_path):
         assert few[name] == many[name]
 
 
+@pytest.mark.slow
 def test_pictures_differ_and_say_what_they_are_of(whole):
     found = pictures.read(whole)
     assert len({rgb.tobytes() for rgb in found.rgb}) == len({labels.tobytes() for labels in found.labels}) == 6
@@ -327,6 +330,7 @@ def on_labels(found):
     return np.array(dlos), np.array(cubes)
 
 
+@pytest.mark.slow
 def test_keypoints_are_on_labels(tmp_path, monkeypatch):
     """On what they are of, or on what hides it; mirrored, they are not."""
     beside_nothing(monkeypatch)
@@ -343,6 +347,7 @@ def test_keypoints_are_on_labels(tmp_path, monkeypatch):
     assert number == 6
 
 
+@pytest.mark.slow
 def test_reference_objects(tmp_path, monkeypatch):
     beside_nothing(monkeypatch)
     actions = scenes.random_actions
@@ -355,6 +360,7 @@ def test_reference_objects(tmp_path, monkeypatch):
     assert len(dlos) >= 8 and np.mean(dlos) > 0.7 and np.mean(cubes) > 0.7
 
 
+@pytest.mark.slow
 def test_sharp_pictures_are_of_the_same_scenes_and_looks(whole, tmp_path):
     """Only the camera's faults are missing."""
     making.make(TWO_SHARP, tmp_path / "set", pick("auto"))

@@ -371,6 +371,7 @@ def test_lone_pixels_go_and_corners_stay():
     np.testing.assert_array_equal(masks.despeckled(jnp.asarray(labels)), expected)
 
 
+@pytest.mark.slow
 def test_keypoints_of_many_are_those_of_each():
     dlos = [shaped("S"), shaped("straight", 0.1)]
     labels, grips = [seen(SIDEWAYS, scene(dlo)) for dlo in dlos], [grip_of(dlo) for dlo in dlos]

@@ -11,6 +11,7 @@ OPTIMISED = True
 """161 pictures are drawn, labelled and searched."""
 
 
+@pytest.mark.slow
 def test_an_object_is_recorded_through_pictures(tmp_path, capsys):
     """By the ray caster, which is everywhere; as by labels, but for the errors of what is learnt."""
     for detector in ("learnt", "centreline"):

@@ -61,6 +61,7 @@ class Reads:
         return 9.0 * jax.nn.one_hot((jnp.round(rgb[..., 0] * 255 / 30).astype(int) + self.wrong) % 8, 8)
 
 
+@pytest.mark.slow
 def test_parts_of_pictures_and_of_labels_are_the_same_parts(monkeypatch):
     monkeypatch.setattr(photograph, "draw", lambda key: SHARP)
     draw = np.random.default_rng(0)
@@ -73,6 +74,7 @@ def test_parts_of_pictures_and_of_labels_are_the_same_parts(monkeypatch):
     assert float(wrong) == pytest.approx(float(certain[0]) + 9, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_it_learns_to_tell_two_colours_apart(small, monkeypatch):
     """Left of a line that differs from picture to picture all is red, and labelled 1; right of it blue, and 7."""
     monkeypatch.setattr(photograph, "draw", lambda key: SHARP)

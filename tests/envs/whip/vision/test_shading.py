@@ -230,6 +230,7 @@ def test_highlights_are_only_where_light_falls(camera):
     assert dark.sum() > 50 and (rgb - dull)[dark].max() < 1e-5
 
 
+@pytest.mark.slow
 def test_colours_are_shares(key):
     """Of random looks, and of lights and grain beyond all measure."""
     frame = tumbled(0)

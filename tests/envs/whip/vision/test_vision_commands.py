@@ -35,6 +35,7 @@ def few(monkeypatch):
     monkeypatch.setattr(commands, "HELD_OUT_ROLLOUTS", 2)
 
 
+@pytest.mark.slow
 def test_training_makes_what_it_needs_and_weights_that_can_be_used(tmp_path, capsys):
     out = tmp_path / "vision"
     assert run("train-vision", "--out", out) == 0

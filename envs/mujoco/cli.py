@@ -1,0 +1,120 @@
+"""The command line of tasks of MuJoCo models: `jaxlfi mujoco film | fit`.
+
+This module imports neither jax nor numpy, so that `--help` answers at once.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxlfi.cli.exit_status import exit_status
+from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.envs.mujoco import require_mujoco
+
+EXAMPLES = """\
+examples:
+  jaxlfi infer mujoco,config=examples/mujoco/arm.toml --heuristic edge --out runs/arm
+  jaxlfi mujoco film runs/arm --out runs/arm.gif                   does the posterior move as the machine did?
+  jaxlfi mujoco film runs/arm --draws 30 --slower 4 --out runs/arm-slowly.gif
+  jaxlfi mujoco fit runs/arm --out runs/arm-fit                    sharper numbers, from the posterior's draws
+  jaxlfi mujoco fit examples/mujoco/arm.toml --starts 256          without a run, from draws of Phi
+
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    formatter = argparse.RawDescriptionHelpFormatter
+    top = OneLineParser(
+        prog="jaxlfi mujoco",
+        description="What follows inference of a MuJoCo model: films of its posterior, and points of least squares.",
+        epilog=EXAMPLES,
+        formatter_class=formatter,
+    )
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    film = commands.add_parser(
+        "film",
+        help="film draws of a posterior over the recorded motion",
+        description="Simulate draws of a run's posterior under the recorded controls, and film them as translucent "
+        "ghosts over the recorded motion, above the measured signals. Writes an animated gif of 25 frames a second, "
+        "and beside it a .png of six moments. Needs EGL or OSMesa.",
+    )
+    film.add_argument("run", type=Path, metavar="RUN", help="folder of a run: jaxlfi infer mujoco,config=FILE")
+    film.add_argument("--draws", type=_count, default=12, metavar="N", help="how many ghosts (default: 12)")
+    film.add_argument(
+        "--slower", type=float, default=1.0, metavar="X", help="times slower than the recording (default: 1)"
+    )
+    film.add_argument(
+        "--size", type=_size, default=(640, 640), metavar="WxH", help="of the film, in pixels (default: 640x640)"
+    )
+    film.add_argument("--camera", metavar="NAME", help="of the model (default: a view that shows the whole motion)")
+    film.add_argument("--episode", type=int, default=0, metavar="N", help="of several recordings, from 0 (default: 0)")
+    film.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .gif, beside it a new .png")
+
+    fit = commands.add_parser(
+        "fit",
+        help="find points of least squares from a posterior's draws",
+        description="Follow the best of some draws to points of least squares, by Gauss-Newton steps, and take the "
+        "integrator's own error off. Prints each point with 90 % intervals, which points explain the recording as "
+        "well as the best, which parameters are hardly told apart or on a bound of Phi, and what the model gets "
+        "wrong, as a table [discrepancy] for the task's file.",
+    )
+    fit.add_argument(
+        "source", metavar="RUN|CONFIG", help="folder of a run, to start from its posterior; or a TOML file, from Phi"
+    )
+    fit.add_argument("--starts", type=_count, default=64, metavar="N", help="draws to choose from (default: 64)")
+    fit.add_argument("--keep", type=_count, default=4, metavar="N", help="the best of them to follow (default: 4)")
+    fit.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="a new folder: fit.json and pairs.png, a pair plot of posterior and points (default: print only)",
+    )
+    return top
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
+    return int(text)
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT in pixels, as 640x480, got {text!r}")
+    return int(width), int(height)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: the words after `jaxlfi mujoco`; by default those of the process.
+
+    Returns:
+        0; 2 for bad input; 130 where it was interrupted.
+    """
+    arguments = parser().parse_args(argv)
+
+    def work() -> None:
+        require_mujoco()
+        from jaxlfi.io import compile_cache
+
+        compile_cache.enable()
+        if arguments.command == "film":
+            from jaxlfi.envs.mujoco.film import film
+
+            film(arguments)
+        else:
+            from jaxlfi.envs.mujoco.commands import fit
+
+            fit(arguments)
+
+    return exit_status("jaxlfi mujoco", work)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
