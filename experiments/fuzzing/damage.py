@@ -14,8 +14,10 @@ import numpy as np
 from experiments.fuzzing.words import picked
 
 VALUES = (
-    None, True, False, 0, 1, -1, 2, 0.5, 1e308, -0.0, 10**30, float("nan"), float("inf"), "", "x", "..", "../../x", "[/x]",
-    "/etc/passwd", "os:system", "名前", "$", "a\nb", [], {}, [[]], [None], [1], [1, 2, 3], ["a"], [float("nan")] * 2, {"a": 1},
+    None, True, False, 0, 1, -1, 2, 0.5, 1e308, -0.0, 10**30, float("nan"), float("inf"), "", "x", "..",
+    "../../x", "[/x]",
+    "/etc/passwd", "os:system", "名前", "$", "a\nb", [], {}, [[]], [None], [1], [1, 2, 3], ["a"],
+    [float("nan")] * 2, {"a": 1},
     {"float": "x"}, {"float": 1}, {"array": [1], "dtype": "object"}, {"array": [1], "dtype": 7}, {"mapping": 1},
     {"mapping": [[[1], {}]]}, {"name": "edge", "hyperparameters": {}}, {"name": [], "hyperparameters": None},
     {"name": "os:system", "hyperparameters": {}}, {"array": [1.0, 2.0], "dtype": "float32"}, "\ud800", "x" * 10_000,
@@ -43,7 +45,20 @@ def json_file(rng: np.random.Generator, path: Path) -> str:
         path.write_text(text[: int(rng.integers(len(text)))])
         return "cut"
     if way == "text" or path.suffix != ".json":
-        odd = ("", "null", "[]", "{}", "1", '"x"', "NaN", DEEP, '{"format": ' + DEEP, "9" * 10_000, "\ufeff" + text, "\0")
+        odd = (
+            "",
+            "null",
+            "[]",
+            "{}",
+            "1",
+            '"x"',
+            "NaN",
+            DEEP,
+            '{"format": ' + DEEP,
+            "9" * 10_000,
+            "\ufeff" + text,
+            "\0",
+        )
         path.write_text(picked(rng, odd))
         return "another text"
     config = json.loads(text)
@@ -166,8 +181,10 @@ def table_file(rng: np.random.Generator, path: Path) -> str:
     """Change an observation's .csv; in words, how."""
     text = path.read_text()
     odd = (
-        "", "\n", "#\n", "x\n", "x,y\n1\n", "1,2\n3\n", "nan\n", "inf\ninf\n", "1\n" * 5, "1,2\n" * 2, "a,1\n", '"1\n', "1;2\n",
-        "\ufeff" + text, text * 100, "time,x\n0,1\n1,2\n", "9" * 400 + "\n", "1\0\n2\n", "x" * 200_000, "٣\n٤\n", "1e400\n" * 2,
+        "", "\n", "#\n", "x\n", "x,y\n1\n", "1,2\n3\n", "nan\n", "inf\ninf\n", "1\n" * 5, "1,2\n" * 2, "a,1\n",
+        '"1\n', "1;2\n",
+        "\ufeff" + text, text * 100, "time,x\n0,1\n1,2\n", "9" * 400 + "\n", "1\0\n2\n", "x" * 200_000,
+        "٣\n٤\n", "1e400\n" * 2,
         "1e38\n" * 2, "x\n" + text, text.replace("\n", "\r\n"), '1\n"' + "2" * 200_000 + "\n",
     )  # fmt: skip
     if rng.random() < 0.2:

@@ -12,6 +12,7 @@ import gc
 import hashlib
 import importlib.metadata
 import io
+import itertools
 import os
 import re
 import resource
@@ -172,7 +173,9 @@ def ended(case: Case) -> Result:
             text = f"{type(error).__name__}: {str(error)[:200]} ({Path(place.filename).name}:{place.lineno})"
             return Result("traceback", text)
     text = errors.getvalue()
-    text += "".join(f"{one.category.__name__}: {one.message}\n" for one in shown if not issubclass(one.category, SILENT))
+    text += "".join(
+        f"{one.category.__name__}: {one.message}\n" for one in shown if not issubclass(one.category, SILENT)
+    )
     if status == 0:
         return Result("works", text)
     if status == 2 and (line := ERROR.fullmatch(text)):
@@ -186,14 +189,16 @@ def contents(root: Path) -> dict[str, str]:
     for folder, names, files in os.walk(root):
         for name in (*files, *names):
             path = Path(folder, name)
-            text = os.readlink(path).encode() if path.is_symlink() else b"folder" if path.is_dir() else path.read_bytes()
+            text = (
+                os.readlink(path).encode() if path.is_symlink() else b"folder" if path.is_dir() else path.read_bytes()
+            )
             found[os.path.relpath(path, root)] = hashlib.sha256(text).hexdigest()
     return found
 
 
 def allowed(words: tuple[str, ...], here: Path) -> list[str]:
     """Where a command may make files: what follows its last --out, and the run that it is about; from a folder on."""
-    given = [after for word, after in zip(words, words[1:], strict=False) if word == "--out"]
+    given = [after for word, after in itertools.pairwise(words) if word == "--out"]
     given += [word.removeprefix("--out=") for word in words if word.startswith("--out=")]
     if words[:2] == ("whip", "convert"):
         given += words[-1:]
@@ -213,7 +218,8 @@ def strayed(before: dict[str, str], after: dict[str, str], words: tuple[str, ...
         for name in after
         if name not in before
         and not any(
-            inside(name, place) or inside(place, name) or name == os.path.splitext(place)[0] + ".json" for place in places
+            inside(name, place) or inside(place, name) or name == os.path.splitext(place)[0] + ".json"
+            for place in places
         )
     ]
     return touched + made

@@ -50,34 +50,47 @@ OWN = ("resume", "sample", "diagnose", "report")
 """Commands that write into the folder they are given."""
 
 NUMBERS = (
-    "-1", "0", "1", "2", "3", "7", "0.5", "1.5", "1e-3", "1e-320", "1e38", "nan", "inf", "-inf", "1e400", "-0", "100000",
-    "2147483647", "2147483648", "4294967296", "9223372036854775807", "-9223372036854775809", "9" * 30, "9" * 5000, "0x10",
+    "-1", "0", "1", "2", "3", "7", "0.5", "1.5", "1e-3", "1e-320", "1e38", "nan", "inf", "-inf", "1e400", "-0",
+    "100000",
+    "2147483647", "2147483648", "4294967296", "9223372036854775807", "-9223372036854775809", "9" * 30,
+    "9" * 5000, "0x10",
     "1_0", "٣", "1,2", "",
 )  # fmt: skip
 VALUES = (
-    *NUMBERS, " ", "true", "None", "null", "[]", "{}", "[/x]", "[bold]", "[red]x[/red]", "é", "名前", "🦾", "\udcff", "a\nb",
-    "a\tb", "a\0b", "\x1b[31m", "%s", "%(prog)s", "{0}", "$HOME", "..", "../..", "../../etc/passwd", "/", "/etc/passwd", "~",
-    "a/b", "a\\b", "-", "--", "-x", "--rounds", "x" * 300, "x" * 5000, "ok", "edge", "ok+edge", "ok+", "+", "ok+edge+mode",
+    *NUMBERS, " ", "true", "None", "null", "[]", "{}", "[/x]", "[bold]", "[red]x[/red]", "é", "名前", "🦾",
+    "\udcff", "a\nb",
+    "a\tb", "a\0b", "\x1b[31m", "%s", "%(prog)s", "{0}", "$HOME", "..", "../..", "../../etc/passwd", "/",
+    "/etc/passwd", "~",
+    "a/b", "a\\b", "-", "--", "-x", "--rounds", "x" * 300, "x" * 5000, "ok", "edge", "ok+edge", "ok+", "+",
+    "ok+edge+mode",
     "none", "mdn", "maf", "nsf", "mdn_likelihood", "ok+../..", "..+edge", ":", "a:b", "os:system", "builtins:dict",
-    "json:loads", "os.path:join", "=", "a=b", "expansion=", "expansion=nan,1", "expansion=0.1,0.2", "expansion=1,1", "tail=a",
-    "=1", "tail=1,1", "posterior", "posterior,posterior", "posterior,ok", ",", ",,", "good", "good/run", "good/file", "own",
-    "good/nowhere", "own/policy.npz", "own/recording.npz", "own/actions.npz", "good/observation.npz", "good/observation.csv",
+    "json:loads", "os.path:join", "=", "a=b", "expansion=", "expansion=nan,1", "expansion=0.1,0.2",
+    "expansion=1,1", "tail=a",
+    "=1", "tail=1,1", "posterior", "posterior,posterior", "posterior,ok", ",", ",,", "good", "good/run",
+    "good/file", "own",
+    "good/nowhere", "own/policy.npz", "own/recording.npz", "own/actions.npz", "good/observation.npz",
+    "good/observation.csv",
     "good/simulations.npz", "uniform", "uniform:x", "median", "median:1", "point:1", "point:nan,1", "point:200,1e5",
     "point:", "constant:1", "constant:nan,nan", "dlo-0", "dlo-9", "socket://", "socket://x", "socket://127.0.0.1:1",
     "socket://127.0.0.1:99999", "tcp://127.0.0.1:1", "own/recording.npz#episode=1", "red=dlo", "whip,detector=clean",
 )  # fmt: skip
 """Values for any flag; by chance some are right."""
 TASKS = (
-    TASK, HOST, "", ",", "gaussian_linear,", "gaussian_linear,trials=0", "gaussian_linear,trials=x", "gaussian_linear,trials",
-    "gaussian_linear,trials=1001", "gaussian_linear,pooling=x,trials=2", "gaussian_linear,a=b", "gaussian", "[/x]", "..",
-    "gaussian_linear,=", "gaussian_linear,trials=2,trials=3", ":", "a:", ":b", "a:b:c", "os:getcwd", "os:path", "json:x",
+    TASK, HOST, "", ",", "gaussian_linear,", "gaussian_linear,trials=0", "gaussian_linear,trials=x",
+    "gaussian_linear,trials",
+    "gaussian_linear,trials=1001", "gaussian_linear,pooling=x,trials=2", "gaussian_linear,a=b", "gaussian",
+    "[/x]", "..",
+    "gaussian_linear,=", "gaussian_linear,trials=2,trials=3", ":", "a:", ":b", "a:b:c", "os:getcwd", "os:path",
+    "json:x",
     "builtins:exit", "builtins:open", "jaxlfi.envs.gaussian_linear:task", "jaxlfi.envs.gaussian_linear:nothing", "..:x",
-    "lynx_hare", "mg1", "whip", "whip,object=x", "mujoco", "mujoco,config=x", "x" * 5000, "\0", "\udcff", "gaussian_linear;x",
+    "lynx_hare", "mg1", "whip", "whip,object=x", "mujoco", "mujoco,config=x", "x" * 5000, "\0", "\udcff",
+    "gaussian_linear;x",
     "/etc/passwd",
 )  # fmt: skip
 """Names of tasks and environments, right and wrong."""
 PLACES = (
-    "good/file", "good/run", "good/nowhere", "", ".", "own/a/../out", "own/" + "x" * 300, "own/[/x]", "own/é\udcff", "own/a\0b",
+    "good/file", "good/run", "good/nowhere", "", ".", "own/a/../out", "own/" + "x" * 300, "own/[/x]",
+    "own/é\udcff", "own/a\0b",
     "/dev/null/x", "/proc/x", "good/file/x", "-", "own/名前", "..", "../new", "own/run", "own/new/deep", "own/out.npz",
     "own/out.csv", "own/out.nc", "own/out.onnx", "own/out.mcap", "own/policy.npz", "own",
 )  # fmt: skip

@@ -287,7 +287,6 @@ def _arrays_if_there(path: Path) -> dict[str, np.ndarray]:
     return read_arrays(path) if path.exists() else {}
 
 
-
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Refuse arrays that do not agree in the numbers of rounds, simulations, parameters or components."""
     if arrays["theta"].ndim != 3 or arrays["logits"].ndim != 2 or arrays["theta"].shape[0] < 1:

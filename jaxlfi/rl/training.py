@@ -12,7 +12,6 @@ import csv
 import dataclasses
 import functools
 import io
-import json
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path

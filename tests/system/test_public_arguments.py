@@ -19,9 +19,15 @@ from tests.small import SETTINGS, gaussian
 
 EXAMPLES = 60
 NUMBERS = st.one_of(
-    st.none(), st.booleans(), st.integers(-3, 5), st.sampled_from([2**31, -(2**63), 10**30, 1e308, -0.0, 1e-320]), st.floats()
+    st.none(),
+    st.booleans(),
+    st.integers(-3, 5),
+    st.sampled_from([2**31, -(2**63), 10**30, 1e308, -0.0, 1e-320]),
+    st.floats(),
 )
-TEXTS = st.one_of(st.text(max_size=5), st.sampled_from(["", "ok", "natural", "inference", "..", "/", "[x]", "a\nb", "\0", "\ud800"]))
+TEXTS = st.one_of(
+    st.text(max_size=5), st.sampled_from(["", "ok", "natural", "inference", "..", "/", "[x]", "a\nb", "\0", "\ud800"])
+)
 ARRAYS = st.builds(
     lambda shape, kind, value: np.full(shape, value).astype(kind),
     st.sampled_from([(), (0,), (1,), (2,), (3,), (2, 2), (0, 2), (1, 1, 1)]),
@@ -29,7 +35,8 @@ ARRAYS = st.builds(
     st.sampled_from([0, 1, -1, 3]),
 ) | st.sampled_from([np.full(2, np.nan), np.full(2, np.inf), np.array([1.0, np.nan]), np.full(2, 1e38)])  # fmt: skip
 ANYTHING = st.recursive(
-    st.one_of(NUMBERS, TEXTS, ARRAYS, st.binary(max_size=3), st.builds(object), st.just(len), st.just(dict), st.just(jaxlfi.QUICK)),
+    st.one_of(NUMBERS, TEXTS, ARRAYS, st.binary(max_size=3), st.builds(object), st.just(len), st.just(dict),
+    st.just(jaxlfi.QUICK)),
     lambda inner: st.one_of(
         st.lists(inner, max_size=3), st.lists(inner, max_size=3).map(tuple), st.dictionaries(TEXTS, inner, max_size=2)
     ),
@@ -76,7 +83,9 @@ def test_settings(name, value):
     right_or_refused(lambda: jaxlfi.QUICK.replace(**{name: value}).check())
 
 
-@given(st.sampled_from([jaxlfi.MixtureNetwork, jaxlfi.MaskedFlow, jaxlfi.SplineFlow, jaxlfi.MixtureLikelihood]), st.data())
+@given(
+    st.sampled_from([jaxlfi.MixtureNetwork, jaxlfi.MaskedFlow, jaxlfi.SplineFlow, jaxlfi.MixtureLikelihood]), st.data()
+)
 @settings(max_examples=3 * EXAMPLES)
 def test_estimators(kind, data):
     name = data.draw(st.sampled_from([field.name for field in dataclasses.fields(kind)]))
@@ -109,7 +118,12 @@ def test_tasks(name, value):
     right_or_refused(jaxlfi.Task, **TASK | {name: value})
 
 
-COMMAND = {"template": "echo [{theta}, {seed}]", "names": ("a", "b"), "supports": TASK["supports"], "feasible": TASK["feasible"]}
+COMMAND = {
+    "template": "echo [{theta}, {seed}]",
+    "names": ("a", "b"),
+    "supports": TASK["supports"],
+    "feasible": TASK["feasible"],
+}
 
 
 @given(st.sampled_from(["template", "names", "supports", "feasible", "timeout", "channels", "name"]), ANYTHING)
@@ -143,7 +157,8 @@ def test_presets(method, preset):
 
 
 ARGUMENTS = (
-    "key", "task", "observation", "support", "heuristic", "settings", "space", "simulations", "executor", "simulation_timeout",
+    "key", "task", "observation", "support", "heuristic", "settings", "space", "simulations", "executor",
+    "simulation_timeout",
 )  # fmt: skip
 
 
