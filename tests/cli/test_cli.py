@@ -318,7 +318,7 @@ def test_npz_files_that_cannot_be_an_observation(tmp_path, capsys):
     (tmp_path / "broken.npz").write_bytes(b"PK not really")
     for name in ("two", "pickled", "broken"):
         arguments = ("infer", TASK, "--observation", tmp_path / f"{name}.npz", "--out", tmp_path / "out")
-        assert "cannot read" in error_line(capsys, *arguments)
+        assert "expected a readable file" in error_line(capsys, *arguments)
 
 
 @pytest.mark.slow
