@@ -8,7 +8,7 @@ from collections.abc import Callable
 def one_line(error: Exception) -> str:
     """What an error of bad input says, in one line; where a path caused it, what was expected instead."""
     text = " ".join(str(error).split()) or type(error).__name__
-    of_path = isinstance(error, OSError) or text == "embedded null byte"
+    of_path = getattr(error, "filename", None) is not None or text == "embedded null byte"
     return f"expected a file or folder that can be used, got {text}" if of_path and "expected" not in text else text
 
 

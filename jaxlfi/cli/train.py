@@ -205,8 +205,10 @@ def check_seeds(first: int, count: int, name: str) -> None:
 
 
 def _plan(arguments: argparse.Namespace) -> Any:
-    if not 1 <= arguments.seeds <= MAX_SEEDS:
-        raise ValueError(f"seeds: expected from 1 to {MAX_SEEDS}, got {arguments.seeds}")
+    if arguments.seeds < 1:
+        raise ValueError(f"seeds: expected at least 1, got {arguments.seeds}")
+    if arguments.seeds > MAX_SEEDS:
+        raise ValueError(f"seeds: expected at most {MAX_SEEDS}, got {arguments.seeds}")
     check_seeds(arguments.first_seed, arguments.seeds, "first_seed")
     from jaxlfi.rl import registry
     from jaxlfi.rl.settings import PRESETS as SETTINGS_OF

@@ -29,9 +29,10 @@ def require_count(value: Any, name: str, least: int = 1, most: int | None = None
         count = operator.index(value)
     except TypeError:
         count = None
-    if count is None or isinstance(value, bool) or count < least or (most is not None and count > most):
-        limits = f"of at least {least}" if most is None else f"from {least} to {most}"
-        raise ValueError(f"{name}: expected a whole number {limits}, got {value!r}")
+    if count is None or isinstance(value, bool) or count < least:
+        raise ValueError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+    if most is not None and count > most:
+        raise ValueError(f"{name}: expected at most {most}, got {value!r}")
     return count
 
 

@@ -347,7 +347,7 @@ def test_bad_input_is_one_line(folder, tmp_path, capsys):
         (["--against", tmp_path / "few.csv"], "expected at least 20 rows of finite numbers"),
         (["--against", tmp_path / "nan.csv"], "expected at least 20 rows of finite numbers"),
         (["--against", tmp_path / "text.csv"], "could not convert"),
-        (["--against", tmp_path / "shape.npz"], "shape [n, 2], got [30, 3]"),
+        (["--against", tmp_path / "shape.npz"], "shape [n, 2], got float64 [30, 3]"),
         (["--against", tmp_path / "other.npz"], "against: expected a readable file"),
     ):
         assert expected in refused(capsys, folder, *given)
