@@ -156,7 +156,11 @@ def test_a_file_that_is_none_is_refused(tmp_path, capsys):
     reference = "tests.runs.test_given_simulations:host_task"
     assert command("infer", reference, *FLAGS, "--simulations", tmp_path / "missing.npz", "--out", tmp_path / "x") == 2
     message = capsys.readouterr().err
-    assert message.count("\n") == 1 and "missing.npz: expected a whole .npz file" in message and not (tmp_path / "x").exists()
+    assert (
+        message.count("\n") == 1
+        and "missing.npz: expected a whole .npz file" in message
+        and not (tmp_path / "x").exists()
+    )
 
 
 # ------------------------------------------------------------------------------------------------------- weights
