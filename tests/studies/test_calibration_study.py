@@ -342,13 +342,13 @@ def test_bad_input_is_one_line(folder, tmp_path, capsys):
         (["--reference", "ok,broad"], "or one of each with a comma between, got 'ok,broad'"),
         (["--reference", "posterior,posterior"], "got 'posterior,posterior'"),
         (["--reference", ""], "got ''"),
-        (["--against", tmp_path / "none.csv"], "against: cannot read"),
+        (["--against", tmp_path / "none.csv"], "against: expected a readable file"),
         (["--against", tmp_path / "columns.csv"], "expected the columns first, second, got first, third"),
         (["--against", tmp_path / "few.csv"], "expected at least 20 rows of finite numbers"),
         (["--against", tmp_path / "nan.csv"], "expected at least 20 rows of finite numbers"),
         (["--against", tmp_path / "text.csv"], "could not convert"),
-        (["--against", tmp_path / "shape.npz"], "shape [n, 2], got [30, 3]"),
-        (["--against", tmp_path / "other.npz"], "against: cannot read"),
+        (["--against", tmp_path / "shape.npz"], "shape [n, 2], got float64 [30, 3]"),
+        (["--against", tmp_path / "other.npz"], "against: expected a readable file"),
     ):
         assert expected in refused(capsys, folder, *given)
     assert not (folder / "diagnostics").exists()
