@@ -40,6 +40,8 @@ def parse(reference: str, word: str = "task") -> tuple[str, dict[str, str]]:
         >>> parse("whip,object=dlo-0")
         ('whip', {'object': 'dlo-0'})
     """
+    if not isinstance(reference, str):
+        raise ValueError(f"{word}: expected a name, got {reference!r}")
     name, *parts = reference.split(",")
     options = dict(part.partition("=")[::2] for part in parts)
     if len(options) < len(parts) or not all(key.isidentifier() and value for key, value in options.items()):

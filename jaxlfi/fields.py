@@ -179,13 +179,13 @@ def check_fields(value: Any) -> None:
 
 def check_value(field: Declared, value: Any) -> None:
     """Refuse one value of a field; see `check_fields`."""
-    if value is None:
+    if value is None and (not field.static or field.default is None):
         return
     if not field.static:
         if _is_known(value):
             _check_number(field, value, whole=False)
     elif field.info.choices is not None:
-        if value not in field.info.choices:
+        if not isinstance(value, tuple({type(one) for one in field.info.choices})) or value not in field.info.choices:
             raise _wrong(field, f"one of {', '.join(map(str, field.info.choices))}", value)
     elif isinstance(field.default, tuple):
         if not isinstance(value, tuple):

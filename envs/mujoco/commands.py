@@ -65,7 +65,7 @@ def fit(arguments: argparse.Namespace) -> None:
         log = [name for name, own in zip(names, task.space.log, strict=True) if own]
         truth = None if task.truth is None else np.asarray(task.truth)
         plot.pairs(sets, names=names, units=task.units, log=log, truth=truth, path=out / "pairs.png", dpi=150)
-        console.print(f"results: {out}", markup=False, highlight=False)
+        console.print(f"results: {out}", markup=False, highlight=False, soft_wrap=True)
 
 
 def task_of(run: Run) -> Task:

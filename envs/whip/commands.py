@@ -120,8 +120,8 @@ def deploy(arguments: argparse.Namespace) -> None:
         raise ValueError(f"repetitions: expected at least 1, got {n}")
     named = [objects.load(name) for name in dict.fromkeys(arguments.object)]
     begins = {word: repetitions.acting(word) for word in arguments.policies}
-    seen_by = sights(arguments.detector, arguments.renderer, arguments.weights)
-    with seen_by as seeing, Progress(console=Console(stderr=True)) as progress:
+    seen_by, console = sights(arguments.detector, arguments.renderer, arguments.weights), Console(stderr=True)
+    with seen_by as seeing, Progress(console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task("episodes", total=len(begins) * len(named) * n)
         advance, key = lambda: progress.advance(bar), jax.random.key(arguments.seed)
         rows = repetitions.repeat(key, begins, named, n, advance, seeing)
@@ -204,8 +204,8 @@ def _read_actions(path: str) -> np.ndarray:
 
 def _search(key: jax.Array, engine: Engine, parameters: WhipParameters) -> planner.Plan:
     """Plan as `planner.plan` does, with a progress bar; the history has only iterations that were needed."""
-    method = planner.CrossEntropy()
-    with Progress(console=Console(stderr=True)) as progress:
+    method, console = planner.CrossEntropy(), Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task("planning", total=method.iterations)
         search = functools.partial(planner.plan, method=method, on_iteration=lambda: progress.advance(bar))
         found = jax.device_get(jax.jit(search, static_argnums=1)(key, engine, parameters))

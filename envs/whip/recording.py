@@ -239,7 +239,7 @@ def _description(path: Path) -> Any:
         raise ValueError(f"a recording is two files: expected a description in {path.name} beside the .npz, got none")
     try:
         return json.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"expected a description in {path.name}, got {type(error).__name__}") from error
 
 
@@ -269,7 +269,10 @@ def checked(described: Any, where: str) -> dict[str, Any]:
 
 
 def _array(name: str, value: Any, kind: type) -> np.ndarray:
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name}: expected an array of {kind.__name__}s, got {value!r}") from error
     if array.dtype.kind not in {bool: "b", float: "fiu"}[kind]:
         raise ValueError(f"{name}: expected an array of {kind.__name__}s, got {array.dtype}")
     array = array.astype(kind)

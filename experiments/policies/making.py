@@ -102,15 +102,16 @@ def split(together: Path, outs: Sequence[Path]) -> None:
     config = training.read_config(together)
     trained = [one["domain"] for one in config["trainings"]]
     header, *lines = (together / "table.csv").read_text().splitlines(keepends=True)
-    arrays = {name: files.read_arrays(together / f"{name}.npz") for name in ("curves", "outcomes", "domains")}
+    arrays = {name: files.read_arrays(together / f"{name}.npz") for name in ("curves", "outcomes")}
+    domains = files.read_sealed(together / "domains.npz")
     for domain, out in zip(dict.fromkeys(trained), outs, strict=True):
         if (out / "table.csv").exists():
             continue
         rows = [row for row, other in enumerate(trained) if other == domain]
         out.mkdir(exist_ok=True)
         shutil.copytree(together / domain, out / domain, dirs_exist_ok=True)
-        points = {name: arrays["domains"][name][rows] for name in ("trained", "held_out")}
-        files.write_arrays(out / "domains.npz", arrays["domains"] | points)
+        points = {name: domains[name][rows] for name in ("trained", "held_out")}
+        files.write_sealed(out / "domains.npz", domains | points)
         files.write_arrays(out / "curves.npz", {name: array[:, rows] for name, array in arrays["curves"].items()})
         files.write_arrays(out / "outcomes.npz", {name: array[rows] for name, array in arrays["outcomes"].items()})
         files.write_json(out / "config.json", config | {"trainings": [config["trainings"][row] for row in rows]})

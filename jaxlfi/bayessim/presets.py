@@ -127,7 +127,7 @@ def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") ->
         ValueError: for settings of the task that no method has, and methods and presets that are not there.
     """
     for what, name, known in (("method", method, METHODS), ("preset", preset, PRESETS)):
-        if name not in known:
+        if not isinstance(name, str) or name not in known:
             raise ValueError(f"{what}: expected one of {', '.join(known)}, got {name!r}")
     fields = {name for known in METHODS.values() for name in declared(known(PRESETS[preset]).estimator)}
     if unknown := sorted(set(task.settings) - fields - set(declared(Settings))):

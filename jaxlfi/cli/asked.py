@@ -17,6 +17,8 @@ from jaxlfi.tasks.executors import one_by_one, scheduler, workers
 from jaxlfi.tasks.observation import read_for
 from jaxlfi.tasks.task import Task
 
+MAX_SEEDS = 10_000
+"""Runs of one command that differ in nothing but their seed; each observes before the first begins."""
 CONFIGURATION_DEFAULTS = ("ok", "misspecified", "broad")
 """Supports that are compared by default, where the task has them."""
 
@@ -124,6 +126,8 @@ def observation_of(arguments: argparse.Namespace, task: Task) -> np.ndarray | No
 
 def seeds_of(arguments: argparse.Namespace) -> range:
     """A seed for each run."""
+    if arguments.seeds > MAX_SEEDS:
+        raise ValueError(f"seeds: expected at most {MAX_SEEDS}, got {arguments.seeds}")
     if arguments.seeds < 1 or not 0 <= arguments.first_seed < 2**31 - arguments.seeds:
         raise ValueError(
             f"seeds: expected at least 1, and first_seed at least 0, got {arguments.seeds} and {arguments.first_seed}"

@@ -5,6 +5,13 @@ import traceback
 from collections.abc import Callable
 
 
+def one_line(error: Exception) -> str:
+    """What an error of bad input says, in one line; where a path caused it, what was expected instead."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    of_path = getattr(error, "filename", None) is not None or text == "embedded null byte"
+    return f"expected a file or folder that can be used, got {text}" if of_path and "expected" not in text else text
+
+
 def exit_status(program: str, work: Callable[[], None], debug: bool = False, advice: Callable[[], str] = str) -> int:
     """Do a command's work.
 
@@ -23,7 +30,7 @@ def exit_status(program: str, work: Callable[[], None], debug: bool = False, adv
         if debug:
             traceback.print_exception(error)
         go_on = advice() if isinstance(error, OSError) and not isinstance(error, BlockingIOError) else ""
-        print(f"{program}: error: {' '.join(str(error).split())}{go_on}", file=sys.stderr)
+        print(f"{program}: error: {one_line(error)}{go_on}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"{program}: interrupted{advice()}", file=sys.stderr)

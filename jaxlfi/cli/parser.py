@@ -18,11 +18,12 @@ import traceback
 from collections.abc import Mapping, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import jaxlfi
 from jaxlfi import flags, source_fields
 from jaxlfi.cli import help_texts, joined
+from jaxlfi.cli.exit_status import one_line
 from jaxlfi.fields import Declared
 
 Commands = argparse._SubParsersAction  # argparse has no public name for it
@@ -41,7 +42,14 @@ class OneLineParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """One line on stderr, and exit status 2."""
-        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+        self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        """The values of a flag; argparse takes the value of `--flag=--` for none, and no value for a right one."""
+        values = super()._get_values(action, arg_strings)
+        if values == [] and action.option_strings and action.nargs in (None, "+"):
+            raise argparse.ArgumentError(action, "expected at least one argument")
+        return values
 
 
 @dataclasses.dataclass(frozen=True)
@@ -472,7 +480,7 @@ def _recorded(arguments: argparse.Namespace) -> dict:
         return {}
     try:
         config = json.loads(path.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return config if isinstance(config, dict) else {}
 
@@ -546,6 +554,5 @@ def _refuse(error: Exception, debug: bool = False, advice: str = "") -> int:
     """Report an error in one line with what to do about it, and where it came from on request."""
     if debug:
         traceback.print_exception(error)
-    text = " ".join(str(error).split()) or type(error).__name__
-    print(f"jaxlfi: error: {text}{advice}", file=sys.stderr)
+    print(f"jaxlfi: error: {one_line(error)}{advice}", file=sys.stderr)
     return 2

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from jaxlfi.rl.environment import Environment
 
 PRESETS = ("quick", "paper")
+MAX_SEEDS = 1000
+"""Trainings of a domain side by side."""
 SETTINGS = "jaxlfi.rl.settings:PPO"
 """The class whose fields are the settings of a training."""
 
@@ -166,7 +168,7 @@ def is_training(out: Path) -> bool:
     """Whether a folder is that of trainings; it may be damaged."""
     try:
         config = json.loads((out / "config.json").read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
     return isinstance(config, dict) and config.get("format") == "jaxlfi-training"
 
@@ -205,6 +207,8 @@ def check_seeds(first: int, count: int, name: str) -> None:
 def _plan(arguments: argparse.Namespace) -> Any:
     if arguments.seeds < 1:
         raise ValueError(f"seeds: expected at least 1, got {arguments.seeds}")
+    if arguments.seeds > MAX_SEEDS:
+        raise ValueError(f"seeds: expected at most {MAX_SEEDS}, got {arguments.seeds}")
     check_seeds(arguments.first_seed, arguments.seeds, "first_seed")
     from jaxlfi.rl import registry
     from jaxlfi.rl.settings import PRESETS as SETTINGS_OF

@@ -19,8 +19,8 @@ def require_key(key: Any, name: str = "key") -> jax.Array:
     return key
 
 
-def require_count(value: Any, name: str, least: int = 1) -> int:
-    """Refuse what is no whole number of at least `least`.
+def require_count(value: Any, name: str, least: int = 1, most: int | None = None) -> int:
+    """Refuse what is no whole number of at least `least`, and at most `most`.
 
     Raises:
         ValueError: naming the argument.
@@ -31,7 +31,25 @@ def require_count(value: Any, name: str, least: int = 1) -> int:
         count = None
     if count is None or isinstance(value, bool) or count < least:
         raise ValueError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+    if most is not None and count > most:
+        raise ValueError(f"{name}: expected at most {most}, got {value!r}")
     return count
+
+
+def require_texts(value: Any, name: str) -> tuple[str, ...]:
+    """Refuse what is no sequence of texts.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    try:
+        texts = () if isinstance(value, str) else tuple(value)
+    except TypeError:
+        texts = (None,)
+    if isinstance(value, str) or not all(isinstance(text, str) for text in texts):
+        what = "the string " * isinstance(value, str)
+        raise ValueError(f"{name}: expected a sequence of names, got {what}{value!r}")
+    return texts
 
 
 def is_concrete(tree: Any) -> bool:

@@ -24,6 +24,9 @@ class Space:
         names: of the D parameters.
         log: for each, whether it is inferred as its logarithm.
 
+    Raises:
+        ValueError: for anything else.
+
     Example:
         >>> space = Space(("length", "young"), (False, True))
         >>> space.labels
@@ -34,6 +37,12 @@ class Space:
 
     names: tuple[str, ...]
     log: tuple[bool, ...]
+
+    def __post_init__(self):
+        if not isinstance(self.names, tuple) or not all(isinstance(name, str) for name in self.names):
+            raise ValueError(f"names: expected a tuple of texts, got {self.names!r}")
+        if not isinstance(self.log, tuple) or [type(one) for one in self.log] != [bool] * len(self.names):
+            raise ValueError(f"log: expected True or False for each of {list(self.names)}, got {self.log!r}")
 
     @property
     def dim(self) -> int:

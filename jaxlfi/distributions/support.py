@@ -77,7 +77,10 @@ class Support:
 
 def _checked_bounds(low, high) -> tuple[np.ndarray, np.ndarray]:
     """Plain bounds as float32 vectors, or a ValueError that says what is wrong with them."""
-    low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
+    try:
+        low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(f"support: expected bounds that are numbers, got low={low!r}, high={high!r}") from error
     if low.ndim != 1 or low.shape != high.shape or low.size == 0:
         raise ValueError(
             f"support: expected two vectors of the same length, got low of shape {low.shape} "

@@ -17,6 +17,8 @@ from jaxlfi.distributions.truncated_mixture import truncated_mixture_draws
 from jaxlfi.distributions.truncation import mass_inside, rejection_sample, truncated_log_prob
 from jaxlfi.estimators.density import Density
 
+MAX_DRAWS = 10_000_000
+"""Draws that are made at once."""
 MEAN_DRAWS = 4096
 """Number of draws that the posterior mean is estimated from (1.6 % of a standard deviation)."""
 MAP_DRAWS = 1000
@@ -58,9 +60,9 @@ class Posterior:
         """`n` independent draws, shape [n, D].
 
         Raises:
-            ValueError: for what is no key, or a number that is not whole and at least 1.
+            ValueError: for what is no key, or a number that is not whole and from 1 to `MAX_DRAWS`.
         """
-        require_count(n, "n")
+        require_count(n, "n", most=MAX_DRAWS)
         natural = is_natural(space)
         draws = _sample(require_key(key), self, int(n))
         return self.space.to_natural(draws) if natural else draws
@@ -71,7 +73,10 @@ class Posterior:
         Raises:
             ValueError: for another number of parameters.
         """
-        theta = jnp.asarray(theta, jnp.float32)
+        try:
+            theta = jnp.asarray(theta, jnp.float32)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise ValueError(f"theta: expected numbers of shape [..., {self.space.dim}], got {theta!r}") from error
         if theta.ndim == 0 or theta.shape[-1] != self.space.dim:
             raise ValueError(f"theta: expected shape [..., {self.space.dim}], got {list(theta.shape)}")
         return _log_prob(self, theta, is_natural(space))

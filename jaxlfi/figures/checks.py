@@ -1,6 +1,5 @@
 """Checks: the observation among simulations from the posterior; all pictures of diagnostics, and a page of them."""
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -46,16 +45,16 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
                 pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
     text = page.render_diagnostics(found, pictures)
     index = folder / "report.html"
-    files.write_bytes(index, text.encode())
+    files.write_bytes(index, text.encode(errors="replace"))
     return [index, *(picture.path for picture in pictures)]
 
 
 def _read(path: Path) -> Mapping[str, Any]:
     try:
-        found = json.loads(path.read_text())
+        found = files.read_json(path)
         if "widths" not in found or "checks" not in found:
             raise ValueError("no verdicts")
-    except (OSError, ValueError, TypeError) as error:
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: expected the results of diagnostics, but they cannot be read ({error})") from error
     return found
 

@@ -1,8 +1,6 @@
 """History: the saved arrays of one inference run, as the figures use them."""
 
 import dataclasses
-import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxlfi.figures import density, statistics
+from jaxlfi.io import files
 
 REQUIRED = (
     "theta",
@@ -25,6 +24,9 @@ REQUIRED = (
     "scale_tril",
 )
 """Arrays of history.npz that a run must have to be drawn."""
+
+TEXTS = ("axes", "channels", "names", "parameters", "reasons", "record_label", "summaries", "units")
+"""Arrays of texts, in any file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,9 +161,8 @@ class History:
     def measured_widths(self) -> str | None:
         """In words, what diagnostics in the run's folder found of its widths; None where there are none, or others."""
         try:
-            found = json.loads((self.folder / "diagnostics" / "diagnostics.json").read_text())
-            return str(found["line"])
-        except (OSError, ValueError, KeyError, TypeError):
+            return str(files.read_json(self.folder / "diagnostics" / "diagnostics.json")["line"])
+        except (ValueError, KeyError, TypeError):
             return None
 
     @property
@@ -250,10 +251,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     path = folder / "config.json"
     if not path.is_file():
         raise ValueError(f"{folder}: expected a folder with config.json, as `jaxlfi infer --out` writes, found none")
-    try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: expected JSON, but it cannot be read ({_one_line(error)})") from error
+    config = files.read_json(path)
     if not isinstance(config, dict) or not isinstance(config.get("format"), str):
         raise ValueError(f"{path}: expected a JSON object with a 'format' that starts with 'jaxlfi-'")
     return config
@@ -267,13 +265,9 @@ def read_arrays(path: Path, required: tuple[str, ...] = ()) -> dict[str, np.ndar
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected the file, found none (has the run ended a round?)")
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-        raise ValueError(
-            f"{path}: expected an npz file of arrays, but it cannot be read ({_one_line(error)})"
-        ) from error
+    arrays = files.read_arrays(path)
+    if texts := [name for name, array in arrays.items() if array.dtype.kind in "SU" and name not in TEXTS]:
+        raise ValueError(f"{path}: expected numbers, got texts as {', '.join(texts)}")
     if missing := [name for name in required if name not in arrays]:
         raise ValueError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
     return arrays
@@ -291,10 +285,6 @@ def robust_sd(x: np.ndarray) -> np.ndarray:
 
 def _arrays_if_there(path: Path) -> dict[str, np.ndarray]:
     return read_arrays(path) if path.exists() else {}
-
-
-def _one_line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -315,6 +305,10 @@ def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{path}: expected {name} of shape {shape}, got {arrays[name].shape}")
+    for name in ("proposal", "support"):
+        low, high = arrays[f"{name}_low"], arrays[f"{name}_high"]
+        if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+            raise ValueError(f"{path}: expected finite bounds with {name}_low below {name}_high, got others")
     for name, shape in {
         "sample_theta_error": (rounds, None, dim),
         "sample_trajectory_error": (rounds, None),
@@ -353,7 +347,9 @@ def _rows(array: np.ndarray | None, columns: int) -> np.ndarray | None:
 
 def _x_scale(dataset: Mapping[str, np.ndarray], obs: int) -> np.ndarray | None:
     """Standard deviations of the summaries of the first round that has any."""
-    if not {"x", "round"} <= dataset.keys() or not len(dataset["x"]) or dataset["x"].shape[1:] != (obs,):
+    if not {"x", "round"} <= dataset.keys() or not dataset["round"].size:
+        return None
+    if dataset["x"].shape != (dataset["round"].size, obs):
         return None
     return robust_sd(dataset["x"][dataset["round"] == dataset["round"].min()])
 
@@ -396,7 +392,10 @@ def _texts(first: Any, second: Any, length: int, default: str) -> tuple[str, ...
 
 def _limits(config: Mapping[str, Any], side: str, dim: int) -> np.ndarray | None:
     limits = config.get(f"feasible_{side}")
-    array = np.asarray([] if limits is None else limits, float)
+    try:
+        array = np.asarray([] if limits is None else limits, float)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"feasible_{side}: expected {dim} numbers in config.json, got {limits!r}") from error
     return array if array.shape == (dim,) else None
 
 

@@ -67,7 +67,7 @@ def _written(folder: Path, makers: Mapping[str, Callable], loaded, render: Calla
             pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
     text = render(pictures)
     index = folder / "report.html"
-    files.write_bytes(index, text.encode())
+    files.write_bytes(index, text.encode(errors="replace"))
     return [index, *(picture.path for picture in pictures)]
 
 

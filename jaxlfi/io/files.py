@@ -4,6 +4,8 @@ import contextlib
 import io
 import json
 import os
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,13 @@ from typing import Any
 import numpy as np
 
 from jaxlfi.io.serialise import json_safe
+
+LARGE, DENSE = 2**30, 100
+"""Bytes of arrays that any file may unpack to, and to how many times its own size a larger one may."""
+KINDS = "biufSU"
+"""Of arrays that files may hold: booleans, integers, reals and texts."""
+SEAL = "seal"
+"""Name of the array that tells whether the others are as they were written."""
 
 
 def write_bytes(path: Path, content: bytes, durable: bool = False) -> None:
@@ -52,6 +61,23 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(json_safe(value), indent=2, allow_nan=False) + "\n").encode(), durable=True)
 
 
+def read_json(path: Path) -> Any:
+    """One JSON document.
+
+    Raises:
+        ValueError: for a file that is missing or damaged, or nested too deeply to be read.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: expected JSON, got a missing or damaged file: {first_line(error)}") from error
+
+
+def first_line(error: Exception) -> str:
+    """What an error says, in one line; its name where it says nothing."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
 def json_line(value: Any) -> str:
     """One JSON object as a line; NaN becomes null."""
     return json.dumps(json_safe(value), allow_nan=False) + "\n"
@@ -89,7 +115,44 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         ValueError: for a file that is missing, damaged, or something else.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+        with zipfile.ZipFile(path) as archive:
+            unpacked, packed = sum(member.file_size for member in archive.infolist()), path.stat().st_size
+        if unpacked <= max(LARGE, DENSE * packed):
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
     except Exception as error:  # zipfile, zlib, numpy and the operating system each have their own for a damaged file
         raise ValueError(f"{path}: expected a whole .npz file, got a missing or damaged one") from error
+    if unpacked > max(LARGE, DENSE * packed):
+        raise ValueError(f"{path}: expected arrays, got {packed} bytes that unpack to {unpacked / 2**30:.3g} GiB")
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in KINDS:
+            raise ValueError(f"{path}: expected numbers or texts, got {getattr(array, 'dtype', 'none')} as {name}")
+    return arrays
+
+
+def write_sealed(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Named arrays as .npz that only `read_sealed` is to read: uncompressed, durable, and sealed against changes."""
+    plain = {name: np.asarray(value) for name, value in arrays.items()}
+    write_arrays(path, plain | {SEAL: _seal(plain)}, compress=False, durable=True)
+
+
+def read_sealed(path: Path) -> dict[str, np.ndarray]:
+    """The arrays that `write_sealed` wrote.
+
+    Raises:
+        ValueError: for a file that is missing, damaged or changed.
+    """
+    arrays = read_arrays(path)
+    seal = arrays.pop(SEAL, None)
+    if not np.array_equal(seal, _seal(arrays)):
+        raise ValueError(f"{path}: expected the arrays as they were written, got others")
+    return arrays
+
+
+def _seal(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """A checksum over names, types, shapes and numbers, in any order of the names."""
+    parts = [
+        [name, array.dtype.str, array.shape, zlib.crc32(np.ascontiguousarray(array).tobytes())]
+        for name, array in sorted(arrays.items())
+    ]
+    return np.asarray(zlib.crc32(json.dumps(parts).encode()), np.uint32)

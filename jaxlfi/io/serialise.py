@@ -44,7 +44,8 @@ def from_json(description: Mapping[str, Any], load: Load) -> Any:
     Raises:
         ValueError: for what is no description, or not of this class.
     """
-    if not isinstance(description, Mapping) or set(description) != {"name", "hyperparameters"}:
+    named = isinstance(description, Mapping) and set(description) == {"name", "hyperparameters"}
+    if not named or not isinstance(description["name"], str):
         raise ValueError(f"expected a description by name and hyperparameters, got {description!r}")
     return made_of(load(description["name"]), description["name"], description["hyperparameters"], load)
 
@@ -99,7 +100,7 @@ def made_of(kind: type, name: str, values: Any, load: Load) -> Any:
     try:
         return kind(**{field: _decoded(value, load) for field, value in values.items()})
     except TypeError as error:
-        raise ValueError(f"{name}: cannot be made of its description: {error}") from error
+        raise ValueError(f"{name}: expected the description of one, got another: {error}") from error
 
 
 def _encoded(value: Any, name_of: NameOf) -> Any:

@@ -160,7 +160,7 @@ def read(path: str | Path, kind: str, version: int) -> tuple[dict[str, np.ndarra
     try:
         schema = json.loads(str(arrays["schema"]))
         got, its_version = schema.pop("format"), schema.pop("version")
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path}: expected a policy that jaxlfi saved, got an .npz without its schema") from error
     if (got, its_version) != (kind, version):
         raise ValueError(f"{path}: expected {kind} of version {version}, got {got} of version {its_version}")

@@ -12,7 +12,6 @@ import csv
 import dataclasses
 import functools
 import io
-import json
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -110,7 +109,7 @@ def begin(plan: Plan, out: Path) -> None:
         "tensorboard": plan.tensorboard,
         **run_folders.environment(),
     }
-    run_folders.create(out, config, lambda staging: files.write_arrays(staging / "domains.npz", arrays))
+    run_folders.create(out, config, lambda staging: files.write_sealed(staging / "domains.npz", arrays))
 
 
 def resumed(out: Path, environment: Environment, on_chunk: Callable[[int, Mapping[str, np.ndarray]], Any]) -> Result:
@@ -172,13 +171,22 @@ def read_config(out: Path) -> dict[str, Any]:
         StoreError: for folders that are none.
     """
     try:
-        config = json.loads((out / "config.json").read_text())
-    except (OSError, ValueError) as error:
+        config = files.read_json(out / "config.json")
+    except ValueError as error:
         raise StoreError(
             f"expected the folder of a training, got {str(out)!r} without a readable config.json"
         ) from error
     if not isinstance(config, dict) or (config.get("format"), config.get("version")) != (FORMAT, VERSION):
         raise StoreError(f"expected the folder of a training of this version, got {str(out)!r}")
+    try:
+        settings_of(config)
+        domains, seeds = zip(*((one["domain"], one["seed"]) for one in config["trainings"]), strict=True)
+        texts = all(isinstance(text, str) for text in (*domains, config["environment_name"]))
+        if not texts or not all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds):
+            raise ValueError("names or seeds that are none")
+        config["environment"], config["versions"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise StoreError(f"{out / 'config.json'}: expected a whole description of a training, got: {error}") from error
     return config
 
 
@@ -226,7 +234,7 @@ def _rows(made: Update) -> dict[str, np.ndarray]:
 def _write_checkpoint(path: Path, done: int, curves: Mapping[str, np.ndarray], state: Training) -> None:
     leaves = trees.to_arrays(state, "state")
     rows = {f"curve/{name}": row for name, row in curves.items()}
-    files.write_arrays(path, {"done": np.asarray(done)} | rows | leaves, compress=False, durable=True)
+    files.write_sealed(path, {"done": np.asarray(done)} | rows | leaves)
 
 
 def _read_checkpoint(path: Path, like: Training) -> tuple[int, dict[str, np.ndarray], Training]:
@@ -241,7 +249,7 @@ def _read_checkpoint(path: Path, like: Training) -> tuple[int, dict[str, np.ndar
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     try:
-        return files.read_arrays(path)
+        return files.read_sealed(path)
     except ValueError as error:
         raise StoreError(str(error)) from error
 

@@ -41,9 +41,7 @@ class Checkpoint:
         """Keep the runs' observations, shape [L, T, C], their summaries, shape [L, S], and given simulations."""
         self.folder.mkdir(parents=True)
         given = {} if first is None else {GIVEN + name: leaf for name, leaf in vars(first).items()}
-        atomic.write_arrays(
-            self.folder / "start.npz", {"observed": observed, "x": x} | given, compress=False, durable=True
-        )
+        atomic.write_sealed(self.folder / "start.npz", {"observed": observed, "x": x} | given)
 
     def read_start(self) -> tuple[np.ndarray, np.ndarray, Simulations | None]:
         """The runs' observations and summaries, and the simulations that were given for the first round."""
@@ -58,15 +56,10 @@ class Checkpoint:
     def write_round(self, index: int, state: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
         """Keep a round's record and the state after it; of some arrays, only the last round's (`record.apart`)."""
         rows, final = apart(rows)
-        atomic.write_arrays(
-            self.folder / _round_name(index),
-            rows | {"seconds": np.asarray(seconds)},
-            compress=False,
-            durable=True,
-        )
+        atomic.write_sealed(self.folder / _round_name(index), rows | {"seconds": np.asarray(seconds)})
         leaves = trees.to_arrays(state)
         done = {_DONE: np.asarray(index + 1)}
-        atomic.write_arrays(self.folder / "state.npz", leaves | done | final, compress=False, durable=True)
+        atomic.write_sealed(self.folder / "state.npz", leaves | done | final)
 
     @property
     def simulations(self) -> Path:
@@ -107,7 +100,7 @@ class Checkpoint:
 
     def _read(self, name: str) -> dict[str, np.ndarray]:
         try:
-            return atomic.read_arrays(self.folder / name)
+            return atomic.read_sealed(self.folder / name)
         except ValueError as error:
             raise CheckpointError(str(error)) from error
 

@@ -321,6 +321,8 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
             plan = dataclasses.replace(plan, task=one_by_one(plan.task, timeout=timeout))
     except (KeyError, TypeError, AttributeError) as error:
         raise StoreError(f"config.json: expected a complete description of the run, got: {error!r}") from error
+    if not plan.specs:
+        raise StoreError(f"{folder / 'config.json'}: expected at least one run, got none")
     if list(plan.task.space.labels) != labels:
         raise StoreError(
             f"{folder}: expected the task as it was when the run was begun, with parameters {labels}, "
@@ -350,6 +352,8 @@ def changed_machine(config: Mapping[str, Any], processes: Processes = ALONE) -> 
 
 
 def _spec(description: dict[str, Any]) -> RunSpec:
+    if type(description["seed"]) is not int:
+        raise StoreError(f"config.json: expected a whole number as the seed of a run, got {description['seed']!r}")
     return RunSpec(
         configuration=description["configuration"],
         support_name=description["support"]["name"],

@@ -166,8 +166,8 @@ def read_config(folder: Path) -> dict[str, Any]:
         raise StoreError(f"expected a run folder, got {str(folder)!r} which is no folder")
     path = folder / "config.json"
     try:
-        config = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        config = atomic.read_json(path)
+    except ValueError as error:
         raise StoreError(f"expected a run folder, got {str(folder)!r} without a readable config.json") from error
     kind = config.get("format") if isinstance(config, dict) else None
     if kind not in (RUN, RUNS, COMPARE):
@@ -312,7 +312,7 @@ def read_ledger(folder: Path) -> list[dict[str, Any]]:
     path = folder / "ledger.jsonl"
     try:
         lines = [json.loads(line) for line in path.read_text().splitlines()]
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise StoreError(f"expected a ledger, got a missing or damaged {path}") from error
     return [{name: float("nan") if value is None else value for name, value in line.items()} for line in lines]
 

@@ -107,7 +107,7 @@ def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space
             task = registry.load(config["task"])
         except ValueError:  # the posterior can be used without it
             return None
-    if task is not None and (task.space != space or list(task.units) != list(config.get("units", task.units))):
+    if task is not None and (task.space != space or list(task.units) != list(config.get("units") or task.units)):
         raise StoreError(
             f"{folder}: expected the task as it was when the run was made, with parameters {list(space.labels)}, "
             f"got {list(task.space.labels)}"
@@ -131,16 +131,26 @@ def _prior(folder: Path, config: dict[str, Any], task: Task | None, settings: Se
 
 def _belief(path: Path, space: Space) -> Belief:
     names = ("logits", "means", "scale_tril", "support_low", "support_high")
-    logits, means, scale_tril, low, high = (jnp.asarray(_arrays(path, names)[name]) for name in names)
-    components, dim = len(logits), space.dim
-    if means.shape != (components, dim) or scale_tril.shape != (components, dim, dim) or low.shape != (dim,):
-        raise StoreError(f"{path}: expected a mixture over {dim} parameters, got means of shape {list(means.shape)}")
+    arrays = _arrays(path, names)
+    components, dim = arrays["logits"].size, space.dim
+    shapes = (components,), (components, dim), (components, dim, dim), (dim,), (dim,)
+    for name, shape in zip(names, shapes, strict=True):
+        array = arrays[name]
+        if array.shape != shape or array.dtype.kind not in "biuf" or np.isnan(array).any():
+            raise StoreError(f"{path}: expected numbers {name} of shape {list(shape)}, got others")
+    logits, means, scale_tril, low, high = (jnp.asarray(arrays[name]) for name in names)
+    if not (low < high).all():
+        raise StoreError(f"{path}: expected support_low below support_high, got others")
     return Belief(GaussianMixture(logits, means, scale_tril), Support(low, high), jnp.asarray(True))
 
 
 def _dataset(path: Path, settings: Settings) -> Dataset:
     arrays = _arrays(path, ("theta", "x", "round", "weight"))
-    size = len(arrays["theta"])
+    size = arrays["round"].size
+    for name, axes in {"theta": 2, "x": 2, "round": 1, "weight": 1}.items():
+        array = arrays[name]
+        if array.ndim != axes or len(array) != size or array.dtype.kind not in "biuf":
+            raise StoreError(f"{path}: expected {size} rows of numbers as {name}, got {list(array.shape)}")
     first = int(np.sum(arrays["round"] == 0))
     room = max(first, settings.simulations_per_round) + (settings.rounds - 1) * settings.simulations_per_round
     filled = {

@@ -52,6 +52,8 @@ class Command:
 
     def __post_init__(self):
         object.__setattr__(self, "names", tuple(self.names))
+        if not isinstance(self.template, str) or "\0" in self.template:
+            raise ValueError(f"command: expected a text, got {self.template!r}")
         try:
             words = shlex.split(self.template)
         except ValueError as error:

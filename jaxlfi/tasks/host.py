@@ -50,9 +50,12 @@ class HostSimulator:
     executor: Executor | None = dataclasses.field(default=None, compare=False, repr=False)
 
     def __post_init__(self):
+        if not isinstance(self.each, bool):
+            raise ValueError(f"each: expected True or False, got {self.each!r}")
         if not self.each and (self.timeout is not None or self.executor is not None):
             raise ValueError("each: expected True where there is a timeout or an executor, got False")
-        if self.timeout is not None and not (self.timeout > 0 and math.isfinite(self.timeout)):
+        known = isinstance(self.timeout, int | float) and not isinstance(self.timeout, bool)
+        if self.timeout is not None and not (known and 0 < self.timeout < math.inf):
             raise ValueError(f"timeout: expected a number of seconds above 0, got {self.timeout!r}")
 
     @property

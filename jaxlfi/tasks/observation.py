@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlfi.distributions.arguments import is_concrete
+from jaxlfi.io import files
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.simulation import trajectory_and_outcome, with_outcome
@@ -51,7 +53,7 @@ def simulator_shapes(task: Task) -> Shapes:
     except Exception as error:
         raise SimulatorError(
             f"simulate: expected a function JAX can trace (wrap a NumPy simulator in jaxlfi.HostSimulator), "
-            f"got {type(error).__name__}: {_first_line(error)}"
+            f"got {type(error).__name__}: {files.first_line(error)}"
         ) from error
     trajectory, outcome = result if isinstance(result, tuple) and len(result) == 2 else (result, None)
     if not isinstance(trajectory, jax.ShapeDtypeStruct) or trajectory.ndim == 0:
@@ -76,7 +78,7 @@ def _summary_size(task: Task, shape: tuple[int, ...]) -> int:
     except Exception as error:
         raise SimulatorError(
             f"summary: expected a function of one trajectory {list(shape)} that JAX can trace, "
-            f"got {type(error).__name__}: {_first_line(error)}"
+            f"got {type(error).__name__}: {files.first_line(error)}"
         ) from error
     if getattr(summary, "ndim", None) != 1:
         raise SimulatorError(f"summary: expected a vector [S] of one trajectory, got {jax.tree.map(_shape, summary)}")
@@ -150,6 +152,8 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
     """
     if observation is None:
         observation = task.observation
+    if is_concrete(observation) and observation is not None:
+        _require_numbers(observation)
     if observation is None:
         simulate = simulate_observation if concrete else trace_observation
         observation = simulate(key, task)
@@ -162,10 +166,22 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
     return observed, x
 
 
+def _require_numbers(observation: Any) -> None:
+    try:
+        kind = np.asarray(observation).dtype.kind
+    except ValueError as error:
+        raise ValueError(f"observation: expected an array, got rows of several shapes in {observation!r}") from error
+    if kind not in "biuf":
+        raise ValueError(f"observation: expected an array of numbers, got {observation!r}")
+
+
 def trials_of(task: Task, observation: Any, pooling: str = "moments") -> tuple[Task, Any]:
     """The task and observation of an inference: where a list of trajectories is given, of all of them together."""
     if not isinstance(observation, list | tuple) or not observation:
         return task, observation
+    if is_concrete(observation):
+        for one in observation:
+            _require_numbers(one)
     first = np.shape(observation[0])
     trials = hasattr(observation[0], "shape") if task.on_host else first == simulator_shapes(task).trajectory
     if not trials or first == ():
@@ -194,7 +210,8 @@ def read(path: str | Path) -> np.ndarray:
     try:
         return readers[path.suffix.lower()](path)
     except Exception as error:  # zipfile, numpy and the operating system each have their own
-        raise ValueError(f"observation: cannot read {str(path)!r}: {_first_line(error)}") from error
+        text = files.first_line(error)
+        raise ValueError(f"observation: expected a readable file, got {str(path)!r}: {text}") from error
 
 
 def read_for(task: Task, *paths: str | Path) -> np.ndarray:
@@ -231,10 +248,10 @@ def _read_csv(path: Path) -> np.ndarray:
 
 
 def _read_npz(path: Path) -> np.ndarray:
-    with np.load(path, allow_pickle=False) as arrays:
-        if "trajectory" not in arrays and len(arrays.files) != 1:
-            raise ValueError(f"expected an array called 'trajectory', got {arrays.files}")
-        array = arrays["trajectory" if "trajectory" in arrays else arrays.files[0]]
+    arrays = files.read_arrays(path)
+    if "trajectory" not in arrays and len(arrays) != 1:
+        raise ValueError(f"expected an array called 'trajectory', got {list(arrays)}")
+    array = arrays.get("trajectory", next(iter(arrays.values())))
     if array.dtype.kind not in "biuf":
         raise ValueError(f"expected real numbers, got an array of type {array.dtype}")
     return np.asarray(array, np.float32)
@@ -254,7 +271,3 @@ def _is_number(cell: str) -> bool:
 
 def _shape(array) -> str:
     return str(getattr(array, "shape", type(array).__name__))
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]

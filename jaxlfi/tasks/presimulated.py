@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.distributions.support import Support
+from jaxlfi.io import files
 from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.simulation import Simulations, summarised_batch
 from jaxlfi.tasks.task import Task
@@ -26,10 +27,9 @@ def read_simulations(path: str | Path) -> dict[str, np.ndarray]:
         ValueError: for a file that cannot be read.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except Exception as error:  # zipfile, numpy and the operating system each have their own
-        raise ValueError(f"simulations: cannot read {str(path)!r}: {str(error).splitlines()[0]}") from error
+        return files.read_arrays(Path(path))
+    except ValueError as error:
+        raise ValueError(f"simulations: {error}") from error
 
 
 def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None = None) -> tuple[Simulations, Support]:
@@ -52,6 +52,8 @@ def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None 
     Raises:
         ValueError: for arrays that are missing, of other names, or of shapes that do not fit.
     """
+    if not isinstance(arrays, Mapping) or not all(isinstance(name, str) for name in arrays):
+        raise ValueError(f"simulations: expected a mapping of arrays, or an .npz file, got {arrays!r}")
     if unknown := sorted(set(arrays) - set(ARRAYS)):
         raise ValueError(f"simulations: expected arrays among {', '.join(ARRAYS)}, got {', '.join(unknown)}")
     theta = _array(arrays, "theta", (None, task.dim))
@@ -80,7 +82,7 @@ def _summaries(task: Task, arrays: Mapping[str, Any], rows: int) -> tuple[jax.Ar
     if ("x" in arrays) == ("trajectory" in arrays):
         raise ValueError("simulations: expected either 'trajectory' or 'x' (summaries), got both or neither")
     if "trajectory" in arrays:
-        trajectory = np.asarray(arrays["trajectory"], np.float32)
+        trajectory = _numbers(arrays["trajectory"], "trajectory")
         if trajectory.ndim < 2 or len(trajectory) != rows:
             raise ValueError(f"simulations: expected {rows} trajectories, got shape {list(trajectory.shape)}")
         if not task.on_host and trajectory.shape[1:] != (shape := simulator_shapes(task).trajectory):
@@ -113,9 +115,19 @@ def _weights(task: Task, arrays: Mapping[str, Any], inner: jax.Array, kept: np.n
 def _array(arrays: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> np.ndarray:
     if name not in arrays:
         raise ValueError(f"simulations: expected an array {name!r}, got {', '.join(arrays) or 'none'}")
-    array = np.asarray(arrays[name])
+    array = _numbers(arrays[name], name)
     fits = array.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, array.shape, strict=True))
-    if not fits or array.dtype.kind not in "biuf":
+    if not fits:
         expected = ["N" if length is None else length for length in shape]
         raise ValueError(f"simulations: expected numbers {name} of shape {expected}, got shape {list(array.shape)}")
-    return np.asarray(array, np.float32)
+    return array
+
+
+def _numbers(value: Any, name: str) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of several lengths
+        array = np.zeros(0, object)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"simulations: expected numbers {name}, got an array of type {array.dtype}")
+    return array.astype(np.float32)

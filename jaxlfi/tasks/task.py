@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlfi.distributions.arguments import require_texts
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support, check_within
 from jaxlfi.tasks import priors, summaries
@@ -115,12 +116,13 @@ class Task:
     def __post_init__(self):
         store = lambda field, value: object.__setattr__(self, field, value)
         for field in ("names", "log", "failures", "summary_names", "channels"):
-            value = getattr(self, field)
-            if isinstance(value, str):
-                raise ValueError(f"{field}: expected a sequence of names, got the string {value!r}")
-            store(field, tuple(value))
+            store(field, require_texts(getattr(self, field), field))
         names = self.names
-        store("units", tuple(self.units) if self.units is not None else ("",) * len(names))
+        store("units", ("",) * len(names) if self.units is None else require_texts(self.units, "units"))
+        for field, kind in (("supports", Mapping), ("settings", Mapping), ("hyperparameters", Mapping), ("name", str)):
+            if not isinstance(getattr(self, field), kind):
+                wanted = "a text" if kind is str else "a mapping from names"
+                raise ValueError(f"{field}: expected {wanted}, got {getattr(self, field)!r}")
         if not callable(self.simulate):
             raise ValueError(f"simulate: expected a function, got {type(self.simulate).__name__}")
         if clash := set(self.failures) & set(self.simulate.reasons if self.on_host else ()):
@@ -134,7 +136,7 @@ class Task:
         if not self.supports:
             raise ValueError("supports: expected at least one named support, got none")
         for label in self.supports:
-            if not LABEL.fullmatch(label):
+            if not isinstance(label, str) or not LABEL.fullmatch(label):
                 raise ValueError(
                     f"supports: expected names of letters, digits, '_', '.', '-' and spaces, got {label!r}"
                 )
@@ -182,7 +184,7 @@ class Task:
             >>> coin.one_by_one, coin.reasons
             (True, ('failed', 'error', 'wrong_shape', 'timeout', 'crash', 'non_finite'))
         """
-        simulate = HostSimulator(Command(template, names), each=True, timeout=timeout)
+        simulate = HostSimulator(Command(template, require_texts(names, "names")), each=True, timeout=timeout)
         return cls(simulate, names=names, supports=supports, feasible=feasible, **others)
 
     @property
@@ -311,7 +313,10 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _vector(value: Any, length: int, name: str) -> np.ndarray:
-    vector = np.asarray(value, np.float32)
+    try:
+        vector = np.asarray(value, np.float32)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(f"{name}: expected {length} finite numbers, got {value!r}") from error
     if vector.shape != (length,) or not np.isfinite(vector).all():
         raise ValueError(f"{name}: expected {length} finite numbers, got shape {vector.shape}")
     return vector

@@ -95,7 +95,7 @@ def check_pooling(pooling: str) -> None:
     Raises:
         ValueError: which names those that there are.
     """
-    if pooling not in (ALL, *POOLINGS):
+    if not isinstance(pooling, str) or pooling not in (ALL, *POOLINGS):
         raise ValueError(f"pooling: expected one of {sorted((ALL, *POOLINGS))}, got {pooling!r}")
 
 

@@ -104,7 +104,7 @@ BAD = {
     "seeds": (["infer", TASK, "--seeds", "0"], "seeds: expected at least 1"),
     "hyperparameter length": (["infer", TASK, "--expansion", "1", "2", "3"], "expansion: expected one finite number or 2"),  # noqa: E501
     "foreign hyperparameter": (["infer", TASK, "--proximity", "0.3"], "proximity: expected a hyperparameter of edge"),
-    "no file": (["infer", TASK, "--observation", "nothing.csv"], "cannot read 'nothing.csv'"),
+    "no file": (["infer", TASK, "--observation", "nothing.csv"], "expected a readable file, got 'nothing.csv'"),
     "no format": (["infer", TASK, "--observation", "x.txt"], "expected a .csv or .npz"),
     "configuration": (["compare", TASK, "--configurations", "ok+x"], "expected support+heuristic"),
     "configurations": (["compare", TASK, "--configurations", "ok", "ok"], "expected distinct ones"),
@@ -318,7 +318,7 @@ def test_npz_files_that_cannot_be_an_observation(tmp_path, capsys):
     (tmp_path / "broken.npz").write_bytes(b"PK not really")
     for name in ("two", "pickled", "broken"):
         arguments = ("infer", TASK, "--observation", tmp_path / f"{name}.npz", "--out", tmp_path / "out")
-        assert "cannot read" in error_line(capsys, *arguments)
+        assert "expected a readable file" in error_line(capsys, *arguments)
 
 
 @pytest.mark.slow

@@ -60,6 +60,7 @@ def test_a_host_simulator_is_inferred(capsys):
     assert "without an outbreak" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_own_heuristic_finds_the_exact_posterior():
     exact, draws = ran("own_heuristic")
     sd = np.sqrt(np.diag(exact.covariance))

@@ -455,3 +455,21 @@ def test_mujoco_models():
     assert f"with {share('right-edge')} of draws in one" in README
     assert f"one is lost in {np.sum(np.abs(positive['wrong-edge'] - 0.5) > 0.45)} of 5 recordings" in README
     assert f"both in all five ({share('wrong-apt')})" in README
+
+
+def test_what_survives():
+    found = {}
+    for name in ("kills", "adversities"):
+        with (RESULTS / f"reliability/{name}.csv").open(newline="") as file:
+            found[name] = list(csv.DictReader(file))
+    kills = found["kills"]
+    assert f"{len({row['trial'] for row in kills})} trials with {len(kills)} kills" in README
+    assert f"{len(found['adversities'])} other adversities" in README
+    assert all(row["result"] == "same bits" for row in kills)
+    names = {name: f"`{name}`" for name in ("infer", "compare", "grid", "train")} | {
+        "dask": "`infer` on a Dask cluster"
+    }
+    for name, words in names.items():
+        how = [row["how"] for row in kills if row["command"] == name]
+        line = rf"\| {re.escape(words)} \| \d+ \| {how.count('in a window')} \| {how.count('at a moment')} \| all \|"
+        assert re.search(line, README), line

@@ -120,6 +120,7 @@ def free_draws(network) -> np.ndarray:
     return np.asarray(jax.jit(lambda flow: flow.sample(jax.random.key(4), 40000))(flow))
 
 
+@pytest.mark.slow
 def test_a_flow_runs_in_the_same_loop_and_repeats(flow_run):
     run, first = flow_run
     again = run()
@@ -134,6 +135,7 @@ def test_a_flow_runs_in_the_same_loop_and_repeats(flow_run):
     assert np.all((mass > 0) & (mass <= 1))
 
 
+@pytest.mark.slow
 def test_a_flows_mixture_has_the_moments_of_its_draws_inside(network, free_draws):
     posterior = condition(network, X, SUPPORT, jax.random.key(1))
     kept = free_draws[np.asarray(SUPPORT.contains(free_draws))]
@@ -153,6 +155,7 @@ def sampled(posterior, seed: int) -> np.ndarray:
     return np.concatenate([posterior.sample(key, DRAWS) for key in keys])
 
 
+@pytest.mark.slow
 def test_draws_of_the_posterior_are_the_flows_own_truncated_to_the_box(network, free_draws):
     posterior = condition(network, X, SUPPORT, jax.random.key(0))
     draws = sampled(posterior, 3)
@@ -226,6 +229,7 @@ def test_a_run_can_be_sampled(folder, tmp_path):
     assert np.abs(first - other).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_library_run_draws_from_the_flow_and_saves_it(flow_run, tmp_path):
     run = flow_run[1]
     draws = np.asarray(run.posterior.sample(jax.random.key(0), DRAWS))

@@ -137,12 +137,22 @@ def test_domains_are_named_as_the_command_line_does(tmp_path):
     assert length == 200 and young == pytest.approx(1e5, rel=0.02)
 
 
+CONFIG = {
+    "format": training.FORMAT, "version": training.VERSION, "environment_name": "whip", "environment": {},
+    "versions": {},
+}  # fmt: skip
+"""Of a training, but for its settings and trainings."""
+
+
+def settings():
+    return serialise.fields_to_json(PRESETS["quick"], serialise.class_name)
+
+
 def test_a_training_of_other_seeds_or_settings_is_not_taken_for_the_one_asked_for(tmp_path):
     study = Study(tmp_path)
     out = study.training("uniform")
     out.mkdir(parents=True)
-    config = {"format": training.FORMAT, "version": training.VERSION, "trainings": [{"domain": "u", "seed": 0}]}
-    config["settings"] = serialise.fields_to_json(PRESETS["quick"], serialise.class_name)
+    config = CONFIG | {"settings": settings(), "trainings": [{"domain": "u", "seed": 0}]}
     files.write_json(out / "config.json", config)
     (out / "table.csv").write_text("")
     making.learn(study, ["uniform"], 1, [])
@@ -159,12 +169,12 @@ def test_domains_trained_side_by_side_get_folders_of_their_own(tmp_path):
         folder = together / one["domain"] / f"seed_{one['seed']:03d}"
         folder.mkdir(parents=True)
         (folder / "policy.npz").write_text(f"{one}")
-    config = {"format": training.FORMAT, "version": training.VERSION, "settings": {}, "trainings": trainings}
+    config = CONFIG | {"settings": settings(), "trainings": trainings}
     files.write_json(together / "config.json", config)
     files.write_arrays(together / "curves.npz", {"value": np.arange(12.0).reshape(3, 4)})
     files.write_arrays(together / "outcomes.npz", {"value": np.arange(20).reshape(4, 5)})
     points = {"trained": np.arange(24).reshape(4, 3, 2), "held_out": -np.arange(8).reshape(4, 1, 2)}
-    files.write_arrays(together / "domains.npz", {**points, "parameters": np.array(["length", "young"])})
+    files.write_sealed(together / "domains.npz", {**points, "parameters": np.array(["length", "young"])})
     (together / "table.csv").write_text("domain,seed,return\npoint-1-2,0,1\npoint-1-2,1,2\nb,0,3\nb,1,4\n")
 
     making.split(together, outs)

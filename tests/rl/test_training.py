@@ -163,7 +163,7 @@ def test_what_cannot_be_gone_on_with_is_refused(finished, tmp_path):
     with pytest.raises(StoreError, match=r"domains\.npz: expected a whole"):
         training.resumed(tmp_path, LINE, print)
     files.write_arrays(tmp_path / "domains.npz", files.read_arrays(out / "domains.npz"))
-    files.write_arrays(tmp_path / "checkpoint.npz", {"done": np.asarray(3)})
+    files.write_sealed(tmp_path / "checkpoint.npz", {"done": np.asarray(3)})
     with pytest.raises(StoreError, match=r"checkpoint\.npz: expected .*params.*, got "):
         training.resumed(tmp_path, LINE, print)
 

@@ -61,7 +61,10 @@ def _sampled(run, path, seed: int) -> np.ndarray:
     return np.stack([posterior[name].values.ravel() for name in ("first", "second")], axis=1)
 
 
-@pytest.fixture(scope="module", params=ESTIMATORS)
+FLOWS = [pytest.param(name, marks=pytest.mark.slow) for name in ESTIMATORS if name != "mdn"]
+
+
+@pytest.fixture(scope="module", params=["mdn", *FLOWS])
 def ways(request, tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
     """A run, and draws of its posterior in every way."""
     folder = tmp_path_factory.mktemp("draws") / "run"

@@ -149,14 +149,18 @@ def test_a_file_of_simulations_enters_by_the_command_line(tmp_path):
 def test_a_file_that_is_none_is_refused(tmp_path, capsys):
     (tmp_path / "no.npz").write_text("text")
     np.savez(tmp_path / "foreign.npz", theta=np.zeros((3, 2)), weights=np.ones(3))
-    with pytest.raises(ValueError, match=r"^simulations: cannot read"):
+    with pytest.raises(ValueError, match=r"^simulations: .*no.npz: expected a whole .npz file"):
         read_simulations(tmp_path / "no.npz")
     with pytest.raises(ValueError, match=r"^simulations: expected arrays among .*, got weights$"):
         presimulated(gaussian(), read_simulations(tmp_path / "foreign.npz"))
     reference = "tests.runs.test_given_simulations:host_task"
     assert command("infer", reference, *FLAGS, "--simulations", tmp_path / "missing.npz", "--out", tmp_path / "x") == 2
     message = capsys.readouterr().err
-    assert message.count("\n") == 1 and "simulations: cannot read" in message and not (tmp_path / "x").exists()
+    assert (
+        message.count("\n") == 1
+        and "missing.npz: expected a whole .npz file" in message
+        and not (tmp_path / "x").exists()
+    )
 
 
 # ------------------------------------------------------------------------------------------------------- weights

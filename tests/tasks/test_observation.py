@@ -95,7 +95,7 @@ def test_columns_are_channels(tmp_path, text, expected):
 def test_broken_files_are_reported_in_one_line(tmp_path, text, message):
     path = tmp_path / "x.csv"
     path.write_text(text)
-    with pytest.raises(ValueError, match=r"^observation: cannot read .*x.csv': ") as error:
+    with pytest.raises(ValueError, match=r"^observation: expected a readable file, got .*x.csv': ") as error:
         read(path)
     assert message in str(error.value) and "\n" not in str(error.value)
 
@@ -104,7 +104,7 @@ def test_other_files_are_refused(tmp_path):
     (tmp_path / "latin.csv").write_bytes("größe\n8.0\n".encode("latin-1"))
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04 not a zip")
     for name in ("latin.csv", "broken.npz", "missing.csv", "missing.npz"):
-        with pytest.raises(ValueError, match=r"^observation: cannot read ") as error:
+        with pytest.raises(ValueError, match=r"^observation: expected a readable file, got ") as error:
             read(tmp_path / name)
         assert "\n" not in str(error.value)
     for name in ("x.npy", "x.txt", "x"):
@@ -128,15 +128,15 @@ def test_arrays_are_read_as_they_are(tmp_path):
     ("arrays", "message"),
     [
         ({"a": np.ones(3), "b": np.ones(3)}, "expected an array called 'trajectory'"),
-        ({"trajectory": np.ones(3) + 1j}, "expected real numbers, got an array of type complex128"),
+        ({"trajectory": np.ones(3) + 1j}, "expected numbers or texts, got complex128 as trajectory"),
         ({"trajectory": np.array(["8.0", "5.3"])}, "expected real numbers, got an array of type <U3"),
-        ({"trajectory": np.array([[1.0], None], object)}, "cannot read"),
+        ({"trajectory": np.array([[1.0], None], object)}, "expected a whole .npz file"),
     ],
 )
 def test_arrays_that_are_no_numbers_are_refused(tmp_path, arrays, message):
     """Object arrays are pickles, and never loaded."""
     np.savez(tmp_path / "x.npz", **arrays)
-    with pytest.raises(ValueError, match=r"^observation: cannot read") as error:
+    with pytest.raises(ValueError, match=r"^observation: expected a readable file") as error:
         read(tmp_path / "x.npz")
     assert message in str(error.value) and "\n" not in str(error.value)
 

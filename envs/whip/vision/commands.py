@@ -54,14 +54,15 @@ def import_pictures(arguments: argparse.Namespace) -> None:
         ValueError: for bad input.
     """
     names, out = dict(_pair(word) for word in arguments.name), arguments.out
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    if arguments.coco is None and arguments.classes is None:
+        raise ValueError("classes: expected the file of the classes' names, got none")
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task("pictures", total=None)
         show = lambda done, count: progress.update(bar, completed=done, total=count)
         if arguments.coco is not None:
             count = labelled.from_coco(arguments.coco, arguments.images, out, names, show)
         else:
-            if arguments.classes is None:
-                raise ValueError("classes: expected the file of the classes' names, got none")
             classes = labelled.read_classes(arguments.classes)
             count = labelled.from_yolo(arguments.yolo, arguments.images, out, classes, names, show)
     print(f"wrote {count} pictures, {arguments.out / pictures.INDEX} names them")
@@ -269,7 +270,8 @@ def _bar(words: str, total: int) -> Iterator[Callable[[int, Any], None]]:
         BarColumn(),
         TextColumn("{task.completed}/{task.total} {task.fields[loss]}"),
     )
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
+    console = Console(stderr=True)
+    with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task(words, total=total, loss="")
 
         def show(done: int, losses: Any) -> None:

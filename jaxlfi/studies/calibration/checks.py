@@ -14,6 +14,7 @@ import numpy as np
 from jaxlfi import diagnostics
 from jaxlfi.diagnostics.predictive import MIN_SIMULATIONS
 from jaxlfi.estimators.normaliser import TRANSFORMS
+from jaxlfi.io import files
 from jaxlfi.runs.run import Run
 from jaxlfi.studies.calibration.plan import AGAINST, CLASSIFIER, MIN_COUNT, PREDICTIVE, TIES, CalibrationPlan
 from jaxlfi.tasks.simulation import simulate_batch
@@ -217,7 +218,8 @@ def read_reference(path: Path, task: Task) -> np.ndarray:
     try:
         theta = (_read_npz if path.suffix == ".npz" else _read_csv)(path, task)
     except Exception as error:  # zipfile, csv, numpy and the operating system each have their own
-        raise ValueError(f"against: cannot read {str(path)!r}: {error}") from error
+        text = files.first_line(error)
+        raise ValueError(f"against: expected a readable file, got {str(path)!r}: {text}") from error
     positive = np.all(theta[:, [name in task.log for name in task.names]] > 0)
     if len(theta) < MIN_COUNT or not np.isfinite(theta).all() or not positive:
         raise ValueError(
@@ -238,8 +240,7 @@ def _read_csv(path: Path, task: Task) -> np.ndarray:
 
 
 def _read_npz(path: Path, task: Task) -> np.ndarray:
-    with np.load(path, allow_pickle=False) as arrays:
-        theta = arrays["theta"].astype(np.float64)
-    if theta.ndim != 2 or theta.shape[1] != task.dim:
-        raise ValueError(f"expected an array 'theta' of shape [n, {task.dim}], got {list(theta.shape)}")
-    return theta
+    theta = files.read_arrays(path).get("theta", np.zeros(0))
+    if theta.ndim != 2 or theta.shape[1] != task.dim or theta.dtype.kind not in "biuf":
+        raise ValueError(f"expected numbers 'theta' of shape [n, {task.dim}], got {theta.dtype} {list(theta.shape)}")
+    return theta.astype(np.float64)

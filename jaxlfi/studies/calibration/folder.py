@@ -77,8 +77,8 @@ def read_plan(path: Path) -> dict[str, Any]:
         StoreError: for one that is damaged or of another kind.
     """
     try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        found = atomic.read_json(path)
+    except ValueError as error:
         raise StoreError(f"{path}: expected a plan, got a damaged one: {error}") from error
     if not isinstance(found, dict) or (found.get("format"), found.get("version")) != (FORMAT, VERSION):
         raise StoreError(f"{path}: expected format {FORMAT!r}, version {VERSION}, got another")

@@ -14,6 +14,8 @@ from jaxlfi.tasks import registry as registry_of_tasks
 from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.task import Task
 
+MAX_DRAWS = 10_000_000
+"""Draws from the posteriors of all truths together."""
 MIN_COUNT = 20
 """Fewest truths, and draws for each, that can show a miscalibration."""
 STREAM = 0xD1A6
@@ -35,7 +37,7 @@ class CalibrationPlan:
         seed: of all random numbers.
 
     Raises:
-        ValueError: for too few truths or draws.
+        ValueError: for too few truths or draws, or too many.
     """
 
     reference: str
@@ -47,6 +49,10 @@ class CalibrationPlan:
         for name in ("truths", "draws"):
             if getattr(self, name) < MIN_COUNT:
                 raise ValueError(f"{name}: expected at least {MIN_COUNT}, got {getattr(self, name)}")
+        if self.truths * self.draws > MAX_DRAWS:
+            raise ValueError(
+                f"truths, draws: expected at most {MAX_DRAWS} draws in all, got {self.truths} x {self.draws}"
+            )
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed: expected at least 0 and less than 2^31, got {self.seed}")
 

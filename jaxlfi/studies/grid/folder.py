@@ -139,8 +139,8 @@ def create(folder: Path, work: Work, processes: Processes = ALONE) -> None:
 def is_grid(folder: Path) -> bool:
     """Whether a folder says that it is a grid's; whether it is sound is checked later."""
     try:
-        config = json.loads((folder / "config.json").read_text())
-    except (OSError, ValueError):
+        config = atomic.read_json(folder / "config.json")
+    except ValueError:
         return False
     return isinstance(config, dict) and config.get("format") == GRID
 
@@ -153,7 +153,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     if not is_grid(folder):
         raise StoreError(f"expected the folder of a grid, got {str(folder)!r} whose config.json is not one's")
-    config = json.loads((folder / "config.json").read_text())
+    config = atomic.read_json(folder / "config.json")
     run_store.check_version(folder / "config.json", config)
     return config
 
