@@ -61,7 +61,7 @@ MAX_MEMORY = 1700 * 2**20
 LONG = (
     "test_examples", "test_cli", "test_outside_package", "test_draws", "test_infer", "test_grid", "test_apt",
     "test_resume", "test_readme", "test_calibration_study", "test_lynx_hare", "test_load", "test_real2sim",
-    "test_algorithm", "test_engines", "test_estimators", "test_training", "test_from_brax",
+    "test_algorithm", "test_engines", "test_estimators", "test_training", "test_from_brax", "test_fuzzing",
 )  # fmt: skip
 """Files of half a minute and more."""
 

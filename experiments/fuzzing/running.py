@@ -9,11 +9,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from experiments.fuzzing.cases import made, prepare
-from experiments.fuzzing.judging import PASSED, Case, Result, judged, sped_up
+from experiments.fuzzing.judging import PASSED, Case, Result, forget, judged, peak, sped_up
 from experiments.fuzzing.words import RIGHT
 
 HERE = Path("a", "here")
 """Where commands run, below the folder that is watched: deep enough for names that lead up."""
+
+KEPT = 2**30
+"""Bytes of compiled programs beyond which they are forgotten between two cases."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +64,10 @@ def workshop(keep: Path | None = None) -> Iterator[Path]:
 def fuzz(root: Path, seed: int, numbers: Iterable[int]) -> Iterator[Ended]:
     """Run cases in a workshop, and say of each how it ended."""
     with sped_up():
+        least = forget()
         for number in numbers:
+            if peak() > least + KEPT:
+                least = forget()
             case = made(seed, number, root / HERE)
             began = time.monotonic()
             result, memory = judged(case, root, root / HERE)
