@@ -182,6 +182,8 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     if grid.is_grid(folder):
         return _resume_grid(folder, arguments.joined, console)
     if train.is_training(folder):
+        if arguments.joined.count > 1:
+            raise ValueError("processes: expected a run, runs side by side or a grid; policies take one process")
         train.resume(folder, console, not arguments.no_figures)
         return None
     config = run_store.read_config(folder)

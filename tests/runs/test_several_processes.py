@@ -94,6 +94,7 @@ def test_a_run_whose_process_was_lost_goes_on_in_as_many_processes_or_one(enviro
             np.testing.assert_allclose(value, expected[name], rtol=5e-3, atol=5e-3, err_msg=str(name))
 
 
+@pytest.mark.slow
 def test_four_processes_give_what_one_gives(environment, tmp_path):
     """A grid, whose last chunk is filled up."""
     words = ["grid", TASK, "--support", "misspecified", "--seeds", 5, *FLAGS, "--vary", "expansion=0.1"]
