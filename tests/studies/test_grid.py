@@ -7,7 +7,6 @@ import json
 import os
 import pathlib
 import shutil
-import socket
 import subprocess
 import sys
 
@@ -294,7 +293,7 @@ def test_a_simulator_that_always_fails_is_refused(finished, monkeypatch):
             failed = np.full((LENGTH, len(TASK.reasons)), 25)
             return None, {"attempted": np.full(LENGTH, 25), "succeeded": np.zeros(LENGTH, int), "failed": failed}
 
-    monkeypatch.setattr(chunks, "engine_for", lambda *_: Hopeless())
+    monkeypatch.setattr(chunks, "engine_for", lambda *_, **__: Hopeless())
     with pytest.raises(SimulatorError, match="got none"):
         study.run_chunk(work, range(LENGTH))
 
@@ -441,34 +440,3 @@ def test_two_devices_give_what_one_gives(finished, tmp_path):
     arrays = atomic.read_arrays(out / "grid.npz")
     for name in study.MEASURES:  # seeds 0 and 1 here, 3, 0 and 1 there
         np.testing.assert_allclose(arrays[name], finished[2][name][:, :, 1:], rtol=5e-3, atol=5e-3, err_msg=name)
-
-
-TWO_PROCESSES = """
-import sys
-from pathlib import Path
-import jax
-jax.config.update("jax_cpu_collectives_implementation", "gloo")
-jax.distributed.initialize(sys.argv[1], num_processes=2, process_id=int(sys.argv[2]))
-from rich.console import Console
-from jaxlfi.studies import grid as study
-from tests.studies.test_grid import LENGTH, make_grid
-assert jax.process_count() == 2 and jax.local_device_count() == 1 and jax.device_count() == 2
-folder = Path(sys.argv[3])
-work = study.begin(folder, make_grid(), runs_per_chunk=LENGTH)
-study.advance(folder, work, Console())
-"""
-
-
-@pytest.mark.slow
-def test_two_processes_share_the_chunks(finished, tmp_path):
-    """Joined by jax.distributed over the loopback; each chunk is the same program as in one process."""
-    folder, _, _ = finished
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    processes = [start(TWO_PROCESSES, address, i, tmp_path / "out", devices=1) for i in range(2)]
-    outputs = [process.communicate(timeout=170)[0] for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], outputs
-    assert "4 of 4 rounds to do" in outputs[0] and "2 of 2 rounds to do" in outputs[1]
-    for name in ("grid.npz", "table.csv"):
-        assert (tmp_path / "out" / name).read_bytes() == (folder / name).read_bytes(), name
