@@ -20,6 +20,7 @@ from jaxlfi.cli import commands
 from jaxlfi.cli import parser as cli
 from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS
 from jaxlfi.io import files
+from jaxlfi.io.processes import ALONE
 from jaxlfi.rl.policy import Policy
 from jaxlfi.runs import execute as executing
 
@@ -32,7 +33,7 @@ def prepare(here: Path) -> None:
     good.mkdir(parents=True)
     with contextlib.ExitStack() as closing:
         arguments = cli.parse(["infer", TASK, *SMALL, "--out", str(good / "run")])
-        arguments.closing = closing
+        arguments.closing, arguments.joined = closing, ALONE
         folder, (plan, observed) = commands.infer(arguments, Console(quiet=True))
 
     def stop(index: int, row: Any) -> None:

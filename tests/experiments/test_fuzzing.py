@@ -36,7 +36,7 @@ def test_bad_input_is_refused_in_one_line_or_works(root):
 def test_every_command_has_words_that_are_right(root):
     assert {name.split()[0] for name in RIGHT} >= set(commands.COMMANDS)
     named = {flag for name in RIGHT for action in flags_of(name) for flag in action.option_strings}
-    assert {"--workers", "--scheduler", "--simulation-timeout", "--domain", "--format"} <= named
+    assert {"--workers", "--scheduler", "--coordinator", "--simulation-timeout", "--domain", "--format"} <= named
 
 
 def test_a_case_follows_from_its_seed_and_number(root):
