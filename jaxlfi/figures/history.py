@@ -385,8 +385,9 @@ def _times(array: np.ndarray | None, trajectory: np.ndarray | None) -> np.ndarra
 def _texts(first: Any, second: Any, length: int, default: str) -> tuple[str, ...]:
     """The first of two lists of texts that has the right length, or numbered defaults."""
     for given in (first, second):
-        if given is not None and len(given) == length and length:
-            return tuple(str(text) for text in given)
+        texts = given.tolist() if isinstance(given, np.ndarray) else given
+        if isinstance(texts, list) and len(texts) == length and length:
+            return tuple(str(text) for text in texts)
     return tuple(default.format(i + 1) for i in range(length))
 
 

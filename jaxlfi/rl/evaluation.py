@@ -106,10 +106,13 @@ def cross_evaluate(
         A row for each policy and domain: mean return, its standard error, and means of the environment's facts.
 
     Raises:
-        ValueError: for policies of another environment (names, units) or several widths, and less than one episode.
+        ValueError: for policies of another environment (names, units) or several widths, and for `episodes` or a `seed` out of
+            range.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes: expected at least 1, got {episodes}")
+    if not 1 <= episodes < 2**31:
+        raise ValueError(f"episodes: expected a number from 1 to 2^31 - 1, got {episodes}")
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"seed: expected a number from 0 to 2^63 - 1, got {seed}")
     for policy in policies.values():
         policy.require(environment.name, environment.observations, environment.actions)
     layers = stacked(list(policies.values()))

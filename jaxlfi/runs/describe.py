@@ -23,9 +23,10 @@ def settings_from_json(description: Mapping[str, Any]) -> Settings:
     """The settings that `settings_to_json` described.
 
     Raises:
-        ValueError: for a description of anything else, or of an estimator that is not installed.
+        ValueError: for a description of anything else, of values that cannot work, or of an estimator that is not
+            installed.
     """
-    return made_of(Settings, "settings", description, _loader(estimators))
+    return made_of(Settings, "settings", description, _loader(estimators)).check()
 
 
 def heuristic_to_json(heuristic: Heuristic) -> dict[str, Any]:

@@ -188,6 +188,7 @@ EDITS = {
     "an unknown setting": lambda config: config["settings"].update(colour="red"),
     "a setting out of range": lambda config: config["settings"].update(rounds=0),
     "a setting of another type": lambda config: config["settings"].update(rounds="many"),
+    "an estimator that is a number": lambda config: config["settings"].update(estimator=10**30),
     "an estimator that is not there": lambda config: config["settings"]["estimator"].update(name="gone"),
     "a heuristic that is not there": lambda config: config["heuristic"].update(name="gone"),
     "no heuristic": drop("heuristic"),

@@ -783,6 +783,14 @@ def test_report_of_a_run_with_nothing_but_what_is_required(tmp_path):
     np.testing.assert_array_equal(history.failed, (history.counted & (history.failure > 0)).sum(1))
 
 
+@pytest.mark.parametrize("units", [7.5, "two", {"m": 1, "s": 2}, ["m"]])
+def test_units_that_are_no_list_of_them_are_left_out(tmp_path, units):
+    folder = write_run(tmp_path / "run", dim=2)
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"units": units}))
+    assert load(folder).units == ("", "")
+
+
 def test_an_older_folder_leaves_out_what_was_not_saved(tmp_path):
     folder = write_run(tmp_path / "run")
     change(folder, "posterior.npz", lambda a: a.pop("draws"))

@@ -371,6 +371,12 @@ def test_each_policy_keeps_its_own_scaling():
     np.testing.assert_allclose([row["return"] for row in rows], sums, atol=0.4)  # starts have a mean of 0 +- 0.025
 
 
+@pytest.mark.parametrize("given", [{"episodes": 0}, {"episodes": 10**30}, {"seed": -1}, {"seed": 10**30}])
+def test_numbers_of_episodes_and_seeds_that_are_none(given):
+    with pytest.raises(ValueError, match=f"{next(iter(given))}: expected a number from"):
+        cross_evaluate(LINE, {}, {}, **{"episodes": 1} | given)
+
+
 def test_policies_of_other_environments_are_not_evaluated(finished, tmp_path, capsys):
     out, _ = finished
     path = out / "median/seed_000/policy.npz"

@@ -105,6 +105,16 @@ def test_a_state_of_another_shape_is_refused(tmp_path):
         checkpoint.read_state({"a": np.zeros(4)})
 
 
+@pytest.mark.parametrize("estimator", [10**30, None, "mdn"])
+def test_an_estimator_that_is_none_is_refused(stopped, tmp_path, capsys, estimator):
+    shutil.copytree(stopped, tmp_path / "out")
+    config = json.loads((tmp_path / "out" / "config.json").read_text())
+    config["settings"]["estimator"] = estimator
+    (tmp_path / "out" / "config.json").write_text(json.dumps(config))
+    assert command("resume", tmp_path / "out") == 2
+    assert "estimator: expected one such as" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("package", "warned"), [("jax", True), ("jaxlfi", True), ("numpy", False), (None, False)])
 def test_resuming_by_other_versions_warns(stopped, tmp_path, capsys, package, warned):
     out = tmp_path / "run"

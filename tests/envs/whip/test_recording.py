@@ -106,6 +106,10 @@ SPOILED = {
         lambda path: path.with_suffix(".json").unlink(),
         "a recording is two files: expected a description in one.json beside the .npz, got none",
     ),
+    "endless number": (
+        lambda path: path.with_suffix(".json").write_text('{"schema": 1' + "0" * 5000 + "}"),
+        "expected a description in",
+    ),
     "damaged description": (lambda path: path.with_suffix(".json").write_text('{"schema'), "expected a description in"),
     "damaged arrays": (lambda path: path.write_bytes(path.read_bytes()[:-700]), "expected a whole .npz file"),
     "no arrays": (lambda path: path.unlink(), "expected a whole .npz file"),
