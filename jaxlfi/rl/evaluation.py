@@ -106,8 +106,8 @@ def cross_evaluate(
         A row for each policy and domain: mean return, its standard error, and means of the environment's facts.
 
     Raises:
-        ValueError: for policies of another environment (names, units) or several widths, and for `episodes` or a `seed` out of
-            range.
+        ValueError: for policies of another environment (names, units) or of several widths, and for `episodes` or a
+            `seed` out of range.
     """
     if not 1 <= episodes < 2**31:
         raise ValueError(f"episodes: expected a number from 1 to 2^31 - 1, got {episodes}")
