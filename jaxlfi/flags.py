@@ -46,6 +46,21 @@ def add(
         group.add_argument(*names, dest=name, into=into, help=_help(owners, defaults), **reading)
 
 
+def seed(text: str) -> int:
+    """A seed's value, from 0 to 2^63 - 1.
+
+    Raises:
+        ArgumentTypeError: for another text.
+    """
+    try:
+        number = int(text)
+    except ValueError:
+        number = -1
+    if not 0 <= number < 2**63:
+        raise argparse.ArgumentTypeError(f"expected a number from 0 to 2^63 - 1, got {textwrap.shorten(text, 40)!r}")
+    return number
+
+
 def by_field(families: Families) -> dict[str, dict[str, Declared]]:
     """The same fields by their own name, and by the name of the class."""
     found: dict[str, dict[str, Declared]] = {}

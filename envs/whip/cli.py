@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxlfi import flags
 from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import OneLineParser
 from jaxlfi.envs.whip import require_mujoco
@@ -90,7 +91,7 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_detector(deploy)
     deploy.add_argument("--repetitions", type=int, default=16, metavar="N", help="places (default: 16)")
-    deploy.add_argument("--seed", type=int, default=0, metavar="N", help="seed of places and noise (default: 0)")
+    deploy.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="seed of places and noise (default: 0)")
     deploy.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
 
     control = commands.add_parser(
@@ -128,7 +129,9 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_detector(control)
     control.add_argument("--remote", action="store_true", help="let the driver be on another host")
-    control.add_argument("--seed", type=int, default=0, metavar="N", help="of a reference object's camera (default: 0)")
+    control.add_argument(
+        "--seed", type=flags.seed, default=0, metavar="N", help="of a reference object's camera (default: 0)"
+    )
     control.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .npz, beside it a new .json")
 
     options.add(commands)
@@ -155,7 +158,9 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--young", type=float, default=2.5e4, metavar="PA", help="Young's modulus of the DLO in Pa, 500 to 5e5"
     )
-    command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all random numbers (default: 0)")
+    command.add_argument(
+        "--seed", type=flags.seed, default=0, metavar="N", help="seed of all random numbers (default: 0)"
+    )
     command.add_argument(
         "--engine",
         default="auto",

@@ -228,8 +228,6 @@ def sample(arguments: argparse.Namespace, console: Console) -> None:
         raise ValueError(f"out: expected a name that ends in .csv or .npz, or .nc for ArviZ, got {out}")
     if out.exists() or out.is_symlink():
         raise ValueError(f"out: expected a new file, got {out}, which exists")
-    if not 0 <= arguments.seed < 2**63:
-        raise ValueError(f"seed: expected a number from 0 to 2^63 - 1, got {arguments.seed}")
     posterior = load(arguments.folder).posterior
     if out.suffix == ".nc":
         export.write_netcdf(out, arguments.folder, arguments.number, arguments.seed)

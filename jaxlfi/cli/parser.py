@@ -239,7 +239,7 @@ def _add_sample(commands: Commands) -> None:
     )
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
     command.add_argument("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
-    command.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the draws (default: 0)")
+    command.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="seed of the draws (default: 0)")
     command.add_argument(
         "--out",
         type=Path,

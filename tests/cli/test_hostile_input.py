@@ -231,3 +231,12 @@ def test_a_description_that_is_none_is_refused_in_one_line(text, named, tmp_path
 def test_numbers_of_samples_and_seeds_that_are_none(arguments, named, tmp_path, capsys):
     error_line(capsys, "sample", named[0], *arguments, "--out", tmp_path / "draws.csv")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("seed", ["-1", str(2**63), "9" * 5000, "1e3"])
+@pytest.mark.parametrize(
+    "words",
+    ["sample run", "evaluate line policy.npz --domain median", "whip control policy.npz --robot dlo-0 --out out.npz"],
+)
+def test_seeds_out_of_range_are_refused(words, seed, capsys):
+    assert "--seed: expected a number from 0 to 2^63 - 1, got" in error_line(capsys, *words.split(), f"--seed={seed}")

@@ -6,6 +6,8 @@ This module imports neither jax nor numpy, so that `--help` answers at once.
 import argparse
 from pathlib import Path
 
+from jaxlfi import flags
+
 COMMANDS = {
     "pictures": "make_pictures",
     "import-pictures": "import_pictures",
@@ -43,7 +45,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     pictures.add_argument(
         "--sharp", action="store_true", help="without blur and noise: for train-vision, which adds them anew each time"
     )
-    pictures.add_argument("--seed", type=int, default=0, metavar="N", help="of everything that is random (default: 0)")
+    pictures.add_argument(
+        "--seed", type=flags.seed, default=0, metavar="N", help="of everything that is random (default: 0)"
+    )
     pictures.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
 
     imported = commands.add_parser(
@@ -93,7 +97,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="data sets that the segmenter learns from, one's own among them (default: sharp raycast ones are made)",
     )
     train.add_argument("--steps", type=int, metavar="N", help="of each training (default: the preset's)")
-    train.add_argument("--seed", type=int, default=0, metavar="N", help="of everything that is random (default: 0)")
+    train.add_argument(
+        "--seed", type=flags.seed, default=0, metavar="N", help="of everything that is random (default: 0)"
+    )
     train.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder, or one to go on with")
 
     export = commands.add_parser(
@@ -120,7 +126,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     record.add_argument(
         "--actions", metavar="FILE", help='an .npz with an array "actions" [16, 2] in m (default: exploratory actions)'
     )
-    record.add_argument("--seed", type=int, default=0, metavar="N", help="of the camera and the scene's look")
+    record.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="of the camera and the scene's look")
     record.add_argument(
         "--out",
         type=Path,
