@@ -19,7 +19,6 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from jaxlfi import flags
 from jaxlfi.cli import parser as command_line
 from jaxlfi.cli import train
 from jaxlfi.cli.exit_status import exit_status
@@ -62,7 +61,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--out", type=Path, required=True, metavar="DIR", help="a folder, new or of the same command")
     top.add_argument("--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)")
     top.add_argument("--preset", choices=("quick", "paper"), default="quick", help="of all stages (default: quick)")
-    top.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="of all stages (default: 0)")
+    top.add_argument("--seed", type=int, default=0, metavar="N", help="of all stages (default: 0)")
     top.add_argument("--iterations", type=int, default=1, metavar="N", help="times to go round (default: 1)")
     top.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")
     top.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz in place of the first training")

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxlfi import flags
 from jaxlfi.rl import deployment
 from jaxlfi.rl.policy import Policy, load
 from jaxlfi.robots import server
@@ -127,7 +126,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m jaxlfi.robots.simulated", description=__doc__.splitlines()[0])
     parser.add_argument("policy", type=Path, metavar="POLICY", help="a policy.npz, whose schema says what is measured")
     parser.add_argument("--port", type=int, default=0, metavar="N", help="of this host (default: any that is free)")
-    parser.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="of all chances (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all chances (default: 0)")
     parser.add_argument("--dropped", type=float, default=0.0, metavar="P", help="part of the frames that never come")
     parser.add_argument("--delayed", type=float, default=0.0, metavar="P", help="part of those that come late")
     parser.add_argument("--spoiled", type=float, default=0.0, metavar="P", help="part of those that miss a number")
