@@ -114,6 +114,7 @@ def test_one_round_learns_the_exact_posterior():
     assert_exact(state.belief, 0.25, 0.5)
 
 
+@pytest.mark.slow
 def test_importance_weights_keep_later_rounds_exact():
     """As above with an effective number of 670 simulations. Uncorrected, the covariance would be halved or
     less. Measured for eight keys: traces of 1.5 to 2.1, and one of 3.7.

@@ -222,6 +222,7 @@ def test_one_weight_of_many_is_limited():
     assert weight[3] / weight[0] == pytest.approx(np.sqrt(100) * raw.mean() / raw[0], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_weights_change_what_is_learnt():
     """Two thirds of the pairs are given the weight of next to nothing: the posterior is that of the others."""
     given = pairs(600)

@@ -1,7 +1,6 @@
 """Commands in several processes, joined by jax.distributed over the loopback."""
 
 import json
-import os
 import shutil
 import socket
 import subprocess
@@ -15,15 +14,10 @@ from jaxlfi.io import files as atomic
 from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401
 
 ROUNDS = 12
+RUN = ["infer", TASK, "--support", "ok", "--seeds", 3, *FLAGS, "--rounds", ROUNDS, "--out"]
 
 
-@pytest.fixture(scope="module")
-def environment(tmp_path_factory):
-    """What was compiled once is not compiled again."""
-    return os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("cache"))}
-
-
-def started(environment, count, *words) -> list[subprocess.Popen]:
+def started(count, *words) -> list[subprocess.Popen]:
     """A command in so many processes."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -31,7 +25,6 @@ def started(environment, count, *words) -> list[subprocess.Popen]:
     return [
         subprocess.Popen(
             [sys.executable, "-m", "jaxlfi", *map(str, words), *joined, "--process-id", str(index)],
-            env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -59,26 +52,38 @@ def arrays(folder):
     }
 
 
-def test_a_run_whose_process_was_lost_goes_on_in_as_many_processes_or_one(environment, tmp_path):
-    """To the same bits in as many, up to rounding in another number."""
-    words = ["infer", TASK, "--support", "ok", "--seeds", 3, *FLAGS, "--rounds", ROUNDS, "--out"]
-    whole, lost, alone = tmp_path / "whole", tmp_path / "lost", tmp_path / "alone"
-    processes = started(environment, 2, *words, lost)
+def lost_in_between(folder) -> subprocess.Popen:
+    """A run of three seeds in two processes, of which one is killed once there is a checkpoint: the other one."""
+    processes = started(2, *RUN, folder)
     deadline = time.monotonic() + 120
-    while not (lost / "checkpoint" / "state.npz").exists():
+    while not (folder / "checkpoint" / "state.npz").exists():
         assert time.monotonic() < deadline and all(process.poll() is None for process in processes)
         time.sleep(0.01)
     processes[1].kill()
-    began = time.monotonic()
-    uninterrupted = started(environment, 2, *words, whole)
-    _, errors = processes[0].communicate(timeout=60)
-    assert time.monotonic() - began < 30
-    assert errors == f"jaxlfi: error: another process of this command was lost; continue with: jaxlfi resume {lost}\n"
-    assert processes[0].returncode == 2
-    assert f"{ROUNDS} of {ROUNDS} rounds" in done(uninterrupted)
-    shutil.copytree(lost, alone)
+    return processes[0]
 
-    assert "warning" not in done(started(environment, 2, "resume", lost, "--no-figures"))
+
+def test_where_a_process_is_lost_the_other_says_so_and_the_run_goes_on_in_one(tmp_path):
+    left = lost_in_between(tmp_path)
+    began = time.monotonic()
+    _, errors = left.communicate(timeout=60)
+    assert time.monotonic() - began < 30
+    assert errors == f"jaxlfi: error: another process of this command was lost; continue with: jaxlfi resume {tmp_path}\n"
+    assert left.returncode == 2
+    assert command("resume", tmp_path, "--no-figures") == 0
+    assert json.loads((tmp_path / "config.json").read_text())["status"] == "finished"
+    assert len((tmp_path / "seed_002" / "ledger.jsonl").read_text().splitlines()) == ROUNDS
+
+
+@pytest.mark.slow
+def test_a_run_whose_process_was_lost_goes_on_in_as_many_processes_or_one(tmp_path):
+    """To the same bits in as many, up to rounding in another number."""
+    whole, lost, alone = tmp_path / "whole", tmp_path / "lost", tmp_path / "alone"
+    lost_in_between(lost).communicate(timeout=60)
+    shutil.copytree(lost, alone)
+    assert f"{ROUNDS} of {ROUNDS} rounds" in done(started(2, *RUN, whole))
+
+    assert "warning" not in done(started(2, "resume", lost, "--no-figures"))
     expected, resumed = arrays(whole), arrays(lost)
     assert expected.keys() == resumed.keys()
     for name, value in expected.items():
@@ -95,11 +100,11 @@ def test_a_run_whose_process_was_lost_goes_on_in_as_many_processes_or_one(enviro
 
 
 @pytest.mark.slow
-def test_four_processes_give_what_one_gives(environment, tmp_path):
+def test_four_processes_give_what_one_gives(tmp_path):
     """A grid, whose last chunk is filled up."""
     words = ["grid", TASK, "--support", "misspecified", "--seeds", 5, *FLAGS, "--vary", "expansion=0.1"]
     words += ["--runs-per-chunk", 4, "--out"]
-    said = done(started(environment, 4, *words, tmp_path / "four"))
+    said = done(started(4, *words, tmp_path / "four"))
     assert "5 runs in 2 chunks of 4" in said
     assert command(*words, tmp_path / "one") == 0
     four, one = (atomic.read_arrays(tmp_path / name / "grid.npz") for name in ("four", "one"))

@@ -447,6 +447,7 @@ def test_a_run_of_a_host_simulator_is_repeated(folder, tmp_path):
     assert np.corrcoef(arrays["draws"].mean(1)[:, 1], arrays["theta"][:, 1])[0, 1] > 0.7
 
 
+@pytest.mark.slow
 def test_at_the_posterior_alone_only_what_holds_there_is_asked(folder, tmp_path, capsys):
     """Ranks and the classifier compare truths with draws under the prior, which these truths are not from."""
     out = tmp_path / "out"

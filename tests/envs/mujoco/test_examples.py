@@ -53,6 +53,7 @@ def test_one_first_guess_holds_the_truth_and_one_does_not(name):
     assert not inside["initial"][0] and inside["initial"][1:].all()
 
 
+@pytest.mark.slow
 def test_a_damping_that_the_first_guess_leaves_out_is_found():
     task = example("furuta")
     truth = np.asarray(task.truth)
