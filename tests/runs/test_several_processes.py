@@ -66,9 +66,9 @@ def lost_in_between(folder) -> subprocess.Popen:
 def test_where_a_process_is_lost_the_other_says_so_and_the_run_goes_on_in_one(tmp_path):
     left = lost_in_between(tmp_path)
     began = time.monotonic()
-    _, errors = left.communicate(timeout=60)
+    _, said = left.communicate(timeout=60)
     assert time.monotonic() - began < 30
-    assert errors == f"jaxlfi: error: another process of this command was lost; continue with: jaxlfi resume {tmp_path}\n"
+    assert said == f"jaxlfi: error: another process of this command was lost; continue with: jaxlfi resume {tmp_path}\n"
     assert left.returncode == 2
     assert command("resume", tmp_path, "--no-figures") == 0
     assert json.loads((tmp_path / "config.json").read_text())["status"] == "finished"
