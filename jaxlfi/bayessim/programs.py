@@ -1,6 +1,7 @@
 """Compiled programs of batches, shared by all engines of equal tasks."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -26,19 +27,29 @@ def program(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...],
 
 @functools.lru_cache(maxsize=KEPT)
 def _program(function, bound: tuple, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...]):
-    one = functools.partial(function, *bound)
+    return jax.jit(side_by_side(functools.partial(function, *bound), mesh, in_axes), donate_argnums=donate)
+
+
+def side_by_side(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...]) -> Callable[..., Any]:
+    """A function of one run as a function of a batch: `vmap` over the runs, which are divided over devices.
+
+    Args:
+        one: the function, with its static arguments bound.
+        mesh: of the devices, of one axis; their number divides that of the runs.
+        in_axes: of the other arguments: 0 for one value a run, None for a value that all share.
+    """
     mapped = jax.vmap(one, in_axes=in_axes)
 
     def many(*arguments):
         return _alone(one, in_axes, arguments) if _runs(in_axes, arguments) == 1 else mapped(*arguments)
 
-    many.__name__ = function.__name__  # in profiles
-    if mesh.size > 1:
-        # Runs are divided by shard_map, as while-loops must not get predicates that cross devices.
-        split = PartitionSpec(mesh.axis_names[0])
-        specs = tuple(PartitionSpec() if axis is None else split for axis in in_axes)
-        many = jax.shard_map(many, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
-    return jax.jit(many, donate_argnums=donate)
+    many.__name__ = one.func.__name__  # in profiles
+    if mesh.size == 1:
+        return many
+    # Runs are divided by shard_map, as while-loops must not get predicates that cross devices.
+    split = PartitionSpec(mesh.axis_names[0])
+    specs = tuple(PartitionSpec() if axis is None else split for axis in in_axes)
+    return jax.shard_map(many, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
 
 
 def _runs(in_axes: tuple[int | None, ...], arguments: tuple) -> int:

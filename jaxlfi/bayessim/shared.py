@@ -1,6 +1,5 @@
 """A batch whose runs are shared out among several processes, each with the devices of its own host."""
 
-import math
 from typing import Any
 
 import jax
@@ -9,17 +8,12 @@ import numpy as np
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine, RunInputs
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.io.processes import Processes
+from jaxlfi.io.processes import Processes, Shares
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
 
 STEERING = ("settled", "succeeded", "failed")
 """Of a round's record, what decides about the next one; every process gets it of all runs."""
-
-
-def devices_used(runs: int, processes: Processes) -> int:
-    """How many devices of each process take part: all of them, or as many as it takes for one run each."""
-    return min(jax.local_device_count(), math.ceil(runs / processes.count))
 
 
 class SharedEngine:
@@ -44,14 +38,9 @@ class SharedEngine:
             ValueError: where there are more processes than runs.
         """
         self.task, self.runs, self._processes = task, len(inputs.x), processes
-        if processes.count > self.runs:
-            raise ValueError(f"processes: expected at most one a run, got {processes.count} for {self.runs}")
-        devices = devices_used(self.runs, processes)
-        each = devices * math.ceil(self.runs / (devices * processes.count))
-        padded = np.minimum(np.arange(processes.count * each), self.runs - 1)  # the last run repeated to fill them
-        self._rows = np.split(padded, processes.count)
-        local = jax.local_devices()[:devices]
-        self._own = BatchEngine(task, settings, self._part(inputs, processes.index), local, first)
+        self._shares = Shares(processes, self.runs, jax.local_device_count())
+        local = jax.local_devices()[: self._shares.devices]
+        self._own = BatchEngine(task, settings, self._shares.own(inputs), local, first)
 
     def start(self) -> State:
         """The state of this process's runs before the first round."""
@@ -64,24 +53,14 @@ class SharedEngine:
     def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
         """Step every run; the record is of all runs, but only `STEERING` where nothing is written."""
         state, row = self._own.round(state, index)
-        row = self._joined(row)
+        row = self._shares.joined(row)
         steering = self._processes.agreed({name: row[name] for name in STEERING})
         return state, row | steering if self._processes.writes else steering
 
     def fetch(self, state: State) -> State:
         """The state of all runs on the host of the process that writes; all processes call it."""
-        return self._joined(self._own.fetch(state))
+        return self._shares.joined(self._own.fetch(state))
 
     def place(self, tree: Any) -> Any:
         """Lay out a state of all runs, which the process that writes has; all processes call it."""
-        parts = (
-            [self._part(tree, index) for index in range(self._processes.count)] if self._processes.writes else [tree]
-        )
-        return self._own.place(self._processes.dealt(parts))
-
-    def _joined(self, tree: Any) -> Any:
-        whole = self._processes.gathered(tree)
-        return jax.tree.map(lambda leaf: leaf[: self.runs], whole) if self._processes.writes else tree
-
-    def _part(self, tree: Any, index: int) -> Any:
-        return jax.tree.map(lambda leaf: leaf[self._rows[index]], tree)
+        return self._own.place(self._shares.dealt(tree))

@@ -182,9 +182,7 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     if grid.is_grid(folder):
         return _resume_grid(folder, arguments.joined, console)
     if train.is_training(folder):
-        if arguments.joined.count > 1:
-            raise ValueError("processes: expected a run, runs side by side or a grid; policies take one process")
-        train.resume(folder, console, not arguments.no_figures)
+        train.resume(folder, console, not arguments.no_figures, arguments.joined)
         return None
     config = run_store.read_config(folder)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):

@@ -458,9 +458,10 @@ def _runs(arguments: argparse.Namespace) -> int:
     """How many runs a command is going to have, as far as its arguments show."""
     if arguments.command == "resume":
         recorded = _recorded(arguments)
-        return (
-            len(recorded.get("runs") or ()) if isinstance(recorded.get("runs"), list) else 2
-        )  # a grid does not list its runs
+        if "trainings" in recorded:
+            return 1  # those of policies fill all cores as one device
+        runs = recorded.get("runs")
+        return len(runs) if isinstance(runs, list) else 2  # a grid does not list its runs
     if arguments.command == "compare":
         return arguments.seeds * (len(arguments.configurations) if arguments.configurations else TYPICAL_CONFIGURATIONS)
     if arguments.command == "grid":

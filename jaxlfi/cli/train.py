@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxlfi import flags, source_fields
+from jaxlfi.cli import joined
 from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
@@ -20,6 +21,7 @@ from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from jaxlfi.io.processes import Processes
     from jaxlfi.rl.environment import Environment
 
 PRESETS = ("quick", "paper")
@@ -39,6 +41,8 @@ examples:
   jaxlfi train whip --domain runs/dlo-0 uniform median --seeds 4 --out runs/policies
   jaxlfi train whip,detector=clean --domain point:200,1e5 --total-steps 30000 --out runs/point
   jaxlfi train whip --domain uniform --seeds 2 --tensorboard --out runs/watched
+  jaxlfi train whip --domain uniform --seeds 16 --out runs/many --coordinator 10.0.0.5:1234 --processes 2 \\
+    --process-id 0                               on 10.0.0.5; and on another host with --process-id 1
   jaxlfi resume runs/policies                    go on after a crash, to the same policies bit for bit
 
 """
@@ -67,6 +71,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
     top.add_argument("--debug", action="store_true", help="show where an error came from")
+    joined.add_flags(top)
     group = top.add_argument_group("PPO (default: the preset's)")
     flags.add(group, {"PPO": source_fields.of_class(SETTINGS).fields}, into="settings", defaults=False)
     top.set_defaults(settings={})
@@ -84,7 +89,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = parser().parse_args(argv)
     begun = lambda: f"; continue with: jaxlfi resume {arguments.out}" if is_training(arguments.out) else ""
-    return exit_status("jaxlfi train", lambda: _train(arguments), arguments.debug, begun)
+    command = lambda: exit_status("jaxlfi train", lambda: _train(arguments), arguments.debug, begun)
+    if arguments.coordinator is None:
+        return command()
+    return joined.work(command, begun, "jaxlfi train", arguments.debug)
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -94,14 +102,20 @@ def _train(arguments: argparse.Namespace) -> None:
     from jaxlfi.io.locks import locked
 
     compile_cache.enable()
-    plan = _plan(arguments)
-    from jaxlfi.rl import training
+    processes = joined.join(arguments)
+    from jaxlfi.rl import registry, training
 
-    training.begin(plan, arguments.out)
+    if not processes.writes:
+        training.resumed(arguments.out, registry.load(arguments.environment), lambda updates, curves: None, processes)
+        processes.leave()
+        return
+    plan = _plan(arguments)
+    training.begin(plan, arguments.out, processes)
     try:
         console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
         with locked(arguments.out):
-            run(arguments.out, plan.environment, console, not arguments.no_figures)
+            run(arguments.out, plan.environment, console, not arguments.no_figures, processes)
+        processes.leave()
     except OSError:
         raise  # as of a full disk, or of another process that goes on with it: the folder is not to be lost
     except Exception:
@@ -110,11 +124,22 @@ def _train(arguments: argparse.Namespace) -> None:
         raise
 
 
-def run(out: Path, environment: "Environment", console: "Console", figures: bool) -> None:
-    """Train what a folder asks for, print how the policies fare, and draw the learning curves."""
+def run(
+    out: Path, environment: "Environment", console: "Console", figures: bool, processes: "Processes | None" = None
+) -> None:
+    """Train what a folder asks for, print how the policies fare, and draw the learning curves.
+
+    Args:
+        out: the folder, which this process writes.
+        environment: that of the folder.
+        console: to print on.
+        figures: whether to draw.
+        processes: that share the trainings out among them; None for this one alone.
+    """
     import numpy as np
     from rich.table import Table
 
+    from jaxlfi.io.processes import ALONE
     from jaxlfi.io.progress import RoundProgress
     from jaxlfi.rl import tensorboard, training
 
@@ -137,7 +162,7 @@ def run(out: Path, environment: "Environment", console: "Console", figures: bool
             if scalars:
                 scalars.write(curves)
 
-        result = training.resumed(out, environment, on_chunk)
+        result = training.resumed(out, environment, on_chunk, processes or ALONE)
         if scalars:
             scalars.write(result.curves)  # where nothing was left to train, it was not called
     facts = [name for name in result.outcomes if name not in training.NOT_FACTS]
@@ -173,20 +198,29 @@ def is_training(out: Path) -> bool:
     return isinstance(config, dict) and config.get("format") == "jaxlfi-training"
 
 
-def resume(out: Path, console: "Console", figures: bool) -> None:
-    """Go on with a training that was stopped."""
+def resume(out: Path, console: "Console", figures: bool, processes: "Processes") -> None:
+    """Go on with a training that was stopped; see `run`. Every process reads the folder."""
     from jaxlfi.rl import registry, training
+    from jaxlfi.runs.execute import changed_machine
 
     config = training.read_config(out)
     if training.finished(out):
-        training.clean(out)
-        if figures and not (out / "curves.png").exists():  # it was stopped while it drew them
-            draw(out, console)
+        if processes.writes:
+            training.clean(out)
+            if figures and not (out / "curves.png").exists():  # it was stopped while it drew them
+                draw(out, console)
         console.print(f"{out} is complete: nothing to resume", markup=False)
         return
     if config["environment"] is None:
         raise ValueError(f"{out}: expected an environment that can be found by name; resume it in Python")
-    run(out, registry.load(config["environment"]), console, figures)
+    if changed := changed_machine(config, processes):
+        warning = f"begun with {', '.join(changed)}: the policies may be other than without an interruption"
+        console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True, highlight=False)
+    environment = registry.load(config["environment"])
+    if processes.writes:
+        run(out, environment, console, figures, processes)
+    else:
+        training.resumed(out, environment, lambda updates, curves: None, processes)
 
 
 def check_seeds(first: int, count: int, name: str) -> None:

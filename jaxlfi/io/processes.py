@@ -9,6 +9,8 @@ import contextlib
 import dataclasses
 import io
 import itertools
+import json
+import math
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -73,6 +75,11 @@ class Processes:
         """The arrays of the process that writes, in all processes."""
         return self.dealt([tree] * self.count) if self.count > 1 else tree
 
+    def told(self, value: Any) -> Any:
+        """A value of JSON, that of the process that writes, in all processes."""
+        text = json.dumps(value).encode() if self.writes else b""
+        return json.loads(self.agreed(np.frombuffer(text, np.uint8)).tobytes())
+
     def leave(self) -> None:
         """Come to the end together: the others wait until all is written."""
         if self.count > 1:
@@ -84,6 +91,56 @@ class Processes:
 
 ALONE = Processes()
 """A command in a process of its own."""
+
+
+class Shares:
+    """The runs of a batch, shared out evenly among processes, and in each of them among its devices.
+
+    Attributes:
+        processes: that the runs are shared out among.
+        runs: how many there are.
+        devices: how many of each process take part: all of them, or as many as it takes for one run each.
+    """
+
+    def __init__(self, processes: Processes, runs: int, devices: int):
+        """Share them out.
+
+        Args:
+            processes: to share them out among.
+            runs: how many there are.
+            devices: of each process.
+
+        Raises:
+            ValueError: where there are more processes than runs.
+        """
+        if processes.count > runs:
+            raise ValueError(f"processes: expected at most one a run, got {processes.count} for {runs}")
+        self.processes, self.runs = processes, runs
+        self.devices = min(devices, math.ceil(runs / processes.count))
+        each = self.devices * math.ceil(runs / (self.devices * processes.count))
+        padded = np.minimum(np.arange(processes.count * each), runs - 1)  # the last run repeated to fill them
+        self._rows = np.split(padded, processes.count)
+
+    def own(self, tree: Any) -> Any:
+        """The part of this process in arrays of all runs."""
+        return self._part(tree, self.processes.index)
+
+    def dealt(self, tree: Any) -> Any:
+        """As `own`, of what only the process that writes has; elsewhere only the structure of `tree` counts."""
+        all_of_them = range(self.processes.count) if self.processes.writes else []
+        return self.processes.dealt([self._part(tree, index) for index in all_of_them] or [tree])
+
+    def joined(self, tree: Any) -> Any:
+        """Arrays of all runs from each process's part, at the one that writes; elsewhere the part."""
+        import jax
+
+        whole = self.processes.gathered(tree)
+        return jax.tree.map(lambda leaf: leaf[: self.runs], whole) if self.processes.writes else tree
+
+    def _part(self, tree: Any, index: int) -> Any:
+        import jax
+
+        return jax.tree.map(lambda leaf: leaf[self._rows[index]], tree)
 
 
 def join(coordinator: str, index: int | None = None, count: int | None = None) -> Processes:

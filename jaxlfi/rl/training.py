@@ -20,8 +20,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
+from jaxlfi.bayessim.programs import side_by_side
 from jaxlfi.io import files, serialise, trees
+from jaxlfi.io.processes import ALONE, Processes, Shares
 from jaxlfi.rl import ppo
 from jaxlfi.rl.domains import POOL, Domain, Draw
 from jaxlfi.rl.environment import Environment
@@ -29,6 +32,7 @@ from jaxlfi.rl.evaluation import evaluate
 from jaxlfi.rl.ppo import Training, Update
 from jaxlfi.rl.settings import PPO
 from jaxlfi.runs import folder as run_folders
+from jaxlfi.runs.execute import devices_of
 from jaxlfi.runs.folder import StoreError
 
 FORMAT, VERSION = "jaxlfi-training", 1
@@ -71,20 +75,26 @@ class Result:
         names: domain and seed of each of the R trainings.
         curves: what each update did, by the names of `ppo.Update`, shape [updates, R].
         outcomes: returns and facts of the deterministic policies on held-out points of their domains, shape [R, M].
-        training: the last states, stacked.
+        params: of the networks at the end, stacked.
     """
 
     names: tuple[tuple[str, int], ...]
     curves: Mapping[str, np.ndarray]
     outcomes: Mapping[str, np.ndarray]
-    training: Training
+    params: Any
 
 
-def begin(plan: Plan, out: Path) -> None:
+def begin(plan: Plan, out: Path, processes: Processes = ALONE) -> None:
     """Make the folder of a training: all that a resume needs.
+
+    Args:
+        plan: what is to be trained.
+        out: the folder.
+        processes: that share the trainings out among them; the one that writes calls this.
 
     Raises:
         StoreError: if something is there already.
+        ValueError: where there are more processes than trainings.
     """
     names = [(domain, seed) for domain in plan.domains for seed in plan.seeds]
     points = POOL if plan.settings.redrawn else plan.settings.environments
@@ -107,58 +117,76 @@ def begin(plan: Plan, out: Path) -> None:
         "settings": serialise.fields_to_json(plan.settings, serialise.class_name),
         "trainings": [{"domain": domain, "seed": seed} for domain, seed in names],
         "tensorboard": plan.tensorboard,
+        "devices": devices_of(len(names), processes),
+        "processes": processes.count,
         **run_folders.environment(),
     }
     run_folders.create(out, config, lambda staging: files.write_sealed(staging / "domains.npz", arrays))
 
 
-def resumed(out: Path, environment: Environment, on_chunk: Callable[[int, Mapping[str, np.ndarray]], Any]) -> Result:
+def resumed(
+    out: Path,
+    environment: Environment,
+    on_chunk: Callable[[int, Mapping[str, np.ndarray]], Any],
+    processes: Processes = ALONE,
+) -> Result | None:
     """Train, from the beginning or from the last checkpoint, to the end.
 
     Args:
-        out: a folder that `begin` made.
+        out: a folder that `begin` made; of several processes, only the one that writes needs it.
         environment: that of the folder.
-        on_chunk: called after each checkpoint with the updates since the last one, and the curves so far.
+        on_chunk: called after each checkpoint, where it is written, with the updates since the last one and the curves
+            so far.
+        processes: that share the trainings out among them.
 
     Returns:
-        What the trainings came to; it is in the folder as well.
+        What the trainings came to; it is in the folder as well. None where another process writes.
 
     Raises:
         StoreError: for a folder that is none, is damaged, or is of another environment.
     """
-    config = read_config(out)
+    config = processes.told(read_config(out) if processes.writes else None)
     settings = settings_of(config)
     names = tuple((one["domain"], one["seed"]) for one in config["trainings"])
     if config["environment_name"] != environment.name:
         raise StoreError(f"{out}: expected a training of {environment.name}, got one of {config['environment_name']}")
-    domains = _read(out / "domains.npz")
-    keys = jnp.stack([_keys(seed)[2] for _, seed in names])
-    start = jax.jit(jax.vmap(lambda key, domain: ppo.init(key, environment, settings, domain)))
-    state = start(keys, Domain(jnp.asarray(domains["trained"])))
+    points = _read(out / "domains.npz") if processes.writes else {}
+    trained, held_out = processes.agreed(tuple(points.get(name, 0) for name in ("trained", "held_out")))
+    _, _, learning, evaluating = (jnp.stack(keys) for keys in zip(*(_keys(seed) for _, seed in names), strict=True))
 
-    done, curves = 0, {}
-    checkpoint = out / "checkpoint.npz"
-    if checkpoint.exists():
-        done, curves, state = _read_checkpoint(checkpoint, state)
+    shares = Shares(processes, len(names), jax.local_device_count())
+    mesh = Mesh(np.asarray(jax.local_devices()[: shares.devices]), ("trainings",))
     chunk = min(MAX_CHUNK, settings.updates)
-    some = lambda state, count: ppo.train(environment, settings, state, chunk, count)
-    advance = jax.jit(jax.vmap(some, in_axes=(0, None), out_axes=(0, 1)), donate_argnums=0)
+    start = side_by_side(functools.partial(_start, environment, settings), mesh, (0, 0))
+    some = side_by_side(functools.partial(_some, environment, settings, chunk), mesh, (None, 0))
+    fares = side_by_side(functools.partial(_fares, environment, settings), mesh, (0, 0, 0))
+
+    state = jax.jit(start)(*shares.own((learning, jnp.asarray(trained))))
+    done, curves, saved = 0, {}, trees.to_arrays(state)
+    checkpoint = out / "checkpoint.npz"
+    if processes.writes and checkpoint.exists():
+        done, curves, saved = _read_checkpoint(checkpoint, jax.eval_shape(start, learning, jnp.asarray(trained)))
+    done = int(processes.agreed(np.asarray(done)))
+    if done:
+        state = trees.from_arrays(shares.dealt(saved), state)
+    advance = jax.jit(some, donate_argnums=1)
     while done < settings.updates:
         began, count = time.monotonic(), min(chunk, settings.updates - done)
-        state, made = advance(state, count)
-        rows = _rows(made)
-        rows["seconds"] = np.full((chunk, len(names)), (time.monotonic() - began) / count)
-        curves = {
-            name: np.concatenate([curves[name], row[:count]]) if done else row[:count] for name, row in rows.items()
-        }
+        state, made = advance(count, state)
         done += count
-        _write_checkpoint(checkpoint, done, curves, state)
-        on_chunk(count, curves)
+        rows, saved = shares.joined((_rows(made), trees.to_arrays(state)))
+        if processes.writes:
+            rows["seconds"] = np.full((len(names), chunk), (time.monotonic() - began) / count)
+            rows = {name: row[:, :count].T for name, row in rows.items()}
+            curves = {name: np.concatenate([curves[name], row]) if curves else row for name, row in rows.items()}
+            _write_checkpoint(checkpoint, done, curves, saved)
+            on_chunk(count, curves)
 
-    fares = jax.jit(jax.vmap(functools.partial(_fares, environment, settings)))
-    outcomes = fares(jnp.stack([_keys(seed)[3] for _, seed in names]), state.params, jnp.asarray(domains["held_out"]))
-    outcomes = {name: np.asarray(value) for name, value in outcomes.items()}
-    result = Result(names, curves, outcomes, state)
+    outcomes = jax.jit(fares)(*shares.own((evaluating, jnp.asarray(held_out))), state.params)
+    outcomes, params = shares.joined((outcomes, state.params))
+    if not processes.writes:
+        return None
+    result = Result(names, curves, {name: np.asarray(value) for name, value in outcomes.items()}, params)
     _write_result(out, environment, config, result)
     clean(out)
     return result
@@ -216,7 +244,17 @@ def _keys(seed: int) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     return tuple(jax.random.split(jax.random.key(seed), 4))
 
 
-def _fares(environment: Environment, settings: PPO, key: jax.Array, params: Any, theta: jax.Array) -> dict[str, Any]:
+def _start(environment: Environment, settings: PPO, key: jax.Array, theta: jax.Array) -> Training:
+    return ppo.init(key, environment, settings, Domain(theta))
+
+
+def _some(
+    environment: Environment, settings: PPO, updates: int, count: int, state: Training
+) -> tuple[Training, Update]:
+    return ppo.train(environment, settings, state, updates, count)
+
+
+def _fares(environment: Environment, settings: PPO, key: jax.Array, theta: jax.Array, params: Any) -> dict[str, Any]:
     act = ppo.deterministic(environment, settings, params)
     outcomes = evaluate(key, environment, act, Domain(theta))
     return {"value": outcomes.value, "steps": outcomes.steps, "theta": theta} | outcomes.facts
@@ -231,16 +269,16 @@ def _rows(made: Update) -> dict[str, np.ndarray]:
 # ------------------------------------------------------------------------------------------------------------- files
 
 
-def _write_checkpoint(path: Path, done: int, curves: Mapping[str, np.ndarray], state: Training) -> None:
-    leaves = trees.to_arrays(state, "state")
-    rows = {f"curve/{name}": row for name, row in curves.items()}
-    files.write_sealed(path, {"done": np.asarray(done)} | rows | leaves)
+def _write_checkpoint(path: Path, done: int, curves: Mapping[str, np.ndarray], state: Mapping[str, np.ndarray]) -> None:
+    parts = {"curve/": curves, "state": state}
+    named = {prefix + name: array for prefix, part in parts.items() for name, array in part.items()}
+    files.write_sealed(path, {"done": np.asarray(done)} | named)
 
 
-def _read_checkpoint(path: Path, like: Training) -> tuple[int, dict[str, np.ndarray], Training]:
+def _read_checkpoint(path: Path, like: Training) -> tuple[int, dict[str, np.ndarray], dict[str, np.ndarray]]:
     arrays = _read(path)
     try:
-        state = trees.from_arrays(arrays, like, "state")
+        state = trees.to_arrays(trees.from_arrays(arrays, like, "state"))
     except ValueError as error:
         raise StoreError(f"{path}: {error}") from error
     curves = {name.removeprefix("curve/"): row for name, row in arrays.items() if name.startswith("curve/")}
@@ -264,7 +302,7 @@ def _write_result(out: Path, environment: Environment, config: Mapping[str, Any]
     for place, (domain, seed) in enumerate(result.names):
         folder = out / domain / f"seed_{seed:03d}"
         folder.mkdir(parents=True, exist_ok=True)
-        params = jax.tree.map(lambda leaf, place=place: leaf[place], result.training.params)
+        params = jax.tree.map(lambda leaf, place=place: leaf[place], result.params)
         recorded = {"reference": config["environment"], "domain": domain, "seed": seed, "versions": config["versions"]}
         ppo.as_file(environment, params, **recorded).save(folder / "policy.npz")
         means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]

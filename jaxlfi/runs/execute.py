@@ -19,9 +19,9 @@ from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.memory import budget, state_bytes
 from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.bayessim.shared import SharedEngine, devices_used
+from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.io import files as atomic
-from jaxlfi.io.processes import ALONE, Processes
+from jaxlfi.io.processes import ALONE, Processes, Shares
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import Checkpoint
@@ -267,7 +267,7 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed, processes: Processe
     ]
     status = {
         "status": "running",
-        "devices": _devices(len(plan.specs), processes),
+        "devices": devices_of(len(plan.specs), processes),
         "processes": processes.count,
         "keep_network": plan.keep_network,
         "executor": plan.task.one_by_one and plan.task.simulate.executor is not None,
@@ -331,9 +331,9 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
     return plan, Observed(*Checkpoint(folder).read_start())
 
 
-def _devices(runs: int, processes: Processes) -> int:
-    """How many devices a batch is spread over."""
-    return min(devices_used(runs, processes) * processes.count, runs)
+def devices_of(runs: int, processes: Processes) -> int:
+    """How many devices of all processes a batch of so many runs is spread over."""
+    return min(Shares(processes, runs, jax.local_device_count()).devices * processes.count, runs)
 
 
 def changed_machine(config: Mapping[str, Any], processes: Processes = ALONE) -> list[str]:
@@ -342,9 +342,9 @@ def changed_machine(config: Mapping[str, Any], processes: Processes = ALONE) -> 
     now = folders.versions()
     changed = [name for name in VERSIONS if recorded.get(name) not in (None, now[name])]
     words = [f"{name} {recorded[name]}, now {now[name]}" for name in changed]
-    runs, devices = config.get("runs"), jax.local_device_count() * processes.count
+    runs, devices = config.get("runs", config.get("trainings")), jax.local_device_count() * processes.count
     if isinstance(runs, list):
-        devices = _devices(len(runs), processes)
+        devices = devices_of(len(runs), processes)
     for name, here in (("devices", devices), ("processes", processes.count)):
         if config.get(name) not in (None, here):
             words.append(f"{config[name]} {name}, now {here}")

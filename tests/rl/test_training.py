@@ -239,7 +239,7 @@ def test_a_return_is_shown_where_an_episode_has_ended(finished, monkeypatch, val
     shown = []
     monkeypatch.setattr(progress.RoundProgress, "advance", lambda self, updates, text: shown.append(text))
 
-    def resumed(out, environment, on_chunk):
+    def resumed(out, environment, on_chunk, processes):
         on_chunk(2, {"value": np.array(values)})
         return result
 

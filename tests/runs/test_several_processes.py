@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -11,35 +10,11 @@ import numpy as np
 import pytest
 
 from jaxlfi.io import files as atomic
+from tests.hosts import done, started
 from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401
 
 ROUNDS = 12
 RUN = ["infer", TASK, "--support", "ok", "--seeds", 3, *FLAGS, "--rounds", ROUNDS, "--out"]
-
-
-def started(count, *words) -> list[subprocess.Popen]:
-    """A command in so many processes."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        joined = ["--coordinator", f"127.0.0.1:{free.getsockname()[1]}", "--processes", str(count)]
-    return [
-        subprocess.Popen(
-            [sys.executable, "-m", "jaxlfi", *map(str, words), *joined, "--process-id", str(index)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for index in range(count)
-    ]
-
-
-def done(processes) -> str:
-    """Wait for their end: the first one speaks, and none of the others."""
-    said = [process.communicate(timeout=150) for process in processes]
-    assert [process.returncode for process in processes] == [0] * len(processes), said
-    assert [text for _, text in said] == [""] * len(said)
-    assert [text for text, _ in said[1:]] == [""] * len(said[1:])
-    return said[0][0]
 
 
 def arrays(folder):
