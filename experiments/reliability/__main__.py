@@ -61,12 +61,12 @@ class Undisturbed:
         self.folder = fresh / "run"
         if not self.folder.exists():
             fresh.mkdir(parents=True, exist_ok=True)
-            words, env = [sys.executable, "-m", "jaxlfi"], os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+            words, env = [sys.executable, "-m", command.program], os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
             subprocess.run([*words, *command.start], cwd=fresh, check=True, stdout=subprocess.DEVNULL, env=env)
         trial = root / f"{command.name}-forked"
         shutil.rmtree(trial, ignore_errors=True)
         trial.mkdir()
-        self.ended = run(trial, command.start)
+        self.ended = run(trial, command.start, program=command.program)
         if self.ended.status or (found := self.compared(trial / "run")):
             raise RuntimeError(f"{command.name}: {self.ended.errors}{'' if self.ended.status else found}")
         windows = enumerate(self.ended.windows)
@@ -92,7 +92,7 @@ def trial(
         words = command.resume if begun else command.start
         second = float(rng.uniform(0, undisturbed.ended.seconds)) if 0 < kill < most else None
         blow = first if kill == 0 else None
-        ended = Running(folder, words, blow=blow).wait(second)
+        ended = Running(folder, words, blow=blow, program=command.program).wait(second)
         if not ended.killed:  # it came to its end before
             break
         rows.append(_row(command, ended, kill, begun, blow))
@@ -203,7 +203,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=100, help="at a moment; half as many are in windows besides")
     parser.add_argument("--every-window", nargs="*", default=[], metavar="COMMAND", help="killed in each window, too")
-    parser.add_argument("--commands", nargs="+", default=["infer", "compare", "grid", "train", "dask"])
+    parser.add_argument("--commands", nargs="+", default=["infer", "compare", "grid", "train", "r2s2r", "dask"])
     parser.add_argument("--adversities", nargs="*", default=OFF_ROUTE, metavar="COMMAND", help="those that meet them")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, default=Path("runs/reliability"), help="folders of the trials")

@@ -25,11 +25,13 @@ class Command:
         name: of the command.
         start: its words.
         resume: the words that go on in the folder `run`.
+        program: the module that has the command.
     """
 
     name: str
     start: tuple[str, ...]
     resume: tuple[str, ...] = ("resume", "run", "--no-figures")
+    program: str = "jaxlfi"
 
 
 def commands(scheduler: str) -> dict[str, Command]:
@@ -38,7 +40,7 @@ def commands(scheduler: str) -> dict[str, Command]:
     Args:
         scheduler: address of a Dask cluster.
     """
-    dask = ("--scheduler", scheduler)
+    dask, loop = ("--scheduler", scheduler), ("--object", "dlo-0", *OUT)
     all_of_them = (
         Command("infer", ("infer", "gaussian_linear", *FAST, *OUT)),
         Command(
@@ -53,6 +55,7 @@ def commands(scheduler: str) -> dict[str, Command]:
             ),
         ),
         Command("train", ("train", *CART, *OUT)),
+        Command("r2s2r", loop, loop, "experiments.reliability.loop"),
         Command(
             "dask",
             ("infer", "experiments.reliability.tasks:one_by_one", *FAST, *dask, *OUT),

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import importlib
 import os
 import signal
 import sys
@@ -44,7 +45,9 @@ class Ended:
 class Running:
     """A process that runs one command of the command line in a folder."""
 
-    def __init__(self, folder: Path, words: Sequence[str], blow: Blow | None = None, clock: bool = False):
+    def __init__(
+        self, folder: Path, words: Sequence[str], blow: Blow | None = None, clock: bool = False, program: str = "jaxlfi"
+    ):
         """Start it.
 
         Args:
@@ -52,6 +55,7 @@ class Running:
             words: after `jaxlfi`.
             blow: what it does to itself.
             clock: whether its clock jumps back by a day as it runs.
+            program: the module of the command; its words follow.
         """
         self._notes = folder.parent / f"{folder.name}.notes"
         self._notes.mkdir(exist_ok=True)
@@ -60,23 +64,22 @@ class Running:
         self._began = time.monotonic()
         self.pid = os.fork()
         if self.pid == 0:
-            self._become(folder, words, blow, clock)
+            self._become(folder, words, blow, clock, program)
 
-    def _become(self, folder: Path, words: Sequence[str], blow: Blow | None, clock: bool) -> None:
+    def _become(self, folder: Path, words: Sequence[str], blow: Blow | None, clock: bool, program: str) -> None:
         status = 1
         try:
             for number, name in ((1, "out"), (2, "err")):
                 os.dup2(os.open(self._notes / name, os.O_WRONLY), number)
             sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
             os.chdir(folder)
-            sys.argv = ["__main__.py", *words]  # as of `python -m jaxlfi`
+            sys.argv = ["__main__.py" if program == "jaxlfi" else f"{program.split('.')[-1]}.py", *words]  # as of -m
             signal.signal(signal.SIGINT, signal.default_int_handler)
             injection.Watch(folder, self._notes / "windows", blow).install()
             if clock:
                 injection.turn_back(86400.0, 1)
-            from jaxlfi.cli import parser
-
-            status = parser.main(list(words))
+            main = importlib.import_module("jaxlfi.cli.parser" if program == "jaxlfi" else program).main
+            status = main(list(words))
         except SystemExit as stop:
             status = stop.code
         except BaseException:

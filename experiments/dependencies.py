@@ -1,0 +1,116 @@
+"""What the library depends on, with licences and last releases: `python -m experiments.dependencies`.
+
+It prints the table of docs/dependencies.md: requirements and reasons from pyproject.toml, licences from the installed
+packages, versions and dates of the last releases from the package index that PIP_INDEX_URL names.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import re
+import tomllib
+import urllib.request
+from importlib import metadata
+from pathlib import Path
+
+PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
+INDEX = "https://pypi.org/simple"
+SIMPLE = "application/vnd.pypi.simple.v1+json"
+SELF = ("test", "bench", "docs", "dev")
+"""Extras for who works on the library or its experiments."""
+LICENCES = {
+    "Apache-2.0": r"apache",
+    "MIT": r"\bmit\b",
+    "BSD-3-Clause": r"3-clause|new bsd|\bbsd license",
+    "MIT-CMU": r"mit-cmu|hpnd",
+    "PSF-based": r"python software foundation|psf",
+}
+"""What packages without an SPDX expression write."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Dependency:
+    """One direct dependency.
+
+    Attributes:
+        name: of the package.
+        needed: the oldest version, as in pyproject.toml.
+        extras: that ask for it; none for one of every installation.
+        why: as its comment in pyproject.toml says.
+    """
+
+    name: str
+    needed: str
+    extras: tuple[str, ...]
+    why: str
+
+
+def dependencies() -> list[Dependency]:
+    """Those of a user: of every installation first, then those of extras."""
+    text = PYPROJECT.read_text()
+    project = tomllib.loads(text)["project"]
+    asked: dict[str, tuple[str, list[str]]] = {}
+    groups = {"": project["dependencies"]} | project["optional-dependencies"]
+    for extra, requirements in groups.items():
+        for requirement in requirements if extra not in SELF else ():
+            name, needed = re.match(r"([A-Za-z0-9_.-]+)(?:\[.*\])?(.*)", requirement).groups()
+            asked.setdefault(name, (needed, []))[1].append(extra)
+    return [
+        Dependency(name, needed, tuple(filter(None, extras)), _why(name, text))
+        for name, (needed, extras) in asked.items()
+    ]
+
+
+def _why(name: str, text: str) -> str:
+    """The comment behind the first requirement of a package that is a user's."""
+    extra = ""
+    for line in text.splitlines():
+        if begun := re.match(r"(\w+) = \[", line):
+            extra = begun[1]
+        requirements, _, comment = line.partition("#")
+        if extra not in SELF and comment and re.search(rf'"{re.escape(name)}[^A-Za-z0-9-]', requirements):
+            return comment.strip()
+    return ""
+
+
+def licence(name: str) -> str:
+    """The licence that an installed package declares, by its SPDX name."""
+    fields = metadata.metadata(name)
+    if expression := fields.get("License-Expression"):
+        return expression
+    classifiers = [text for text in fields.get_all("Classifier", []) if text.startswith("License ::")]
+    declared = " ".join([*classifiers, (fields.get("License") or "")[:200]]).lower()
+    return next((spdx for spdx, pattern in LICENCES.items() if re.search(pattern, declared)), "not declared")
+
+
+def last_release(name: str) -> tuple[str, str]:
+    """Version and day of the last release."""
+    address = f"{os.environ.get('PIP_INDEX_URL', INDEX).rstrip('/')}/{re.sub(r'[-_.]+', '-', name).lower()}/"
+    with urllib.request.urlopen(urllib.request.Request(address, headers={"Accept": SIMPLE}), timeout=60) as answer:
+        files = json.load(answer)["files"]
+    final = [file for file in files if re.fullmatch(r"[0-9.]+(\.post\d+)?", version(file["filename"]))]
+    newest = max(final, key=lambda file: [int(part) for part in re.findall(r"\d+", version(file["filename"]))])
+    return version(newest["filename"]), newest["upload-time"][:10]
+
+
+def version(file: str) -> str:
+    """The version in the name of a wheel or a source archive."""
+    name = re.sub(r"\.(tar\.gz|zip)$", "", file)
+    return file.split("-")[1] if file.endswith(".whl") else name.rpartition("-")[2]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.parse_args()
+    print("| package | needed | for | licence | last release | why |\n|---|---|---|---|---|---|")
+    for one in dependencies():
+        last, day = last_release(one.name)
+        extras = ", ".join(f"`{extra}`" for extra in one.extras) or "everything"
+        cells = one.name, one.needed, extras, licence(one.name), f"{last}, {day}", one.why
+        print(f"| {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
