@@ -46,8 +46,8 @@ class EnsembleDensity:
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` independent draws, each of a network chosen at random; some may leave any support."""
-        *keys, key_choice = jax.random.split(key, self.ensemble_size + 1)
-        draws = jax.vmap(lambda key, q: q.sample(key, n))(jnp.stack(keys), self.each)
+        keys = jax.random.split(key, self.ensemble_size + 1)
+        draws = jax.vmap(lambda key, q: q.sample(key, n))(keys[:-1], self.each)
         # In turn would not do: whoever takes the first of several draws that is inside would prefer the first network.
-        choice = jax.random.randint(key_choice, (n,), 0, self.ensemble_size)
+        choice = jax.random.randint(keys[-1], (n,), 0, self.ensemble_size)
         return self.shift + self.scale * draws[choice, jnp.arange(n)]
