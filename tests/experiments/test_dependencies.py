@@ -1,0 +1,42 @@
+"""The table of what the library depends on: that of pyproject.toml and of the installed packages."""
+
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from experiments import dependencies
+
+PAGE = Path(__file__).parents[2] / "docs" / "dependencies.md"
+ROWS = {
+    cells[0]: cells
+    for cells in (line.strip("| \n").split(" | ") for line in PAGE.read_text().splitlines() if "|" in line)
+}
+
+
+def test_the_table_has_what_pyproject_asks_for():
+    found = dependencies.dependencies()
+    assert list(ROWS)[2:] == [one.name for one in found]
+    for one in found:
+        extras = ", ".join(f"`{extra}`" for extra in one.extras) or "everything"
+        _, needed, of, _, last, why = ROWS[one.name]
+        assert (needed, of, why) == (one.needed, extras, one.why) and why
+        assert len(last.split(", ")[1]) == len("2026-11-24")
+
+
+@pytest.mark.parametrize("name", list(ROWS)[2:])
+def test_licences_are_those_of_the_installed_packages(name):
+    """The first of several, as other versions carry other parts."""
+    try:
+        assert dependencies.licence(name).split(" AND ")[0] == ROWS[name][3].split(" AND ")[0] != "not declared"
+    except metadata.PackageNotFoundError:
+        pytest.skip("not installed")
+
+
+def test_versions_in_names_of_files():
+    names = [
+        "mujoco_mjx-3.17.0-py3-none-any.whl",
+        "dm-tree-0.1.9.tar.gz",
+        "jaxlib-0.12.0.1-cp313-cp313-macosx_11_0_arm64.whl",
+    ]
+    assert list(map(dependencies.version, names)) == ["3.17.0", "0.1.9", "0.12.0.1"]
