@@ -150,22 +150,23 @@ def resumed(
     names = tuple((one["domain"], one["seed"]) for one in config["trainings"])
     if config["environment_name"] != environment.name:
         raise StoreError(f"{out}: expected a training of {environment.name}, got one of {config['environment_name']}")
-    points = _read(out / "domains.npz") if processes.writes else {}
-    trained, held_out = processes.agreed(tuple(points.get(name, 0) for name in ("trained", "held_out")))
+    points = _read(out / "domains.npz") if processes.writes else dict.fromkeys(("trained", "held_out"), 0)
+    trained, held_out = processes.agreed((points["trained"], points["held_out"]))
     _, _, learning, evaluating = (jnp.stack(keys) for keys in zip(*(_keys(seed) for _, seed in names), strict=True))
 
     shares = Shares(processes, len(names), jax.local_device_count())
     mesh = Mesh(np.asarray(jax.local_devices()[: shares.devices]), ("trainings",))
     chunk = min(MAX_CHUNK, settings.updates)
-    start = side_by_side(functools.partial(_start, environment, settings), mesh, (0, 0))
+    start = functools.partial(_start, environment, settings)
     some = side_by_side(functools.partial(_some, environment, settings, chunk), mesh, (None, 0))
     fares = side_by_side(functools.partial(_fares, environment, settings), mesh, (0, 0, 0))
 
-    state = jax.jit(start)(*shares.own((learning, jnp.asarray(trained))))
+    given = learning, jnp.asarray(trained)
+    state = jax.jit(side_by_side(start, mesh, (0, 0)))(*shares.own(given))
     done, curves, saved = 0, {}, trees.to_arrays(state)
     checkpoint = out / "checkpoint.npz"
     if processes.writes and checkpoint.exists():
-        done, curves, saved = _read_checkpoint(checkpoint, jax.eval_shape(start, learning, jnp.asarray(trained)))
+        done, curves, saved = _read_checkpoint(checkpoint, jax.eval_shape(jax.vmap(start), *given))
     done = int(processes.agreed(np.asarray(done)))
     if done:
         state = trees.from_arrays(shares.dealt(saved), state)

@@ -19,9 +19,10 @@ WORDS = ["train", "rl.toy:Line", "--domain", "uniform", "--seeds", 3, "--no-figu
 
 @pytest.fixture(autouse=True)
 def the_tests_environment(monkeypatch):
-    """The processes find rl.toy, as this one does."""
+    """The processes that are started find rl.toy, as this one does, and have two devices each."""
     folders = [os.path.dirname(os.path.dirname(__file__)), os.environ.get("PYTHONPATH")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, folders)))
+    monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2")
 
 
 def arrays(folder):
@@ -34,8 +35,7 @@ def arrays(folder):
     }
 
 
-def test_two_processes_of_two_devices_train_what_one_trains(tmp_path, monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2")
+def test_two_processes_of_two_devices_train_what_one_trains(tmp_path):
     words = [*WORDS, "--total-steps", 80, "--out"]
     said = done(started(2, *words, tmp_path / "two"))
     assert "update 2 of 2" in said and said.count("uniform") >= 3
