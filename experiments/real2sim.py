@@ -1,7 +1,8 @@
 """Real2Sim of the four FEM reference objects: posteriors on a fixed support and adapted by EDGE, and their errors.
 
     python -m experiments.real2sim --runs runs/real2sim --out experiments/results/real2sim
-    python -m experiments.real2sim --runs runs/seen --out experiments/results/real2sim-learnt --detector learnt
+    python -m experiments.real2sim --runs runs/seen --out experiments/results/real2sim-learnt --detector learnt \
+        --configurations initial+edge
 
 Runs `jaxlfi compare whip --object dlo-K --configurations initial initial+edge` for each object (finished runs are not
 repeated), reports the result of every seed in table.csv, and draws counterparts of the paper's figures from the folders
@@ -33,7 +34,8 @@ from jaxlfi.io import files as atomic
 from jaxlfi.runs import folder as run_store
 
 OBJECTS = ("dlo-0", "dlo-1", "dlo-2", "dlo-3")
-CONFIGURATIONS = ("initial", "initial+edge")
+CONFIGURATIONS = {"initial": "fixed", "initial+edge": "EDGE"}
+"""What is compared, and how pictures call it."""
 DOMAINS = 12
 """Environments a policy is trained in at once, each with parameters of its own (section VI-H)."""
 BEST = 0.25
@@ -93,29 +95,28 @@ def domains(history: History) -> np.ndarray:
 
 
 def draw_progression(figure: Figure, histories: Mapping[str, Mapping[str, History]]) -> None:
-    """One row per object: samples and last mixture, with the support fixed and adapted."""
-    axes = figure.subplots(len(histories), 4, squeeze=False)
+    """One row per object: samples and last mixture of each configuration."""
+    axes = figure.subplots(len(histories), 2 * len(next(iter(histories.values()))), squeeze=False)
     for row, (name, own) in enumerate(histories.items()):
-        for column, configuration in enumerate(CONFIGURATIONS):
-            history = own[configuration]
+        for column, (configuration, history) in enumerate(own.items()):
             left, right = axes[row, 2 * column : 2 * column + 2]
             window = [samples.limits(list(own.values()), d) for d in (0, 1)]
             samples.draw_proposals(left, history, (0, 1), window)
             samples.draw_mixture(right, history, (0, 1))
-            left.set_title(f"{name}, {'EDGE' if column else 'fixed'}")
-    style.iteration_bar(figure, axes, histories[next(iter(histories))][CONFIGURATIONS[0]].rounds)
+            left.set_title(f"{name}, {CONFIGURATIONS[configuration]}")
+    style.iteration_bar(figure, axes, max(history.rounds for own in histories.values() for history in own.values()))
 
 
 def draw_domains(figure: Figure, histories: Mapping[str, Mapping[str, History]]) -> None:
-    """One column per object: the last mixture and twelve domains drawn from it, fixed above and adapted below."""
-    axes = figure.subplots(2, len(histories), squeeze=False)
+    """One column per object, one row per configuration: the last mixture and twelve domains drawn from it."""
+    axes = figure.subplots(len(next(iter(histories.values()))), len(histories), squeeze=False)
     for column, (name, own) in enumerate(histories.items()):
-        for row, configuration in enumerate(CONFIGURATIONS):
-            samples.draw_mixture(axes[row, column], own[configuration], (0, 1))
+        for row, (configuration, history) in enumerate(own.items()):
+            samples.draw_mixture(axes[row, column], history, (0, 1))
             axes[row, column].plot(
-                *domains(own[configuration]).T, "o", markersize=3, markerfacecolor="none", color="black", zorder=6
+                *domains(history).T, "o", markersize=3, markerfacecolor="none", color="black", zorder=6
             )
-            axes[row, column].set_title(f"{name}, {'EDGE' if row else 'fixed'}")
+            axes[row, column].set_title(f"{name}, {CONFIGURATIONS[configuration]}")
 
 
 def draw_gaps(figure: Figure, found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]) -> None:
@@ -126,8 +127,8 @@ def draw_gaps(figure: Figure, found: Mapping[str, Mapping[str, Mapping[str, np.n
         left, right = axes[column], axes[column].twinx()
         for configuration, gap in own.items():
             steps = np.arange(1, len(gap["summary"]) + 1)
-            colour, label = colours[configuration], "EDGE" if "edge" in configuration else "fixed"
-            left.errorbar(steps, *gap["summary"].T, color=colour, capsize=1.5, label=label)
+            colour = colours[configuration]
+            left.errorbar(steps, *gap["summary"].T, color=colour, capsize=1.5, label=CONFIGURATIONS[configuration])
             right.errorbar(steps, *gap["pixels"].T, color=colour, alpha=0.35, capsize=1.5)
         left.set_title(name)
         left.set_xlabel("iteration")
@@ -188,6 +189,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--objects", nargs="+", default=OBJECTS, help="names, or recorded rollouts' .npz")
     parser.add_argument("--seeds", type=int, default=3, help="runs of each configuration, in one batch")
+    parser.add_argument("--configurations", nargs="+", choices=list(CONFIGURATIONS), default=list(CONFIGURATIONS))
     parser.add_argument("--detector", default="centreline", help="what sees the objects, as in `jaxlfi whip record`")
     arguments = parser.parse_args()
     runs = {}
@@ -196,7 +198,7 @@ def main() -> None:
         if arguments.detector != "centreline":
             task, rollout = f"whip,detector={arguments.detector}", recorded(name, arguments.detector, arguments.runs)
         words = ["compare", task, "--object", rollout, "--seeds", str(arguments.seeds)]
-        words += ["--configurations", *CONFIGURATIONS, "--out", str(folder), "--keep-network"]
+        words += ["--configurations", *arguments.configurations, "--out", str(folder), "--keep-network"]
         if not (folder / "config.json").exists():
             if status := cli.main(words):
                 raise SystemExit(status)
@@ -221,11 +223,11 @@ def main() -> None:
         for kind, value in gap.items()
     }
     atomic.write_arrays(arguments.out / "gaps.npz", arrays)
-    rows = len(histories)
+    rows, kinds = len(histories), len(arguments.configurations)
     with style.context():
         for name, size, paint in (
-            ("progression", (7.2, 1.75 * rows), lambda f: draw_progression(f, histories)),
-            ("domains", (1.8 * rows, 3.8), lambda f: draw_domains(f, histories)),
+            ("progression", (3.6 * kinds, 1.75 * rows), lambda f: draw_progression(f, histories)),
+            ("domains", (1.8 * rows, 1.9 * kinds), lambda f: draw_domains(f, histories)),
             ("gap", (1.9 * rows, 1.9), lambda f: draw_gaps(f, found)),
         ):
             figure = style.new_figure(*size)

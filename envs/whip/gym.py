@@ -198,8 +198,9 @@ class WhipVector(VectorEnv):
         super().reset(seed=seeds[0])
         if self._keys is None:
             self._keys = jax.random.split(jax.random.key(_entropy(self.np_random)), self.num_envs)
-        given = {i: jax.random.key(own) for i, own in enumerate(seeds) if own is not None}
-        self._keys = jnp.stack([given.get(i, self._keys[i]) for i in range(self.num_envs)])
+        for i, own in enumerate(seeds):
+            if own is not None:
+                self._keys = self._keys.at[i].set(jax.random.key(own))
         self._keys, self._scenes, self._episodes, now = _begin_many(
             self._parts, self._detector, self._parameters, self._keys
         )

@@ -169,6 +169,7 @@ def join(coordinator: str, index: int | None = None, count: int | None = None) -
         )
     except (RuntimeError, ValueError) as error:
         raise ValueError(f"coordinator: expected to join the other processes at {coordinator}, got: {error}") from error
+    jax.local_devices()  # later jax makes them together: all processes are to ask before any of them works or ends
     return Processes(_state().process_id, _state().num_processes)
 
 

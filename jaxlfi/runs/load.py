@@ -45,7 +45,10 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         >>> run = load("runs/demo/misspecified+edge/seed_000")  # doctest: +SKIP
         >>> run.posterior.sample(jax.random.key(0), 1000)  # doctest: +SKIP
     """
-    folder = Path(folder)
+    try:
+        folder = Path(folder)
+    except TypeError as error:
+        raise TypeError(f"folder: expected a path, got {type(folder).__name__}") from error
     config = folders.read_config(folder)
     if config["format"] != folders.RUN:
         one = next((run["folder"] for run in config.get("runs", ())), "seed_000")
