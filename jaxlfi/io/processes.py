@@ -194,7 +194,8 @@ def _receive(name: str) -> list[np.ndarray]:
     client = _state().client
     with _lost():
         pieces = _awaited(client, f"jaxlfi/{name}")
-        content = b"".join(client.blocking_key_value_get_bytes(f"jaxlfi/{name}/{i}", SECOND) for i in range(pieces))
+        wait = LOST * SECOND  # they are there, but a busy machine may take a while to say so
+        content = b"".join(client.blocking_key_value_get_bytes(f"jaxlfi/{name}/{i}", wait) for i in range(pieces))
         client.key_value_delete(f"jaxlfi/{name}")  # with its pieces
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         return [arrays[f"arr_{place}"] for place in range(len(arrays.files))]
