@@ -8,7 +8,7 @@ import numpy as np
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine, RunInputs
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.io.processes import Processes, Shares
+from jaxlfi.io.processes import Partition, Processes
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
 
@@ -38,9 +38,9 @@ class SharedEngine:
             ValueError: where there are more processes than runs.
         """
         self.task, self.runs, self._processes = task, len(inputs.x), processes
-        self._shares = Shares(processes, self.runs, jax.local_device_count())
-        local = jax.local_devices()[: self._shares.devices]
-        self._own = BatchEngine(task, settings, self._shares.own(inputs), local, first)
+        self._partition = Partition(processes, self.runs, jax.local_device_count())
+        local = jax.local_devices()[: self._partition.devices]
+        self._own = BatchEngine(task, settings, self._partition.local(inputs), local, first)
 
     def start(self) -> State:
         """The state of this process's runs before the first round."""
@@ -53,14 +53,14 @@ class SharedEngine:
     def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
         """Step every run; the record is of all runs, but only `STEERING` where nothing is written."""
         state, row = self._own.round(state, index)
-        row = self._shares.joined(row)
-        steering = self._processes.agreed({name: row[name] for name in STEERING})
+        row = self._partition.gather(row)
+        steering = self._processes.broadcast({name: row[name] for name in STEERING})
         return state, row | steering if self._processes.writes else steering
 
     def fetch(self, state: State) -> State:
         """The state of all runs on the host of the process that writes; all processes call it."""
-        return self._shares.joined(self._own.fetch(state))
+        return self._partition.gather(self._own.fetch(state))
 
     def place(self, tree: Any) -> Any:
         """Lay out a state of all runs, which the process that writes has; all processes call it."""
-        return self._own.place(self._shares.dealt(tree))
+        return self._own.place(self._partition.scatter(tree))

@@ -49,7 +49,7 @@ class Processes:
         """Whether this is the one that prints and writes."""
         return self.index == 0
 
-    def gathered(self, tree: Any) -> Any:
+    def gather(self, tree: Any) -> Any:
         """Arrays of all processes, joined along their leading axes, at the one that writes; elsewhere its own."""
         call = next(self._calls)
         if not self.writes:
@@ -58,7 +58,7 @@ class Processes:
         parts = [_leaves(tree), *(_receive(f"{call}/{other}") for other in range(1, self.count))]
         return _like(tree, [np.concatenate(leaves) for leaves in zip(*parts, strict=True)])
 
-    def dealt(self, trees: list[Any]) -> Any:
+    def scatter(self, trees: list[Any]) -> Any:
         """The part that the process that writes has for this one.
 
         Args:
@@ -71,21 +71,21 @@ class Processes:
             _send(f"{call}/{other}", _leaves(trees[other]))
         return trees[0]
 
-    def agreed(self, tree: Any) -> Any:
+    def broadcast(self, tree: Any) -> Any:
         """The arrays of the process that writes, in all processes."""
-        return self.dealt([tree] * self.count) if self.count > 1 else tree
+        return self.scatter([tree] * self.count) if self.count > 1 else tree
 
-    def told(self, value: Any) -> Any:
+    def broadcast_json(self, value: Any) -> Any:
         """A value of JSON, that of the process that writes, in all processes."""
         text = json.dumps(value).encode() if self.writes else b""
-        return json.loads(self.agreed(np.frombuffer(text, np.uint8)).tobytes())
+        return json.loads(self.broadcast(np.frombuffer(text, np.uint8)).tobytes())
 
     def leave(self) -> None:
         """Come to the end together: the others wait until all is written."""
         if self.count > 1:
             import jax
 
-            self.agreed(np.zeros(()))
+            self.broadcast(np.zeros(()))
             jax.distributed.shutdown()
 
 
@@ -93,20 +93,20 @@ ALONE = Processes()
 """A command in a process of its own."""
 
 
-class Shares:
-    """The runs of a batch, shared out evenly among processes, and in each of them among its devices.
+class Partition:
+    """The runs of a batch, divided evenly among processes, and in each of them among its devices.
 
     Attributes:
-        processes: that the runs are shared out among.
+        processes: that the runs are divided among.
         runs: how many there are.
         devices: how many of each process take part: all of them, or as many as it takes for one run each.
     """
 
     def __init__(self, processes: Processes, runs: int, devices: int):
-        """Share them out.
+        """Divide them.
 
         Args:
-            processes: to share them out among.
+            processes: to divide them among.
             runs: how many there are.
             devices: of each process.
 
@@ -121,20 +121,20 @@ class Shares:
         padded = np.minimum(np.arange(processes.count * each), runs - 1)  # the last run repeated to fill them
         self._rows = np.split(padded, processes.count)
 
-    def own(self, tree: Any) -> Any:
+    def local(self, tree: Any) -> Any:
         """The part of this process in arrays of all runs."""
         return self._part(tree, self.processes.index)
 
-    def dealt(self, tree: Any) -> Any:
-        """As `own`, of what only the process that writes has; elsewhere only the structure of `tree` counts."""
+    def scatter(self, tree: Any) -> Any:
+        """As `local`, of what only the process that writes has; elsewhere only the structure of `tree` counts."""
         all_of_them = range(self.processes.count) if self.processes.writes else []
-        return self.processes.dealt([self._part(tree, index) for index in all_of_them] or [tree])
+        return self.processes.scatter([self._part(tree, index) for index in all_of_them] or [tree])
 
-    def joined(self, tree: Any) -> Any:
+    def gather(self, tree: Any) -> Any:
         """Arrays of all runs from each process's part, at the one that writes; elsewhere the part."""
         import jax
 
-        whole = self.processes.gathered(tree)
+        whole = self.processes.gather(tree)
         return jax.tree.map(lambda leaf: leaf[: self.runs], whole) if self.processes.writes else tree
 
     def _part(self, tree: Any, index: int) -> Any:

@@ -24,7 +24,7 @@ from jax.sharding import Mesh
 
 from jaxlfi.bayessim.programs import side_by_side
 from jaxlfi.io import files, serialise, trees
-from jaxlfi.io.processes import ALONE, Processes, Shares
+from jaxlfi.io.processes import ALONE, Partition, Processes
 from jaxlfi.rl import ppo
 from jaxlfi.rl.domains import POOL, Domain, Draw
 from jaxlfi.rl.environment import Environment
@@ -145,37 +145,37 @@ def resumed(
     Raises:
         StoreError: for a folder that is none, is damaged, or is of another environment.
     """
-    config = processes.told(read_config(out) if processes.writes else None)
+    config = processes.broadcast_json(read_config(out) if processes.writes else None)
     settings = settings_of(config)
     names = tuple((one["domain"], one["seed"]) for one in config["trainings"])
     if config["environment_name"] != environment.name:
         raise StoreError(f"{out}: expected a training of {environment.name}, got one of {config['environment_name']}")
     points = _read(out / "domains.npz") if processes.writes else dict.fromkeys(("trained", "held_out"), 0)
-    trained, held_out = processes.agreed((points["trained"], points["held_out"]))
+    trained, held_out = processes.broadcast((points["trained"], points["held_out"]))
     _, _, learning, evaluating = (jnp.stack(keys) for keys in zip(*(_keys(seed) for _, seed in names), strict=True))
 
-    shares = Shares(processes, len(names), jax.local_device_count())
-    mesh = Mesh(np.asarray(jax.local_devices()[: shares.devices]), ("trainings",))
+    partition = Partition(processes, len(names), jax.local_device_count())
+    mesh = Mesh(np.asarray(jax.local_devices()[: partition.devices]), ("trainings",))
     chunk = min(MAX_CHUNK, settings.updates)
     start = functools.partial(_start, environment, settings)
     some = side_by_side(functools.partial(_some, environment, settings, chunk), mesh, (None, 0))
     fares = side_by_side(functools.partial(_fares, environment, settings), mesh, (0, 0, 0))
 
     given = learning, jnp.asarray(trained)
-    state = jax.jit(side_by_side(start, mesh, (0, 0)))(*shares.own(given))
+    state = jax.jit(side_by_side(start, mesh, (0, 0)))(*partition.local(given))
     done, curves, saved = 0, {}, trees.to_arrays(state)
     checkpoint = out / "checkpoint.npz"
     if processes.writes and checkpoint.exists():
         done, curves, saved = _read_checkpoint(checkpoint, jax.eval_shape(jax.vmap(start), *given))
-    done = int(processes.agreed(np.asarray(done)))
+    done = int(processes.broadcast(np.asarray(done)))
     if done:
-        state = trees.from_arrays(shares.dealt(saved), state)
+        state = trees.from_arrays(partition.scatter(saved), state)
     advance = jax.jit(some, donate_argnums=1)
     while done < settings.updates:
         began, count = time.monotonic(), min(chunk, settings.updates - done)
         state, made = advance(count, state)
         done += count
-        rows, saved = shares.joined((_rows(made), trees.to_arrays(state)))
+        rows, saved = partition.gather((_rows(made), trees.to_arrays(state)))
         if processes.writes:
             rows["seconds"] = np.full((len(names), chunk), (time.monotonic() - began) / count)
             rows = {name: row[:, :count].T for name, row in rows.items()}
@@ -183,8 +183,8 @@ def resumed(
             _write_checkpoint(checkpoint, done, curves, saved)
             on_chunk(count, curves)
 
-    outcomes = jax.jit(fares)(*shares.own((evaluating, jnp.asarray(held_out))), state.params)
-    outcomes, params = shares.joined((outcomes, state.params))
+    outcomes = jax.jit(fares)(*partition.local((evaluating, jnp.asarray(held_out))), state.params)
+    outcomes, params = partition.gather((outcomes, state.params))
     if not processes.writes:
         return None
     result = Result(names, curves, {name: np.asarray(value) for name, value in outcomes.items()}, params)

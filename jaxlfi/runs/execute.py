@@ -21,7 +21,7 @@ from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, t
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.io import files as atomic
-from jaxlfi.io.processes import ALONE, Processes, Shares
+from jaxlfi.io.processes import ALONE, Partition, Processes
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import Checkpoint
@@ -116,7 +116,7 @@ def prepare(
     seeds = dict.fromkeys(spec.seed for spec in plan.specs)
     by_seed = {seed: observe(run_keys(key_of(seed)).observe, plan.task, observation) for seed in seeds}
     observed, x = (np.stack([np.asarray(by_seed[spec.seed][i]) for spec in plan.specs]) for i in range(2))
-    observed, x = processes.agreed((observed, x))
+    observed, x = processes.broadcast((observed, x))
     plan.settings.estimator.check_for(plan.task.dim, x.shape[1])
     plan.settings.estimator.reading(layout(plan.task.summary, observed.shape[1:], x.shape[1]))
     if first is not None and first.x.shape[1] != x.shape[1]:
@@ -200,7 +200,7 @@ def execute(
         on_round(index, row)
 
     last = done if rows and np.all(rows[-1]["settled"]) else plan.settings.rounds
-    done, last = map(int, processes.agreed((np.asarray(done), np.asarray(last))))
+    done, last = map(int, processes.broadcast((np.asarray(done), np.asarray(last))))
     with contextlib.closing(journal):
         state = drive(engine, _state(engine, checkpoint, done), range(done, last), keep, on_compiled)
     state = engine.fetch(state)
@@ -333,7 +333,7 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
 
 def devices_of(runs: int, processes: Processes) -> int:
     """How many devices of all processes a batch of so many runs is spread over."""
-    return min(Shares(processes, runs, jax.local_device_count()).devices * processes.count, runs)
+    return min(Partition(processes, runs, jax.local_device_count()).devices * processes.count, runs)
 
 
 def changed_machine(config: Mapping[str, Any], processes: Processes = ALONE) -> list[str]:

@@ -88,7 +88,7 @@ class ChunkStore:
             one: from a chunk's items to its results, and the seconds they took.
             processes: that compute each chunk together; the one that writes looks which are there.
         """
-        done = processes.agreed(np.asarray(self.done() if processes.writes else [], int))
+        done = processes.broadcast(np.asarray(self.done() if processes.writes else [], int))
         for index, items in enumerate(self.chunks):
             if index not in done:
                 results = one(items)

@@ -26,19 +26,19 @@ def command():
     found = processes.join(address, index, count)
     (folder / f"{index}.pid").write_text(str(os.getpid()))
     large = np.arange(5_000_000.0) + index  # several messages
-    whole = found.gathered({"own": np.full((2, 3), index), "large": large})
+    whole = found.gather({"own": np.full((2, 3), index), "large": large})
     if found.writes:
         assert whole["own"][:, 0].tolist() == [0, 0, 1, 1], whole
         np.testing.assert_array_equal(whole["large"].reshape(count, -1)[:, [0, -1]], [[0, 4999999], [1, 5000000]])
     else:
         assert whole["large"] is large
-    assert found.dealt([np.array([7]), np.array([8])] if found.writes else [np.zeros(0)]).tolist() == [7 + index]
-    assert found.agreed({"x": np.array(index + 5)})["x"] == 5
+    assert found.scatter([np.array([7]), np.array([8])] if found.writes else [np.zeros(0)]).tolist() == [7 + index]
+    assert found.broadcast({"x": np.array(index + 5)})["x"] == 5
     (folder / f"{index}.met").touch()
     if sys.argv[5] == "wait":
         if found.writes:
             time.sleep(100)
-        found.agreed(np.zeros(()))
+        found.broadcast(np.zeros(()))
     found.leave()
     return 0
 
@@ -65,8 +65,8 @@ def started(folder, last: str) -> list[subprocess.Popen]:
 
 def test_a_process_alone_has_all_it_needs():
     tree = {"x": np.arange(3)}
-    assert ALONE.writes and ALONE.gathered(tree)["x"].tolist() == [0, 1, 2]
-    assert ALONE.agreed(tree) is tree and ALONE.dealt([tree]) is tree
+    assert ALONE.writes and ALONE.gather(tree)["x"].tolist() == [0, 1, 2]
+    assert ALONE.broadcast(tree) is tree and ALONE.scatter([tree]) is tree
     ALONE.leave()
 
 

@@ -111,7 +111,7 @@ def begin(
         create(folder, work, processes)
     else:
         work = Work(grid, *observations(grid, observation), length=0)
-    observed, x, length = processes.agreed((work.observed, work.x, np.asarray(work.length)))
+    observed, x, length = processes.broadcast((work.observed, work.x, np.asarray(work.length)))
     return Work(grid, observed, x, int(length))
 
 
