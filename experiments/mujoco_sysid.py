@@ -15,8 +15,8 @@ both boxes:
     apt-fit      off, and their intervals (jaxlfi.envs.mujoco.least_squares)
 
 All simulate by the same code. sysid, scipy and cma stay in the box; so do not the others. Errors and half-widths are
-shares of the right box's width, in logarithms where those are inferred; the puck's lateral speed is taken without its
-sign, which its recording does not tell. What is there already is kept.
+fractions of the right box's width, in logarithms where those are inferred; the puck's lateral speed is taken without
+its sign, which its recording does not tell. What is there already is kept.
 """
 
 import argparse
@@ -233,7 +233,7 @@ def judged(task: Task, found: dict[str, np.ndarray], arrays: dict[str, np.ndarra
     """How right a method is.
 
     Returns:
-        `error` and `half` [N, D], half of an interval's width, as shares of the right box's width; `held` [N, D],
+        `error` and `half` [N, D], half of an interval's width, as fractions of the right box's width; `held` [N, D],
         whether intervals hold the truth; `held_out` [N], root mean square misfit of another recording in standard
         deviations of the noise.
     """

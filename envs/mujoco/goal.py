@@ -198,8 +198,8 @@ class Reading:
             turning = self._owners[goal.signals.index(name)][1]
             cost += goal.targets[name][1] * (2 * (1 - xp.cos(off)) if turning else off**2)
         for i, name in enumerate(self._actuators):
-            share = (control[i] - self.actions.centre[i]) / self.actions.scale[i]
-            cost += goal.costs.get(name, 0.0) * share**2
+            fraction = (control[i] - self.actions.centre[i]) / self.actions.scale[i]
+            cost += goal.costs.get(name, 0.0) * fraction**2
         return -goal.interval * cost
 
     def off(self, values: Float[Array | np.ndarray, " signals"], xp: Any = jnp) -> dict[str, Any]:

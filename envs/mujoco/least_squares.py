@@ -21,15 +21,15 @@ from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.tasks.task import Task
 
 STEP = 1e-4
-"""Of central differences, as a share of the box's width."""
+"""Of central differences, as a fraction of the box's width."""
 CORRECTIONS = 2
 """How often the point is found again with the integrator's error there."""
 _NOISELESS = 1e-3
-"""Standard deviation, as a share of the signal's own, that stands for the noise of a signal that has none."""
+"""Standard deviation, as a fraction of the signal's own, that stands for the noise of a signal that has none."""
 _FAILED = 1e3
 """Residuals of simulations that fail, in standard deviations."""
 _APART = 0.05
-"""Points nearer than this share of the box's width, in all parameters, are the same."""
+"""Points nearer than this fraction of the box's width, in all parameters, are the same."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,8 +77,8 @@ class Residuals:
         self._log, self.simulator, self.simulations = np.asarray(task.space.log), simulator, 0
         self.observed = np.asarray(simulator.observation if observation is None else observation, float)
         there = simulator.there
-        spread = np.array([self.observed[own, c].std() for c, own in enumerate(there.T)])
-        self.noise = np.maximum(simulator.noise, _NOISELESS * spread)
+        deviation = np.array([self.observed[own, c].std() for c, own in enumerate(there.T)])
+        self.noise = np.maximum(simulator.noise, _NOISELESS * deviation)
         self.defect = np.zeros(self.observed.shape)
 
     def __call__(self, coordinates: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n rows"]:

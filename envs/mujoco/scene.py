@@ -18,7 +18,7 @@ OPAQUE = 0.9
 MARGIN = 1.08
 """How much larger than the motion a picture is."""
 PLANAR = 0.02
-"""Extent of a motion along one direction, as a share of its largest extent, below which it is seen from there."""
+"""Extent of a motion along one direction, as a fraction of its largest extent, below which it is seen from there."""
 POSES = 250
 """Of each motion that a view is fitted to, at most."""
 _CORNERS = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(8, 3)

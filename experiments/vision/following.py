@@ -46,7 +46,7 @@ def _row(name: str, following: Following) -> dict:
         "drift between rollouts": float(following.between.mean()),
         "away (px of 256)": float(256 * np.nanmean(following.away)),
         "frames in another order": following.switched,
-        "share covered": following.covered,
+        "fraction covered": following.covered,
     }
 
 

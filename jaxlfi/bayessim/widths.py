@@ -47,6 +47,7 @@ def _expected(settings: Settings, heuristic: Heuristic) -> str:
             return f"right in principle, as proposals {inflation:g} times as wide are divided out"
         return "uncertain, as the correction 'quotient' divides by proposals as wide as the posterior (no inflation)"
     if inflation > 1:
-        share = 100 * math.sqrt(1 - 1 / inflation**2)
-        return f"about {share:.0f} % of the right ones, as proposals are {inflation:g} times as wide and not corrected"
+        percent = 100 * math.sqrt(1 - 1 / inflation**2)
+        wide = f"{inflation:g} times as wide"
+        return f"about {percent:.0f} % of the right ones, as proposals are {wide} and not corrected"
     return "too narrow as a rule, as every round counts the observation again, uncorrected"

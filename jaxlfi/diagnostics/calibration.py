@@ -191,9 +191,9 @@ def histogram(rank: Int[Array | np.ndarray, " n"], draws: int) -> Histogram:
     rank = np.asarray(rank)
     bins = int(np.clip(len(rank) // 10, 2, min(20, draws + 1)))
     edges = np.round(np.linspace(0, draws + 1, bins + 1)).astype(int)
-    share = np.diff(edges) / (draws + 1)
+    probability = np.diff(edges) / (draws + 1)
     count = np.histogram(rank, edges - 0.5)[0]
-    return Histogram(edges, count, len(rank) * share, _band(_two_sided(len(rank), share) > 1 - POINTWISE))
+    return Histogram(edges, count, len(rank) * probability, _band(_two_sided(len(rank), probability) > 1 - POINTWISE))
 
 
 def ranks_verdict(result: Uniformity) -> str:
@@ -232,12 +232,12 @@ def _edges(draws: int) -> np.ndarray:
     return np.unique(np.round(np.linspace(1, draws, min(draws, POINTS))).astype(int))
 
 
-def _two_sided(count: int, share: np.ndarray) -> np.ndarray:
+def _two_sided(count: int, probability: np.ndarray) -> np.ndarray:
     """Probability that a binomial count is as far out as each of 0 to N, or farther, shape [K, N + 1]."""
     log_factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, count + 1)))])
     k = np.arange(count + 1)
     log_choose = log_factorial[-1] - log_factorial - log_factorial[::-1]
-    mass = np.exp(log_choose + k * np.log(share)[:, None] + (count - k) * np.log1p(-share)[:, None])
+    mass = np.exp(log_choose + k * np.log(probability)[:, None] + (count - k) * np.log1p(-probability)[:, None])
     below, above = np.cumsum(mass, axis=1), np.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
     return np.minimum(1.0, 2 * np.minimum(below, above))
 
@@ -246,8 +246,8 @@ def _two_sided(count: int, share: np.ndarray) -> np.ndarray:
 def _null(count: int, draws: int) -> np.ndarray:
     """Least tail probabilities of calibrated curves, in ascending order; the same each time they are asked for."""
     edges = _edges(draws)
-    share = np.diff([0, *edges, draws + 1]) / (draws + 1)
-    below = np.cumsum(np.random.default_rng(0).multinomial(count, share, NULL_DRAWS), axis=1)[:, :-1]
+    probability = np.diff([0, *edges, draws + 1]) / (draws + 1)
+    below = np.cumsum(np.random.default_rng(0).multinomial(count, probability, NULL_DRAWS), axis=1)[:, :-1]
     tails = _two_sided(count, edges / (draws + 1))
     return np.sort(np.min(tails[np.arange(len(edges)), below], axis=1))
 

@@ -45,7 +45,7 @@ class Likelihood(Estimator):
         noise_floor: standard deviation of the normal noise that is added to normalised summaries before each round's
             training. Summaries that hardly vary for given parameters make a likelihood that is as sharp as a network
             can be, and wrong by more than its width: with the noise, the likelihood is that of an observation which
-            is known to so much of the summaries' spread. A leaf.
+            is known to so much of the summaries' standard deviation. A leaf.
         particles: of sequential Monte Carlo.
     """
 
@@ -165,9 +165,9 @@ class LikelihoodDensity:
             n, CANDIDATES - EVERYWHERE, -1
         )
         theta = jnp.concatenate([box, mixture], axis=1)
-        share = EVERYWHERE / CANDIDATES
-        uniform = jnp.log(share) - jnp.sum(jnp.log(self.support.width))
-        log_drawn = jnp.logaddexp(uniform, jnp.log1p(-share) + self.mixture.log_prob(theta))
+        fraction = EVERYWHERE / CANDIDATES
+        uniform = jnp.log(fraction) - jnp.sum(jnp.log(self.support.width))
+        log_drawn = jnp.logaddexp(uniform, jnp.log1p(-fraction) + self.mixture.log_prob(theta))
         return theta, self.log_prob(theta) - log_drawn
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:

@@ -173,7 +173,7 @@ def _widths_table(found: Mapping[str, Any]) -> str:
     for rows in zip(*(one["found"] for one in found["widths"]), strict=True):
         cells = ""
         for row in rows:
-            held = [_estimate(share, lambda x: f"{100 * x:.0f}") for share in row["held"]]
+            held = [_estimate(fraction, lambda x: f"{100 * x:.0f}") for fraction in row["held"]]
             values = [*held, _estimate(row["factor"], lambda x: f"{x:.2f}"), row["verdict"]]
             cells += "".join(f'<td class="{"first" * (i == 0)}">{html.escape(v)}</td>' for i, v in enumerate(values))
         lines.append(f"<tr><td>{html.escape(rows[0]['name'])}</td>{cells}</tr>")

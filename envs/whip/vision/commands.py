@@ -212,12 +212,12 @@ def _transporter(out: Path, preset: training.Preset, arguments: argparse.Namespa
     made = training.from_grip_to_tip(made, learnt[some], lines[some])
     following = training.followed(made, masks[held_out], lines[held_out])
     figures = {
-        "mean place (share of the length)": following.mean.tolist(),
+        "mean place (fraction of the length)": following.mean.tolist(),
         "drift within a rollout": following.within.tolist(),
         "drift between rollouts": following.between.tolist(),
         "distance from the DLO (px of 64)": (64 * following.away.mean(axis=(0, 1))).tolist(),
         "frames in another order": following.switched,
-        "share of the DLO covered": following.covered,
+        "fraction of the DLO covered": following.covered,
     }
     _keep(out, "transporter", made, losses, figures, arguments)
 

@@ -122,10 +122,10 @@ def whole(labels: Int[Array, "size size"]) -> Int[np.ndarray, "size size"]:
 
 
 def downsized(mask: Bool[Array, "size size"]) -> Array:
-    """A mask as the transporter sees it, in bytes, shape [64, 64, 1]: shares of pixels."""
+    """A mask as the transporter sees it, in bytes, shape [64, 64, 1]: fractions of pixels."""
     side = mask.shape[0] // transporter.SIZE
-    shares = mask.astype(jnp.float32).reshape(transporter.SIZE, side, transporter.SIZE, side).mean(axis=(1, 3))
-    return jnp.round(255 * shares).astype(jnp.uint8)[..., None]
+    fractions = mask.astype(jnp.float32).reshape(transporter.SIZE, side, transporter.SIZE, side).mean(axis=(1, 3))
+    return jnp.round(255 * fractions).astype(jnp.uint8)[..., None]
 
 
 _along_labels = jax.jit(masks.keypoints)

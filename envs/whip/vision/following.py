@@ -41,7 +41,7 @@ class Following:
 
     @property
     def covered(self) -> float:
-        """Mean share of the DLO's length that lies between the first and the last keypoint."""
+        """Mean fraction of the DLO's length that lies between the first and the last keypoint."""
         return float(np.mean(self.arcs.max(axis=-1) - self.arcs.min(axis=-1)))
 
 

@@ -221,9 +221,10 @@ def _bitmap(surface: Surface, grain: float, look: Look, along: tuple[int, int]) 
     period, angle = float(surface.period), float(surface.angle)
     turned = np.cos(angle) * first + np.sin(angle) * second, np.cos(angle) * second - np.sin(angle) * first
     cells = [np.floor(turned[i] / period + float(surface.phase[i])) for i in range(2)]
-    share = {0: 0 * first, 1: sum(cells) % 2, 2: cells[0] % 2}[int(surface.pattern)][..., None]
+    fraction = {0: 0 * first, 1: sum(cells) % 2, 2: cells[0] % 2}[int(surface.pattern)][..., None]
     colours, waves = np.asarray(surface.colours), np.asarray(look.waves)[:, along]
     phases = waves[:, 0, None, None] * first + waves[:, 1, None, None] * second
     noise = np.sin(phases + np.asarray(look.phases)[:, None, None]).sum(0) * (2 / len(waves)) ** 0.5
-    covered = (colours[0] * (1 - share) + colours[1] * share) * np.asarray(look.tint) * (1 + grain * noise[..., None])
+    painted = colours[0] * (1 - fraction) + colours[1] * fraction
+    covered = painted * np.asarray(look.tint) * (1 + grain * noise[..., None])
     return np.round(255 * np.clip(covered, 0, 1)).astype(np.uint8)

@@ -20,7 +20,7 @@ class Shot:
         gamma: exponent of the response.
         offset: added to all channels: light that strays into the lens, or black that is cut.
         noise: standard deviation of each channel of each pixel where it is black, and where it is white, shape [2].
-        stuck: share of pixels that are black or white in each channel.
+        stuck: fraction of pixels that are black or white in each channel.
     """
 
     defocus: Float[Array, ""]

@@ -42,10 +42,10 @@ class Rollouts:
 def random_scene(key: jax.Array) -> WhipParameters:
     """A scene with length and the logarithm of the modulus uniform in Phi, and all nuisances in their ranges."""
     key_theta, key_rest = jax.random.split(key)
-    share = jax.random.uniform(key_theta, (2,))
+    fraction = jax.random.uniform(key_theta, (2,))
     low, high = jnp.asarray(FEASIBLE.low), jnp.asarray(FEASIBLE.high)
-    length = low[0] + share[0] * (high[0] - low[0])
-    return randomised(key_rest, length, low[1] * (high[1] / low[1]) ** share[1])
+    length = low[0] + fraction[0] * (high[0] - low[0])
+    return randomised(key_rest, length, low[1] * (high[1] / low[1]) ** fraction[1])
 
 
 def random_actions(key: jax.Array) -> Float[Array, "16 2"]:

@@ -54,8 +54,8 @@ def summary(
 
     Returns:
         Mean overlaps of the DLO and of cubes; median and 99th percentile of the distances of cubes' centroids and of
-        the DLO's keypoints from the true ones, in pixels; shares of cubes and of DLOs in the pictures that were missed,
-        and of pictures in which something was seen that is not there.
+        the DLO's keypoints from the true ones, in pixels; fractions of cubes and of DLOs in the pictures that were
+        missed, and of pictures in which something was seen that is not there.
     """
     overlap = overlaps(true, found)
     at, seen_at = centroids(true), centroids(found)

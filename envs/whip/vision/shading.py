@@ -59,9 +59,9 @@ def shaded(
     channels = []
     for c in range(3):
         colour = plain[hits.body, c]
-        for body, surface, share in ((table, look.table, on_table), (wall, look.wall, on_wall)):
+        for body, surface, fraction in ((table, look.table, on_table), (wall, look.wall, on_wall)):
             colour = jnp.where(
-                hits.body == body, surface.colours[0, c] * (1 - share) + surface.colours[1, c] * share, colour
+                hits.body == body, surface.colours[0, c] * (1 - fraction) + surface.colours[1, c] * fraction, colour
             )
         channels.append(jnp.clip(look.tint[c] * (colour * grain * light + highlight), 0.0, 1.0))
     return tuple(channels), labels

@@ -90,9 +90,9 @@ def sentence(name: str, found: Intervals) -> str:
     if BIASED_LOW in found.verdict or BIASED_HIGH in found.verdict:
         above = found.above
         below = Estimate(1 - above.value, 1 - above.high, 1 - above.low)
-        side, share = ("above", above) if BIASED_LOW in found.verdict else ("below", below)
+        side, fraction = ("above", above) if BIASED_LOW in found.verdict else ("below", below)
         rest = f"to hold {_LEVEL} they would have to be {_number(factor.value)} times as wide"
-        return f"{name}: {found.verdict}, {_percent(share)} of the truths lie {side} its median ({numbers}; {rest})"
+        return f"{name}: {found.verdict}, {_percent(fraction)} of the truths lie {side} its median ({numbers}; {rest})"
     if found.verdict in (HONEST, UNDECIDED) and factor is not None:
         numbers = f"{numbers}; {_right(factor)}"
     if found.verdict == UNDECIDED:
@@ -135,8 +135,8 @@ def _by(found: Intervals) -> str:
     return f", by {_number(factor.value)} [{_number(factor.low)}, {_number(factor.high)}]"
 
 
-def _percent(share: Estimate) -> str:
-    return f"{100 * share.value:.0f} % [{100 * share.low:.0f}, {100 * share.high:.0f}]"
+def _percent(fraction: Estimate) -> str:
+    return f"{100 * fraction.value:.0f} % [{100 * fraction.low:.0f}, {100 * fraction.high:.0f}]"
 
 
 def _number(factor: float) -> str:
