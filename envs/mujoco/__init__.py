@@ -4,17 +4,19 @@ Needs the extra `mujoco`.
 """
 
 from pathlib import Path
+from typing import Literal
 
 
-def task(config: Path | None = None, log: tuple[Path, ...] = ()):
+def task(config: Path | None = None, log: tuple[Path, ...] = (), engine: Literal["native", "mjx"] = "native"):
     """The task that a TOML file describes (`jaxlfi.envs.mujoco.config`).
 
     Args:
         config: the file, which there has to be.
         log: recordings in place of those that the file names; several are episodes of the same parameters.
+        engine: "native" is MuJoCo on the processor's cores; "mjx" is MuJoCo in JAX, where it can simulate the model.
 
     Raises:
-        ImportError: where MuJoCo is not installed, with what to install.
+        ImportError: where MuJoCo, or MJX for its engine, is not installed, with what to install.
         ValueError: for whatever does not fit together, in one line.
     """
     require_mujoco()
@@ -22,7 +24,7 @@ def task(config: Path | None = None, log: tuple[Path, ...] = ()):
         raise ValueError("config: expected a TOML file that describes a task, as mujoco,config=arm.toml; got none")
     from jaxlfi.envs.mujoco.config import read
 
-    return read(config, log)
+    return read(config, log, engine)
 
 
 def require_mujoco() -> None:

@@ -29,7 +29,7 @@ interval = 0.02
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.model_task import mujoco_task
@@ -51,12 +51,13 @@ KEYS: Mapping[str, type] = {
 PARAMETER = ("support", "feasible", "unit", "log", "truth")
 
 
-def read(path: Path, recorded: Sequence[Path] = ()) -> Task:
+def read(path: Path, recorded: Sequence[Path] = (), engine: Literal["native", "mjx"] = "native") -> Task:
     """The task that a file describes.
 
     Args:
         path: of the file.
         recorded: recordings in place of its own.
+        engine: what simulates the model (`model_task.mujoco_task`).
 
     Raises:
         ValueError: for a file that is missing, damaged or describes no task, in one line.
@@ -76,6 +77,7 @@ def read(path: Path, recorded: Sequence[Path] = ()) -> Task:
             numbers(config, "initial"),
             {name: _discrepancy(name, table) for name, table in config.get("discrepancy", {}).items()},
             {label: _guess(label, table) for label, table in config.get("supports", {}).items()},
+            engine=engine,
             name=config.get("name", path.stem),
         )
     except ValueError as error:

@@ -8,8 +8,10 @@ have. A Gaussian process on each signal says how far the model may be wrong, and
 import dataclasses
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 _PERSISTS = np.exp(-1.0)
 """The autocorrelation of an Ornstein-Uhlenbeck process after its correlation time."""
@@ -47,6 +49,19 @@ class Discrepancy:
         values = rng.standard_normal((n, len(times)))
         for t, share in enumerate(keep, start=1):
             values[:, t] = share * values[:, t - 1] + np.sqrt(1 - share**2) * values[:, t]
+        return self.deviation * values
+
+    def draw(self, key: jax.Array, times: Float[np.ndarray, " time"]) -> Float[Array, " time"]:
+        """One such draw, inside of compiled programs."""
+        keep = np.exp(-np.diff(times, prepend=-np.inf) / self.time)  # nothing of what was before the first one
+
+        def following(before, inputs):
+            share, fresh = inputs
+            value = share * before + jnp.sqrt(1 - share**2) * fresh
+            return value, value
+
+        fresh = jax.random.normal(key, times.shape)
+        _, values = jax.lax.scan(following, jnp.zeros_like(fresh[0]), (jnp.asarray(keep, fresh.dtype), fresh))
         return self.deviation * values
 
 

@@ -19,16 +19,15 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
-from jaxlfi.envs.mujoco.effects import STATE, built, effects, initial_state, state_place
+from jaxlfi.envs.mujoco.effects import built, effects, initial_state, state_place
 from jaxlfi.envs.mujoco.goal import Goal, Reading
 from jaxlfi.envs.mujoco.measured import add_sensors
+from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, started
 from jaxlfi.envs.mujoco.mjx_models import Models, mjx
+from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable, state_of
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
 from jaxlfi.envs.mujoco.parameters import Parameter
 from jaxlfi.rl.environment import EnvState
-
-LARGEST = 1e10
-"""What positions and velocities of a stable simulation stay below, as in MuJoCo itself."""
 
 
 @struct.dataclass
@@ -36,10 +35,7 @@ class Inner:
     """A model's state, and what lasts for an episode.
 
     Attributes:
-        qpos: positions.
-        qvel: velocities.
-        act: activations of actuators.
-        warmstart: accelerations that the solver begins with.
+        state: positions and velocities.
         controls: the last ones, the latest at the end, shape [B, A].
         numbers: of the model, that depend on its parameters (`Models`).
         theta: in natural units, shape [D].
@@ -47,10 +43,7 @@ class Inner:
         key: of noise to come.
     """
 
-    qpos: Float[Array, "*batch nq"]
-    qvel: Float[Array, "*batch nv"]
-    act: Float[Array, "*batch na"]
-    warmstart: Float[Array, "*batch nv"]
+    state: State
     controls: Float[Array, "*batch before act"]
     numbers: Float[Array, "*batch numbers"]
     theta: Float[Array, "*batch dim"]
@@ -109,19 +102,13 @@ class MujocoEnvironment:
         self.models = Models(
             functools.partial(built, spec, self._does), self.space.names, np.asarray(self.nominal), self.feasible
         )
+        self._physics = Physics(self.models, compiled, self.reading.places)
         self._check(compiled, goal)
 
-        start = initial_state(compiled, initial or {})
-        if mujoco.mj_stateSize(compiled, STATE) != 1 + compiled.nq + compiled.nv + compiled.na:
-            raise ValueError("model: expected states of positions, velocities and activations, got one of more")
-        self._start, self._cuts = start[1:], (compiled.nq, compiled.nq + compiled.nv)
-        self._drawn = [
-            (state_place(compiled, key, f"initial/{key}") - 1, bounds) for key, bounds in goal.initial.items()
-        ]
+        self._start = initial_state(compiled, initial or {})
+        self._drawn = [(state_place(compiled, key, f"initial/{key}"), bounds) for key, bounds in goal.initial.items()]
         self._timestep = compiled.opt.timestep
         self._substeps = round(goal.interval / self._timestep)
-        self._data = mjx.make_data(self.models.base)
-        self._accelerations = bool(np.any(compiled.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC))
         self._noise = np.array([(noises or {}).get(name, 0.0) for name in goal.signals])
         longest = 0.0 if self._does.delay is None else float(self.feasible.high[self._does.delay])
         self._before = int(np.ceil(longest / goal.interval - 1e-6)) + 1
@@ -131,17 +118,14 @@ class MujocoEnvironment:
     def reset(self, key: jax.Array, theta: Float[Array, " dim"]) -> EnvState:
         """The start of an episode with these parameters."""
         key_start, key_noise, key = jax.random.split(key, 3)
-        start = jnp.asarray(self._start, jnp.float32)
-        for place, d in self._does.starts:
-            start = start.at[place - 1].set(theta[d])
+        start = started(self._does, theta, self._start)
         for (place, (low, high)), one in zip(
             self._drawn, jax.random.split(key_start, max(len(self._drawn), 1)), strict=False
         ):
             start = start.at[place].set(jax.random.uniform(one, minval=low, maxval=high))
-        qpos, qvel, act = jnp.split(start, self._cuts)
         numbers, refused = self.models.numbers(theta)
-        inner = Inner(qpos, qvel, act, jnp.zeros_like(qvel), jnp.asarray(self._rest), numbers, theta, refused, key)
-        values = self._values(*self._loaded(inner, inner.controls[-1]))
+        inner = Inner(self._physics.state(start), jnp.asarray(self._rest), numbers, theta, refused, key)
+        values = self._physics.values(*self._loaded(inner, inner.controls[-1]))
         no = jnp.asarray(False)
         seen, reward = self._seen(key_noise, theta, values), jnp.asarray(0.0, jnp.float32)  # not of a weak type
         return EnvState(inner, seen, reward, no, no, self._facts(values, no))
@@ -158,12 +142,9 @@ class MujocoEnvironment:
 
         data, _ = jax.lax.scan(substep, data, jnp.arange(self._substeps))
         # MuJoCo's sensors are those of the state before a step: of the state after it they are read besides.
-        values = self._values(model, data)
-        numbers = jnp.concatenate([data.qpos, data.qvel, values])
-        failed = before.refused | ~jnp.all(jnp.isfinite(numbers) & (jnp.abs(numbers) < LARGEST))
-        after = before.replace(
-            qpos=data.qpos, qvel=data.qvel, act=data.act, warmstart=data.qacc_warmstart, controls=controls, key=key
-        )
+        values = self._physics.values(model, data)
+        failed = before.refused | ~stable(data.qpos, data.qvel, values)
+        after = before.replace(state=state_of(data), controls=controls, key=key)
         return EnvState(
             inner=after,
             observation=jnp.where(failed, state.observation, self._seen(key_noise, before.theta, values)),
@@ -174,10 +155,6 @@ class MujocoEnvironment:
         )
 
     def _check(self, compiled: mujoco.MjModel, goal: Goal) -> None:
-        if compiled.nplugin:
-            raise ValueError("model: MJX cannot simulate it: it has plugins")
-        if "opt.timestep" in self.models.varied:
-            raise ValueError("parameters: expected numbers other than the model's time step, got option/timestep")
         ratio = goal.interval / compiled.opt.timestep
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:
             raise ValueError(
@@ -187,10 +164,7 @@ class MujocoEnvironment:
 
     def _loaded(self, inner: Inner, control: Float[Array, " act"]) -> tuple[mjx.Model, mjx.Data]:
         """The model and its data in this state."""
-        data = self._data.replace(
-            qpos=inner.qpos, qvel=inner.qvel, act=inner.act, qacc_warmstart=inner.warmstart, ctrl=control
-        )
-        return self.models.model(inner.numbers), data
+        return self.models.model(inner.numbers), self._physics.data(inner.state, control)
 
     def _control(self, controls: Float[Array, "before act"], theta: Array, index: Array) -> Float[Array, " act"]:
         """What acts in a substep: with a delay, a control that was given before."""
@@ -199,23 +173,10 @@ class MujocoEnvironment:
         since = (index * self._timestep - theta[self._does.delay]) / self.reading.goal.interval
         return controls[jnp.clip(self._before - 1 + jnp.floor(since + 1e-5).astype(int), 0, self._before - 1)]
 
-    def _values(self, model: mjx.Model, data: mjx.Data) -> Float[Array, " signals"]:
-        """Signals of this state; what accelerations would need is left out where no sensor measures any."""
-        if self._accelerations:
-            data = mjx.sensor_acc(model, mjx.forward(model, data))  # which forward leaves out without constraints
-        else:
-            data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
-            data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
-        return data.sensordata[self.reading.places]
-
     def _seen(self, key: jax.Array, theta: Float[Array, " dim"], values: Float[Array, " signals"]) -> Array:
         """An observation: with offsets and noise of the sensors."""
-        deviation, count = jnp.asarray(self._noise, jnp.float32), len(self._noise)
-        for signal, d in self._does.deviations:
-            deviation = deviation.at[signal].set(theta[d]) if signal < count else deviation
-        for signal, d in self._does.biases:
-            values = values.at[signal].add(theta[d]) if signal < count else values
-        return self.reading.seen(values + deviation * jax.random.normal(key, values.shape))
+        noise = deviations(self._does, theta, self._noise) * jax.random.normal(key, values.shape)
+        return self.reading.seen(biased(self._does, theta, values) + noise)
 
     def _facts(self, values: Float[Array, " signals"], failed: Array) -> dict[str, Array]:
         """How far the episode's last state is from its targets, and whether it failed."""

@@ -68,19 +68,23 @@ class Log:
         object.__setattr__(self, "times", times - times[0])
         object.__setattr__(self, "signals", signals)
 
+    def samples(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Times and values of a signal's samples."""
+        there = np.flatnonzero(np.isfinite(self.signals[name]))
+        return self.times[there], self.signals[name][there]
+
     def held(self, name: str, times: np.ndarray) -> np.ndarray:
         """The last sample of a signal at other times, and before its first that one; shape that of `times`."""
-        there = np.flatnonzero(np.isfinite(self.signals[name]))
-        last = np.searchsorted(self.times[there], times + 1e-9, side="right") - 1
-        return self.signals[name][there[np.maximum(last, 0)]]
+        since, values = self.samples(name)
+        last = np.searchsorted(since, times + 1e-9, side="right") - 1
+        return values[np.maximum(last, 0)]
 
     def mean_held(self, name: str, times: np.ndarray, interval: float) -> np.ndarray:
         """Means of a held signal over intervals that begin at other times; shape that of `times`.
 
         Unlike its values they are continuous in the times: a delay by a part of a step makes a difference.
         """
-        there = np.flatnonzero(np.isfinite(self.signals[name]))
-        since, values = self.times[there], self.signals[name][there]
+        since, values = self.samples(name)
         before = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(since))])
 
         def integral(to: np.ndarray) -> np.ndarray:

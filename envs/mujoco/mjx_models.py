@@ -3,7 +3,7 @@
 MuJoCo derives many numbers of a model from the few that an MJCF file holds: of a body's mass its inertia, the masses of
 all trees that it belongs to, the inverse weights of constraints. MJX derives none of them. Each parameter vector's
 model is therefore compiled by MuJoCo, on the host, and whatever depends on the parameters is put into the MJX model, so
-that every parameter is as exact as in inference. Compiling takes about a millisecond, and the numbers are kept: a
+that every parameter is as exact as in MuJoCo itself. Compiling takes about a millisecond, and the numbers are kept: a
 policy is trained on few models, which begin many episodes. (Rules for the derived numbers in JAX would have been one
 more implementation of MuJoCo's compiler: inverse weights alone are rational functions of all masses.)
 """
@@ -28,7 +28,9 @@ try:
     with contextlib.redirect_stdout(io.StringIO()):  # MJX says there that Warp is not installed
         from mujoco import mjx
 except ImportError as error:
-    raise ImportError("policies of MuJoCo models need MJX: pip install 'jaxlfi[mujoco,policy]'") from error
+    raise ImportError(
+        "engine=mjx and policies of MuJoCo models need MJX: pip install 'jaxlfi[mujoco,policy]'"
+    ) from error
 
 CACHED = 65536
 """Models whose numbers are kept, a few hundred bytes each."""

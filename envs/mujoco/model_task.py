@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,9 @@ from jaxlfi.tasks.task import Task
 SAMPLES = 30
 """Rows of an episode that the network sees, at most."""
 
+ENGINES = ("native", "mjx")
+"""What simulates a model."""
+
 
 def samples(trajectory: Float[Array, "rows signals"], rows: tuple[int, ...]) -> Float[Array, " obs"]:
     """Some rows of a trajectory, as they are."""
@@ -43,6 +46,7 @@ def mujoco_task(
     supports: Mapping[str, Mapping[str, tuple[float, float]]] | None = None,
     summary: str | Callable[[jax.Array], jax.Array] = "samples",
     threads: int | None = None,
+    engine: Literal["native", "mjx"] = "native",
     **others: Any,
 ) -> Task:
     """Infer numbers of a MuJoCo model from recordings of controls and sensors.
@@ -64,11 +68,16 @@ def mujoco_task(
         supports: other first guesses by name: the bounds of some parameters, those of others being their `support`.
         summary: "samples", up to 30 rows of each episode at equal intervals; or as for `jaxlfi.Task`.
         threads: of simulations; by default as many as processors.
+        engine: "native" is MuJoCo on the processor's cores, in double precision; "mjx" is MuJoCo in JAX, in single
+            precision and inside of compiled programs, where it can simulate the model (`mjx_simulator`).
         **others: of `jaxlfi.Task`.
 
     Raises:
         ValueError: for whatever does not fit together, in one line, before anything is simulated.
+        ImportError: for the engine "mjx" where MJX is not installed.
     """
+    if engine not in ENGINES:
+        raise ValueError(f"engine: expected one of {', '.join(ENGINES)}, got {engine!r}")
     spec = specification(model)
     several = [recorded] if isinstance(recorded, Log | str | Path) else list(recorded)
     if not several or not parameters:
@@ -92,7 +101,12 @@ def mujoco_task(
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
     simulator = Simulator(compiled, build, episodes, measured, deviations, starts, does, discrepancies, threads)
     others = {"name": spec.modelname or "mujoco"} | others
-    return task_of(simulator, parameters, measured, summary, supports, **others)
+    task = task_of(simulator, parameters, measured, summary, supports, **others)
+    if engine == "native":
+        return task
+    from jaxlfi.envs.mujoco.mjx_simulator import by_mjx  # MJX is not needed otherwise
+
+    return by_mjx(task)
 
 
 def task_of(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import mujoco
 import mujoco.rollout
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxlfi.envs.mujoco import measured
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
@@ -38,6 +38,10 @@ class Simulator:
         signals: that are measured, C of them.
         units: of the signals; "" where the sensor does not say.
         noise: standard deviation of each signal's noise, shape [C]; 0 where it is inferred.
+        actuators: names of the controls.
+        places: of the signals among the model's sensor data, C of them.
+        discrepancies: what the model gets wrong, by the signal's number.
+        model, build, does, logs, starts: as they are given, below.
     """
 
     def __init__(
@@ -68,13 +72,13 @@ class Simulator:
         Raises:
             ValueError: for recordings that do not fit the model, in one line.
         """
-        self._model, self._build, self._does = model, build, does
-        self._logs, self.signals, self._starts = tuple(logs), tuple(signals), tuple(starts)
-        self._places = measured.places(model, signals)
+        self.model, self.build, self.does = model, build, does
+        self.logs, self.signals, self.starts = tuple(logs), tuple(signals), tuple(starts)
+        self.places = measured.places(model, signals)
         self.units = tuple(measured.unit(model, name) for name in signals)
         self.noise = np.array([noise[name] for name in signals])
-        self._discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
-        self._actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
+        self.discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
+        self.actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
         rows = [self._measured_rows(log) for log in logs]
         self.times = [log.times[own] for log, own in zip(logs, rows, strict=True)]
         recorded = np.concatenate(
@@ -95,29 +99,29 @@ class Simulator:
             change: of the samples of each control, shape [T].
         """
         other = copy.copy(self)
-        other._logs = tuple(
+        other.logs = tuple(
             dataclasses.replace(
-                log, signals=dict(log.signals) | {name: change(log.signals[name]) for name in self._actuators}
+                log, signals=dict(log.signals) | {name: change(log.signals[name]) for name in self.actuators}
             )
-            for log in self._logs
+            for log in self.logs
         )
         return other
 
     def finer(self, factor: int = 10) -> "Simulator":
         """The same, integrated by Runge-Kutta in steps that are shorter by a factor."""
-        finer, build = copy.copy(self), self._build
+        finer, build = copy.copy(self), self.build
 
         def sharpened(model: mujoco.MjModel) -> mujoco.MjModel:
-            model.opt.timestep, model.opt.integrator = self._model.opt.timestep / factor, mujoco.mjtIntegrator.mjINT_RK4
+            model.opt.timestep, model.opt.integrator = self.model.opt.timestep / factor, mujoco.mjtIntegrator.mjINT_RK4
             return model
 
-        finer._model, finer._build = sharpened(copy.copy(self._model)), lambda theta: sharpened(build(theta))
+        finer.model, finer.build = sharpened(copy.copy(self.model)), lambda theta: sharpened(build(theta))
         return finer
 
     def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
         """Rows of a log with a sample of anything that is measured."""
         known = ", ".join(log.signals)
-        if missing := [name for name in self._actuators if name not in log.signals]:
+        if missing := [name for name in self.actuators if name not in log.signals]:
             raise ValueError(
                 f"{log.name}: expected a control for each actuator of the model, got none of {', '.join(missing)} "
                 f"among {known}"
@@ -127,9 +131,9 @@ class Simulator:
         for name, unit in zip(self.signals, self.units, strict=True):
             if unit and log.units.get(name, unit) != unit:
                 raise ValueError(f"{log.name}: {name}: expected {unit} as the sensor, got {log.units[name]}")
-        if log.times[-1] < self._model.opt.timestep:
+        if log.times[-1] < self.model.opt.timestep:
             raise ValueError(
-                f"{log.name}: expected more than a step of the model, {self._model.opt.timestep:g} s, "
+                f"{log.name}: expected more than a step of the model, {self.model.opt.timestep:g} s, "
                 f"got {log.times[-1]:g} s"
             )
         return np.flatnonzero(np.isfinite([log.signals[name] for name in self.signals]).any(axis=0))
@@ -140,10 +144,10 @@ class Simulator:
         """Measurements with their noise and discrepancies, and 0 or why each simulation failed."""
         clean, outcome = self.clean(theta)
         deviation = np.tile(self.noise, (len(theta), 1))
-        for signal, d in self._does.deviations:
+        for signal, d in self.does.deviations:
             deviation[:, signal] = theta[:, d]
         noisy = clean + deviation[:, None] * rng.standard_normal(clean.shape)
-        for signal, process in self._discrepancies.items():
+        for signal, process in self.discrepancies.items():
             noisy[:, :, signal] += np.concatenate([process.draws(rng, len(theta), own) for own in self.times], axis=1)
         return np.where(self.there, noisy, 0.0), outcome
 
@@ -157,7 +161,7 @@ class Simulator:
             for first in range(0, len(theta), CHUNK):
                 part = slice(first, first + CHUNK)
                 rows[part], outcome[part] = self._rolled(theta[part])
-        for signal, d in self._does.biases:
+        for signal, d in self.does.biases:
             rows[:, :, signal] += theta[:, d, None]
         rows[outcome != 0] = 0.0
         return rows, outcome
@@ -173,10 +177,10 @@ class Simulator:
             ValueError: for models that MuJoCo refuses.
         """
         theta = np.asarray(theta, float)
-        models, grid = [self._build(row) for row in theta], self._grid(self.times[episode])
-        start, controls = self._start(episode, theta), self._controls(self._logs[episode], theta, grid)
+        models, grid = [self.build(row) for row in theta], self.grid(self.times[episode])
+        start, controls = self._start(episode, theta), self.controls(self.logs[episode], theta, grid)
         with _LOCK, quietly():
-            states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self._model), start, controls)
+            states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self.model), start, controls)
         return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
 
     def _rolled(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -188,66 +192,67 @@ class Simulator:
             return rows, outcome
         if self._pool is None:
             self._pool = mujoco.rollout.Rollout(nthread=self._threads)
-        data = [mujoco.MjData(self._model) for _ in range(self._threads)]
+        data = [mujoco.MjData(self.model) for _ in range(self._threads)]
         begin = 0
-        for episode, (log, times) in enumerate(zip(self._logs, self.times, strict=True)):
-            start, grid = self._start(episode, theta[good]), self._grid(times)
+        for episode, (log, times) in enumerate(zip(self.logs, self.times, strict=True)):
+            start, grid = self._start(episode, theta[good]), self.grid(times)
             states, sensors = self._pool.rollout(
-                [models[row] for row in good], data, start, self._controls(log, theta[good], grid)
+                [models[row] for row in good], data, start, self.controls(log, theta[good], grid)
             )
             # MuJoCo begins anew where a simulation has become unstable, and its clock with it.
-            step = self._model.opt.timestep
+            step = self.model.opt.timestep
             stopped = np.abs(states[:, -1, 0] - start[:, 0] - len(grid) * step) > step / 2
-            values = sensors[:, :, self._places]
+            values = sensors[:, :, self.places]
             stopped |= ~np.isfinite(values).all(axis=(1, 2)) | ~np.isfinite(states[:, -1]).all(axis=1)
             outcome[good[stopped]] = UNSTABLE
-            rows[good, begin : begin + len(times)] = _between(grid, values, times)
+            rows[good, begin : begin + len(times)] = between(grid, values, times)
             begin += len(times)
         return rows, outcome
 
     def _start(self, episode: int, theta: np.ndarray) -> np.ndarray:
         """States that an episode begins in, one for each parameter vector."""
-        start = np.tile(self._starts[episode], (len(theta), 1))
-        for place, d in self._does.starts:
+        start = np.tile(self.starts[episode], (len(theta), 1))
+        for place, d in self.does.starts:
             start[:, place] = theta[:, d]
         return start
 
-    def _grid(self, times: np.ndarray) -> np.ndarray:
+    def grid(self, times: np.ndarray) -> np.ndarray:
         """Times of the model's steps that reach beyond an episode's last measurement."""
-        step = self._model.opt.timestep
+        step = self.model.opt.timestep
         return step * np.arange(max(int(np.ceil(times[-1] / step - 1e-9)), 1) + 1)
 
-    def _controls(self, log: Log, theta: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    def controls(self, log: Log, theta: np.ndarray, grid: np.ndarray) -> np.ndarray:
         """Controls of each model over each step, shape [N, steps, actuators]."""
-        delays = np.zeros(len(theta)) if self._does.delay is None else theta[:, self._does.delay]
+        delays = np.zeros(len(theta)) if self.does.delay is None else theta[:, self.does.delay]
         when = grid - delays[:, None]
-        held = [log.mean_held(name, when, self._model.opt.timestep) for name in self._actuators]
+        held = [log.mean_held(name, when, self.model.opt.timestep) for name in self.actuators]
         return np.stack(held, axis=-1) if held else np.zeros((len(theta), len(grid), 0))
 
     def _made(self, theta: np.ndarray) -> mujoco.MjModel | None:
         """A model of its own; None where MuJoCo refuses it, as for a body of negative mass."""
         try:
-            return self._build(theta)
+            return self.build(theta)
         except ValueError:
             return None
 
 
 def simulator_of(task: Task) -> Simulator:
-    """The simulator of a task.
+    """The simulator of a task by MuJoCo itself, which a task that MJX simulates has, too.
 
     Raises:
         ValueError: for a task that is not of a MuJoCo model.
     """
-    function = getattr(task.simulate, "function", None)
+    function = getattr(task.simulate, "function", task.simulate)
     if isinstance(function, OneOfBatch):  # of a run whose simulations were made one by one, as --workers makes them
         function = function.function
+    function = getattr(function, "native", function)  # beside simulations by MJX
     if not isinstance(function, Simulator):
         raise ValueError(f"task: expected one of a MuJoCo model, got {task.name}")
     return function
 
 
-def _between(grid: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Values [N, steps, C] at other times, linearly between steps."""
+def between(grid: np.ndarray, values: Array | np.ndarray, times: np.ndarray) -> Array | np.ndarray:
+    """Values [..., steps, C] at other times, linearly between steps. Works on JAX's arrays and on NumPy's."""
     after = np.clip(np.searchsorted(grid, times - 1e-9), 1, len(grid) - 1)
     share = np.clip((times - grid[after - 1]) / (grid[after] - grid[after - 1]), 0.0, 1.0)[:, None]
-    return (1 - share) * values[:, after - 1] + share * values[:, after]
+    return (1 - share) * values[..., after - 1, :] + share * values[..., after, :]

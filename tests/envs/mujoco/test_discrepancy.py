@@ -5,6 +5,8 @@ import pytest
 
 pytest.importorskip("mujoco")
 
+import jax
+
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy, estimated
 
 PROCESS = Discrepancy(0.3, 0.25)
@@ -18,6 +20,12 @@ def test_draws_have_the_covariance_of_the_process():
     np.testing.assert_allclose(np.cov(draws.T), PROCESS.covariance(TIMES), atol=5 * 0.3**2 * np.sqrt(2 / 40_000))
     closed_form = [[0.09, 0.09 * np.exp(-(TIMES[7] - TIMES[2]) / 0.25)]]
     np.testing.assert_allclose(PROCESS.covariance(TIMES)[2:3, [2, 7]], closed_form)
+
+
+def test_draws_inside_of_compiled_programs_have_it_too():
+    keys = jax.random.split(jax.random.key(0), 40_000)
+    draws = jax.jit(jax.vmap(lambda key: PROCESS.draw(key, TIMES)))(keys)
+    np.testing.assert_allclose(np.cov(draws.T), PROCESS.covariance(TIMES), atol=5 * 0.3**2 * np.sqrt(2 / 40_000))
 
 
 def test_the_process_is_read_off_residuals():

@@ -146,7 +146,9 @@ def test_unstable_simulations_and_refused_models_end_episodes(arm, compiled):
     wrong = THETA.copy()
     wrong[1, 2] = -1.0  # a negative mass
     state = reset(jax.random.split(jax.random.key(0), 3), jnp.asarray(wrong))
-    state = state.replace(inner=state.inner.replace(qvel=state.inner.qvel.at[2].set(1e12)))
+    inner = state.inner
+    fast = inner.state.replace(qvel=inner.state.qvel.at[2].set(1e12))
+    state = state.replace(inner=inner.replace(state=fast))
     after = step(state, jnp.zeros((3, 1)))
     assert after.truncated.tolist() == [False, True, True] == after.facts["failed"].tolist()
     assert after.reward[1:].tolist() == [0.0, 0.0] and not after.terminated.any()
@@ -184,7 +186,7 @@ def test_first_states_are_drawn_and_noise_is_added():
     env = MujocoEnvironment(ARM, [PARAMETERS[0], noisy, unseen], spread)
     theta = jnp.tile(jnp.asarray([0.05, 0.08, 0.3]), (400, 1))
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 400), theta)
-    start = state.inner.qpos[:, 0]
+    start = state.inner.state.qpos[:, 0]
     assert 0.2 <= start.min() < 0.22 and 0.68 < start.max() <= 0.7
     angle = jnp.arctan2(state.observation[:, 1], state.observation[:, 0])
     assert (angle - start).std() == pytest.approx(0.08, rel=0.15)

@@ -1,0 +1,66 @@
+"""What parameters do inside of compiled programs, besides the model: to the start, the sensors and the controls."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlfi.envs.mujoco.effects import Effects
+from jaxlfi.envs.mujoco.logs import Log
+
+
+def started(does: Effects, theta: Float[Array, " dim"], start: Float[np.ndarray, " state"]) -> Float[Array, " state"]:
+    """The state (`effects.STATE`) that an episode begins in."""
+    state = jnp.asarray(start, jnp.float32)
+    for place, d in does.starts:
+        state = state.at[place].set(theta[d])
+    return state
+
+
+def biased(
+    does: Effects, theta: Float[Array, " dim"], values: Float[Array, "*rows signals"]
+) -> Float[Array, "*rows signals"]:
+    """Signals with the offsets of their sensors, but for signals beyond the last one."""
+    for signal, d in does.biases:
+        values = values.at[..., signal].add(theta[d]) if signal < values.shape[-1] else values
+    return values
+
+
+def deviations(
+    does: Effects, theta: Float[Array, " dim"], noise: Float[np.ndarray, " signals"]
+) -> Float[Array, " signals"]:
+    """Standard deviations of the signals' noise, given or inferred."""
+    deviation = jnp.asarray(noise, jnp.float32)
+    for signal, d in does.deviations:
+        deviation = deviation.at[signal].set(theta[d]) if signal < len(deviation) else deviation
+    return deviation
+
+
+class Held:
+    """A recorded control, held from sample to sample, at times that depend on parameters.
+
+    The numbers are those of `Log.mean_held`, by jumps instead of integrals from the beginning, whose differences would
+    lose in single precision what a long recording adds to them.
+    """
+
+    def __init__(self, log: Log, name: str, interval: float):
+        """Look up the samples.
+
+        Args:
+            log: the recording.
+            name: of the control.
+            interval: that means are taken over, in s.
+        """
+        since, values = log.samples(name)
+        # As many samples as lie within an interval matter besides the one before; after the last one nothing changes.
+        self._most = int(np.max(np.searchsorted(since, since + interval, side="right") - np.arange(len(since))))
+        self._since = np.append(since, np.full(self._most, np.inf)).astype(np.float32)
+        self._jumps = np.append(np.diff(values), np.zeros(self._most + 1)).astype(np.float32)
+        self._values, self._interval = values.astype(np.float32), interval
+
+    def __call__(self, times: Float[Array, " steps"]) -> Float[Array, " steps"]:
+        """Means over the intervals that begin at these times; before the first sample it is that one."""
+        last = jnp.maximum(jnp.searchsorted(self._since[: len(self._values)], times, side="right") - 1, 0)
+        later = last[:, None] + np.arange(1, self._most + 1)
+        since, jumps = jnp.asarray(self._since)[later], jnp.asarray(self._jumps)[later - 1]
+        shares = jnp.clip((times[:, None] + self._interval - since) / self._interval, 0.0, 1.0)
+        return jnp.asarray(self._values)[last] + jnp.sum(jumps * shares, axis=1)

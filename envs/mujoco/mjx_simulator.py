@@ -1,0 +1,115 @@
+"""Simulations of a model under the recorded controls by MJX, inside of compiled programs."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlfi.envs.mujoco.mjx_effects import Held, biased, deviations, started
+from jaxlfi.envs.mujoco.mjx_models import Models, mjx
+from jaxlfi.envs.mujoco.mjx_physics import Physics, State
+from jaxlfi.envs.mujoco.simulator import REFUSED, UNSTABLE, Simulator, between, simulator_of
+from jaxlfi.tasks.task import Task
+
+
+def by_mjx(task: Task) -> Task:
+    """The task with simulations by MJX, in single precision.
+
+    Films and points of least squares of it are MuJoCo's own, as of any task of a MuJoCo model.
+
+    Args:
+        task: of a MuJoCo model, as `mujoco_task` makes it.
+
+    Raises:
+        ValueError: for a model or parameters that MJX cannot simulate, in one line.
+        ImportError: where MJX is not installed.
+    """
+    native = simulator_of(task)
+    nominal = np.asarray(task.space.to_natural(task.support().centre), float)
+    try:
+        simulator = MjxSimulator(native, Models(native.build, task.names, nominal, task.feasible))
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"engine: expected native for what MJX cannot simulate, got mjx: {reason}") from error
+    return dataclasses.replace(task, simulate=simulator)
+
+
+class MjxSimulator:
+    """Simulates all episodes of one parameter vector, as `jaxlfi.Task` calls it.
+
+    Episodes are simulated side by side, for as long as the longest of them. What is simulated, and in which rows, is
+    said by the simulator of MuJoCo itself.
+
+    Attributes:
+        native: that simulator.
+    """
+
+    def __init__(self, native: Simulator, models: Models):
+        """Nothing is simulated or compiled yet.
+
+        Args:
+            native: MuJoCo's own simulator of the same.
+            models: MJX models of its parameters.
+
+        Raises:
+            ValueError: for a model that MJX cannot simulate, in one line.
+        """
+        self.native = native
+        self._physics = Physics(models, native.model, native.places)
+        grids = [native.grid(times) for times in native.times]
+        self._grid = max(grids, key=len)
+        self._needed = np.arange(len(self._grid)) < np.array([len(grid) for grid in grids])[:, None]
+        step = native.model.opt.timestep
+        self._held = [[Held(log, name, step) for name in native.actuators] for log in native.logs]
+
+    def __call__(
+        self, key: jax.Array, theta: Float[Array | np.ndarray, " dim"]
+    ) -> tuple[Float[Array, "rows signals"], Int[Array, ""]]:
+        """Measurements with their noise and discrepancies, and 0 or why the simulation failed."""
+        native = self.native
+        key_noise, *keys = jax.random.split(key, 1 + len(native.discrepancies))
+        rows, outcome = self.clean(theta)
+        rows += deviations(native.does, theta, native.noise) * jax.random.normal(key_noise, rows.shape)
+        for own, (signal, process) in zip(keys, native.discrepancies.items(), strict=True):
+            each = zip(jax.random.split(own, len(native.times)), native.times, strict=True)
+            rows = rows.at[:, signal].add(jnp.concatenate([process.draw(one, times) for one, times in each]))
+        return jnp.where(native.there, rows, 0.0), outcome
+
+    def clean(self, theta: Float[Array | np.ndarray, " dim"]) -> tuple[Float[Array, "rows signals"], Int[Array, ""]]:
+        """Measurements without noise, and 0 or why the simulation failed; of one that failed they are zero."""
+        native, theta = self.native, jnp.asarray(theta, jnp.float32)
+        numbers, refused = self._physics.models.numbers(theta)
+        episode = functools.partial(self._episode, self._physics.models.model(numbers))
+        starts = jnp.stack([started(native.does, theta, start) for start in native.starts])
+        values, stable = jax.vmap(episode)(starts, self._controls(theta))
+        rows = [between(self._grid, own, times) for own, times in zip(values, native.times, strict=True)]
+        unstable = jnp.any(self._needed & ~stable)
+        outcome = jnp.where(refused, REFUSED, jnp.where(unstable, UNSTABLE, 0))
+        return jnp.where(outcome == 0, biased(native.does, theta, jnp.concatenate(rows)), 0.0), outcome
+
+    def _episode(
+        self, model: mjx.Model, start: Float[Array, " state"], controls: Float[Array, "steps act"]
+    ) -> tuple[Float[Array, "steps signals"], Bool[Array, " steps"]]:
+        """Signals at the beginning of each step, and whether the step is stable."""
+        first = self._physics.state(start)
+
+        def step(state: State, control: Float[Array, " act"]):
+            after, values, stable = self._physics.step(model, state, control)
+            # As in MuJoCo it begins anew: solvers would go on for long with numbers that are none.
+            after = jax.tree.map(lambda own, anew: jnp.where(stable, own, anew), after, first)
+            return after, (values, stable)
+
+        _, measured = jax.lax.scan(step, first, controls)
+        return measured
+
+    def _controls(self, theta: Float[Array, " dim"]) -> Float[Array, "episodes steps act"]:
+        """Controls of each episode over each step."""
+        native = self.native
+        if native.does.delay is None:  # they are the same for all
+            recorded = [native.controls(log, np.zeros((1, 0)), self._grid)[0] for log in native.logs]
+            return jnp.asarray(np.stack(recorded), jnp.float32)
+        when = jnp.asarray(self._grid, jnp.float32) - theta[native.does.delay]
+        return jnp.stack([jnp.stack([held(when) for held in several], axis=-1) for several in self._held])
