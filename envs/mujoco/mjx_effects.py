@@ -62,5 +62,5 @@ class Held:
         last = jnp.maximum(jnp.searchsorted(self._since[: len(self._values)], times, side="right") - 1, 0)
         later = last[:, None] + np.arange(1, self._most + 1)
         since, jumps = jnp.asarray(self._since)[later], jnp.asarray(self._jumps)[later - 1]
-        shares = jnp.clip((times[:, None] + self._interval - since) / self._interval, 0.0, 1.0)
-        return jnp.asarray(self._values)[last] + jnp.sum(jumps * shares, axis=1)
+        fractions = jnp.clip((times[:, None] + self._interval - since) / self._interval, 0.0, 1.0)
+        return jnp.asarray(self._values)[last] + jnp.sum(jumps * fractions, axis=1)
