@@ -424,6 +424,21 @@ def test_how_long_the_learner_of_the_paper_took():
     assert f"A training took {minutes.min():.0f} to {minutes.max():.0f} minutes" in README
 
 
+@pytest.mark.parametrize("detector", ["centreline", "learnt"])
+@pytest.mark.parametrize("dlo", ["dlo-0", "dlo-1", "dlo-2", "dlo-3"])
+def test_real2sim_through_pictures(dlo, detector):
+    """Medians and intervals of seed 0, and medians of the other seeds."""
+    found = [row for row in rows(f"real2sim-{detector}") if row["object"] == dlo]
+    section = README[README.index("**What seeing costs Real2Sim.**") :]
+    section = section[section.index(f"| {dlo}: ") :]
+    cells = [cell.strip() for cell in section[section.index(f"| {detector} |") :].split("|")[2:6]]
+    numbers = lambda text: re.findall(r"[\d.]+", text)
+    for first, others, measure in ((*cells[:2], "length [mm]"), (*cells[2:], "E [kPa]")):
+        kept = [list(map(float, numbers(row[measure]))) for row in found]
+        assert len(kept) == 3 and all(map(same, numbers(first), kept[0])) and len(numbers(first)) == 3
+        assert all(map(same, numbers(others), (row[0] for row in kept[1:]))) and len(numbers(others)) == 2
+
+
 @pytest.mark.parametrize("name", ["segmentation", "keypoints", "errors-learnt", "errors-learnt-transporter", "speed"])
 def test_learnt_vision(name):
     with (RESULTS / "vision" / f"{name}.csv").open(newline="") as file:
