@@ -6,12 +6,13 @@ Needs the extra `mujoco`.
 from pathlib import Path
 
 
-def task(config: Path | None = None, log: tuple[Path, ...] = ()):
+def task(config: Path | None = None, log: tuple[Path, ...] = (), summary: str | None = None):
     """The task that a TOML file describes (`jaxlfi.envs.mujoco.config`).
 
     Args:
         config: the file, which there has to be.
         log: recordings in place of those that the file names; several are episodes of the same parameters.
+        summary: what the network sees of them, by its name, in place of what the file says.
 
     Raises:
         ImportError: where MuJoCo is not installed, with what to install.
@@ -22,7 +23,7 @@ def task(config: Path | None = None, log: tuple[Path, ...] = ()):
         raise ValueError("config: expected a TOML file that describes a task, as mujoco,config=arm.toml; got none")
     from jaxlfi.envs.mujoco.config import read
 
-    return read(config, log)
+    return read(config, log, summary)
 
 
 def require_mujoco() -> None:

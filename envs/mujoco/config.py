@@ -3,6 +3,7 @@
 model = "pendulum.xml"              # beside this file
 log = ["swing.csv"]                 # recordings, one for each episode
 measured = ["angle"]                # by default all signals but the controls
+summary = "samples"                 # what the network sees of them (`jaxlfi.envs.mujoco.summaries`)
 
 [parameters."joint/hinge/damping"]
 support = [0.001, 0.01]             # Theta_0
@@ -40,6 +41,7 @@ KEYS: Mapping[str, type] = {
     "model": str,
     "log": list,
     "measured": list,
+    "summary": str,
     "parameters": dict,
     "noise": dict,
     "initial": dict,
@@ -51,12 +53,13 @@ KEYS: Mapping[str, type] = {
 PARAMETER = ("support", "feasible", "unit", "log", "truth")
 
 
-def read(path: Path, recorded: Sequence[Path] = ()) -> Task:
+def read(path: Path, recorded: Sequence[Path] = (), summary: str | None = None) -> Task:
     """The task that a file describes.
 
     Args:
         path: of the file.
         recorded: recordings in place of its own.
+        summary: a name in place of its own.
 
     Raises:
         ValueError: for a file that is missing, damaged or describes no task, in one line.
@@ -76,6 +79,7 @@ def read(path: Path, recorded: Sequence[Path] = ()) -> Task:
             numbers(config, "initial"),
             {name: _discrepancy(name, table) for name, table in config.get("discrepancy", {}).items()},
             {label: _guess(label, table) for label, table in config.get("supports", {}).items()},
+            summary=summary or config.get("summary", "samples"),
             name=config.get("name", path.stem),
         )
     except ValueError as error:
