@@ -53,7 +53,7 @@ class Regular(NamedTuple):
     after: Int[np.ndarray, "moments signals"]
     share: Float[np.ndarray, "moments signals"]
 
-    def of(self, trajectory: Float[Array, "rows signals"]) -> Float[Array, "moments signals"]:
+    def of(self, trajectory: Float[Array | np.ndarray, "rows signals"]) -> Float[Array | np.ndarray, "moments signals"]:
         """The signals at equal intervals; those without a sample in this episode are 0."""
         signals = np.arange(self.share.shape[1])
         before, after = trajectory[self.before, signals], trajectory[self.after, signals]
