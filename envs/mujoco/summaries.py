@@ -130,7 +130,7 @@ def lags(count: int) -> list[int]:
 
     Example:
         >>> lags(400), lags(8)
-        ([0, 6, 12, 25, 50, 100], [0, 1, 2])
+        ([0, 6, 13, 25, 50, 100], [0, 1, 2])
     """
     return sorted({int(np.floor(share * count + 0.5)) for share in LAGS} & set(range(count)))
 
