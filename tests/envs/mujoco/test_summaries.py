@@ -208,6 +208,7 @@ def test_learnt_is_the_raw_series_and_an_embedding_of_it():
     assert "embedding" not in task("samples").settings
 
 
+@pytest.mark.slow
 def test_a_run_learns_its_summary_anew_in_every_round():
     own = task("learnt", [recorded(), recorded(count=81)])
     estimator = small.SETTINGS.estimator.replace(embedding="series")
