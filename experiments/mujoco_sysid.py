@@ -22,7 +22,6 @@ its sign, which its recording does not tell. What is there already is kept.
 import argparse
 import dataclasses
 import importlib.util
-import io
 import json
 import time
 import tomllib
@@ -40,7 +39,7 @@ from experiments.widths import Cases, final_states
 from jaxlfi import Edge
 from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.presets import settings_for
-from jaxlfi.envs.mujoco import least_squares
+from jaxlfi.envs.mujoco import least_squares, sysid_point
 from jaxlfi.io import files
 from jaxlfi.runs.folder import environment
 from jaxlfi.tasks import registry
@@ -60,9 +59,9 @@ FIRST_SEED = 1000
 """Of the recordings; that of the examples' own is 0."""
 
 
-def truths(task: Task, count: int) -> np.ndarray:
+def truths(task: Task, count: int, first_seed: int = FIRST_SEED) -> np.ndarray:
     """From the right box, where the wrong one is not; in natural units, shape [count, D]."""
-    rng = np.random.default_rng(FIRST_SEED)
+    rng = np.random.default_rng(first_seed)
     right, wrong = (task.support(BOXES[name]) for name in ("right", "wrong"))
     low, high = np.asarray(right.low), np.asarray(right.high)
     found: list[np.ndarray] = []
@@ -81,7 +80,7 @@ def script():
     return module
 
 
-def recordings(path: Path, task: Task, name: str, count: int) -> dict[str, np.ndarray]:
+def recordings(path: Path, task: Task, name: str, count: int, first_seed: int = FIRST_SEED) -> dict[str, np.ndarray]:
     """Truths, what was recorded of them, and what another recording would have been; made where they are missing.
 
     Returns:
@@ -90,12 +89,12 @@ def recordings(path: Path, task: Task, name: str, count: int) -> dict[str, np.nd
     """
     if path.exists() and len(files.read_arrays(path)["theta"]) >= count:
         return {key: values[:count] for key, values in files.read_arrays(path).items()}
-    record, theta = script(), truths(task, count)
+    record, theta = script(), truths(task, count, first_seed)
     series = lambda log: np.stack([log.signals[signal] for signal in task.simulate.function.signals], axis=1)
     observed, held_out = [], []
     for row, own in enumerate(track(theta, f"recordings of {name}")):
         truth = dict(zip(task.names, map(float, own), strict=True))
-        observed.append(series(record.recorded(name, truth, FIRST_SEED + row)))
+        observed.append(series(record.recorded(name, truth, first_seed + row)))
         held_out.append(series(record.recorded(name, truth, None, backwards=True)))
     arrays = {"theta": theta, "observed": np.stack(observed), "held_out": np.stack(held_out)}
     files.write_arrays(path, arrays)
@@ -117,31 +116,19 @@ def point(method: str, task: Task, observed: np.ndarray, box: str) -> Point:
     residuals = least_squares.Residuals(task, observed)
     low, high = (np.asarray(bound, float) for bound in (task.support(box).low, task.support(box).high))
     centre = 0.5 * (low + high)
-    theta = {"sysid": _sysid, "scipy": _scipy, "cma": _cma}[method](residuals, centre, low, high)
+    theta = {"sysid": sysid_point.solved, "scipy": _scipy, "cma": _cma}[method](residuals, centre, low, high)
     spent = residuals.simulations
     half = np.full(len(theta), np.nan)
     if method != "cma":
         left, jacobian = residuals(theta[None])[0], residuals.jacobian(theta, low, high)
         if method == "sysid":
-            from mujoco.sysid import calculate_intervals
-
-            _, half = calculate_intervals([left], jacobian, alpha=0.1)
+            half = sysid_point.half_widths(left, jacobian)
         else:
             variance = np.sum(left**2) / (len(left) - len(theta))
             half = LEVEL * np.sqrt(variance * np.diagonal(np.linalg.pinv(jacobian.T @ jacobian)))
     near = 1e-3 * (high - low)
     interval = np.stack([theta - half, theta + half], axis=1)
     return Point(theta, interval, (theta - low < near) | (high - theta < near), spent)
-
-
-def _sysid(residuals, centre, low, high) -> np.ndarray:
-    from mujoco.sysid import Parameter, ParameterDict, optimize
-
-    parameters = ParameterDict({"theta": Parameter("theta", centre, low, high)})
-    residual = lambda x, _: ([residuals(np.reshape(x, (len(centre), -1)).T).T], None, None)
-    with np.errstate(all="ignore"):
-        _, found = optimize(parameters, residual, verbose=False, output=io.StringIO())
-    return np.asarray(found.x, float)
 
 
 def _scipy(residuals, centre, low, high) -> np.ndarray:
@@ -162,12 +149,14 @@ def _cma(residuals, centre, low, high) -> np.ndarray:
     return low + search.result.xbest * (high - low)
 
 
-def believed(method: str, task: Task, observed: np.ndarray, box: str) -> dict[str, np.ndarray]:
+def believed(
+    method: str, task: Task, observed: np.ndarray, box: str, first_seed: int = FIRST_SEED
+) -> dict[str, np.ndarray]:
     """Posterior draws of all recordings by jaxlfi, in inference space [N, DRAWS, D]."""
     settings = settings_for(task, {"edge": "bayessim"}.get(method, method))
     x = np.asarray(jax.vmap(task.summary)(jnp.asarray(observed, jnp.float32)))
     theta = np.zeros((len(observed), task.dim), np.float32)
-    cases = Cases(FIRST_SEED + np.arange(len(observed)), theta, observed.astype(np.float32), x)
+    cases = Cases(first_seed + np.arange(len(observed)), theta, observed.astype(np.float32), x)
     began = time.perf_counter()
     states, _ = final_states(task, settings, box, Edge(), cases, len(observed), Console())
     seconds = time.perf_counter() - began

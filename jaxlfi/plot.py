@@ -26,6 +26,7 @@ def pairs(
     units: Sequence[str] | None = None,
     truth: Sequence[float] | None = None,
     support: Any = None,
+    points: Mapping[str, tuple[Sequence[float], Any]] | None = None,
     log: Sequence[bool] | Sequence[str] = (),
     path: Path | str | None = None,
     dpi: float = 300.0,
@@ -41,6 +42,8 @@ def pairs(
         units: of the D parameters, such as "N/m"; "" for none.
         truth: true parameters, shape [D]; NaN where unknown.
         support: box to mark, an object with `low` and `high` or a pair of them, shape [D] each.
+        points: estimates by label, each with an interval of every parameter, shapes [D] and [D, 2]; NaN for none.
+            One that is called as a set of samples has its look.
         log: parameters to be drawn as natural logarithms: their names, or D booleans.
         path: file to write the figure to as well, .png, .pdf or .svg.
         dpi: resolution of a .png.
@@ -71,20 +74,27 @@ def pairs(
     sets = {label: to_drawn(_called(label), draws) for label, draws in sets.items()}
     marked = np.full(dim, np.nan) if truth is None else to_drawn("truth", _vector("truth", truth, dim, unknown=True))
     box = None if support is None else tuple(to_drawn("support", bound) for bound in _bounds(support, dim))
+    estimates = {
+        label: [to_drawn(f"points[{label!r}]", part) for part in parts] for label, parts in _points(points, dim).items()
+    }
+    all_labels = list(dict.fromkeys([*sets, *estimates]))
+    if len(all_labels) > MAX_SETS:
+        raise ValueError(f"points: expected up to {MAX_SETS} labels in all, got {len(all_labels)}")
 
     # Imported here so that `import jaxlfi.plot` does not load matplotlib.
     from jaxlfi.figures import style
-    from jaxlfi.figures.pairs import Cloud, draw_overlay
+    from jaxlfi.figures.pairs import Cloud, Point, draw_overlay
 
-    looks = style.set_looks(list(sets))
-    clouds = [Cloud(draws, look, marked, box) for draws, look in zip(sets.values(), looks, strict=True)]
+    looks = dict(zip(all_labels, style.set_looks(all_labels), strict=True))
+    clouds = [Cloud(draws, looks[label], marked, box) for label, draws in sets.items()]
+    marks = [Point(value, np.stack(ends, axis=1), looks[label]) for label, (value, *ends) in estimates.items()]
     texts = [style.symbol(d) if names is None else style.plain(name) for d, name in enumerate(names_)]
     texts = [f"ln {text}" if logarithm else text for text, logarithm in zip(texts, is_log, strict=True)]
     labels = [style.with_unit(text, unit) for text, unit in zip(texts, units_, strict=True)]
     width = style.TEXT_WIDTH if dim > 2 else style.COLUMN_WIDTH
     with style.context():
         figure = style.new_figure(width, 0.65 * width + 0.5 if dim == 1 else width + 0.3)
-        draw_overlay(figure, clouds, labels)
+        draw_overlay(figure, clouds, labels, marks)
         if path is None:
             figure.draw_without_rendering()  # makes ticks and layout in this style, before the settings are restored
         else:
@@ -137,6 +147,22 @@ def _vector(what: str, values: Any, dim: int, unknown: bool = False) -> np.ndarr
     if not (np.isfinite(vector) | (unknown & np.isnan(vector))).all():
         raise ValueError(f"{what}: expected finite numbers{' or NaN' if unknown else ''}, got {vector.tolist()}")
     return vector
+
+
+def _points(given: Any, dim: int) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Estimates, and the lower and upper ends of their intervals, checked."""
+    if not isinstance(given, Mapping | None):
+        raise ValueError(f"points: expected estimates by label, got {given!r}")
+    found = {}
+    for label, pair in (given or {}).items():
+        what = f"points[{label!r}]"
+        if not isinstance(pair, list | tuple) or len(pair) != 2:
+            raise ValueError(f"{what}: expected an estimate and its intervals, got {pair!r}")
+        interval = _numbers(what, pair[1])
+        if interval.shape != (dim, 2) or np.isinf(interval).any():
+            raise ValueError(f"{what}: expected intervals of shape [{dim}, 2], finite or NaN, got {interval.tolist()}")
+        found[str(label)] = _vector(what, pair[0], dim), *interval.T
+    return found
 
 
 def _bounds(support: Any, dim: int) -> tuple[np.ndarray, np.ndarray]:

@@ -7,12 +7,18 @@ from pathlib import Path
 from typing import Literal
 
 
-def task(config: Path | None = None, log: tuple[Path, ...] = (), engine: Literal["native", "mjx"] = "native"):
+def task(
+    config: Path | None = None,
+    log: tuple[Path, ...] = (),
+    summary: str | None = None,
+    engine: Literal["native", "mjx"] = "native",
+):
     """The task that a TOML file describes (`jaxlfi.envs.mujoco.config`).
 
     Args:
         config: the file, which there has to be.
         log: recordings in place of those that the file names; several are episodes of the same parameters.
+        summary: what the network sees of them, by its name, in place of what the file says.
         engine: "native" is MuJoCo on the processor's cores; "mjx" is MuJoCo in JAX, where it can simulate the model.
 
     Raises:
@@ -24,7 +30,7 @@ def task(config: Path | None = None, log: tuple[Path, ...] = (), engine: Literal
         raise ValueError("config: expected a TOML file that describes a task, as mujoco,config=arm.toml; got none")
     from jaxlfi.envs.mujoco.config import read
 
-    return read(config, log, engine)
+    return read(config, log, summary, engine)
 
 
 def require_mujoco() -> None:

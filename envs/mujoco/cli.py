@@ -72,6 +72,9 @@ def parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="a new folder: fit.json and pairs.png, a pair plot of posterior and points (default: print only)",
     )
+    fit.add_argument(
+        "--sysid", action="store_true", help="the point of mujoco.sysid beside them (pip install 'mujoco[sysid]')"
+    )
     return top
 
 

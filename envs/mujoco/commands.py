@@ -11,9 +11,10 @@ from rich.table import Table
 
 import jaxlfi
 from jaxlfi import plot
-from jaxlfi.envs.mujoco import config, least_squares
+from jaxlfi.envs.mujoco import config, least_squares, sysid_point
 from jaxlfi.envs.mujoco.least_squares import Fit
 from jaxlfi.envs.mujoco.simulator import simulator_of
+from jaxlfi.envs.mujoco.sysid_point import SysidPoint
 from jaxlfi.io import files
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs.folder import environment
@@ -25,6 +26,9 @@ ALIKE = 0.95
 AS_GOOD = 1.1
 """Points whose misfit is within this factor of the best one's explain the recording as well."""
 DRAWS = 1000
+SYSID = "mujoco.sysid"
+SHOWN = 6
+"""Points of a pair plot, at most, beside the posterior and the point of mujoco.sysid."""
 
 
 def fit(arguments: argparse.Namespace) -> None:
@@ -32,7 +36,10 @@ def fit(arguments: argparse.Namespace) -> None:
 
     Raises:
         ValueError: for a run of another kind of task, and a folder that is there already.
+        ImportError: where the point of `mujoco.sysid` is asked for and cannot be found.
     """
+    if arguments.sysid:
+        sysid_point.require_sysid()
     source, out = Path(arguments.source), arguments.out
     if out is not None and out.exists():
         raise ValueError(f"--out: expected a new folder, got {out}")
@@ -53,19 +60,43 @@ def fit(arguments: argparse.Namespace) -> None:
     fits = least_squares.best_fits(task, starts, arguments.keep, observation=observation, counted=counted)
     for number, one in enumerate(fits):
         console.print(_table(task, one, f"point {number + 1} of {len(fits)}"))
+    other = sysid_point.sysid_point(task, observation) if arguments.sysid else None
+    if other is not None:
+        console.print(_table(task, other, f"{SYSID}, from the middle of the first guess"))
     for line in said(task, fits):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if out is not None:
         out.mkdir(parents=True)
-        files.write_json(out / "fit.json", {"points": [_plain(task, one) for one in fits], **environment()})
-        sets = {"points of least squares": np.concatenate([_drawn(task, one) for one in _as_good(fits)])}
-        if run is not None:
-            sets = {"posterior": np.asarray(run.draws(DRAWS)), **sets}
-        names = [name.replace("/", "/ ") for name in task.names]  # which may be broken at spaces
-        log = [name for name, own in zip(names, task.space.log, strict=True) if own]
-        truth = None if task.truth is None else np.asarray(task.truth)
-        plot.pairs(sets, names=names, units=task.units, log=log, truth=truth, path=out / "pairs.png", dpi=150)
+        found = {"points": [_plain(task, one) for one in fits]} | ({SYSID: _plain(task, other)} if other else {})
+        files.write_json(out / "fit.json", {**found, **environment()})
+        draw(out / "pairs.png", task, fits, other, None if run is None else np.asarray(run.draws(DRAWS)))
         console.print(f"results: {out}", markup=False, highlight=False, soft_wrap=True)
+
+
+def draw(
+    path: Path, task: Task, fits: Sequence[Fit], other: SysidPoint | None = None, posterior: np.ndarray | None = None
+) -> None:
+    """A pair plot of the points that explain the recording as well as the best, with their intervals.
+
+    Args:
+        path: of the .png file.
+        task: of a MuJoCo model.
+        fits: the best first. Around each are draws of the normal distribution that its covariance stands for.
+        other: what `mujoco.sysid` finds.
+        posterior: draws in natural units, shape [n, D].
+    """
+    several = _as_good(fits)[:SHOWN]
+    called = {f"point {number + 1}, 90 %": one for number, one in enumerate(several)}
+    sets = {label: _drawn(task, one) for label, one in called.items()}
+    points = {label: (one.theta, one.interval) for label, one in called.items()}
+    if posterior is not None:
+        sets = {"posterior": posterior, **sets}
+    if other is not None:
+        points[f"{SYSID}, 90 %"] = other.theta, other.interval
+    names = [name.replace("/", "/ ") for name in task.names]  # which may be broken at spaces
+    log = [name for name, own in zip(names, task.space.log, strict=True) if own]
+    truth = None if task.truth is None else np.asarray(task.truth)
+    plot.pairs(sets, names=names, units=task.units, log=log, truth=truth, points=points, path=path, dpi=150)
 
 
 def task_of(run: Run) -> Task:
@@ -120,18 +151,21 @@ def _drawn(task: Task, one: Fit) -> np.ndarray:
     """Draws of the normal distribution that a point's covariance stands for, within Phi; in natural units."""
     centre = np.asarray(task.space.to_inference(one.theta), float)
     draws = np.random.default_rng(0).multivariate_normal(centre, one.covariance, DRAWS, method="eigh")
-    inside = np.asarray(task.inference.feasible.contains(draws))
-    return np.asarray(task.space.to_natural(draws[inside] if inside.sum() > 1 else draws))
+    feasible = task.inference.feasible
+    inside = np.asarray(feasible.contains(draws))
+    if inside.sum() < plot.MIN_DRAWS:  # as where the recording does not tell a parameter at all
+        return np.asarray(task.space.to_natural(np.clip(draws, feasible.low, feasible.high)))
+    return np.asarray(task.space.to_natural(draws[inside]))
 
 
-def _plain(task: Task, one: Fit) -> dict:
+def _plain(task: Task, one: Fit | SysidPoint) -> dict:
     found = dataclasses.asdict(one)
     return {"names": list(task.names)} | {
         key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in found.items()
     }
 
 
-def _table(task: Task, one: Fit, title: str) -> Table:
+def _table(task: Task, one: Fit | SysidPoint, title: str) -> Table:
     table = Table(title=f"{title}: misfit {one.misfit:.3g}, {one.simulations} simulations in all")
     for heading in ("parameter", "unit", "value", "90 % interval", ""):
         table.add_column(heading)

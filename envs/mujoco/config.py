@@ -3,6 +3,7 @@
 model = "pendulum.xml"              # beside this file
 log = ["swing.csv"]                 # recordings, one for each episode
 measured = ["angle"]                # by default all signals but the controls
+summary = "samples"                 # what the network sees of them (`jaxlfi.envs.mujoco.summaries`)
 
 [parameters."joint/hinge/damping"]
 support = [0.001, 0.01]             # Theta_0
@@ -40,6 +41,7 @@ KEYS: Mapping[str, type] = {
     "model": str,
     "log": list,
     "measured": list,
+    "summary": str,
     "parameters": dict,
     "noise": dict,
     "initial": dict,
@@ -51,12 +53,18 @@ KEYS: Mapping[str, type] = {
 PARAMETER = ("support", "feasible", "unit", "log", "truth")
 
 
-def read(path: Path, recorded: Sequence[Path] = (), engine: Literal["native", "mjx"] = "native") -> Task:
+def read(
+    path: Path,
+    recorded: Sequence[Path] = (),
+    summary: str | None = None,
+    engine: Literal["native", "mjx"] = "native",
+) -> Task:
     """The task that a file describes.
 
     Args:
         path: of the file.
         recorded: recordings in place of its own.
+        summary: a name in place of its own.
         engine: what simulates the model (`model_task.mujoco_task`).
 
     Raises:
@@ -77,6 +85,7 @@ def read(path: Path, recorded: Sequence[Path] = (), engine: Literal["native", "m
             numbers(config, "initial"),
             {name: _discrepancy(name, table) for name, table in config.get("discrepancy", {}).items()},
             {label: _guess(label, table) for label, table in config.get("supports", {}).items()},
+            summary=summary or config.get("summary", "samples"),
             engine=engine,
             name=config.get("name", path.stem),
         )

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import logs, noise
+from jaxlfi.envs.mujoco import logs, noise, summaries
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import built, effects, initial_state
 from jaxlfi.envs.mujoco.logs import Log
@@ -23,16 +21,8 @@ from jaxlfi.envs.mujoco.simulator import FAILURES, Simulator
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.task import Task
 
-SAMPLES = 30
-"""Rows of an episode that the network sees, at most."""
-
 ENGINES = ("native", "mjx")
 """What simulates a model."""
-
-
-def samples(trajectory: Float[Array, "rows signals"], rows: tuple[int, ...]) -> Float[Array, " obs"]:
-    """Some rows of a trajectory, as they are."""
-    return jnp.ravel(trajectory[np.asarray(rows)])
 
 
 def mujoco_task(
@@ -66,7 +56,7 @@ def mujoco_task(
         initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
         discrepancies: what the model gets wrong of signals, beyond their noise; `least_squares` finds it.
         supports: other first guesses by name: the bounds of some parameters, those of others being their `support`.
-        summary: "samples", up to 30 rows of each episode at equal intervals; or as for `jaxlfi.Task`.
+        summary: what the network sees, by its name (`summaries`); or as for `jaxlfi.Task`.
         threads: of simulations; by default as many as processors.
         engine: "native" is MuJoCo on the processor's cores, in double precision; "mjx" is MuJoCo in JAX, in single
             precision and inside of compiled programs, where it can simulate the model (`mjx_simulator`).
@@ -118,8 +108,8 @@ def task_of(
     **others: Any,
 ) -> Task:
     """The task of a simulator; see `mujoco_task`."""
-    if summary == "samples":
-        summary = functools.partial(samples, rows=_rows([len(times) for times in simulator.times]))
+    seen = summaries.fields(summary, simulator)
+    others["settings"] = seen.pop("settings", {}) | dict(others.get("settings", {}))
     supports = {"initial": _box([one.support for one in parameters])}
     for label, bounds in (guesses or {}).items():
         supports[label] = _box([one.support for one in _guessed(parameters, label, bounds)])
@@ -134,11 +124,11 @@ def task_of(
         feasible=_box(feasible),
         truth=None if None in truth else np.asarray(truth, np.float32),
         observation=simulator.observation,
-        summary=summary,
         failures=FAILURES,
         channels=[f"{name} [{unit}]" if unit else name for name, unit in zip(measured, simulator.units, strict=True)],
         record_label="time [s]" if len(simulator.times) == 1 else None,
         times=simulator.times[0] if len(simulator.times) == 1 else None,
+        **seen,
         **others,
     )
 
@@ -202,15 +192,6 @@ def _deviations(log: Log, measured: Sequence[str], given: Mapping[str, float], i
             except ValueError as error:
                 raise ValueError(f"noises: {name}: {error}") from error
     return found
-
-
-def _rows(lengths: Sequence[int]) -> tuple[int, ...]:
-    """Rows at equal intervals of episodes that lie one after another, the first and the last among them."""
-    rows, begin = [], 0
-    for length in lengths:
-        rows += [begin + int(row) for row in np.unique(np.linspace(0, length - 1, min(SAMPLES, length)).round())]
-        begin += length
-    return tuple(rows)
 
 
 def _box(bounds: Sequence[tuple[float, float]]) -> Support:

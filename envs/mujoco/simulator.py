@@ -92,6 +92,11 @@ class Simulator:
         self._threads = threads or processors()
         self._pool: mujoco.rollout.Rollout | None = None
 
+    def held(self, episode: int, times: Float[np.ndarray, " moments"]) -> Float[np.ndarray, "moments controls"]:
+        """The recorded controls of an episode at some times, held from sample to sample."""
+        columns = [self.logs[episode].held(name, times) for name in self.actuators]
+        return np.stack(columns, axis=-1) if columns else np.zeros((len(times), 0))
+
     def under(self, change: Callable[[np.ndarray], np.ndarray]) -> "Simulator":
         """The same under other controls.
 

@@ -34,6 +34,8 @@ FRACTIONS = (0.95, 0.8, 0.5)
 _SHADES = (0.68, 0.3, -0.2)
 _BINS = 48
 _TRUTH_POINT = TRUTH | {"markersize": 5.5, "markeredgewidth": 0.5}
+_POINT = {"markersize": 4, "markeredgewidth": 0.5, "markeredgecolor": "white", "linewidth": 1.3}
+_MARKERS = "DsvP^X<>"
 _SUPPORT = {"linestyle": "-", "linewidth": 0.9}
 _FIRST_SUPPORT = {"linestyle": (0, (1, 1.2)), "linewidth": 0.8}
 
@@ -71,6 +73,21 @@ class Cloud:
         return [(box, style) for box, style in both if box is not None]
 
 
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """An estimate of D parameters.
+
+    Attributes:
+        value: shape [D].
+        interval: of each parameter, shape [D, 2]; NaN where there is none.
+        look: how it is drawn.
+    """
+
+    value: np.ndarray
+    interval: np.ndarray
+    look: Look
+
+
 def drawable(history: History) -> bool:
     """Whether finite draws of the last posterior were saved, of at most `MAX_PARAMETERS` parameters."""
     return history.draws is not None and history.dim <= MAX_PARAMETERS and bool(np.isfinite(history.draws).all())
@@ -83,10 +100,12 @@ def cloud_of(history: History, look: Look) -> Cloud:
     return Cloud(history.draws, look, history.truth, (low[-1], high[-1]), first)
 
 
-def window(clouds: Sequence[Cloud], d: int) -> tuple[float, float]:
-    """Axis limits of a parameter: the central 99.4 % of the draws, the truth, and bounds that are near them."""
+def window(clouds: Sequence[Cloud], d: int, points: Sequence[Point] = ()) -> tuple[float, float]:
+    """Axis limits of a parameter: the central 99.4 % of the draws, truth and points, and bounds that are near them."""
     ends = np.concatenate([np.quantile(cloud.draws[:, d], [0.003, 0.997]) for cloud in clouds])
     ends = np.concatenate([ends, [cloud.truth[d] for cloud in clouds if np.isfinite(cloud.truth[d])]])
+    marked = np.array([end for point in points for end in (point.value[d], *point.interval[d])])
+    ends = np.concatenate([ends, marked[np.isfinite(marked)]])
     low, high = float(ends.min()), float(ends.max())
     bounds = np.array([bound[d] for cloud in clouds for box, _ in cloud.boxes for bound in box])
     width = (high - low) or float(np.ptp(bounds) if bounds.size else 0.0) or 0.1 * abs(low) or 1.0
@@ -136,13 +155,14 @@ def levels(fraction: np.ndarray, enclosed: Sequence[float] = FRACTIONS) -> np.nd
     return ordered[np.searchsorted(np.cumsum(ordered), enclosed).clip(max=ordered.size - 1)]
 
 
-def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int) -> None:
-    """Histograms of one parameter's draws, with the supports' bounds and the truth.
+def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int, points: Sequence[Point] = ()) -> None:
+    """Histograms of one parameter's draws, with the supports' bounds and the truth; above them points.
 
     Args:
         axes: to draw on.
         clouds: to draw over one another.
         d: index of the parameter.
+        points: with their intervals, one above the other.
     """
     highest = 0.0
     for cloud in clouds:
@@ -160,12 +180,15 @@ def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int) -> None:
     for truth in _truths(clouds):
         if np.isfinite(truth[d]):
             axes.axvline(truth[d], gid="truth", **TRUTH_LINE)
-    axes.set_ylim(0, 1.12 * highest)
+    for row, point in enumerate(points):
+        height = (1.12 + 0.12 * row) * highest
+        _draw_point(axes, point, row, [(point.value[d], height)], [(point.interval[d], [height] * 2)])
+    axes.set_ylim(0, (1.12 + 0.12 * len(points)) * highest)
     axes.set_yticks([])
 
 
-def draw_pair(axes: Axes, clouds: Sequence[Cloud], pair: tuple[int, int]) -> None:
-    """Contours around fractions of the draws of two parameters, with the supports and the truth.
+def draw_pair(axes: Axes, clouds: Sequence[Cloud], pair: tuple[int, int], points: Sequence[Point] = ()) -> None:
+    """Contours around fractions of the draws of two parameters, with the supports, the truth and points.
 
     One cloud has filled contours; several have lines over a light fill.
 
@@ -173,6 +196,7 @@ def draw_pair(axes: Axes, clouds: Sequence[Cloud], pair: tuple[int, int]) -> Non
         axes: to draw on.
         clouds: to draw over one another.
         pair: indices of the parameters, the horizontal one first.
+        points: with their intervals, as crosses.
     """
     chosen = list(pair)
     for cloud in clouds:
@@ -183,6 +207,17 @@ def draw_pair(axes: Axes, clouds: Sequence[Cloud], pair: tuple[int, int]) -> Non
     for truth in _truths(clouds):
         if np.isfinite(truth[chosen]).all():
             axes.plot(*truth[chosen], gid="truth", zorder=3, **_TRUTH_POINT)
+    for row, point in enumerate(points):
+        (x, y), (across, along) = point.value[chosen], point.interval[chosen]
+        _draw_point(axes, point, row, [(x, y)], [(across, [y] * 2), ([x] * 2, along)])
+
+
+def _draw_point(axes: Axes, point: Point, row: int, places: list, bars: list) -> None:
+    """A marker, and lines along its intervals."""
+    colour, marker = point.look.colour, _MARKERS[row % len(_MARKERS)]
+    for ends in bars:
+        axes.plot(*ends, color=colour, gid="interval", zorder=4, linewidth=_POINT["linewidth"])
+    axes.plot(*zip(*places, strict=True), color=colour, marker=marker, gid="point", zorder=5, **_POINT)
 
 
 def _boxes(clouds: Sequence[Cloud]) -> list[tuple[Box, dict]]:
@@ -232,22 +267,34 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
     below(figure, handles, at_most=len(handles) if is_wide(figure) else 2, title=key, handlelength=1.6)
 
 
-def draw_overlay(figure: Figure, clouds: Sequence[Cloud], labels: Sequence[str]) -> None:
+def draw_overlay(figure: Figure, clouds: Sequence[Cloud], labels: Sequence[str], points: Sequence[Point] = ()) -> None:
     """One pair plot with all clouds drawn over one another.
 
     Args:
         figure: empty.
         clouds: draws of the same parameters.
         labels: of the axes, one for each parameter.
+        points: estimates of the same parameters; one that is labelled as a cloud shares its entry in the legend.
     """
-    draw_groups(figure, [clouds], labels)
+    draw_groups(figure, [clouds], labels, points=points)
     own = _cloud_handles(clouds) if len(clouds) > 1 else _fraction_handles(clouds, _colour(clouds))
+    shared = {handle.get_label(): handle for handle in own if isinstance(handle, Line2D)}
+    for row, point in enumerate(points):
+        marker = {"marker": _MARKERS[row % len(_MARKERS)], **_POINT}
+        if point.look.label in shared:
+            shared[point.look.label].set(**marker)
+        else:
+            own.append(Line2D([], [], color=point.look.colour, label=point.look.label, **marker))
     if handles := [*own, *_mark_handles(clouds)]:
         below(figure, handles, at_most=grid_shape(len(handles), 5 if is_wide(figure) else 2)[1])
 
 
 def draw_groups(
-    figure: Figure, groups: Sequence[Sequence[Cloud]], labels: Sequence[str], titles: Sequence[str] | None = None
+    figure: Figure,
+    groups: Sequence[Sequence[Cloud]],
+    labels: Sequence[str],
+    titles: Sequence[str] | None = None,
+    points: Sequence[Point] = (),
 ) -> None:
     """A pair plot for each group of clouds; the clouds of a group are drawn over one another.
 
@@ -256,10 +303,11 @@ def draw_groups(
         groups: clouds over the same parameters.
         labels: of the axes, one for each parameter.
         titles: of the groups, in the colour of their first cloud; or None.
+        points: drawn over every group.
     """
     dim = groups[0][0].dim
     rows, columns = arrangement(len(groups), dim)
-    windows = [window([cloud for group in groups for cloud in group], d) for d in range(dim)]
+    windows = [window([cloud for group in groups for cloud in group], d, points) for d in range(dim)]
     # Groups of panels with a gap beside and a title above them: one grid keeps all panels of one size.
     widths = [1.0] * dim + ([0.16] + [1.0] * dim) * (columns - 1)
     heights = ([0.32 if titles else 0.01] + [1.0] * dim) * rows
@@ -275,9 +323,9 @@ def draw_groups(
             for j in range(i + 1):
                 axes = figure.add_subplot(grid[top + i, left + j])
                 if i == j:
-                    draw_marginal(axes, group, i)
+                    draw_marginal(axes, group, i, points)
                 else:
-                    draw_pair(axes, group, (j, i))
+                    draw_pair(axes, group, (j, i), points)
                 _frame(axes, (j, i), windows, labels, last=i == dim - 1, numbered=left == 0)
                 for axis in (axes.xaxis, axes.yaxis) if i != j else (axes.xaxis,):
                     round_ticks(axis, 4 if columns * dim <= 4 else 3)

@@ -472,6 +472,46 @@ def test_mujoco_models():
     assert f"both in all five ({share('wrong-apt')})" in README
 
 
+def test_summaries_of_mujoco_models():
+    lines = (RESULTS / "mujoco-summaries/table.md").read_text().splitlines()
+    cells = [[cell.strip().strip("`") for cell in line.strip("|").split("|")] for line in lines]
+    assert_printed([*lines])
+    found = {tuple(own[:3]): dict(zip(cells[0][3:], own[3:], strict=True)) for own in cells[2:]}
+    recordings = lambda *key: (
+        f"{float(found[key]['truth found']) * int(found[key]['recordings']):.0f} of " + (found[key]["recordings"])
+    )
+    error = lambda *key: found[key]["error, median (worst 10th)"].split()[0]
+    assert recordings("all", "right", "samples") == recordings("all", "wrong", "samples")
+    others = [recordings("all", box, name) for name in ("cross-correlation", "spectrum") for box in ("right", "wrong")]
+    spectra = [100 * float(found["all", box, "spectrum"]["90 % intervals hold"]) for box in ("right", "wrong")]
+    half = [found["puck", "right", name]["half-width"] for name in ("learnt", "samples")]
+    seconds = [float(found["puck", "right", name]["s"]) for name in ("learnt", "samples")]
+    assert 4 < seconds[0] / seconds[1] < 5 and 2 * float(half[0]) < float(half[1])
+    correlations = [error("arm", box, "cross-correlation") for box in ("right", "wrong")]
+    held = [
+        float(own["90 % intervals hold"])
+        for (name, _, summary), own in found.items()
+        if name == "furuta" and summary in ("samples", "cross-correlation")
+    ]
+    delay = {}  # half-widths of the arm's fifth parameter, in widths of its box, which is 0.04 s
+    for summary in ("samples", "spectrum"):
+        draws = arrays(f"mujoco-summaries/arm-right-{summary}")["draws"][..., 4]
+        low, high = np.quantile(draws, [0.05, 0.95], axis=1)
+        delay[summary] = np.median(high - low) / 2 / 0.04
+    assert_printed(
+        [
+            f"It finds the truth in {recordings('all', 'right', 'samples')} recordings from either box",
+            f"{correlations[0]} and {correlations[1]} against {error('arm', 'right', 'samples')}",
+            "cross-correlations in {} and {}, spectra in {} and {}".format(*others),
+            f"Their intervals hold {spectra[0]:.0f} and {spectra[1]:.0f} % of truths",
+            f"{half[0]} against {half[1]}, and hold all truths",
+            f"the truth is found in {recordings('puck', 'right', 'cross-correlation')} recordings",
+            f"has a half-width of {delay['spectrum']:.3f} from the right box in place of {delay['samples']:.3f}",
+            f"hold {100 * min(held):.0f} to {100 * max(held):.0f} % of truths by samples and correlations",
+        ]
+    )
+
+
 def test_what_survives():
     found = {}
     for name in ("kills", "adversities"):

@@ -112,6 +112,30 @@ def test_several_sets_share_the_axes_in_looks_of_their_own(tmp_path):
     assert imread(path).shape[1] == round(40 * figure.get_size_inches()[0])
 
 
+def test_points_have_their_intervals():
+    """A point that is called as a set looks like it; one interval reaches far beyond the draws, another is unknown."""
+    sets = {"posterior": DRAWS, "run": DRAWS + 0.1}
+    far = (np.array([9.0, 0.9, 0.8]), np.array([[8.0, 40.0], [np.nan, np.nan], [0.7, 0.85]]))
+    points = {"run": ((2.0, 0.5, 0.6), [[1.5, 3.0], [0.4, 0.55], [0.3, 0.65]]), "other": far}
+    figure = plot.pairs(sets, names=NAMES, log=[True, False, False], points=points)
+    grid = panels(figure)
+    near, other = marked(grid[2, 0], "point")
+    np.testing.assert_allclose(near.get_xydata(), [[np.log(2.0), 0.6]])
+    np.testing.assert_allclose(other.get_xydata(), [[np.log(9.0), 0.8]])
+    ends = [line.get_xydata() for line in marked(grid[2, 0], "interval")]
+    np.testing.assert_allclose(ends[0], [[np.log(1.5), 0.6], [np.log(3.0), 0.6]])
+    np.testing.assert_allclose(ends[1], [[np.log(2.0), 0.3], [np.log(2.0), 0.65]])
+    np.testing.assert_allclose(ends[2], [[np.log(8.0), 0.8], [np.log(40.0), 0.8]])
+    assert np.log(40.0) < grid[2, 0].get_xlim()[1]
+    assert np.isnan(marked(grid[2, 1], "interval")[2].get_xdata()).all()
+    heights = [line.get_ydata()[0] for line in marked(grid[0, 0], "point")]
+    assert len(set(heights)) == 2 and max(heights) < grid[0, 0].get_ylim()[1]
+    assert legend(figure) == ["posterior", "run", "contours: 50, 80, 95 % of the draws", "other"]
+    posterior, run, _, last = figure.legends[0].get_lines()
+    assert [posterior.get_marker(), run.get_marker(), last.get_marker()] == ["None", "D", "s"]
+    assert run.get_color() == near.get_color() != other.get_color() == last.get_color()
+
+
 @pytest.mark.parametrize("place", [0.0, 3.0, -1e-6])
 def test_draws_that_do_not_vary_are_in_sight(place):
     axes = panels(plot.pairs(np.full((30, 2), place)))[1, 0]
@@ -146,6 +170,14 @@ WRONG = {
     "bounds": ({"support": ([0, 0], [1, 1])}, r"support low: expected shape \[3\]"),
     "unknown bound": ({"support": ([0, 0, np.nan], [1, 1, 1])}, "support low: expected finite numbers, got"),
     "reversed": ({"support": (BOX[1], BOX[0])}, "support: expected low < high, got"),
+    "points": ({"points": TRUTH}, "points: expected estimates by label, got"),
+    "a point": ({"points": {"a": np.zeros(3)}}, r"points\['a'\]: expected an estimate and its intervals, got"),
+    "intervals": ({"points": {"a": (np.ones(3), np.ones(3))}}, r"points\['a'\]: expected intervals of shape \[3, 2\]"),
+    "infinite": ({"points": {"a": (np.ones(3), np.full((3, 2), np.inf))}}, "finite or NaN, got"),
+    "many points": (
+        {"points": {str(i): (np.ones(3), np.ones((3, 2))) for i in range(8)}},
+        "points: expected up to 8 labels in all, got 9",
+    ),
     "log": ({"log": (True,)}, r"log: expected names of parameters or 3 booleans, got \(True,\)"),
     "log of none": ({"log": ("mass",)}, r"log: expected names of parameters or 3 booleans, got \('mass',\)"),
     "unknown log": ({"names": NAMES, "log": ("mass",)}, "log: expected some of stiffness, .*, got mass"),

@@ -1,12 +1,15 @@
 """`jaxlfi mujoco`: its commands on a run's folder, and whatever is refused, in one line."""
 
 import csv
+import dataclasses
 import json
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
+import scipy.optimize
 
 pytest.importorskip("mujoco")
 
@@ -15,7 +18,8 @@ from envs_mujoco import ARM, recorded
 from PIL import Image
 from small import whole_runs  # noqa: F401
 
-from jaxlfi.envs.mujoco import commands, config, least_squares
+from jaxlfi.envs.mujoco import commands, config, least_squares, sysid_point
+from jaxlfi.envs.mujoco.sysid_point import SysidPoint
 from tests.envs.mujoco.test_film import renderer  # noqa: F401
 
 CONFIG = """
@@ -110,6 +114,62 @@ def test_what_a_fit_says(runs):
     assert "Residuals are 1.00 times the noise" in lines and '\n"angle" = { deviation = ' in lines
     alone = "\n".join(commands.said(task, [best, changed[1]]))
     assert not any(word in alone for word in ("as well", "bound", "told apart"))
+
+
+def test_the_picture_has_intervals_of_all_points(runs, tmp_path, monkeypatch):
+    """Two points that are as good, one that is not, and the one of mujoco.sysid."""
+    task = config.read(runs / "arm.toml")
+    best = dataclasses.replace(least_squares.fit(task, [0.1, 1.2]), misfit=1.0)
+    second, worse = (
+        dataclasses.replace(best, theta=np.array([0.2, 2.0]), misfit=misfit, covariance=covariance)
+        for misfit, covariance in ((1.05, np.diag([1e3, 1e3])), (9.0, best.covariance))  # nearly all outside of Phi
+    )
+    other = SysidPoint(np.array([0.3, 1.0]), 4.0, np.array([[0.2, 0.4], [np.nan, np.nan]]), np.zeros(2, bool), 9)
+    drawn, pairs = {}, commands.plot.pairs
+    monkeypatch.setattr(
+        commands.plot, "pairs", lambda *sets, **given: drawn.update(given, sets=sets) or pairs(*sets, **given)
+    )
+    commands.draw(tmp_path / "pairs.png", task, [best, second, worse], other, np.full((30, 2), 0.5))
+    (sets,) = drawn["sets"]
+    assert list(sets) == ["posterior", "point 1, 90 %", "point 2, 90 %"]
+    assert list(drawn["points"]) == ["point 1, 90 %", "point 2, 90 %", "mujoco.sysid, 90 %"]
+    np.testing.assert_array_equal(drawn["points"]["point 2, 90 %"][0], [0.2, 2.0])
+    np.testing.assert_array_equal(drawn["points"]["mujoco.sysid, 90 %"][1], other.interval)
+    commands.draw(tmp_path / "alone.png", task, [best])
+    assert list(drawn["points"]) == ["point 1, 90 %"] and (tmp_path / "alone.png").exists()
+
+
+def test_the_point_of_sysid_beside(runs, tmp_path, capsys):
+    """It starts in the middle of the first guess, and its interval is that of ordinary least squares."""
+    try:
+        sysid_point.require_sysid()
+    except ImportError:
+        pytest.skip("needs mujoco[sysid], of the extra bench")
+    words = ("fit", runs / "arm.toml", "--sysid", "--starts", 4, "--keep", 1, "--out", tmp_path / "fit")
+    assert mujoco(*words) == 0
+    assert "mujoco.sysid, from the middle of the first guess" in capsys.readouterr().out
+    found = json.loads((tmp_path / "fit/fit.json").read_text())["mujoco.sysid"]
+    task = config.read(runs / "arm.toml")
+    residuals = least_squares.Residuals(task)
+    low, high = (np.asarray(bound, float) for bound in (task.inference.feasible.low, task.inference.feasible.high))
+    solved = scipy.optimize.least_squares(
+        lambda x: residuals(x[None])[0], [np.log(0.1), 1.75], lambda x: residuals.jacobian(x, low, high), (low, high)
+    )
+    np.testing.assert_allclose(found["theta"], [np.exp(solved.x[0]), solved.x[1]], rtol=1e-3)
+    variance = np.sum(solved.fun**2) / (len(solved.fun) - 2) * np.linalg.inv(solved.jac.T @ solved.jac)
+    reach = 1.66 * np.sqrt(np.diagonal(variance))  # Student's t of 99 degrees of freedom
+    expected = solved.x + np.outer([-1, 1], reach)
+    np.testing.assert_allclose(found["interval"][0], np.exp(expected[:, 0]), rtol=2e-3)
+    np.testing.assert_allclose(found["interval"][1], expected[:, 1], rtol=2e-3)
+    assert found["at_bound"] == [False, False] and found["misfit"] == pytest.approx(np.sqrt(np.mean(solved.fun**2)))
+
+
+def test_without_sysid_it_says_what_to_install(runs, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "mujoco.sysid", types.ModuleType("mujoco.sysid"))  # as MuJoCo alone brings it
+    assert mujoco("fit", runs / "arm.toml", "--sysid", "--out", tmp_path / "fit") == 2
+    error = capsys.readouterr().err
+    assert "points of mujoco.sysid need its packages: pip install 'mujoco[sysid]'" in error and error.count("\n") == 1
+    assert not (tmp_path / "fit").exists()
 
 
 # -------------------------------------------------------------------------------------------------- what is refused

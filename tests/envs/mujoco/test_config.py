@@ -2,6 +2,7 @@
 
 import csv
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -71,6 +72,17 @@ def test_another_recording_in_its_place(folder):
     assert both.observation.shape == (103, 1)
 
 
+def test_a_summary_by_its_name(folder):
+    """Of the file, and in its place."""
+    path = folder / "arm.toml"
+    path.write_text('summary = "spectrum"\n' + CONFIG)
+    shape = lambda task: task.summary(jnp.asarray(task.observation)).shape
+    assert shape(read(path)) == (12,)
+    assert shape(registry.load(f"mujoco,config={path},summary=samples")) == (30,)
+    learnt = registry.load(f"mujoco,config={path},summary=learnt")
+    assert shape(learnt) == (101,) and learnt.settings["embedding"] == "series"
+
+
 def test_without_a_file_it_says_what_it_needs(capsys):
     assert cli.main(["tasks", "mujoco"]) == 2
     assert "config: expected a TOML file that describes a task, as mujoco,config=arm.toml" in capsys.readouterr().err
@@ -95,6 +107,8 @@ def test_without_a_file_it_says_what_it_needs(capsys):
         ("feasible = [0.001, 1]", "feasible = [0, 1]", "expected positive bounds for the log parameters"),
         ("joint/elbow/damping", "joint/elbo/damping", "expected a joint such as elbow, got 'elbo'"),
         ('"shoulder/qpos"', '"wrist/qpos"', "expected a joint such as "),
+        ('model = "arm.xml"', 'model = "arm.xml"\nsummary = "spectra"', "summary: expected one of .*, got 'spectra'"),
+        ('model = "arm.xml"', 'model = "arm.xml"\nsummary = 3', "summary: expected a str, got 3"),
         ("[initial]", "[initial", "expected a TOML file, got a missing or damaged one"),
     ],
 )
