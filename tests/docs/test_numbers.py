@@ -57,8 +57,8 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     "line",
     [
         line
-        for task in ("lotka_volterra", "gaussian_linear")
-        for line in widths.table(RESULTS / "widths" / task / "misspecified+edge").splitlines()[2:]
+        for folder in sorted((RESULTS / "widths").glob("*/*"))
+        for line in widths.table(folder).splitlines()[2:]
     ],
 )
 def test_widths(line):
