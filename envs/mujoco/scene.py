@@ -204,14 +204,14 @@ def fitted(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]], aspect: float) 
 def _places(motions: Sequence[tuple[mujoco.MjModel, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """How far geoms are from their mean places over time, and corners of boxes about them and what is near; [n, 3]."""
     model = motions[0][0]
-    data, places, turns = mujoco.MjData(model), [], []
+    data, places, orientations = mujoco.MjData(model), [], []
     for own, positions in motions:
         for qpos in positions[:: -(-len(positions) // POSES)]:
             place(own, data, qpos)
             places.append(data.geom_xpos.copy())
-            turns.append(data.geom_xmat.reshape(-1, 3, 3).copy())
+            orientations.append(data.geom_xmat.reshape(-1, 3, 3).copy())
     local = model.geom_aabb[:, None, :3] + _CORNERS * model.geom_aabb[:, None, 3:]
-    corners = np.array(places)[:, :, None] + np.einsum("tgij,gkj->tgki", np.array(turns), local)
+    corners = np.array(places)[:, :, None] + np.einsum("tgij,gkj->tgki", np.array(orientations), local)
     moves = model.body_weldid[model.geom_bodyid] != 0
     if not moves.any():
         raise ValueError("model: expected a geom that moves, got none: there is nothing to film")

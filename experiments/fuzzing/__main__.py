@@ -23,7 +23,7 @@ from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
-from experiments.fuzzing.running import Ended, fuzz, workshop
+from experiments.fuzzing.running import Ended, fuzz, prepared_folder
 from jaxlfi.io import files
 from jaxlfi.runs.folder import environment
 
@@ -48,7 +48,7 @@ def main() -> None:
         parser.error("expected at least one case, and no negative numbers")
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, resource.getrlimit(resource.RLIMIT_AS)[1]))
     console, began, every = Console(stderr=True), time.monotonic(), []
-    with workshop(arguments.keep) as root:
+    with prepared_folder(arguments.keep) as root:
         prepared = time.monotonic() - began
         numbers = range(arguments.first, arguments.first + arguments.cases)
         for one in fuzz(root, arguments.seed, track(numbers, "cases", console=console)):

@@ -49,7 +49,7 @@ class Ended:
 
 
 @contextlib.contextmanager
-def workshop(keep: Path | None = None) -> Iterator[Path]:
+def prepared_folder(keep: Path | None = None) -> Iterator[Path]:
     """A temporary folder with good files; at the end it goes to `keep`, or away."""
     root = Path(tempfile.mkdtemp(prefix="jaxlfi-fuzzing-")).resolve()
     try:
@@ -62,7 +62,7 @@ def workshop(keep: Path | None = None) -> Iterator[Path]:
 
 
 def fuzz(root: Path, seed: int, numbers: Iterable[int]) -> Iterator[Ended]:
-    """Run cases in a workshop, and say of each how it ended."""
+    """Run cases in a prepared folder, and say of each how it ended."""
     with sped_up():
         least = forget()
         for number in numbers:

@@ -12,7 +12,7 @@ pytest.importorskip("mujoco")
 from experiments.fuzzing import judging
 from experiments.fuzzing.cases import made
 from experiments.fuzzing.judging import Case, judged
-from experiments.fuzzing.running import HERE, fuzz, workshop
+from experiments.fuzzing.running import HERE, fuzz, prepared_folder
 from experiments.fuzzing.words import RIGHT, flags_of
 from jaxlfi.cli import commands
 from tests.small import whole_runs  # noqa: F401 - a fixture
@@ -22,7 +22,7 @@ CASES = 500
 
 @pytest.fixture(scope="module")
 def root(whole_runs):  # noqa: F811 - the fixture
-    with workshop() as folder:
+    with prepared_folder() as folder:
         yield folder
 
 
