@@ -260,14 +260,19 @@ def same(text: str, value: float) -> bool:
     return abs(float(text) - value) <= 0.51 * 10.0**-digits
 
 
-SIM2SIM = [row for row in rows("sim2sim") if row["truths"] in ("inside", "outside")]
+SIM2SIM = {"sim2sim": "## The whip: known truth", "sim2sim-learnt": "**Known truths.**"}
+"""Where the results of a folder are printed."""
 
 
-@pytest.mark.parametrize("row", SIM2SIM, ids=lambda row: "-".join((row["detector"], row["truths"], row["support"])))
-def test_sim2sim(row):
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [(name, row) for name in SIM2SIM for row in rows(name) if row["truths"] in ("inside", "outside")],
+    ids=lambda given: given if isinstance(given, str) else "-".join(map(given.get, ("detector", "truths", "support"))),
+)
+def test_sim2sim(name, row):
     """Errors as printed are the table's."""
     label = {"fixed": "fixed", "edge": "EDGE"}[row["support"]]
-    section = README[README.index("## The whip: known truth") :]
+    section = README[README.index(SIM2SIM[name]) :]
     section = section[section.index(f"| {row['detector']} | 20 inside") :]
     section = section if row["truths"] == "inside" else section[section.index("| 8 outside") :]
     cells = [cell.strip() for cell in section[section.index(f"| {label} |") :].split("|")[2:6]]
