@@ -6,8 +6,10 @@ adds cannot be taken for another argument.
 
 import argparse
 import math
+import os
 import textwrap
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from jaxlfi.fields import Declared
@@ -59,6 +61,11 @@ def seed(text: str) -> int:
     if not 0 <= number < 2**63:
         raise argparse.ArgumentTypeError(f"expected a number from 0 to 2^63 - 1, got {textwrap.shorten(text, 40)!r}")
     return number
+
+
+def output(text: str) -> Path:
+    """Where results go. Steps to a parent are taken, so that no folder is made that the path only passes through."""
+    return Path(os.path.relpath(os.path.realpath(text))) if ".." in Path(text).parts else Path(text)
 
 
 def by_field(families: Families) -> dict[str, dict[str, Declared]]:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxlfi import flags
 from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import OneLineParser
 from jaxlfi.envs.mujoco import require_mujoco
@@ -51,7 +52,9 @@ def parser() -> argparse.ArgumentParser:
     )
     film.add_argument("--camera", metavar="NAME", help="of the model (default: a view that shows the whole motion)")
     film.add_argument("--episode", type=int, default=0, metavar="N", help="of several recordings, from 0 (default: 0)")
-    film.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .gif, beside it a new .png")
+    film.add_argument(
+        "--out", type=flags.output, required=True, metavar="FILE", help="a new .gif, beside it a new .png"
+    )
 
     fit = commands.add_parser(
         "fit",
@@ -68,7 +71,7 @@ def parser() -> argparse.ArgumentParser:
     fit.add_argument("--keep", type=_count, default=4, metavar="N", help="the best of them to follow (default: 4)")
     fit.add_argument(
         "--out",
-        type=Path,
+        type=flags.output,
         metavar="DIR",
         help="a new folder: fit.json and pairs.png, a pair plot of posterior and points (default: print only)",
     )

@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help="a model of its errors: clean, mask, noisy, transporter, learnt or learnt-transporter (default: clean)",
     )
-    render.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    render.add_argument("--out", type=flags.output, required=True, metavar="DIR", help="a new folder")
 
     plan = commands.add_parser(
         "plan",
@@ -72,7 +72,9 @@ def parser() -> argparse.ArgumentParser:
         description="Search for actions that hit the top cube only, by the cross-entropy method.",
     )
     _add_scene(plan)
-    plan.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .npz: actions, value, history")
+    plan.add_argument(
+        "--out", type=flags.output, required=True, metavar="FILE", help="a new .npz: actions, value, history"
+    )
 
     deploy = commands.add_parser(
         "deploy",
@@ -92,7 +94,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_detector(deploy)
     deploy.add_argument("--repetitions", type=int, default=16, metavar="N", help="places (default: 16)")
     deploy.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="seed of places and noise (default: 0)")
-    deploy.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    deploy.add_argument("--out", type=flags.output, required=True, metavar="DIR", help="a new folder")
 
     control = commands.add_parser(
         "control",
@@ -132,7 +134,9 @@ def parser() -> argparse.ArgumentParser:
     control.add_argument(
         "--seed", type=flags.seed, default=0, metavar="N", help="of a reference object's camera (default: 0)"
     )
-    control.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .npz, beside it a new .json")
+    control.add_argument(
+        "--out", type=flags.output, required=True, metavar="FILE", help="a new .npz, beside it a new .json"
+    )
 
     options.add(commands)
 

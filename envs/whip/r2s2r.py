@@ -19,6 +19,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from jaxlfi import flags
 from jaxlfi.cli import parser as command_line
 from jaxlfi.cli import train
 from jaxlfi.cli.exit_status import exit_status
@@ -58,7 +59,9 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--object", required=True, metavar="NAME", help="dlo-0, dlo-1, dlo-2 or dlo-3")
-    top.add_argument("--out", type=Path, required=True, metavar="DIR", help="a folder, new or of the same command")
+    top.add_argument(
+        "--out", type=flags.output, required=True, metavar="DIR", help="a folder, new or of the same command"
+    )
     top.add_argument("--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)")
     top.add_argument("--preset", choices=("quick", "paper"), default="quick", help="of all stages (default: quick)")
     top.add_argument("--seed", type=int, default=0, metavar="N", help="of all stages (default: 0)")

@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--domain", nargs="+", required=True, metavar="DOMAIN", help="what to evaluate on; several: each")
     top.add_argument("--episodes", type=int, default=128, metavar="N", help="on each domain (default: 128)")
     top.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="of the points and episodes (default: 0)")
-    top.add_argument("--out", type=Path, metavar="FILE", help="a new .csv, a row for each policy and domain")
+    top.add_argument("--out", type=flags.output, metavar="FILE", help="a new .csv, a row for each policy and domain")
     top.add_argument("--debug", action="store_true", help="show where an error came from")
     return top
 

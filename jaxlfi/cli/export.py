@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxlfi import flags
 from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import OneLineParser
 
@@ -36,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("policy", type=Path, metavar="POLICY", help="a policy.npz, or the folder of its training")
     top.add_argument("--format", choices=SUFFIXES, default="numpy", help="of the file (default: numpy)")
-    top.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new file")
+    top.add_argument("--out", type=flags.output, required=True, metavar="FILE", help="a new file")
     top.add_argument("--debug", action="store_true", help="show where an error came from")
     return top
 

@@ -242,7 +242,7 @@ def _add_sample(commands: Commands) -> None:
     command.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="seed of the draws (default: 0)")
     command.add_argument(
         "--out",
-        type=Path,
+        type=flags.output,
         metavar="FILE",
         help="a new .csv or .npz file, or .nc for ArviZ's InferenceData (default: samples.csv in the folder)",
     )
@@ -281,7 +281,10 @@ def _add_diagnose(commands: Commands) -> None:
         'headings, or an .npz with an array "theta"',
     )
     command.add_argument(
-        "--out", type=Path, metavar="DIR", help="a new folder for the results (default: diagnostics in the run's)"
+        "--out",
+        type=flags.output,
+        metavar="DIR",
+        help="a new folder for the results (default: diagnostics in the run's)",
     )
     _add_executor(command)
     _add_machine(command)
@@ -367,7 +370,9 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         "files: recordings of one object, each under its own actions, believed together (short for "
         "TASK,object=NAME;NAME)",
     )
-    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results")
+    command.add_argument(
+        "--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results"
+    )
     command.add_argument(
         "--method",
         choices=METHODS,

@@ -62,7 +62,9 @@ def parser() -> argparse.ArgumentParser:
         help="an environment's name, such as whip, or module:factory; NAME,key=value sets options",
     )
     top.add_argument("--domain", nargs="+", required=True, metavar="DOMAIN", help="what to train on; several: each")
-    top.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the results")
+    top.add_argument(
+        "--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results"
+    )
     top.add_argument("--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)")
     top.add_argument("--seeds", type=int, default=1, metavar="N", help="trainings of each domain (default: 1)")
     top.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first one's seed (default: 0)")

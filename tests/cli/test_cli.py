@@ -8,13 +8,14 @@ import subprocess
 import sys
 import time
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import factories, plugins
+from jaxlfi import factories, flags, plugins
 from jaxlfi.bayessim import memory
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
@@ -500,3 +501,13 @@ def test_default_configurations_are_the_matrix_of_the_paper():
     assert asked.default_configurations(gaussian()) == [
         "ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre",
     ]  # fmt: skip
+
+
+def test_no_folder_is_made_that_a_path_only_passes_through(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert flags.output("runs/a/../b") == Path("runs/b")
+    assert flags.output("../b") == Path("../b")
+    (tmp_path / "elsewhere/inner").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("elsewhere/inner")
+    assert flags.output("link/../b") == Path("elsewhere/b")
+    assert flags.output("link/b") == Path("link/b")

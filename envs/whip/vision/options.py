@@ -48,7 +48,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     pictures.add_argument(
         "--seed", type=flags.seed, default=0, metavar="N", help="of everything that is random (default: 0)"
     )
-    pictures.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    pictures.add_argument("--out", type=flags.output, required=True, metavar="DIR", help="a new folder")
 
     imported = commands.add_parser(
         "import-pictures",
@@ -70,7 +70,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar="THEIRS=OURS",
         help="what their classes are called here: rope=dlo; background for those that are to be ignored",
     )
-    imported.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    imported.add_argument("--out", type=flags.output, required=True, metavar="DIR", help="a new folder")
 
     train = commands.add_parser(
         "train-vision",
@@ -100,7 +100,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     train.add_argument(
         "--seed", type=flags.seed, default=0, metavar="N", help="of everything that is random (default: 0)"
     )
-    train.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder, or one to go on with")
+    train.add_argument(
+        "--out", type=flags.output, required=True, metavar="DIR", help="a new folder, or one to go on with"
+    )
 
     export = commands.add_parser(
         "export-vision",
@@ -113,7 +115,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     export.add_argument(
         "--weights", type=Path, metavar="DIR", help="by train-vision (default: those that come with the package)"
     )
-    export.add_argument("--out", type=Path, required=True, metavar="FILE", help="a new .onnx, or .npz of StableHLO")
+    export.add_argument(
+        "--out", type=flags.output, required=True, metavar="FILE", help="a new .onnx, or .npz of StableHLO"
+    )
 
     record = commands.add_parser(
         "record",
@@ -129,7 +133,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     record.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="of the camera and the scene's look")
     record.add_argument(
         "--out",
-        type=Path,
+        type=flags.output,
         required=True,
         metavar="FILE",
         help="the recording, a new .npz; its description is written beside it as .json",
