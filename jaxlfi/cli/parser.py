@@ -451,10 +451,14 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
     runs, processes = _runs(arguments), arguments.joined.count
     if runs > 1:
         # The same batch on the same number of devices repeats bit for bit.
-        devices = _recorded(arguments).get("devices") or min(host_devices.processors() * processes, runs)
+        devices = _recorded(arguments).get("devices")
+        if not isinstance(devices, int) or not 1 <= devices <= MAX_DEVICES:
+            devices = min(host_devices.processors() * processes, runs)
         host_devices.divide(math.ceil(devices / processes))
 
 
+MAX_DEVICES = 1024
+"""Maximum number of devices that a folder may ask for: a damaged one asks for any."""
 TYPICAL_CONFIGURATIONS = 6
 """Of a comparison that names none: three supports, and one of them with three heuristics."""
 

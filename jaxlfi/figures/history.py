@@ -206,6 +206,8 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     trajectory = _trajectory(observation.get("trajectory"))
     times = _times(observation.get("times"), trajectory)
     x = observation.get("x")
+    if x is not None and x.ndim != 1:
+        raise ValueError(f"{folder / 'observation.npz'}: expected x of one dimension, got shape {x.shape}")
     obs = 0 if x is None else len(x)
     counted, failure = arrays["counted"].astype(bool), arrays["failure"]
     return History(
@@ -310,12 +312,15 @@ def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise ValueError(f"{path}: expected finite bounds with {name}_low below {name}_high, got others")
     for name, shape in {
-        "sample_theta_error": (rounds, None, dim),
-        "sample_trajectory_error": (rounds, None),
+        "sample_theta_error": (rounds, "samples", dim),
+        "sample_trajectory_error": (rounds, "samples"),
+        "attempted": (rounds,),
+        "failed": (rounds, "reasons"),
+        "seconds": (rounds,),
     }.items():
         got = arrays[name].shape if name in arrays else shape
-        if len(got) != len(shape) or any(s not in (None, g) for s, g in zip(shape, got, strict=True)):
-            raise ValueError(f"{path}: expected {name} of shape {shape}, got {got}".replace("None", "samples"))
+        if len(got) != len(shape) or any(s != g for s, g in zip(shape, got, strict=True) if isinstance(s, int)):
+            raise ValueError(f"{path}: expected {name} of shape {shape}, got {got}".replace("'", ""))
 
 
 def _optional(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
@@ -347,7 +352,7 @@ def _rows(array: np.ndarray | None, columns: int) -> np.ndarray | None:
 
 def _x_scale(dataset: Mapping[str, np.ndarray], obs: int) -> np.ndarray | None:
     """Standard deviations of the summaries of the first round that has any."""
-    if not {"x", "round"} <= dataset.keys() or not dataset["round"].size:
+    if not {"x", "round"} <= dataset.keys() or not dataset["round"].size or dataset["round"].ndim != 1:
         return None
     if dataset["x"].shape != (dataset["round"].size, obs):
         return None

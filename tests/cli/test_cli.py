@@ -192,6 +192,14 @@ def test_a_grid_has_as_many_devices_as_it_was_begun_with(tmp_path, monkeypatch):
     assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=7"
 
 
+@pytest.mark.parametrize("damaged", ["7", {}, -7, 0, None, 10**9, 1.5])
+def test_a_damaged_number_of_devices_is_not_asked_for(damaged, tmp_path, monkeypatch):
+    atomic.write_json(tmp_path / "config.json", {"format": grid.GRID, "axes": [{}], "devices": damaged})
+    monkeypatch.setenv("XLA_FLAGS", "")
+    cli.prepare_jax(cli.parser().parse_args(["resume", str(tmp_path), "--no-cache"]))
+    assert os.environ["XLA_FLAGS"] in ("", "--xla_force_host_platform_device_count=2")  # of one core, or more
+
+
 def test_report_refuses_a_grid_that_is_not_finished(tmp_path, capsys):
     atomic.write_json(tmp_path / "config.json", {"format": grid.GRID, "version": run_store.VERSION})
     assert "expected a finished grid, found no grid.npz" in error_line(capsys, "report", tmp_path)

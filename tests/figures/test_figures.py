@@ -941,6 +941,8 @@ SPOILED = {
         spoil_array("sample_theta_error", lambda v: v[0]),
         "expected sample_theta_error of shape",
     ),
+    "wrong numbers of simulations": (spoil_array("attempted", lambda v: v[None]), "expected attempted of shape (2,)"),
+    "wrong summary": (lambda f: change(f, "observation.npz", lambda a: a.update(x=np.zeros(()))), "expected x of one"),
     "no rounds": (spoil_array("theta", lambda v: v[:0]), "at least one round"),
     "pickles": (spoil_array("theta", lambda v: np.array([{}], dtype=object)), "expected a whole .npz"),
     "texts": (spoil_array("logits", lambda v: v.astype("S3")), "expected numbers, got texts as logits"),
