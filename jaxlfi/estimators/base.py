@@ -25,9 +25,6 @@ from jaxlfi.fields import Checked, check_fields, hyperparameter, option
 FIT_DRAWS = 1000
 """Number of draws of a density that its mixture of Gaussians is fitted to."""
 
-MAX_COUNT = 10**6
-"""Maximum number of networks, and of Gaussians in each: the size of their mixture remains a 64-bit number."""
-
 SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jnp.cos(jnp.pi * progress))}
 """The learning rate's factor at a point of progress through the round's fitting, by name."""
 
@@ -75,8 +72,8 @@ class Estimator(Checked, abc.ABC):
     clip_norm: Float[Array, "*batch"] | float = hyperparameter(
         math.inf, above=0.0, high=math.inf, help="norm the gradients are clipped to; inf: not clipped"
     )
-    components: int = option(4, low=1, high=MAX_COUNT, help="Gaussians K in each network's mixture")
-    ensemble_size: int = option(1, low=1, high=MAX_COUNT, help="networks in the ensemble")
+    components: int = option(4, low=1, high=1_000_000, help="Gaussians K in each network's mixture")
+    ensemble_size: int = option(1, low=1, high=1_000_000, help="networks in the ensemble")
     epochs: int = option(1000, low=0, help="full passes over the data each round")
     steps: int = option(0, low=0, help="gradient steps each round, in place of epochs")
     batch_size: int = option(100, low=1, help="simulations in a minibatch")
