@@ -175,7 +175,7 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
     if not (out / "curves.png").exists():  # the last of its files
         steps = [] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)]
         preset = ["--preset", arguments.preset, "--first-seed", str(arguments.seed)]
-        begun = (out / "config.json").exists()
+        begun = _begun(out)
         _command(
             command_line.main if begun else train.main,
             ["resume", str(out)]
@@ -184,6 +184,14 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
             f"a policy on {domain}",
         )
     return next(out.glob("*/seed_*/policy.npz"))
+
+
+def _begun(out: Path) -> bool:
+    """Whether a stage's folder is there. Where it is not, what a kill left of the making of one goes."""
+    begun = (out / "config.json").exists()
+    for left in () if begun else out.parent.glob(f".{out.name}-*"):
+        shutil.rmtree(left)
+    return begun
 
 
 def _whip(arguments: argparse.Namespace) -> str:
@@ -219,7 +227,7 @@ def _infer(arguments: argparse.Namespace, rollouts: Sequence[Path], out: Path) -
     if not (out / "report.html").exists():  # the last of its files
         words = ["infer", _whip(arguments), "--object", *map(str, rollouts), "--heuristic", arguments.heuristic]
         words += ["--preset", arguments.preset, "--first-seed", str(arguments.seed), "--out", str(out)]
-        begun = (out / "config.json").exists()
+        begun = _begun(out)
         _command(command_line.main, ["resume", str(out)] if begun else words, f"what {arguments.object} may be")
         if not (out / "report.html").exists():  # it was stopped while it drew its pictures
             _command(command_line.main, ["report", str(out)], "its pictures")

@@ -148,7 +148,8 @@ def kills(
         one(undisturbed, undisturbed.blows[order[undisturbed.command.name][place]], KILLS_PER_TRIAL)
     for undisturbed in all_undisturbed:
         name = undisturbed.command.name
-        done = {(str(row["window"]), row["moment"]) for row in rows if row["command"] == name}
+        own = [row for row in rows if row["command"] == name and row["how"] == IN_A_WINDOW]
+        done = {(str(row["window"]), row["moment"]) for row in own}
         for blow in undisturbed.blows if name in every else ():
             if (str(blow.window), blow.moment) not in done:
                 one(undisturbed, blow, 1)

@@ -85,7 +85,12 @@ def _table(
     of_budget: Sequence[Row], measure, best, digits: int, settings: Sequence[str], methods: Sequence[str]
 ) -> list[str]:
     values = {
-        (method, setting): [measure(row) for row in of_budget if (row["method"], row["setting"]) == (method, setting)]
+        (method, setting): [
+            measure(row)
+            for row in of_budget
+            # A likelihood's posterior has no density of its own: such a measure is not one that failed.
+            if (row["method"], row["setting"]) == (method, setting) and (row["note"] or measure(row) is not None)
+        ]
         for method in methods
         for setting in settings
     }

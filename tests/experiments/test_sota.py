@@ -124,9 +124,10 @@ def test_tables_have_means_deviations_counts_and_the_best():
         row("mg1", "npe", 0, error="3.0", ranks="1 2 3", inside="2", log_prob="-1"),
         row("mg1", "apt", 0, error="1.5", ranks="1 2 3", inside="1", log_prob="-4"),
         row("mg1", "npe", 0, simulations="10000", error="0.25"),
-        row("mg1", "npe", 1, simulations="10000"),
+        row("mg1", "npe", 1, simulations="10000", note="TimeoutError: gave up"),
+        row("two_moons", "snle", 0, c2st="0.7", seconds="9"),
     ]
-    text = rows.tables(kept, ["two_moons", "mg1", "gaussian_linear"], ["npe", "apt", "sbi-apt"])
+    text = rows.tables(kept, ["two_moons", "mg1", "gaussian_linear"], ["npe", "apt", "sbi-apt", "snle"])
     first = [line for line in text.splitlines() if line.startswith("|")]
     assert first[:4] == [
         "| method | `two_moons` | `mg1` |",
@@ -135,6 +136,7 @@ def test_tables_have_means_deviations_counts_and_the_best():
         "| `apt` | **0.65** (1) | **1.50** (1) |",
     ]
     assert first[4] == "| `sbi-apt` | nothing (0 of 1) |  |"
+    assert "nothing (0 of 1)" not in "".join(line for line in first if "snle" in line)  # which has no density
     assert "| `npe` | **-1.00** (1) |" in first and "| `apt` | 0.33 (1) |" in first and "| `npe` | 2 ± 0 (2) |" in first
     assert text.index("1,000 simulations") < text.index("10,000 simulations")
     assert first[-1] == "| `npe` | **0.25** (1 of 2) |"
