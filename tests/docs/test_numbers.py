@@ -515,6 +515,26 @@ def test_summaries_of_mujoco_models():
     )
 
 
+def test_ten_thousand_bad_inputs():
+    found = json.loads((RESULTS / "fuzzing/fuzzing.json").read_text())
+    names = {
+        "refused": "refused in one line",
+        "works": "worked",
+        "accepted": "accepted, up to the work itself",
+        "traceback": "traceback",
+        "vague": "a line that does not say what was expected",
+        "changed": "a folder made outside of the output",
+    }
+    assert found["outcomes"].keys() == names.keys() and sum(found["outcomes"].values()) == 10_000
+    slowest, memory = found["slowest"]["seconds"], found["most_memory_gib"]
+    assert_printed(
+        [
+            *(f"| {names[name]} | {count:,} |" for name, count in found["outcomes"].items()),
+            f"The slowest case took {slowest} s, and the most memory was {memory:.1f} GiB",
+        ]
+    )
+
+
 def test_what_survives():
     found = {}
     for name in ("kills", "adversities"):

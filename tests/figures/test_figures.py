@@ -961,6 +961,15 @@ def test_damaged_folders_are_refused_in_one_line(tmp_path, spoil, message):
     assert not (folder / "report.html").exists()
 
 
+def test_simulations_whose_rounds_are_of_another_shape_give_no_scale(tmp_path):
+    folder = write_run(tmp_path / "run", rounds=2)
+    arrays = {"x": np.zeros((8, len(load(folder).x))), "round": np.repeat([0, 1], 4)}
+    np.savez(folder / "dataset.npz", **arrays)
+    assert load(folder).x_scale is not None
+    np.savez(folder / "dataset.npz", **arrays | {"round": np.repeat([0, 1], 4)[:, None]})
+    assert load(folder).x_scale is None
+
+
 def test_missing_and_empty_folders_are_refused(tmp_path):
     with pytest.raises(ValueError, match="expected a run folder, found none"):
         report(tmp_path / "nowhere")
