@@ -140,7 +140,15 @@ class Partition:
     def _part(self, tree: Any, index: int) -> Any:
         import jax
 
-        return jax.tree.map(lambda leaf: leaf[self._rows[index]], tree)
+        rows = self._rows[index]
+
+        def part(leaf: Any) -> Any:
+            if not jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+                return leaf[rows]
+            # A key checker takes the choice of rows of keys for their use: the last run may be among them twice.
+            return jax.random.wrap_key_data(jax.random.key_data(leaf)[rows])
+
+        return jax.tree.map(part, tree)
 
 
 def join(coordinator: str, index: int | None = None, count: int | None = None) -> Processes:

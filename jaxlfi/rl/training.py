@@ -100,7 +100,7 @@ def begin(plan: Plan, out: Path, processes: Processes = ALONE) -> None:
     points = POOL if plan.settings.redrawn else plan.settings.environments
     drawn = []
     for name, seed in names:
-        key_trained, key_held_out, *_ = _keys(seed)
+        key_trained, key_held_out, *_ = _keys(jax.random.key(seed))
         drawn.append((plan.domains[name](key_trained, points), plan.domains[name](key_held_out, HELD_OUT)))
     arrays = {
         "trained": np.stack([np.asarray(domain.theta) for domain, _ in drawn]),
@@ -152,7 +152,10 @@ def resumed(
         raise StoreError(f"{out}: expected a training of {environment.name}, got one of {config['environment_name']}")
     points = _read(out / "domains.npz") if processes.writes else dict.fromkeys(("trained", "held_out"), 0)
     trained, held_out = processes.broadcast((points["trained"], points["held_out"]))
-    _, _, learning, evaluating = (jnp.stack(keys) for keys in zip(*(_keys(seed) for _, seed in names), strict=True))
+    # By their numbers, as a key checker takes a stack of keys for their use.
+    seeds = np.stack([jax.random.key_data(jax.random.key(seed)) for _, seed in names])
+    keys = jax.vmap(_keys)(jax.random.wrap_key_data(jnp.asarray(seeds)))
+    learning, evaluating = keys[:, 2], keys[:, 3]
 
     partition = Partition(processes, len(names), jax.local_device_count())
     mesh = Mesh(np.asarray(jax.local_devices()[: partition.devices]), ("trainings",))
@@ -240,9 +243,9 @@ def finished(out: Path) -> bool:
     return (out / "table.csv").exists()
 
 
-def _keys(seed: int) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Keys of a seed: of the points trained on, of those held out, of the training, of the evaluation."""
-    return tuple(jax.random.split(jax.random.key(seed), 4))
+def _keys(key: jax.Array) -> jax.Array:
+    """Keys of a training: of the points trained on, of those held out, of the training, of the evaluation."""
+    return jax.random.split(key, 4)
 
 
 def _start(environment: Environment, settings: PPO, key: jax.Array, theta: jax.Array) -> Training:

@@ -87,7 +87,7 @@ def test_what_it_leaves(finished):
 def test_the_table_is_that_of_the_saved_policies(finished):
     """The policies' files, in a plain loop over NumPy's numbers, earn what the table says."""
     out, result = finished
-    theta, start = np.asarray(result.outcomes["theta"][1]), jax.random.split(training._keys(5)[3], 128)
+    theta, start = np.asarray(result.outcomes["theta"][1]), jax.random.split(training._keys(jax.random.key(5))[3], 128)
     policy = load(out / "uniform/seed_005/policy.npz").require("line", LINE.observations, LINE.actions)
     for i in range(0, 128, 16):
         gain, target = theta[i]
