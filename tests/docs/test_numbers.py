@@ -537,14 +537,15 @@ def test_ten_thousand_bad_inputs():
 
 def test_what_survives():
     found = {}
-    for name in ("kills", "adversities"):
+    for name in ("kills", "adversities", "kills-r2s2r"):
         with (RESULTS / f"reliability/{name}.csv").open(newline="") as file:
             found[name] = list(csv.DictReader(file))
     kills = found["kills"]
     assert f"{len({row['trial'] for row in kills})} trials with {len(kills)} kills" in README
     assert f"{len(found['adversities'])} other adversities" in README
+    kills += found["kills-r2s2r"]
     assert all(row["result"] == "same bits" for row in kills)
-    names = {name: f"`{name}`" for name in ("infer", "compare", "grid", "train")} | {
+    names = {name: f"`{name}`" for name in ("infer", "compare", "grid", "train", "r2s2r")} | {
         "dask": "`infer` on a Dask cluster"
     }
     for name, words in names.items():
