@@ -91,6 +91,16 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(autouse=True, scope="module")
+def own_devices():
+    """Commands say by variables how many devices the processor is: processes of later files are not to see them."""
+    kept = {name: os.environ.get(name) for name in ("XLA_FLAGS", "NPROC")}
+    yield
+    for name, value in kept.items():
+        os.environ.pop(name, None)
+        os.environ.update({} if value is None else {name: value})
+
+
+@pytest.fixture(autouse=True, scope="module")
 def compiling(request: pytest.FixtureRequest):
     """Compile without most optimisations, but for modules that set `OPTIMISED`; forget programs once they are many."""
     jax.config.update("jax_disable_most_optimizations", not getattr(request.module, "OPTIMISED", False))

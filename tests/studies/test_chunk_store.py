@@ -70,7 +70,7 @@ def test_a_computation_that_stops_leaves_what_it_had_done(tmp_path):
 
 def test_where_another_process_writes_the_same_chunks_are_computed(tmp_path):
     """The one that writes says which are there."""
-    other = mock.Mock(writes=False, agreed=lambda done: np.array([1]))
+    other = mock.Mock(writes=False, broadcast=lambda done: np.array([1]))
     one, asked = store(tmp_path), []
     one.compute(lambda items: asked.append(items.start) or squares(items), other)
     assert asked == [0, 8] and one.done() == []
