@@ -1,7 +1,8 @@
-"""What the library depends on, with licences and last releases: `python -m experiments.dependencies`.
+"""What the library depends on, with licences and last releases: `python -m experiments.dependencies --index URL`.
 
 It prints the table of docs/dependencies.md: requirements and reasons from pyproject.toml, licences from the installed
-packages, versions and dates of the last releases from the package index that PIP_INDEX_URL names.
+packages, versions and dates of the last releases from a package index: the address that pip would be given by
+`--index-url`, of an index that answers in JSON. Where PIP_INDEX_URL is set, that one is the default.
 """
 
 import argparse
@@ -15,7 +16,6 @@ from importlib import metadata
 from pathlib import Path
 
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
-INDEX = "https://pypi.org/simple"
 SIMPLE = "application/vnd.pypi.simple.v1+json"
 SELF = ("test", "bench", "docs", "dev")
 """Extras for who works on the library or its experiments."""
@@ -84,9 +84,9 @@ def licence(name: str) -> str:
     return next((spdx for spdx, pattern in LICENCES.items() if re.search(pattern, declared)), "not declared")
 
 
-def last_release(name: str) -> tuple[str, str]:
-    """Version and day of the last release."""
-    address = f"{os.environ.get('PIP_INDEX_URL', INDEX).rstrip('/')}/{re.sub(r'[-_.]+', '-', name).lower()}/"
+def last_release(name: str, index: str) -> tuple[str, str]:
+    """Version and day of the last release that a package index has."""
+    address = f"{index.rstrip('/')}/{re.sub(r'[-_.]+', '-', name).lower()}/"
     with urllib.request.urlopen(urllib.request.Request(address, headers={"Accept": SIMPLE}), timeout=60) as answer:
         files = json.load(answer)["files"]
     final = [file for file in files if re.fullmatch(r"[0-9.]+(\.post\d+)?", version(file["filename"]))]
@@ -103,10 +103,13 @@ def version(file: str) -> str:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.parse_args()
+    parser.add_argument("--index", default=os.environ.get("PIP_INDEX_URL"), metavar="URL", help="of the package index")
+    arguments = parser.parse_args()
+    if not arguments.index:
+        parser.error("--index: expected the address of a package index, as PIP_INDEX_URL is not set")
     print("| package | needed | for | licence | last release | why |\n|---|---|---|---|---|---|")
     for one in dependencies():
-        last, day = last_release(one.name)
+        last, day = last_release(one.name, arguments.index)
         extras = ", ".join(f"`{extra}`" for extra in one.extras) or "everything"
         cells = one.name, one.needed, extras, licence(one.name), f"{last}, {day}", one.why
         print(f"| {' | '.join(cells)} |", flush=True)

@@ -34,7 +34,7 @@ def measured(requirement: str, statement: str, folder: Path) -> dict[str, object
     subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-compile", requirement], check=True)
     megabytes = (size(folder) - before) / 1e6
     timed = [python, "-c", TIMED.format(statement)]
-    # Where Python is told to keep no bytecode, every process would compile what it imports.
+    # With PYTHONDONTWRITEBYTECODE set, each process would compile the imported modules, and that would be timed, too.
     keeping = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     runs = [subprocess.run(timed, check=True, capture_output=True, env=keeping) for _ in range(REPETITIONS + 1)]
     seconds = [float(run.stdout) for run in runs[1:]]

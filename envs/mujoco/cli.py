@@ -53,7 +53,11 @@ def parser() -> argparse.ArgumentParser:
     film.add_argument("--camera", metavar="NAME", help="of the model (default: a view that shows the whole motion)")
     film.add_argument("--episode", type=int, default=0, metavar="N", help="of several recordings, from 0 (default: 0)")
     film.add_argument(
-        "--out", type=flags.output, required=True, metavar="FILE", help="a new .gif, beside it a new .png"
+        "--out",
+        type=flags.output,
+        required=True,
+        metavar="FILE",
+        help="the film, a new .gif; six frames of it are written to a .png of the same name",
     )
 
     fit = commands.add_parser(
@@ -76,7 +80,9 @@ def parser() -> argparse.ArgumentParser:
         help="a new folder: fit.json and pairs.png, a pair plot of posterior and points (default: print only)",
     )
     fit.add_argument(
-        "--sysid", action="store_true", help="the point of mujoco.sysid beside them (pip install 'mujoco[sysid]')"
+        "--sysid",
+        action="store_true",
+        help="also find the point estimate of mujoco.sysid (pip install 'mujoco[sysid]')",
     )
     return top
 

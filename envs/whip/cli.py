@@ -135,7 +135,11 @@ def parser() -> argparse.ArgumentParser:
         "--seed", type=flags.seed, default=0, metavar="N", help="of a reference object's camera (default: 0)"
     )
     control.add_argument(
-        "--out", type=flags.output, required=True, metavar="FILE", help="a new .npz, beside it a new .json"
+        "--out",
+        type=flags.output,
+        required=True,
+        metavar="FILE",
+        help="the recording, a new .npz; its description is written to a .json of the same name",
     )
 
     options.add(commands)

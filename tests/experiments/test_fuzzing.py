@@ -79,8 +79,8 @@ def test_a_file_made_elsewhere_is_found_and_removed(root, monkeypatch, place):
     assert not os.path.lexists(here / place)
 
 
-def test_files_below_out_are_its_own():
-    strayed = functools.partial(judging.strayed, {}, root=judging.Path("/root"), here=judging.Path("/root/here"))
+def test_files_below_out_are_its_own(tmp_path):
+    strayed = functools.partial(judging.strayed, {}, root=tmp_path, here=tmp_path / "here")
     assert strayed({"here": "", "here/out": "", "here/out/x": ""}, words=("infer", "--out=out")) == []
     assert strayed({"here/outer": ""}, words=("infer", "--out", "out")) == ["here/outer"]
     assert strayed({"here/own/run/x": ""}, words=("infer", "--out", "out")) == ["here/own/run/x"]
