@@ -64,7 +64,7 @@ def seed(text: str) -> int:
 
 
 def output(text: str) -> Path:
-    """Where results go. Steps to a parent are taken, so that no folder is made that the path only passes through."""
+    """The path of results. `..` is resolved, so that no folder is created that the path only passes through."""
     return Path(os.path.relpath(os.path.realpath(text))) if ".." in Path(text).parts else Path(text)
 
 

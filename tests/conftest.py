@@ -92,7 +92,7 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture(autouse=True, scope="module")
 def own_devices():
-    """Commands say by variables how many devices the processor is: processes of later files are not to see them."""
+    """Restore the variables by which commands set the number of devices: later files start processes, too."""
     kept = {name: os.environ.get(name) for name in ("XLA_FLAGS", "NPROC")}
     yield
     for name, value in kept.items():

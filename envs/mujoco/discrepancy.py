@@ -47,17 +47,17 @@ class Discrepancy:
         """Independent draws of its values at increasing times, exact for any intervals."""
         keep = np.exp(-np.diff(times) / self.time)
         values = rng.standard_normal((n, len(times)))
-        for t, share in enumerate(keep, start=1):
-            values[:, t] = share * values[:, t - 1] + np.sqrt(1 - share**2) * values[:, t]
+        for t, decay in enumerate(keep, start=1):
+            values[:, t] = decay * values[:, t - 1] + np.sqrt(1 - decay**2) * values[:, t]
         return self.deviation * values
 
     def draw(self, key: jax.Array, times: Float[np.ndarray, " time"]) -> Float[Array, " time"]:
-        """One such draw, inside of compiled programs."""
+        """The same for one draw, in JAX: it can be compiled and mapped."""
         keep = np.exp(-np.diff(times, prepend=-np.inf) / self.time)  # nothing of what was before the first one
 
         def following(before, inputs):
-            share, fresh = inputs
-            value = share * before + jnp.sqrt(1 - share**2) * fresh
+            decay, fresh = inputs
+            value = decay * before + jnp.sqrt(1 - decay**2) * fresh
             return value, value
 
         fresh = jax.random.normal(key, times.shape)

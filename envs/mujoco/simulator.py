@@ -259,5 +259,5 @@ def simulator_of(task: Task) -> Simulator:
 def between(grid: np.ndarray, values: Array | np.ndarray, times: np.ndarray) -> Array | np.ndarray:
     """Values [..., steps, C] at other times, linearly between steps. Works on JAX's arrays and on NumPy's."""
     after = np.clip(np.searchsorted(grid, times - 1e-9), 1, len(grid) - 1)
-    share = np.clip((times - grid[after - 1]) / (grid[after] - grid[after - 1]), 0.0, 1.0)[:, None]
-    return (1 - share) * values[..., after - 1, :] + share * values[..., after, :]
+    fraction = np.clip((times - grid[after - 1]) / (grid[after] - grid[after - 1]), 0.0, 1.0)[:, None]
+    return (1 - fraction) * values[..., after - 1, :] + fraction * values[..., after, :]

@@ -176,6 +176,8 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
         steps = [] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)]
         preset = ["--preset", arguments.preset, "--first-seed", str(arguments.seed)]
         begun = _begun(out)
+        if not begun:
+            _remove_leftovers(out)
         _command(
             command_line.main if begun else train.main,
             ["resume", str(out)]
@@ -187,11 +189,14 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
 
 
 def _begun(out: Path) -> bool:
-    """Whether a stage's folder is there. Where it is not, what a kill left of the making of one goes."""
-    begun = (out / "config.json").exists()
-    for left in () if begun else out.parent.glob(f".{out.name}-*"):
+    """Whether a stage has begun."""
+    return (out / "config.json").exists()
+
+
+def _remove_leftovers(out: Path) -> None:
+    """Remove the temporary folders of a stage that was killed while its folder was created."""
+    for left in out.parent.glob(f".{out.name}-*"):
         shutil.rmtree(left)
-    return begun
 
 
 def _whip(arguments: argparse.Namespace) -> str:
@@ -228,6 +233,8 @@ def _infer(arguments: argparse.Namespace, rollouts: Sequence[Path], out: Path) -
         words = ["infer", _whip(arguments), "--object", *map(str, rollouts), "--heuristic", arguments.heuristic]
         words += ["--preset", arguments.preset, "--first-seed", str(arguments.seed), "--out", str(out)]
         begun = _begun(out)
+        if not begun:
+            _remove_leftovers(out)
         _command(command_line.main, ["resume", str(out)] if begun else words, f"what {arguments.object} may be")
         if not (out / "report.html").exists():  # it was stopped while it drew its pictures
             _command(command_line.main, ["report", str(out)], "its pictures")

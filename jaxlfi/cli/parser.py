@@ -458,7 +458,7 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
 
 
 MAX_DEVICES = 1024
-"""Maximum number of devices that a folder may ask for: a damaged one asks for any."""
+"""Maximum number of devices that is taken from a folder's record, which may be damaged."""
 TYPICAL_CONFIGURATIONS = 6
 """Of a comparison that names none: three supports, and one of them with three heuristics."""
 

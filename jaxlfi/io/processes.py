@@ -145,7 +145,7 @@ class Partition:
         def part(leaf: Any) -> Any:
             if not jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
                 return leaf[rows]
-            # A key checker takes the choice of rows of keys for their use: the last run may be among them twice.
+            # As raw data: jax's key-reuse checker counts the indexing of keys as their use, since rows may repeat.
             return jax.random.wrap_key_data(jax.random.key_data(leaf)[rows])
 
         return jax.tree.map(part, tree)
@@ -177,7 +177,7 @@ def join(coordinator: str, index: int | None = None, count: int | None = None) -
         )
     except (RuntimeError, ValueError) as error:
         raise ValueError(f"coordinator: expected to join the other processes at {coordinator}, got: {error}") from error
-    jax.local_devices()  # later jax makes them together: all processes are to ask before any of them works or ends
+    jax.local_devices()  # jax 0.12 initialises those of all processes together: before any of them works or exits
     return Processes(_state().process_id, _state().num_processes)
 
 

@@ -152,7 +152,7 @@ def resumed(
         raise StoreError(f"{out}: expected a training of {environment.name}, got one of {config['environment_name']}")
     points = _read(out / "domains.npz") if processes.writes else dict.fromkeys(("trained", "held_out"), 0)
     trained, held_out = processes.broadcast((points["trained"], points["held_out"]))
-    # By their numbers, as a key checker takes a stack of keys for their use.
+    # Stacked as raw data: jax's key-reuse checker counts the stacking of keys as their use.
     seeds = np.stack([jax.random.key_data(jax.random.key(seed)) for _, seed in names])
     keys = jax.vmap(_keys)(jax.random.wrap_key_data(jnp.asarray(seeds)))
     learning, evaluating = keys[:, 2], keys[:, 3]

@@ -254,6 +254,7 @@ def test_what_a_kill_left_of_the_making_of_a_stage_goes(tmp_path):
     for name in (".policy-x1", ".policy_0-x2", "policy"):
         (tmp_path / name).mkdir()
     assert not r2s2r._begun(tmp_path / "policy")
+    r2s2r._remove_leftovers(tmp_path / "policy")
     assert sorted(path.name for path in tmp_path.iterdir()) == [".policy_0-x2", "policy"]
     (tmp_path / "policy" / "config.json").write_text("{}")
     assert r2s2r._begun(tmp_path / "policy")
