@@ -144,7 +144,8 @@ def read_sealed(path: Path) -> dict[str, np.ndarray]:
     """
     arrays = read_arrays(path)
     seal = arrays.pop(SEAL, None)
-    if not np.array_equal(seal, _seal(arrays)):
+    expected = _seal(arrays)
+    if seal is None or seal.dtype != expected.dtype or not np.array_equal(seal, expected):
         raise ValueError(f"{path}: expected the arrays as they were written, got others")
     return arrays
 
