@@ -66,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
         description="Follow the best of some draws to points of least squares, by Gauss-Newton steps, and take the "
         "integrator's own error off. Prints each point with 90 % intervals, which points explain the recording as "
         "well as the best, which parameters are hardly told apart or on a bound of Phi, and what the model gets "
-        "wrong, as a table [discrepancy] for the task's file.",
+        "wrong, as unmodelled_force and a table [discrepancy] for the task's file.",
     )
     fit.add_argument(
         "source", metavar="RUN|CONFIG", help="folder of a run, to start from its posterior; or a TOML file, from Phi"

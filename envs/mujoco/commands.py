@@ -131,7 +131,8 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
         f"Residuals are {best.misfit:.2f} times the noise; of a model without error they would be 1. "
         f"The integrator's own error is {best.defect:.2f} times the noise, and is taken off."
     )
-    lines.append("What the model gets wrong, for the file of the task:\n\n[discrepancy]")
+    lines.append("What the model gets wrong, for the file of the task; the first line goes above its tables:\n")
+    lines.append(f"unmodelled_force = {best.unmodelled_force:.2g}\n\n[discrepancy]")
     for name, one in zip(simulator_of(task).signals, best.discrepancies, strict=True):
         lines.append(f'"{name}" = {{ deviation = {one.deviation:.2g}, time = {one.time:.2g} }}')
     return lines

@@ -4,6 +4,7 @@ model = "pendulum.xml"              # beside this file
 log = ["swing.csv"]                 # recordings, one for each episode
 measured = ["angle"]                # by default all signals but the controls
 summary = "samples"                 # what the network sees of them (`jaxlfi.envs.mujoco.summaries`)
+unmodelled_force = 0.02             # forces that the model lacks, as a fraction of those that act on each joint
 
 [parameters."joint/hinge/damping"]
 support = [0.001, 0.01]             # Theta_0
@@ -42,6 +43,7 @@ KEYS: Mapping[str, type] = {
     "log": list,
     "measured": list,
     "summary": str,
+    "unmodelled_force": float,
     "parameters": dict,
     "noise": dict,
     "initial": dict,
@@ -86,6 +88,7 @@ def read(
             {name: _discrepancy(name, table) for name, table in config.get("discrepancy", {}).items()},
             {label: _guess(label, table) for label, table in config.get("supports", {}).items()},
             summary=summary or config.get("summary", "samples"),
+            unmodelled_force=config.get("unmodelled_force", 0.0),
             engine=engine,
             name=config.get("name", path.stem),
         )
@@ -107,7 +110,7 @@ def load(path: Path) -> dict[str, Any]:
     for name, value in config.items():
         if name not in KEYS:
             raise ValueError(f"{path}: expected keys among {', '.join(KEYS)}, got {name!r}")
-        if not isinstance(value, KEYS[name]):
+        if not isinstance(value, int | float if KEYS[name] is float else KEYS[name]) or isinstance(value, bool):
             raise ValueError(f"{path}: {name}: expected a {KEYS[name].__name__}, got {value!r}")
     for name in ("model", "parameters"):
         if not config.get(name):

@@ -5,7 +5,9 @@ recording allows. The interval of a point takes its residuals as they are: where
 wrong model do, they count as fewer samples than they are (the sandwich estimator of White, 1980, with the covariance
 that `discrepancy.estimated` reads off the residuals). What residuals cannot show is an error that the parameters make
 up for, as a pendulum's damping does for an integrator that damps. The integrator's own error is known, however: the
-point is found again with the difference that a finer one makes there (defect correction; Stetter, 1978).
+point is found again with the difference that a finer one makes there (defect correction; Stetter, 1978). And forces
+that the model lacks (`forces`) are taken to be as large in the directions that parameters make up for as in those that
+residuals show.
 """
 
 import dataclasses
@@ -16,12 +18,16 @@ import scipy.optimize
 from jaxtyping import Bool, Float
 
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs.mujoco import forces
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy, estimated
+from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.tasks.task import Task
 
 STEP = 1e-4
 """Of central differences, as a fraction of the box's width."""
+FORCE_STEP = 1e-3
+"""Of differences by forces, as a fraction of those that act on a joint."""
 CORRECTIONS = 2
 """How often the point is found again with the integrator's error there."""
 _NOISELESS = 1e-3
@@ -43,6 +49,8 @@ class Fit:
         interval: 90 % interval of each parameter, in natural units, within the box; shape [D, 2].
         at_bound: which parameters ended on a bound of the box, shape [D].
         discrepancies: of each signal: what the model, by its own integrator, gets wrong at the point.
+        unmodelled_force: how large forces besides the model's own would leave such residuals, those of its own
+            integrator, as a fraction of what acts on each joint at the centre of Theta_0.
         defect: root mean square of what the integrator adds at the point, in standard deviations of the noise.
         simulations: that were needed.
     """
@@ -53,6 +61,7 @@ class Fit:
     interval: Float[np.ndarray, "dim 2"]
     at_bound: Bool[np.ndarray, " dim"]
     discrepancies: tuple[Discrepancy, ...]
+    unmodelled_force: float
     defect: float
     simulations: int
 
@@ -110,6 +119,18 @@ class Residuals:
         distance = np.diagonal(sides[: len(point)] - sides[len(point) :])
         return ((ahead - behind) / distance[:, None]).T
 
+    def of_forces(
+        self, point: Float[np.ndarray, " dim"], besides: UnmodelledForces
+    ) -> Float[np.ndarray, "rows numbers"]:
+        """What each of some forces besides the model's own changes at a point, by differences; 0 where one fails."""
+        steps = FORCE_STEP * np.diag(besides.deviations)
+        steps = np.concatenate([np.zeros((1, len(steps))), steps])
+        self.simulations += len(steps)
+        theta = self.natural(np.tile(point, (len(steps), 1)))
+        clean, failed = self.simulator.lacking(besides).clean(theta, steps)
+        changed = ((clean[1:] - clean[0]) / self.noise)[:, self.simulator.there] / FORCE_STEP
+        return np.where((failed[0] == 0) & (failed[1:, None] == 0), changed, 0.0).T
+
 
 def fit(task: Task, start: Sequence[float], box: Support | None = None, observation: np.ndarray | None = None) -> Fit:
     """The point of least squares that is reached from a start, by SciPy's trust-region method.
@@ -129,9 +150,13 @@ def fit(task: Task, start: Sequence[float], box: Support | None = None, observat
     for _ in range(CORRECTIONS):
         residuals.correct(found.x)
         found = _solved(residuals, found.x, low, high)
-    covariance = _sandwich(found.jac, _covariances(residuals, _discrepancies(residuals, found.fun)))
+    by_forces = residuals.of_forces(found.x, _typical_forces(task, residuals.natural(found.x)))
+    covariance = _covariances(residuals, _discrepancies(residuals, found.fun))
+    covariance += forces.estimated(found.fun, found.jac, by_forces) ** 2 * by_forces @ by_forces.T
+    covariance = _sandwich(found.jac, covariance)
     defect = (residuals.defect / residuals.noise)[residuals.simulator.there]
     discrepancies = _discrepancies(residuals, found.fun - defect)
+    force = forces.estimated(found.fun - defect, found.jac, by_forces)
     reach = 1.6449 * np.sqrt(np.diagonal(covariance))
     ends = np.clip(np.stack([found.x - reach, found.x + reach]), low, high)
     natural = residuals.natural(np.concatenate([found.x[None], ends]))
@@ -139,7 +164,9 @@ def fit(task: Task, start: Sequence[float], box: Support | None = None, observat
     at_bound = (found.x - low < margin) | (high - found.x < margin)
     misfit = float(np.sqrt(np.mean(found.fun**2)))
     added = float(np.sqrt(np.mean(defect**2)))
-    return Fit(natural[0], misfit, covariance, natural[1:].T, at_bound, discrepancies, added, residuals.simulations)
+    return Fit(
+        natural[0], misfit, covariance, natural[1:].T, at_bound, discrepancies, force, added, residuals.simulations
+    )
 
 
 def best_fits(
@@ -185,6 +212,14 @@ def _solved(
         bounds=(low, high),
         x_scale=high - low,
     )
+
+
+def _typical_forces(task: Task, point: Float[np.ndarray, " dim"]) -> UnmodelledForces:
+    """Those at the centre of Theta_0, as inference takes them; at a point where the centre cannot be simulated."""
+    simulator = simulator_of(task)
+    centre = np.asarray(task.space.to_natural(task.support().centre), float)
+    _, failed = simulator.clean(centre[None])
+    return simulator.typical_forces(point if failed[0] else centre)
 
 
 def _bounds(task: Task, box: Support | None) -> tuple[np.ndarray, np.ndarray]:

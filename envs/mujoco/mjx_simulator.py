@@ -5,14 +5,19 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco.mjx_effects import Held, biased, deviations, started
-from jaxlfi.envs.mujoco.mjx_models import Models, mjx
+from jaxlfi.envs.mujoco.mjx_models import LEAST_FRICTION, Models, mjx
 from jaxlfi.envs.mujoco.mjx_physics import Physics, State
 from jaxlfi.envs.mujoco.simulator import REFUSED, UNSTABLE, Simulator, between, simulator_of
 from jaxlfi.tasks.task import Task
+
+MOST = 4.0
+"""Standard deviations within which the forces that a model lacks are probed."""
 
 
 def by_mjx(task: Task) -> Task:
@@ -30,11 +35,28 @@ def by_mjx(task: Task) -> Task:
     native = simulator_of(task)
     nominal = np.asarray(task.space.to_natural(task.support().centre), float)
     try:
-        simulator = MjxSimulator(native, Models(native.build, task.names, nominal, task.feasible))
+        simulator = MjxSimulator(native, _models(native, task, nominal))
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"engine: expected native for what MJX cannot simulate, got mjx: {reason}") from error
     return dataclasses.replace(task, simulate=simulator)
+
+
+def _models(native: Simulator, task: Task, nominal: np.ndarray) -> Models:
+    """Models of parameters and, where there are any, of the forces that the model lacks."""
+    forces = native.forces
+    if forces is None:
+        return Models(native.build, task.names, nominal, task.feasible)
+    least, most = LEAST_FRICTION * (forces.friction > 0), MOST * forces.deviations
+
+    def build(numbers: np.ndarray) -> mujoco.MjModel:
+        model = native.made(numbers[: task.dim], numbers[task.dim :])
+        # MJX lays out its solver for the degrees of freedom that have friction: here always the same ones.
+        model.dof_frictionloss[:] = np.maximum(model.dof_frictionloss, least)
+        return model
+
+    box = Support(np.append(task.feasible.low, -most), np.append(task.feasible.high, most))
+    return Models(build, (*task.names, *forces.names), np.append(nominal, 0.0 * most), box)
 
 
 class MjxSimulator:
@@ -70,18 +92,28 @@ class MjxSimulator:
     ) -> tuple[Float[Array, "rows signals"], Int[Array, ""]]:
         """Measurements with their noise and discrepancies, and 0 or why the simulation failed."""
         native = self.native
-        key_noise, *keys = jax.random.split(key, 1 + len(native.discrepancies))
-        rows, outcome = self.clean(theta)
+        key_noise, key_forces, *keys = jax.random.split(key, 2 + len(native.discrepancies))
+        rows, outcome = self.clean(theta, self._drawn(key_forces))
         rows += deviations(native.does, theta, native.noise) * jax.random.normal(key_noise, rows.shape)
         for own, (signal, process) in zip(keys, native.discrepancies.items(), strict=True):
             each = zip(jax.random.split(own, len(native.times)), native.times, strict=True)
             rows = rows.at[:, signal].add(jnp.concatenate([process.draw(one, times) for one, times in each]))
         return jnp.where(native.there, rows, 0.0), outcome
 
-    def clean(self, theta: Float[Array | np.ndarray, " dim"]) -> tuple[Float[Array, "rows signals"], Int[Array, ""]]:
-        """Measurements without noise, and 0 or why the simulation failed; of one that failed they are zero."""
+    def clean(
+        self, theta: Float[Array | np.ndarray, " dim"], lacking: Float[Array, " numbers"] | None = None
+    ) -> tuple[Float[Array, "rows signals"], Int[Array, ""]]:
+        """Measurements without noise, and 0 or why the simulation failed; of one that failed they are zero.
+
+        Args:
+            theta: in natural units.
+            lacking: of the forces that the model lacks (`UnmodelledForces.add`); by default they are not there.
+        """
         native, theta = self.native, jnp.asarray(theta, jnp.float32)
-        numbers, refused = self._physics.models.numbers(theta)
+        if native.forces is not None and lacking is None:
+            lacking = jnp.zeros(len(native.forces.deviations))
+        given = theta if lacking is None else jnp.concatenate([theta, lacking])
+        numbers, refused = self._physics.models.numbers(given)
         episode = functools.partial(self._episode, self._physics.models.model(numbers))
         starts = jnp.stack([started(native.does, theta, start) for start in native.starts])
         values, stable = jax.vmap(episode)(starts, self._controls(theta))
@@ -89,6 +121,13 @@ class MjxSimulator:
         unstable = jnp.any(self._needed & ~stable)
         outcome = jnp.where(refused, REFUSED, jnp.where(unstable, UNSTABLE, 0))
         return jnp.where(outcome == 0, biased(native.does, theta, jnp.concatenate(rows)), 0.0), outcome
+
+    def _drawn(self, key: jax.Array) -> Float[Array, " numbers"] | None:
+        """The coefficients of the forces that the model lacks, of one simulation."""
+        if self.native.forces is None:
+            return None
+        deviations = jnp.asarray(self.native.forces.deviations, jnp.float32)
+        return deviations * jax.random.normal(key, deviations.shape)
 
     def _episode(
         self, model: mjx.Model, start: Float[Array, " state"], controls: Float[Array, "steps act"]

@@ -36,6 +36,7 @@ def mujoco_task(
     supports: Mapping[str, Mapping[str, tuple[float, float]]] | None = None,
     summary: str | Callable[[jax.Array], jax.Array] = "samples",
     threads: int | None = None,
+    unmodelled_force: float = 0.0,
     engine: Literal["native", "mjx"] = "native",
     **others: Any,
 ) -> Task:
@@ -58,6 +59,9 @@ def mujoco_task(
         supports: other first guesses by name: the bounds of some parameters, those of others being their `support`.
         summary: what the network sees, by its name (`summaries`); or as for `jaxlfi.Task`.
         threads: of simulations; by default as many as processors.
+        unmodelled_force: how large the forces may be that the model lacks, as a fraction of what acts on each joint at
+            the centre of Theta_0. Each simulation has springs, dampers and dry friction of its own, of that standard
+            deviation (`forces`); `least_squares` finds it.
         engine: "native" is MuJoCo on the processor's cores, in double precision; "mjx" is MuJoCo in JAX, in single
             precision and inside of compiled programs, where it can simulate the model (`mjx_simulator`).
         **others: of `jaxlfi.Task`.
@@ -91,7 +95,7 @@ def mujoco_task(
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
     simulator = Simulator(compiled, build, episodes, measured, deviations, starts, does, discrepancies, threads)
     others = {"name": spec.modelname or "mujoco"} | others
-    task = task_of(simulator, parameters, measured, summary, supports, **others)
+    task = task_of(simulator, parameters, measured, summary, supports, unmodelled_force, **others)
     if engine == "native":
         return task
     from jaxlfi.envs.mujoco.mjx_simulator import by_mjx  # MJX is not needed otherwise
@@ -105,9 +109,15 @@ def task_of(
     measured: Sequence[str],
     summary: str | Callable[[jax.Array], jax.Array] = "samples",
     guesses: Mapping[str, Mapping[str, tuple[float, float]]] | None = None,
+    unmodelled_force: float = 0.0,
     **others: Any,
 ) -> Task:
     """The task of a simulator; see `mujoco_task`."""
+    if not 0 <= unmodelled_force < np.inf:
+        raise ValueError(f"unmodelled_force: expected a fraction of at least 0, got {unmodelled_force!r}")
+    if unmodelled_force:
+        centre = np.array([_centre(one) for one in parameters])
+        simulator = simulator.lacking(simulator.typical_forces(centre).times(unmodelled_force))
     seen = summaries.fields(summary, simulator)
     others["settings"] = seen.pop("settings", {}) | dict(others.get("settings", {}))
     supports = {"initial": _box([one.support for one in parameters])}
@@ -131,6 +141,12 @@ def task_of(
         **seen,
         **others,
     )
+
+
+def _centre(parameter: Parameter) -> float:
+    """Of its bounds in Theta_0, in inference space, as a number in natural units."""
+    low, high = parameter.support
+    return float(np.sqrt(low * high)) if parameter.log else 0.5 * (low + high)
 
 
 def _guessed(parameters: Sequence[Parameter], label: str, bounds: Mapping[str, tuple[float, float]]) -> list[Parameter]:

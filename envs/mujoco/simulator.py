@@ -12,7 +12,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.envs.mujoco import measured
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
-from jaxlfi.envs.mujoco.effects import Effects
+from jaxlfi.envs.mujoco.effects import STATE, Effects
+from jaxlfi.envs.mujoco.forces import UnmodelledForces, typical
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.quiet import quietly
 from jaxlfi.io.host_devices import processors
@@ -41,6 +42,7 @@ class Simulator:
         actuators: names of the controls.
         places: of the signals among the model's sensor data, C of them.
         discrepancies: what the model gets wrong, by the signal's number.
+        forces: that the model lacks, if any are drawn (`lacking`).
         model, build, does, logs, starts: as they are given, below.
     """
 
@@ -78,6 +80,7 @@ class Simulator:
         self.units = tuple(measured.unit(model, name) for name in signals)
         self.noise = np.array([noise[name] for name in signals])
         self.discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
+        self.forces: UnmodelledForces | None = None
         self.actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
         rows = [self._measured_rows(log) for log in logs]
         self.times = [log.times[own] for log, own in zip(logs, rows, strict=True)]
@@ -123,6 +126,24 @@ class Simulator:
         finer.model, finer.build = sharpened(copy.copy(self.model)), lambda theta: sharpened(build(theta))
         return finer
 
+    def typical_forces(self, theta: Float[np.ndarray, " dim"]) -> UnmodelledForces:
+        """Springs, dampers and dry friction as strong as the forces on each joint in the simulated episodes.
+
+        Raises:
+            ValueError: for parameters whose model is unstable or refused.
+        """
+        _, failed = self.clean(theta[None])
+        if failed[0]:
+            raise ValueError(f"unmodelled_force: expected a model that can be simulated, got {FAILURES[failed[0] - 1]}")
+        episodes = [self.states(theta[None], episode)[2][0] for episode in range(len(self.logs))]
+        return typical(self.build(theta), np.concatenate(episodes), STATE)
+
+    def lacking(self, forces: UnmodelledForces) -> "Simulator":
+        """The same, every simulation with forces besides those of the model."""
+        other = copy.copy(self)
+        other.forces = forces
+        return other
+
     def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
         """Rows of a log with a sample of anything that is measured."""
         known = ", ".join(log.signals)
@@ -146,8 +167,8 @@ class Simulator:
     def __call__(
         self, rng: np.random.Generator, theta: Float[np.ndarray, "n dim"]
     ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
-        """Measurements with their noise and discrepancies, and 0 or why each simulation failed."""
-        clean, outcome = self.clean(theta)
+        """Measurements with their noise and what the model gets wrong, and 0 or why each simulation failed."""
+        clean, outcome = self.clean(theta, None if self.forces is None else self.forces.draws(rng, len(theta)))
         deviation = np.tile(self.noise, (len(theta), 1))
         for signal, d in self.does.deviations:
             deviation[:, signal] = theta[:, d]
@@ -157,15 +178,21 @@ class Simulator:
         return np.where(self.there, noisy, 0.0), outcome
 
     def clean(
-        self, theta: Float[np.ndarray, "n dim"]
+        self, theta: Float[np.ndarray, "n dim"], lacking: Float[np.ndarray, "n numbers"] | None = None
     ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
-        """Measurements without noise, and 0 or why each simulation failed; those that failed are zero."""
+        """Measurements without noise, and 0 or why each simulation failed; those that failed are zero.
+
+        Args:
+            theta: in natural units.
+            lacking: of the forces that the model lacks (`UnmodelledForces.add`); by default they are not there.
+        """
         theta = np.asarray(theta, float)
+        lacking = np.zeros((len(theta), 0)) if lacking is None else lacking
         rows, outcome = np.zeros((len(theta), *self.observation.shape)), np.zeros(len(theta), int)
         with _LOCK, quietly():
             for first in range(0, len(theta), CHUNK):
                 part = slice(first, first + CHUNK)
-                rows[part], outcome[part] = self._rolled(theta[part])
+                rows[part], outcome[part] = self._rolled(theta[part], lacking[part])
         for signal, d in self.does.biases:
             rows[:, :, signal] += theta[:, d, None]
         rows[outcome != 0] = 0.0
@@ -188,8 +215,8 @@ class Simulator:
             states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self.model), start, controls)
         return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
 
-    def _rolled(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        models = [self._made(row) for row in theta]
+    def _rolled(self, theta: np.ndarray, lacking: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        models = [self._made(*rows) for rows in zip(theta, lacking, strict=True)]
         outcome = np.array([0 if model else REFUSED for model in models])
         good = np.flatnonzero(outcome == 0)
         rows = np.zeros((len(theta), *self.observation.shape))
@@ -233,10 +260,19 @@ class Simulator:
         held = [log.mean_held(name, when, self.model.opt.timestep) for name in self.actuators]
         return np.stack(held, axis=-1) if held else np.zeros((len(theta), len(grid), 0))
 
-    def _made(self, theta: np.ndarray) -> mujoco.MjModel | None:
-        """A model of its own; None where MuJoCo refuses it, as for a body of negative mass."""
+    def made(self, theta: Float[np.ndarray, " dim"], lacking: Float[np.ndarray, " numbers"]) -> mujoco.MjModel:
+        """The model of a parameter vector with forces that it lacks, if there are any.
+
+        Raises:
+            ValueError: where MuJoCo refuses it, as for a body of negative mass.
+        """
+        model = self.build(theta)
+        return self.forces.add(model, lacking) if len(lacking) else model
+
+    def _made(self, theta: np.ndarray, lacking: np.ndarray) -> mujoco.MjModel | None:
+        """The same; None where MuJoCo refuses it."""
         try:
-            return self.build(theta)
+            return self.made(theta, lacking)
         except ValueError:
             return None
 

@@ -38,7 +38,7 @@ def from_sysid(
         units: by name.
         noise: standard deviations of the sensors' noise, by sensor or by its number, as "imu[2]". Of others it is
             estimated from the first sequence.
-        **others: of `mujoco_task`'s `summary` and `threads`, and of `jaxlfi.Task`.
+        **others: of `mujoco_task`'s `summary`, `threads` and `unmodelled_force`, and of `jaxlfi.Task`.
 
     Raises:
         ValueError: for names that are not known, and recordings that do not fit the model, in one line.
@@ -83,8 +83,10 @@ def from_sysid(
         for name, a, b in bounds
     ]
     summary, threads = others.pop("summary", "samples"), others.pop("threads", None)
+    unmodelled_force = others.pop("unmodelled_force", 0.0)
     simulator = Simulator(model, build, episodes, signals, deviations, sequences.initial_state, threads=threads)
-    return task_of(simulator, doubted, signals, summary, **{"name": sequences.name} | others)
+    others = {"name": sequences.name} | others
+    return task_of(simulator, doubted, signals, summary, unmodelled_force=unmodelled_force, **others)
 
 
 def _numbers(name: str, count: int) -> list[str]:

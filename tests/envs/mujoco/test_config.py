@@ -109,6 +109,8 @@ def test_without_a_file_it_says_what_it_needs(capsys):
         ('"shoulder/qpos"', '"wrist/qpos"', "expected a joint such as "),
         ('model = "arm.xml"', 'model = "arm.xml"\nsummary = "spectra"', "summary: expected one of .*, got 'spectra'"),
         ('model = "arm.xml"', 'model = "arm.xml"\nsummary = 3', "summary: expected a str, got 3"),
+        ('model = "arm.xml"', 'model = "arm.xml"\nunmodelled_force = -1', "expected a fraction of at least 0, got -1"),
+        ('model = "arm.xml"', 'model = "arm.xml"\nunmodelled_force = true', "expected a float, got True"),
         ("[initial]", "[initial", "expected a TOML file, got a missing or damaged one"),
     ],
 )
@@ -131,6 +133,7 @@ def test_other_first_guesses_and_what_the_model_gets_wrong(folder):
         + "[discrepancy]\nangle = { deviation = 0.5, time = 0.2 }\n"
     )
     task = registry.load(f"mujoco,config={folder / 'arm.toml'}")
+    assert task.simulate.function.forces is None
     np.testing.assert_allclose(task.supports["wide"].low, [0.001, 0])
     np.testing.assert_allclose(task.supports["wide"].high, [0.9, 0.1])
     theta = np.tile([0.03, 0.0], (400, 1))
@@ -140,6 +143,14 @@ def test_other_first_guesses_and_what_the_model_gets_wrong(folder):
     # A standard deviation of 0.5 within four sigma, and neighbours that persist: exp(-0.02 / 0.2) = 0.905.
     assert error[:, 50].std() == pytest.approx(np.hypot(0.5, 0.002), rel=4 / np.sqrt(800))
     assert np.corrcoef(error[:, 50], error[:, 51])[0, 1] == pytest.approx(np.exp(-0.1), abs=0.05)
+
+
+def test_forces_that_the_model_lacks(folder):
+    """A fraction of what acts on each joint at the centre of the box."""
+    (folder / "arm.toml").write_text("unmodelled_force = 1\n" + CONFIG)
+    task = registry.load(f"mujoco,config={folder / 'arm.toml'}")
+    expected = task.simulate.function.typical_forces(np.array([np.sqrt(0.01 * 0.2), 0.05]))
+    np.testing.assert_allclose(task.simulate.function.forces.deviations, expected.deviations)
 
 
 @pytest.mark.parametrize(

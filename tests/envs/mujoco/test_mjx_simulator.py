@@ -65,11 +65,13 @@ def part(log, first, last, without=()):
     return Log(log.times[first:last], signals, log.name)
 
 
-def example(name, several, *besides):
+def example(name, several, *besides, **others):
     """The task of an example, with more parameters and other recordings."""
     table = config.load(FOLDER / f"{name}.toml")
     parameters = [*config.parameters_of(table), *besides]
-    return mujoco_task(FOLDER / f"{name}.xml", parameters, several, noises=config.numbers(table, "noise"), engine="mjx")
+    return mujoco_task(
+        FOLDER / f"{name}.xml", parameters, several, noises=config.numbers(table, "noise"), engine="mjx", **others
+    )
 
 
 def drawn(task, count=3):
@@ -253,3 +255,18 @@ def test_engines_are_chosen_by_name(tmp_path, capsys):
     assert small.command("infer", f"{reference},engine=mjx", "--out", tmp_path / "run") == 2
     assert "engine: expected native for what MJX cannot simulate" in capsys.readouterr().err.replace("\n", " ")
     assert not (tmp_path / "run").exists()
+
+
+def test_forces_that_a_model_lacks():
+    """Springs, dampers and dry friction as MuJoCo simulates them; drawn anew for each simulation."""
+    task = example("arm", part(read(FOLDER / "arm.csv"), 0, 40), unmodelled_force=0.1)
+    native, theta = simulator_of(task), drawn(task)
+    numbers = native.forces.draws(np.random.default_rng(1), len(theta)).astype(np.float32)
+    rows, outcome = jax.jit(jax.vmap(task.simulate.clean))(theta, numbers)
+    expected, counted = native.clean(theta, numbers)
+    assert not counted.any() and not np.asarray(outcome).any()
+    np.testing.assert_allclose(rows, expected, atol=1e-3)
+    assert np.abs(expected - native.clean(theta)[0]).max() > 0.01
+    same = np.tile(theta[:1], (2, 1))
+    several, _ = jax.jit(jax.vmap(task.simulate))(jax.random.split(jax.random.key(0), 2), same)
+    assert np.abs(several[0] - several[1]).max() > 10 * native.noise.max()

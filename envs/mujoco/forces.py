@@ -1,0 +1,127 @@
+"""Forces that a model lacks: a spring, a damper and dry friction of random size on each joint.
+
+A random error of the measurements (`discrepancy`) shows how far a simulation is off, but not in which parameter's
+direction: what the parameters can make up for leaves no residual. An error of the forces acts as the parameters do. A
+force that is a function of a joint's position and speed is, to first order, a spring, a damper and dry friction; each
+simulation has them with coefficients of its own, drawn anew and not inferred, so that the posterior is that of the
+parameters whatever these were (as nuisance parameters are marginalised by simulating them; Cranmer, Brehmer and Louppe
+2020, doi:10.1073/pnas.1912789117).
+"""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import scipy.stats
+from jaxtyping import Float
+
+from jaxlfi.envs.mujoco.quiet import quietly
+
+SHOWN = 200
+"""States of each episode, at most, that typical forces are the mean over."""
+_SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+@dataclasses.dataclass(frozen=True)
+class UnmodelledForces:
+    """Standard deviations of what is added to a model, N numbers in SI units.
+
+    Attributes:
+        stiffness: of each joint's spring; 0 for balls and free bodies, shape [J].
+        damping: of each degree of freedom, shape [V].
+        friction: of each degree of freedom, shape [V].
+    """
+
+    stiffness: Float[np.ndarray, " joints"]
+    damping: Float[np.ndarray, " dofs"]
+    friction: Float[np.ndarray, " dofs"]
+
+    @property
+    def deviations(self) -> Float[np.ndarray, " numbers"]:
+        """All of them."""
+        return np.concatenate([self.stiffness, self.damping, self.friction])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the numbers, for messages."""
+        of = {"stiffness": self.stiffness, "damping": self.damping, "friction": self.friction}
+        return tuple(f"unmodelled {what}[{i}]" for what, several in of.items() for i in range(len(several)))
+
+    def times(self, factor: float) -> "UnmodelledForces":
+        """All larger by a factor."""
+        return UnmodelledForces(factor * self.stiffness, factor * self.damping, factor * self.friction)
+
+    def draws(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n numbers"]:
+        """Independent draws, normal about zero."""
+        return self.deviations * rng.standard_normal((n, len(self.deviations)))
+
+    def add(self, model: mujoco.MjModel, numbers: Float[np.ndarray, " numbers"]) -> mujoco.MjModel:
+        """The model with these forces besides its own, changed in place; damping and friction stay at least 0."""
+        stiffness, damping, friction = np.split(numbers, np.cumsum([len(self.stiffness), len(self.damping)]))
+        model.jnt_stiffness += stiffness
+        model.dof_damping[:] = np.maximum(model.dof_damping + damping, 0.0)
+        model.dof_frictionloss[:] = np.maximum(model.dof_frictionloss + friction, 0.0)
+        return model
+
+
+def typical(model: mujoco.MjModel, states: Float[np.ndarray, "steps state"], spec: mujoco.mjtState) -> UnmodelledForces:
+    """Springs, dampers and friction as strong as the forces of a motion: of one's root mean square each.
+
+    Args:
+        model: that moves.
+        states: in the course of the motion.
+        spec: what the states hold.
+    """
+    data, forces, places, speeds = mujoco.MjData(model), [], [], []
+    scalar = np.isin(model.jnt_type, _SCALAR)
+    own = model.jnt_qposadr[scalar]
+    with quietly():
+        for state in states[:: -(-len(states) // SHOWN)]:
+            mujoco.mj_setState(model, data, state, spec)
+            mujoco.mj_forward(model, data)
+            forces.append([data.qfrc_passive, data.qfrc_actuator, data.qfrc_bias, data.qfrc_constraint])
+            forces[-1] = np.sum(np.square(forces[-1]), axis=0)
+            places.append(data.qpos[own] - model.qpos_spring[own])
+            speeds.append(data.qvel.copy())
+    force, speed = np.sqrt(np.mean(forces, axis=0)), np.sqrt(np.mean(np.square(speeds), axis=0))
+    stiffness = np.zeros(model.njnt)
+    stiffness[scalar] = _ratio(force[model.jnt_dofadr[scalar]], np.sqrt(np.mean(np.square(places), axis=0)))
+    return UnmodelledForces(stiffness, _ratio(force, speed), force)
+
+
+def estimated(
+    residuals: Float[np.ndarray, " rows"],
+    jacobian: Float[np.ndarray, "rows dim"],
+    by_forces: Float[np.ndarray, "rows numbers"],
+) -> float:
+    """How large forces that a model lacks are, by what they leave in residuals that parameters cannot make up for.
+
+    By moments: with P the projection on what is orthogonal to the parameters' directions J, and F what forces of size 1
+    change, |P r|^2 is a^2 tr(P F F^T) + tr(P) in the mean.
+
+    So few directions may be visible that a is hardly known: it is enlarged by as much as 90 % intervals of Student's t
+    are wider than those of a normal distribution, for tr(M)^2 / tr(M^2) degrees of freedom with M = P F F^T P
+    (Satterthwaite 1946).
+
+    Args:
+        residuals: at a point of least squares, in standard deviations of the noise.
+        jacobian: of the parameters.
+        by_forces: F.
+
+    Returns:
+        a, at least 0.
+    """
+    directions, _, _ = np.linalg.svd(jacobian, full_matrices=False)
+    beside = lambda values: values - directions @ (directions.T @ values)
+    visible = np.linalg.svd(beside(by_forces), compute_uv=False) ** 2
+    excess = np.sum(beside(residuals) ** 2) - (len(residuals) - directions.shape[1])
+    if excess <= 0 or not visible.any():
+        return 0.0
+    degrees = np.sum(visible) ** 2 / np.sum(visible**2)
+    widened = scipy.stats.t.ppf(0.95, degrees) / scipy.stats.norm.ppf(0.95)
+    return float(widened * np.sqrt(excess / np.sum(visible)))
+
+
+def _ratio(force: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """Coefficients by which motions cause forces; 0 where nothing moves."""
+    return np.divide(force, motion, out=np.zeros_like(force), where=motion > 1e-9)
