@@ -93,15 +93,11 @@ def estimated(
     residuals: Float[np.ndarray, " rows"],
     jacobian: Float[np.ndarray, "rows dim"],
     by_forces: Float[np.ndarray, "rows numbers"],
-) -> float:
+) -> tuple[float, float]:
     """How large forces that a model lacks are, by what they leave in residuals that parameters cannot make up for.
 
     By moments: with P the projection on what is orthogonal to the parameters' directions J, and F what forces of size 1
     change, |P r|^2 is a^2 tr(P F F^T) + tr(P) in the mean.
-
-    So few directions may be visible that a is hardly known: it is enlarged by as much as 90 % intervals of Student's t
-    are wider than those of a normal distribution, for tr(M)^2 / tr(M^2) degrees of freedom with M = P F F^T P
-    (Satterthwaite 1946).
 
     Args:
         residuals: at a point of least squares, in standard deviations of the noise.
@@ -109,17 +105,19 @@ def estimated(
         by_forces: F.
 
     Returns:
-        a, at least 0.
+        a, at least 0; and by how much 90 % intervals are wider because few directions may be visible, so that a is
+        hardly known: those of Student's t, for tr(M)^2 / tr(M^2) degrees of freedom with M = P F F^T P (Satterthwaite
+        1946).
     """
     directions, _, _ = np.linalg.svd(jacobian, full_matrices=False)
     beside = lambda values: values - directions @ (directions.T @ values)
     visible = np.linalg.svd(beside(by_forces), compute_uv=False) ** 2
     excess = np.sum(beside(residuals) ** 2) - (len(residuals) - directions.shape[1])
     if excess <= 0 or not visible.any():
-        return 0.0
+        return 0.0, 1.0
     degrees = np.sum(visible) ** 2 / np.sum(visible**2)
     widened = scipy.stats.t.ppf(0.95, degrees) / scipy.stats.norm.ppf(0.95)
-    return float(widened * np.sqrt(excess / np.sum(visible)))
+    return float(np.sqrt(excess / np.sum(visible))), float(widened)
 
 
 def _ratio(force: np.ndarray, motion: np.ndarray) -> np.ndarray:

@@ -120,10 +120,11 @@ def test_size_from_residuals():
             jacobian @ rng.standard_normal(3) + by_forces @ (size * rng.standard_normal(6)) + rng.standard_normal(400)
             for _ in range(300)
         ]
-        found.append(np.sqrt(np.mean([estimated(own, jacobian, by_forces) ** 2 for own in sets])))
+        found.append(np.sqrt(np.mean([estimated(own, jacobian, by_forces)[0] ** 2 for own in sets])))
     assert found[0] < 0.003
-    assert found[1] == pytest.approx(0.2 * 1.943 / 1.645, rel=4 / np.sqrt(2 * 300 * 6))
-    assert estimated(sets[0], jacobian, np.zeros((400, 6))) == 0
+    assert found[1] == pytest.approx(0.2, rel=4 / np.sqrt(2 * 300 * 6))
+    assert estimated(sets[0], jacobian, by_forces)[1] == pytest.approx(1.943 / 1.645, rel=0.02)
+    assert estimated(sets[0], jacobian, np.zeros((400, 6))) == (0, 1)
 
 
 @pytest.mark.slow
@@ -137,7 +138,7 @@ def test_intervals_hold_truths_where_forces_are_lacking(monkeypatch):
         rows, _ = real(rng, np.array([[0.08, 1.5]]))
         log = Log(recorded().times, {"motor": recorded().signals["motor"], "angle": rows[0, :, 0].astype(float)})
         for known, several in held.items():
-            monkeypatch.setattr(forces, "estimated", estimate if known else lambda *given: 0.0)
+            monkeypatch.setattr(forces, "estimated", estimate if known else lambda *given: (0.0, 1.0))
             low, high = fit(task(log), [0.1, 1.3]).interval.T
             several.append((low < [0.08, 1.5]) & ([0.08, 1.5] < high))
     assert np.mean(held[True]) >= 0.8 > np.mean(held[False]) + 0.2
