@@ -15,10 +15,8 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from jaxlfi.envs.mujoco.quiet import quietly
-
 SHOWN = 200
-"""States of each episode, at most, that typical forces are the mean over."""
+"""States of a motion, at most, that typical forces are the mean over."""
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
@@ -65,7 +63,7 @@ class UnmodelledForces:
 
 
 def typical(model: mujoco.MjModel, states: Float[np.ndarray, "steps state"], spec: mujoco.mjtState) -> UnmodelledForces:
-    """Springs, dampers and friction as strong as the forces of a motion: of one's root mean square each.
+    """Springs, dampers and dry friction whose forces each have the root mean square of those that act in a motion.
 
     Args:
         model: that moves.
@@ -75,14 +73,13 @@ def typical(model: mujoco.MjModel, states: Float[np.ndarray, "steps state"], spe
     data, forces, places, speeds = mujoco.MjData(model), [], [], []
     scalar = np.isin(model.jnt_type, _SCALAR)
     own = model.jnt_qposadr[scalar]
-    with quietly():
-        for state in states[:: -(-len(states) // SHOWN)]:
-            mujoco.mj_setState(model, data, state, spec)
-            mujoco.mj_forward(model, data)
-            forces.append([data.qfrc_passive, data.qfrc_actuator, data.qfrc_bias, data.qfrc_constraint])
-            forces[-1] = np.sum(np.square(forces[-1]), axis=0)
-            places.append(data.qpos[own] - model.qpos_spring[own])
-            speeds.append(data.qvel.copy())
+    for state in states[:: -(-len(states) // SHOWN)]:
+        mujoco.mj_setState(model, data, state, spec)
+        mujoco.mj_forward(model, data)
+        acting = [data.qfrc_passive, data.qfrc_actuator, data.qfrc_bias, data.qfrc_constraint]
+        forces.append(np.sum(np.square(acting), axis=0))
+        places.append(data.qpos[own] - model.qpos_spring[own])
+        speeds.append(data.qvel.copy())
     force, speed = np.sqrt(np.mean(forces, axis=0)), np.sqrt(np.mean(np.square(speeds), axis=0))
     stiffness = np.zeros(model.njnt)
     stiffness[scalar] = _ratio(force[model.jnt_dofadr[scalar]], np.sqrt(np.mean(np.square(places), axis=0)))

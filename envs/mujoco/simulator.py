@@ -134,9 +134,13 @@ class Simulator:
         """
         _, failed = self.clean(theta[None])
         if failed[0]:
-            raise ValueError(f"unmodelled_force: expected a model that can be simulated, got {FAILURES[failed[0] - 1]}")
+            raise ValueError(
+                "unmodelled_force: expected a model that can be simulated at the centre of its first guess, "
+                f"got {FAILURES[failed[0] - 1]}"
+            )
         episodes = [self.states(theta[None], episode)[2][0] for episode in range(len(self.logs))]
-        return typical(self.build(theta), np.concatenate(episodes), STATE)
+        with _LOCK, quietly():
+            return typical(self.build(theta), np.concatenate(episodes), STATE)
 
     def lacking(self, forces: UnmodelledForces) -> "Simulator":
         """The same, every simulation with forces besides those of the model."""

@@ -152,7 +152,7 @@ def test_a_size_is_at_least_zero(fraction):
 
 def test_the_centre_has_to_be_simulated():
     unstable = Parameter("joint/shoulder/stiffness", (-1e9, -1e8))
-    with pytest.raises(ValueError, match="unmodelled_force: expected a model that can be simulated, got unstable"):
+    with pytest.raises(ValueError, match="centre of its first guess, got unstable"):
         mujoco_task(ARM, [unstable], recorded(), ["angle"], {"angle": 0.01}, unmodelled_force=0.01)
 
 
