@@ -61,6 +61,16 @@ def test_widths(line):
     assert " ".join(line.split()) in README
 
 
+def test_widths_near_bounds():
+    folder = RESULTS / "widths/lotka_volterra"
+    table = (folder / "near_bounds.md").read_text()
+    assert table in README
+    for path in folder.glob("*/quick-drawn.npz"):
+        held = arrays(path.relative_to(RESULTS).with_suffix(""))["density_rank"][:100] < 0.9 * 201
+        row = next(line for line in table.splitlines() if line.startswith(f"| `{path.parent.name}` |"))
+        assert np.mean([float(cell) for cell in row.split("|")[2:6]]) == pytest.approx(held.mean(), abs=0.01)
+
+
 VARIANTS = sorted(path.stem for path in (RESULTS / "ablation").glob("*.npz"))
 
 
