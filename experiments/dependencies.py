@@ -1,22 +1,19 @@
-"""What the library depends on, with licences and last releases: `python -m experiments.dependencies --index URL`.
+"""What the library depends on, with licences and last releases: `python -m experiments.dependencies`.
 
-It prints the table of docs/dependencies.md: requirements and reasons from pyproject.toml, licences from the installed
-packages, versions and dates of the last releases from a package index: the address that pip would be given by
-`--index-url`, of an index that answers in JSON. Where PIP_INDEX_URL is set, that one is the default.
+It prints the table of docs/dependencies.md, but for the days of the releases: requirements and reasons from
+pyproject.toml, licences from the installed packages, and the last versions that pip finds for this Python.
 """
 
 import argparse
 import dataclasses
-import json
-import os
 import re
+import subprocess
+import sys
 import tomllib
-import urllib.request
 from importlib import metadata
 from pathlib import Path
 
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
-SIMPLE = "application/vnd.pypi.simple.v1+json"
 SELF = ("test", "bench", "docs", "dev")
 """Extras for who works on the library or its experiments."""
 LICENCES = {
@@ -84,34 +81,24 @@ def licence(name: str) -> str:
     return next((spdx for spdx, pattern in LICENCES.items() if re.search(pattern, declared)), "not declared")
 
 
-def last_release(name: str, index: str) -> tuple[str, str]:
-    """Version and day of the last release that a package index has."""
-    address = f"{index.rstrip('/')}/{re.sub(r'[-_.]+', '-', name).lower()}/"
-    with urllib.request.urlopen(urllib.request.Request(address, headers={"Accept": SIMPLE}), timeout=60) as answer:
-        files = json.load(answer)["files"]
-    final = [file for file in files if re.fullmatch(r"[0-9.]+(\.post\d+)?", version(file["filename"]))]
-    newest = max(final, key=lambda file: [int(part) for part in re.findall(r"\d+", version(file["filename"]))])
-    return version(newest["filename"]), newest["upload-time"][:10]
+def last_release(name: str) -> str:
+    """The last version that pip finds."""
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "index", "versions", name]
+    return version(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
-def version(file: str) -> str:
-    """The version in the name of a wheel or a source archive."""
-    name = re.sub(r"\.(tar\.gz|zip)$", "", file)
-    return file.split("-")[1] if file.endswith(".whl") else name.rpartition("-")[2]
+def version(found: str) -> str:
+    """The version that `pip index versions` begins with: "NAME (VERSION)"."""
+    return re.match(r"\S+ \((\S+)\)", found)[1]
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--index", default=os.environ.get("PIP_INDEX_URL"), metavar="URL", help="of the package index")
-    arguments = parser.parse_args()
-    if not arguments.index:
-        parser.error("--index: expected the address of a package index, as PIP_INDEX_URL is not set")
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     print("| package | needed | for | licence | last release | why |\n|---|---|---|---|---|---|")
     for one in dependencies():
-        last, day = last_release(one.name, arguments.index)
         extras = ", ".join(f"`{extra}`" for extra in one.extras) or "everything"
-        cells = one.name, one.needed, extras, licence(one.name), f"{last}, {day}", one.why
+        cells = one.name, one.needed, extras, licence(one.name), last_release(one.name), one.why
         print(f"| {' | '.join(cells)} |", flush=True)
 
 

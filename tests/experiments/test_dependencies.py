@@ -33,10 +33,6 @@ def test_licences_are_those_of_the_installed_packages(name):
         pytest.skip("not installed")
 
 
-def test_versions_in_names_of_files():
-    names = [
-        "mujoco_mjx-3.17.0-py3-none-any.whl",
-        "dm-tree-0.1.9.tar.gz",
-        "jaxlib-0.12.0.1-cp313-cp313-macosx_11_0_arm64.whl",
-    ]
-    assert list(map(dependencies.version, names)) == ["3.17.0", "0.1.9", "0.12.0.1"]
+def test_the_version_that_pip_begins_with():
+    found = "jaxlib (0.12.0.1)\nAvailable versions: 0.12.0.1, 0.12.0\n  INSTALLED: 0.9.2\n"
+    assert dependencies.version(found) == "0.12.0.1"
