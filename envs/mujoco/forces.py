@@ -15,7 +15,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-SHOWN = 200
+MOST_STATES = 200
 """States of a motion, at most, that typical forces are the mean over."""
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
@@ -73,7 +73,7 @@ def typical(model: mujoco.MjModel, states: Float[np.ndarray, "steps state"], spe
     data, forces, places, speeds = mujoco.MjData(model), [], [], []
     scalar = np.isin(model.jnt_type, _SCALAR)
     own = model.jnt_qposadr[scalar]
-    for state in states[:: -(-len(states) // SHOWN)]:
+    for state in states[:: -(-len(states) // MOST_STATES)]:
         mujoco.mj_setState(model, data, state, spec)
         mujoco.mj_forward(model, data)
         acting = [data.qfrc_passive, data.qfrc_actuator, data.qfrc_bias, data.qfrc_constraint]
