@@ -113,7 +113,9 @@ def main() -> None:
             first = arguments.first_seed
             cases = own_cases(task, first, count) if kind == "own" else drawn_cases(task, arguments.box, first, count)
             batch = min(arguments.runs_per_batch, count)
-            found = infer_all(task, settings, support, RULES[rule or "none"], cases, arguments.box, batch, console)
+            found = infer_all(
+                task, settings, task.support(support), RULES[rule or "none"], cases, arguments.box, batch, console
+            )
             save(path, found | {"width": np.asarray(box.width)}, settings, box=arguments.box)
     (folder / "table.md").write_text(table(folder))
     print(table(folder))

@@ -161,7 +161,7 @@ def believed(
     theta = np.zeros((len(observed), task.dim), np.float32)
     cases = Cases(first_seed + np.arange(len(observed)), theta, observed.astype(np.float32), x)
     began = time.perf_counter()
-    states, _ = final_states(task, settings, box, Edge(), cases, len(observed), Console())
+    states, _ = final_states(task, settings, task.support(box), Edge(), cases, len(observed), Console())
     seconds = time.perf_counter() - began
 
     @jax.jit

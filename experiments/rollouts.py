@@ -101,7 +101,9 @@ def inferred(task: Task, settings: Settings, own: Cases, console: Console) -> di
     def one(key, truth, x, state):
         return described(key, truth, posterior_after(state.belief, state.network, x), DRAWS)
 
-    state, seconds = final_states(task, settings, "initial", HEURISTICS["edge"], own, len(own.seeds), console)
+    state, seconds = final_states(
+        task, settings, task.support("initial"), HEURISTICS["edge"], own, len(own.seeds), console
+    )
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(77), jnp.asarray(own.seeds))
     found = one(keys, own.theta, own.x, state) | {"low": state.belief.support.low, "high": state.belief.support.high}
     return jax.device_get(found) | {"seeds": own.seeds, "theta": own.theta, "seconds": np.asarray(seconds)}

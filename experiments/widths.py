@@ -10,6 +10,8 @@ theirs. The two are different questions: most truths drawn over a box are easier
 
 All runs of a candidate are stepped in batches of `--runs-per-batch`. A candidate whose arrays are there is not run
 again; the table is drawn from the arrays.
+
+`--margin` starts from the named support made larger on every side, and reads posteriors on the support itself.
 """
 
 import argparse
@@ -129,7 +131,7 @@ def both(key: jax.Array, truth: jax.Array, posterior: Posterior, box: Support) -
 
 
 def final_states(
-    task: Task, settings: Settings, support: str, rule: Heuristic, cases: Cases, batch: int, console: Console
+    task: Task, settings: Settings, support: Support, rule: Heuristic, cases: Cases, batch: int, console: Console
 ) -> tuple[State, float]:
     """The last states of all cases' runs, stacked, and the seconds they took without compiling.
 
@@ -144,7 +146,7 @@ def final_states(
             for start in range(0, len(active), batch):
                 rows = active[start : start + batch]
                 part = cases.rows(np.resize(rows, batch))
-                specs = [RunSpec("", support, task.support(support), rule, int(seed)) for seed in part.seeds]
+                specs = [RunSpec("", "", support, rule, int(seed)) for seed in part.seeds]
                 engine = engine_for(task, settings, stack_inputs(specs, part.observed, part.x)[0])
                 state = (
                     engine.place(stack([states[row] for row in np.resize(rows, batch)])) if index else engine.start()
@@ -161,15 +163,30 @@ def final_states(
     return stack([states[row] for row in range(len(states))]), seconds
 
 
+def widened(task: Task, support: Support, margin: float) -> Support:
+    """A support made larger on every side by a fraction of its width, as far as Phi goes."""
+    reach, phi = margin * support.width, task.inference.feasible
+    return Support(phi.clip(support.low - reach), phi.clip(support.high + reach))
+
+
 def infer_all(
-    task: Task, settings: Settings, support: str, rule: Heuristic, cases: Cases, box: str, batch: int, console: Console
+    task: Task,
+    settings: Settings,
+    support: Support,
+    rule: Heuristic,
+    cases: Cases,
+    box: str,
+    batch: int,
+    console: Console,
+    on: Support | None = None,
 ) -> dict[str, np.ndarray]:
-    """The posteriors of all cases, described."""
+    """The posteriors of all cases, described: on their final supports, or on one that is given."""
 
     @jax.jit
     @jax.vmap
     def one(key, truth, x, state):
-        found = both(key, truth, posterior_after(state.belief, state.network, x), task.support(box))
+        posterior = posterior_after(state.belief, state.network, x)
+        found = both(key, truth, posterior if on is None else posterior.on(on), task.support(box))
         return found | {"rounds": state.progress.rounds, "moved": state.progress.moved}
 
     states, seconds = final_states(task, settings, support, rule, cases, batch, console)
@@ -258,6 +275,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="lotka_volterra")
     parser.add_argument("--configuration", default="misspecified+edge", help="support, or support+heuristic")
+    parser.add_argument("--margin", type=float, default=0.0, help="fraction of the support's width, on each side")
     parser.add_argument("--box", default="ok", help="support that truths are drawn over")
     parser.add_argument("--candidates", nargs="+", choices=list(candidates()), default=list(candidates()))
     parser.add_argument("--seeds", type=int, default=20, help="observations of the task's own truth")
@@ -266,10 +284,13 @@ def main() -> None:
     parser.add_argument("--runs-per-batch", type=int, default=20)
     parser.add_argument("--out", type=Path, default=Path("runs/widths"))
     arguments = parser.parse_args()
-    folder = arguments.out / arguments.task / arguments.configuration
-    folder.mkdir(parents=True, exist_ok=True)
     task, console = registry.load(arguments.task), Console()
-    support, _, rule = arguments.configuration.partition("+")
+    box, _, rule = arguments.configuration.partition("+")
+    start, on, margin = task.support(box), None, ""
+    if arguments.margin:
+        start, on, margin = widened(task, start, arguments.margin), start, f"-margin-{arguments.margin:g}"
+    folder = arguments.out / arguments.task / f"{arguments.configuration}{margin}"
+    folder.mkdir(parents=True, exist_ok=True)
     sets = {"own": own_cases(task, arguments.first_seed, arguments.seeds)}
     if arguments.truths:
         sets["drawn"] = drawn_cases(task, arguments.box, arguments.first_seed, arguments.truths)
@@ -281,7 +302,8 @@ def main() -> None:
                 continue
             console.print(f"{name}, {kind}", highlight=False)
             arrays = infer_all(
-                task, settings, support, RULES[rule or "none"], cases, arguments.box, arguments.runs_per_batch, console
+                *(task, settings, start, RULES[rule or "none"], cases, arguments.box),
+                *(arguments.runs_per_batch, console, on),
             )
             save(path, arrays, settings, box=arguments.box)
     (folder / "table.md").write_text(table(folder))
