@@ -80,7 +80,8 @@ def candidates(clipped: Settings = CLIPPED) -> dict[str, Settings]:
     }
     divided = {f"{name}-quotient": wide[name].replace(correction="quotient") for name in wide}
     paced = {f"paced-{name}": settings.replace(estimator=PACED) for name, settings in (once | wide).items()}
-    return {"quick": QUICK, "snle": snle(QUICK)} | once | wide | divided | paced
+    whole = {"quick": QUICK, "quick-reject": QUICK.replace(restriction="reject"), "snle": snle(QUICK)}
+    return whole | once | wide | divided | paced
 
 
 @dataclasses.dataclass(frozen=True)
