@@ -188,7 +188,7 @@ def _unless_settled(before: State, after: State, info: Round) -> tuple[State, Ro
 
 def _started(state: State, dataset: Dataset) -> Network:
     """A network that is trained on takes its normalisers from the first round that has simulations."""
-    fresh = state.network.with_normalisers(dataset)
+    fresh = state.network.begun(dataset)
     return jax.tree.map(lambda kept, new: jnp.where(state.dataset.size > 0, kept, new), state.network, fresh)
 
 

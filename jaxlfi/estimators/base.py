@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_fit import fit_mixture
@@ -53,8 +53,8 @@ class Estimator(Checked, abc.ABC):
         warm_start: continue from the last round's weights, or start anew each round (reading C).
         loss: "likelihood", or "atomic" or "combined", which need no correction for the proposals
             (`jaxlfi.estimators.losses.LOSSES`).
-        normaliser: "zscore", "asinh" or "none" (`jaxlfi.estimators.normaliser.TRANSFORMS`): what is done to the raw
-            summaries. It belongs to the network: computed where the network starts and kept while it is trained on.
+        normaliser: "zscore", "asinh", "fitted-asinh" or "none" (`jaxlfi.estimators.normaliser`): what is done to the
+            raw summaries. It belongs to the network: computed where the network starts and kept while it is trained on.
         embedding: "none", or a network before the family's own that makes a few features of a long summary and is
             trained with it (`jaxlfi.estimators.embeddings`): "mlp" of any summary, "series" of a raw trajectory,
             "trials" of records in no order. With the last two, numbers at the same place of all records are
@@ -162,6 +162,12 @@ class Estimator(Checked, abc.ABC):
         module = self.embedded(dim)
         return jax.vmap(lambda k: module.init(k, jnp.zeros(obs)))(jax.random.split(key, self.ensemble_size))
 
+    def begin(
+        self, params: dict, theta: Float[Array, "n dim"], x: Float[Array, "n obs"], valid: Bool[Array, " n"]
+    ) -> dict:
+        """Fresh weights, changed by what the first simulations are, as the network sees them; here nothing is."""
+        return params
+
     def rows(
         self,
         key: jax.Array,
@@ -254,15 +260,17 @@ class Network:
             return self.scale.centre, half
         return self.scale.centre + half * self.theta_normaliser.mean, half * self.theta_normaliser.scale
 
-    def with_normalisers(self, dataset: Dataset) -> "Network":
-        """The same weights with the normalisers of a network that starts on these simulations."""
+    def begun(self, dataset: Dataset) -> "Network":
+        """The same fresh weights with all that a network takes from the simulations it starts on."""
         of_x, of_theta = _normalisers(self.estimator, dataset, self.scale)
-        return self.replace(normaliser=of_x, theta_normaliser=of_theta)
+        network = self.replace(normaliser=of_x, theta_normaliser=of_theta)
+        theta, x = network.to_network(dataset.theta), network.normaliser(dataset.x)
+        return network.replace(params=self.estimator.begin(self.params, theta, x, dataset.valid))
 
     def restarted(self, key: jax.Array, dataset: Dataset) -> "Network":
         """Fresh weights, and the normalisers of these simulations."""
         params = self.estimator.initialise(key, self.scale.dim, dataset.x.shape[-1])
-        return self.replace(params=params).with_normalisers(dataset)
+        return self.replace(params=params).begun(dataset)
 
 
 def untrained(

@@ -1,10 +1,13 @@
 """Conditional normalizing flows as estimators (appendix A): masked autoregressive, and neural spline."""
 
 import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from jaxlfi.estimators.base import Estimator
-from jaxlfi.estimators.flows import MAF, NSF
+from jaxlfi.estimators.flows import MAF, NSF, REGRESSION
 from jaxlfi.estimators.mdn import ACTIVATIONS
+from jaxlfi.estimators.ridge import ridge
 from jaxlfi.fields import option
 
 
@@ -53,6 +56,10 @@ class SplineFlow(FlowEstimator):
     Attributes:
         bins: pieces of each spline.
         tail_bound: half the splines' range, in standard deviations of theta; beyond, they are the identity.
+        regression: how many networks of the ensemble start from a ridge regression of the parameters on the summaries
+            (`jaxlfi.estimators.ridge`), which is trained with the rest: what they have left to learn is how the
+            posterior differs from a shifted normal. They are the better ones where parameters are about linear in the
+            summaries, and extrapolate more boldly. None do behind an embedding, whose features are not known before.
 
     Example:
         >>> SplineFlow(bins=8).check().bins
@@ -61,6 +68,19 @@ class SplineFlow(FlowEstimator):
 
     bins: int = option(10, low=1, high=999, help="pieces of each spline")
     tail_bound: float = option(5.0, low=0.1, help="half the splines' range, in standard deviations")
+    regression: int = option(0, low=0, help="networks that start from a ridge regression on the summaries")
+
+    def begin(
+        self, params: dict, theta: Float[Array, "n dim"], x: Float[Array, "n obs"], valid: Bool[Array, " n"]
+    ) -> dict:
+        """Fresh weights, with the regression for the linear term of the first shift of some networks."""
+        if not self.regression or self.embedding != "none":
+            return params
+        coefficients, intercept = ridge(x, theta, valid)
+        start = jnp.concatenate([coefficients, intercept[:, None]], axis=1)
+        linear = params["params"][REGRESSION]
+        chosen = jnp.arange(len(linear)) < self.regression
+        return {"params": params["params"] | {REGRESSION: jnp.where(chosen[:, None, None], start, linear)}}
 
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one ensemble member for D parameters."""

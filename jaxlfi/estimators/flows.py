@@ -15,6 +15,9 @@ from jaxlfi.estimators.mdn import ACTIVATIONS, Dense
 LOG_SCALE_BOUND = 3.0
 """Maximum log-scale of one affine transform, in nats. Ten of them take 1e3 to 1e16, whose square float32 holds."""
 
+REGRESSION = "regression"
+"""Name of the parameters by which a spline flow's shift is linear in x: coefficients, the constant last, [D, S + 1]."""
+
 MIN_BIN = 1e-3
 """Minimum width of a spline's bin, as a fraction of its range."""
 
@@ -233,7 +236,8 @@ class NSF(nn.Module):
     Departs from the paper in what mixes dimensions between the splines. Instead of learnt linear maps, the transforms
     divide the dimensions by the binary digits of their numbers, each digit once either way, so that any two
     dimensions are on different sides in some transform; and one shift and scale by x comes first, which brings a
-    narrow density to the size of the splines' range.
+    narrow density to the size of the splines' range. The shift has a term that is linear in x, `REGRESSION` among its
+    parameters: a place for a regression to start from.
 
     Attributes:
         dim: D.
@@ -369,12 +373,13 @@ def _conditioner(module: nn.Module, name: str, x: Array, masks: Sequence[np.ndar
 
 
 def _affine(module: nn.Module, name: str, x: Array) -> Affine:
-    """A shift and a scale by x alone, of one hidden layer; the identity at the start."""
+    """A shift and a scale by x alone, of one hidden layer and a linear term; the identity at the start."""
     zeros = nn.initializers.zeros_init()
     h = ACTIVATIONS[module.activation](Dense(module.hidden, name=f"{name}_context")(x))
     kernel = module.param(f"{name}_kernel", zeros, (2 * module.dim, module.hidden))
     shift, raw = jnp.split(_product(h, kernel) + module.param(f"{name}_bias", zeros, (2 * module.dim,)), 2, axis=-1)
-    return Affine(shift, _bounded(raw))
+    regression = module.param(REGRESSION, zeros, (module.dim, x.shape[-1] + 1))
+    return Affine(shift + _product(x, regression[:, :-1]) + regression[:, -1], _bounded(raw))
 
 
 def _bounded(raw: Array) -> Array:

@@ -58,7 +58,7 @@ def toy(seed: int, size: int, capacity: int | None = None) -> Dataset:
 DATA = toy(0, SIZE, CAPACITY)
 
 _untrained = jax.jit(lambda key, estimator: untrained(key, estimator, 2, SCALE, SPACE))
-_normalised = jax.jit(Network.with_normalisers)
+_normalised = jax.jit(Network.begun)
 _condition = jax.jit(lambda network, x: network.condition(x, SCALE).mixture)
 
 
@@ -461,7 +461,7 @@ def test_leaves_do_not_recompile():
 
 REFUSED = [
     ({"activation": "gelu"}, r"^activation: expected one of relu, tanh, silu, got 'gelu'"),
-    ({"normaliser": "log"}, r"^normaliser: expected one of none, zscore, asinh, got 'log'"),
+    ({"normaliser": "log"}, r"^normaliser: expected one of none, zscore, asinh, fitted-asinh, got 'log'"),
     ({"schedule": "linear"}, r"^schedule: expected one of constant, cosine, got 'linear'"),
     ({"loss": "hinge"}, r"^loss: expected one of likelihood, atomic, combined, got 'hinge'"),
     ({"components": 0}, r"^components: expected a whole number in \[1, 1e\+06\], got 0"),
@@ -503,6 +503,7 @@ def test_wrong_settings_are_refused_where_they_are_made_or_replaced(kind, change
         (MaskedFlow, {"transforms": 0}, r"^transforms: expected a whole number in \[1, inf\), got 0"),
         (SplineFlow, {"transforms": 0}, r"^transforms: expected a whole number in \[1, inf\), got 0"),
         (SplineFlow, {"bins": 0}, r"^bins: expected a whole number in \[1, 999\], got 0"),
+        (SplineFlow, {"regression": -1}, r"^regression: expected a whole number in \[0, inf\), got -1"),
         (SplineFlow, {"tail_bound": 0.0}, r"^tail_bound: expected a number in \[0.1, inf\), got 0.0"),
     ],
 )
@@ -529,6 +530,33 @@ def test_settings_that_contradict_each_other_are_refused_by_check(kind, changes,
     estimator = kind(**changes)
     with pytest.raises(ValueError, match=message):
         estimator.check()
+
+
+def residuals(network: Network, x, theta) -> np.ndarray:
+    """What each network of the ensemble makes of parameters at their summaries, shape [E, N, D]."""
+    module = network.estimator.embedded(2)
+    one = lambda params: module.apply(params, network.normaliser(x)).forward(network.to_network(theta))[0]
+    return np.asarray(jax.jit(jax.vmap(one))(network.params))
+
+
+@pytest.mark.parametrize("regression", [0, 2, 5])
+def test_so_many_networks_of_a_spline_flow_start_from_a_linear_regression(regression):
+    network = start(SplineFlow(hidden=(8,), transforms=2, ensemble_size=3, regression=regression))
+    theta, x = DATA.theta[:SIZE], DATA.x[:SIZE]
+    seen = np.asarray(network.to_network(theta))
+    predictors = np.column_stack([x, np.ones(SIZE)])
+    left = seen - predictors @ np.linalg.lstsq(predictors, seen, rcond=None)[0]
+    assert left.std() < 0.8
+    for number, found in enumerate(residuals(network, x, theta)):
+        # The penalty is that of a few rows of forty, and splines start as the identity.
+        np.testing.assert_allclose(found, left if number < regression else seen, atol=0.1)
+
+
+def test_behind_an_embedding_a_spline_flow_starts_without_a_regression():
+    estimator = SplineFlow(hidden=(8,), transforms=1, regression=1, embedding="mlp", features=2)
+    network = start(estimator)
+    seen = np.asarray(network.to_network(DATA.theta[:SIZE]))
+    np.testing.assert_allclose(residuals(network, DATA.x[:SIZE], DATA.theta[:SIZE])[0], seen, atol=1e-5)
 
 
 def test_flows_have_layers_of_one_width_as_many_as_parameters():

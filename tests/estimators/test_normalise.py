@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
-from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser
+from jaxlfi.estimators.normaliser import TRANSFORMS, UNITS, Normaliser, fit_normaliser
 from tests.strategies import vectors
 
 NUMPY = {"zscore": lambda x: x, "asinh": np.arcsinh}
 
 
 def test_all_transforms_are_tested():
-    assert set(TRANSFORMS) == {*NUMPY, "none"}
+    assert set(TRANSFORMS) == {*NUMPY, "none", "fitted-asinh"}
 
 
 @pytest.mark.parametrize("name", NUMPY)
@@ -79,3 +80,47 @@ def test_no_rows_at_all_leave_summaries_as_they_are():
     normaliser = fit_normaliser("zscore", jnp.full((3, 2), 5.0), jnp.zeros(3, bool))
     np.testing.assert_array_equal(normaliser.mean, [0, 0])
     np.testing.assert_array_equal(normaliser.scale, [1, 1])
+
+
+def log_likelihood(x, unit):
+    """Of one summary's values, as normal variables after asinh, up to a constant: density by change of variables."""
+    values = np.arcsinh(x / unit)
+    density = stats.norm(values.mean(), values.std()).logpdf(values) - 0.5 * np.log(unit**2 + x**2)
+    return density.mean()
+
+
+TAILS = {
+    "normal": lambda g: g.normal(50.0, 2.0, 400),
+    "uniform": lambda g: g.uniform(-10.0, 10.0, 400),
+    "positive": lambda g: g.lognormal(0.0, 2.0, 400),
+    "both sides": lambda g: g.standard_cauchy(400),
+}
+
+
+@pytest.mark.parametrize("name", TAILS)
+@pytest.mark.parametrize("factor", [1.0, 1e-4, 1e5])
+def test_the_unit_of_asinh_is_the_likeliest_whatever_the_units_of_a_summary(name, factor):
+    x = factor * TAILS[name](np.random.default_rng(0))
+    filled = np.concatenate([x, np.full(100, np.nan)]).astype(np.float32)
+    found = fit_normaliser("fitted-asinh", jnp.asarray(filled[:, None]), jnp.arange(500) < 400)
+    units = np.median(np.abs(x)) * UNITS
+    best = max(log_likelihood(x, unit) for unit in units)
+    np.testing.assert_allclose(log_likelihood(x, float(found.unit[0])), best, atol=1e-3)
+    seen = np.asarray(found(jnp.asarray(filled[:400, None])))[:, 0]
+    expected = np.arcsinh(x / float(found.unit[0]))
+    np.testing.assert_allclose(seen, (expected - expected.mean()) / expected.std(), atol=2e-3)
+    tails = found.unit[0] / np.median(np.abs(x))
+    assert tails >= 10 if name in ("normal", "uniform") else tails < 5
+
+
+def test_a_fitted_unit_survives_summaries_that_do_not_vary_and_no_rows():
+    for x, valid in [(jnp.zeros((5, 1)), jnp.ones(5, bool)), (jnp.full((5, 1), jnp.nan), jnp.zeros(5, bool))]:
+        normaliser = fit_normaliser("fitted-asinh", x, valid)
+        np.testing.assert_array_equal(normaliser(jnp.zeros(1)), 0)
+        assert np.isfinite(normaliser(jnp.ones(1))).all()
+
+
+def test_records_have_one_fitted_unit():
+    x = jnp.asarray(np.random.default_rng(1).lognormal(0.0, 1.0, (30, 6)), jnp.float32)
+    unit = np.asarray(fit_normaliser("fitted-asinh", x, jnp.ones(30, bool), record_size=2).unit)
+    np.testing.assert_array_equal(unit, np.tile(unit[:2], 3))

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxlfi import diagnostics
 from jaxlfi.diagnostics.predictive import MIN_SIMULATIONS
-from jaxlfi.estimators.normaliser import TRANSFORMS
+from jaxlfi.estimators.normaliser import fit_normaliser
 from jaxlfi.io import files
 from jaxlfi.runs.run import Run
 from jaxlfi.studies.calibration.plan import AGAINST, CLASSIFIER, MIN_COUNT, PREDICTIVE, TIES, CalibrationPlan
@@ -134,7 +134,8 @@ def _curve_check(name: str, result: diagnostics.Uniformity, verdict: str) -> Che
 
 def _classifier_check(run: Run, plan: CalibrationPlan, truths: Mapping[str, np.ndarray], draws: np.ndarray) -> Check:
     """Whether a classifier that sees the simulations tells truths from posterior draws."""
-    x = np.asarray(TRANSFORMS[run.settings.estimator.normaliser](jnp.asarray(truths["x"])))
+    x = jnp.asarray(truths["x"])
+    x = np.asarray(fit_normaliser(run.settings.estimator.normaliser, x, jnp.ones(len(x), bool))(x))
     rows = [np.concatenate([theta, x], axis=1) for theta in (truths["theta"], draws[:, 0])]
     accuracy = _accuracy(plan.key(CLASSIFIER), *rows)
     # Held-out rows are nearly independent where there is nothing to learn.

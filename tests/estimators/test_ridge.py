@@ -1,0 +1,74 @@
+"""Ridge regression against NumPy's normal equations, and its penalty against the hat matrix."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlfi.estimators.ridge import PENALTIES, ridge
+
+RIDGE = jax.jit(ridge)
+
+
+def problem(rows, obs, noise, seed=0):
+    """x [N, S], y [N, 2], and the coefficients [2, S] that made it, all from zero but for an intercept."""
+    generator = np.random.default_rng(seed)
+    x = generator.normal(3.0, 1.0, (rows, obs))
+    coefficients = generator.normal(0.0, 1.0, (2, obs)) * np.array([[1.0], [0.1]])
+    y = x @ coefficients.T + [2.0, -7.0] + noise * generator.normal(size=(rows, 2))
+    return x.astype(np.float32), y.astype(np.float32), coefficients
+
+
+def by_normal_equations(x, y):
+    """The same by centred normal equations in double precision; the penalty by the trace of the hat matrix."""
+    x, y = x.astype(np.float64), y.astype(np.float64)
+    a, b = x - x.mean(0), y - y.mean(0)
+    rows, best = len(a), []
+    for d in range(y.shape[1]):
+        found = []
+        for penalty in PENALTIES.astype(np.float64):
+            inverse = np.linalg.inv(a.T @ a + penalty * np.eye(a.shape[1]))
+            residual = b[:, d] - a @ inverse @ a.T @ b[:, d]
+            free = rows - 1 - np.trace(a @ inverse @ a.T)
+            found.append((np.sum(residual**2) / free**2, tuple(inverse @ a.T @ b[:, d])))
+        best.append(min(found)[1])
+    coefficients = np.array(best)
+    return coefficients, y.mean(0) - coefficients @ x.mean(0)
+
+
+@pytest.mark.parametrize(("rows", "obs", "noise"), [(60, 4, 0.3), (40, 30, 2.0), (25, 60, 0.5)])
+def test_against_normal_equations(rows, obs, noise):
+    x, y, _ = problem(rows, obs, noise)
+    coefficients, intercept = RIDGE(x, y, jnp.ones(rows, bool))
+    expected, constant = by_normal_equations(x, y)
+    np.testing.assert_allclose(coefficients, expected, atol=2e-4)
+    np.testing.assert_allclose(intercept, constant, atol=5e-3)
+
+
+def test_rows_that_do_not_count_change_nothing():
+    x, y, _ = problem(50, 5, 0.2)
+    valid = np.arange(50) < 30
+    alone = RIDGE(x[:30], y[:30], jnp.ones(30, bool))
+    x[30:], y[30:] = np.nan, np.inf
+    for found, expected in zip(RIDGE(x, y, valid), alone, strict=True):
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+def test_a_linear_relation_is_found():
+    x, y, coefficients = problem(400, 6, 0.05)
+    found, intercept = RIDGE(x, y, jnp.ones(400, bool))
+    np.testing.assert_allclose(found, coefficients, atol=0.02)
+    np.testing.assert_allclose(intercept, [2.0, -7.0], atol=0.15)
+
+
+def test_noise_is_not_interpolated_by_more_predictors_than_rows():
+    generator = np.random.default_rng(3)
+    x, y = generator.normal(size=(60, 112)).astype(np.float32), generator.normal(size=(60, 2)).astype(np.float32)
+    coefficients, _ = RIDGE(x, y, jnp.ones(60, bool))
+    interpolating = np.linalg.lstsq(x - x.mean(0), y - y.mean(0), rcond=None)[0].T
+    assert np.linalg.norm(coefficients) < 0.2 * np.linalg.norm(interpolating)
+
+
+def test_nothing_is_predicted_without_rows():
+    for values in RIDGE(jnp.full((4, 3), jnp.nan), jnp.full((4, 2), jnp.nan), jnp.zeros(4, bool)):
+        np.testing.assert_array_equal(values, 0)
