@@ -16,7 +16,7 @@ both boxes:
 
 All simulate by the same code. sysid, scipy and cma stay in the box; so do not the others. Errors and half-widths are
 fractions of the right box's width, in logarithms where those are inferred; the puck's lateral speed is taken without
-its sign, which its recording does not tell. What is there already is kept.
+its sign, which its recording does not tell. What is there already is kept: a larger --recordings adds the missing ones.
 """
 
 import argparse
@@ -53,6 +53,8 @@ POINTS = ("sysid", "scipy", "cma")
 POSTERIORS = ("edge", "apt")
 METHODS = (*POINTS, *(name for posterior in POSTERIORS for name in (posterior, f"{posterior}-fit")))
 DRAWS = 500
+SIDE_BY_SIDE = 10
+"""Runs that step together."""
 LEVEL = 1.6449
 """Of 90 % intervals of a normal distribution."""
 BEYOND = 0.95
@@ -161,7 +163,8 @@ def believed(
     theta = np.zeros((len(observed), task.dim), np.float32)
     cases = Cases(first_seed + np.arange(len(observed)), theta, observed.astype(np.float32), x)
     began = time.perf_counter()
-    states, _ = final_states(task, settings, task.support(box), Edge(), cases, len(observed), Console())
+    batch = min(len(observed), SIDE_BY_SIDE)
+    states, _ = final_states(task, settings, task.support(box), Edge(), cases, batch, Console())
     seconds = time.perf_counter() - began
 
     @jax.jit
@@ -169,7 +172,7 @@ def believed(
     def drawn(key, x, state):
         return posterior_after(state.belief, state.network, x).sample(key, DRAWS, "inference")
 
-    draws = drawn(jax.random.split(jax.random.key(5), len(observed)), jnp.asarray(x), states)
+    draws = drawn(jax.vmap(jax.random.key)(jnp.asarray(cases.seeds)), jnp.asarray(x), states)
     support = states.belief.support
     return {
         "draws": np.asarray(draws),
@@ -196,21 +199,28 @@ def fitted(task: Task, observed: np.ndarray, draws: np.ndarray) -> dict[str, np.
     }
 
 
-def run(method: str, task: Task, found: dict[str, np.ndarray], box: str, beside: Callable[[str], Path]) -> dict:
-    """A method on all recordings."""
-    observed = found["observed"]
+def run(method: str, task: Task, found: dict[str, np.ndarray], box: str, beside: Callable[[str], Path]) -> None:
+    """A method on all recordings of which there is nothing yet."""
+    path = beside(method)
+    known = files.read_arrays(path) if path.exists() else {}
+    done = len(known.get("seconds", ()))
+    observed = found["observed"][done:]
+    if not len(observed):
+        return
     if method in POSTERIORS:
-        return believed(method, task, observed, BOXES[box])
-    rows = []
-    draws = files.read_arrays(beside(method.removesuffix("-fit")))["draws"] if method.endswith("-fit") else None
-    for row, own in enumerate(track(observed, f"{task.name}, {box} box: {method}")):
-        if draws is not None:
-            rows.append(fitted(task, own, draws[row]))
-        else:
-            began = time.perf_counter()
-            one = dataclasses.asdict(point(method, task, own, BOXES[box]))
-            rows.append(one | {"seconds": time.perf_counter() - began})
-    return {key: np.stack([np.asarray(row[key]) for row in rows]) for key in rows[0]}
+        arrays = believed(method, task, observed, BOXES[box], FIRST_SEED + done)
+    else:
+        draws = files.read_arrays(beside(method.removesuffix("-fit")))["draws"] if method.endswith("-fit") else None
+        rows = []
+        for row, own in enumerate(track(observed, f"{task.name}, {box} box: {method}")):
+            if draws is not None:
+                rows.append(fitted(task, own, draws[done + row]))
+            else:
+                began = time.perf_counter()
+                one = dataclasses.asdict(point(method, task, own, BOXES[box]))
+                rows.append(one | {"seconds": time.perf_counter() - began})
+        arrays = {key: np.stack([np.asarray(row[key]) for row in rows]) for key in rows[0]}
+    files.write_arrays(path, {key: np.concatenate([*([known[key]] if done else []), arrays[key]]) for key in arrays})
 
 
 def folded(task: Task, theta: np.ndarray) -> np.ndarray:
@@ -324,8 +334,7 @@ def main() -> None:
         for box in arguments.boxes:
             beside = lambda method, name=name, box=box: arguments.out / f"{name}-{box}-{method}.npz"
             for method in arguments.methods:
-                if not beside(method).exists():
-                    files.write_arrays(beside(method), run(method, task, found, box, beside))
+                run(method, task, found, box, beside)
         with (FOLDER / f"{name}.toml").open("rb") as file:
             config = {"example": tomllib.load(file), "first_seed": FIRST_SEED, **environment()}
         (arguments.out / f"{name}.json").write_text(json.dumps(config, indent=2) + "\n")
