@@ -116,17 +116,17 @@ def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> F
     """Draw theta ~ p_i (line 8): the prior over Theta_0 in the first round, then the restricted posterior.
 
     A belief that is not informed is the prior over its support: so it is in the first round, and always by `Truncate`.
-    A defensive fraction of the draws stays with the prior over the *current* support: it covers the ground that the
-    support has gained, also where the posterior has locked itself onto a place where it learns nothing more.
+    Where nothing else accounts for a prior that the task brings, it is a factor of the proposals: else a posterior
+    would forget it after the first round. A defensive fraction of the draws stays with the prior over the *current*
+    support: it covers the ground that the support has gained, also where the posterior has locked itself onto a place
+    where it learns nothing more.
     """
     key_prior, key_posterior, key_choice = jax.random.split(key, 3)
-    restricted = RESTRICTIONS[settings.restriction]
-    informed = restricted(key_posterior, belief, settings.simulation_budget, settings.inflation)
-    prior = prior_draws(key_prior, task.inference.prior, belief.support, settings.simulation_budget)
-    from_prior = (
-        jax.random.bernoulli(key_choice, settings.defensive, (settings.simulation_budget, 1)) | ~belief.informed
-    )
-    return jnp.where(from_prior, prior, informed)
+    attempts, prior = settings.simulation_budget, task.inference.prior
+    factor = None if prior is None or settings.accounts_for_prior else prior.log_prob
+    informed = RESTRICTIONS[settings.restriction](key_posterior, belief, attempts, settings.inflation, factor)
+    from_prior = jax.random.bernoulli(key_choice, settings.defensive, (attempts, 1)) | ~belief.informed
+    return jnp.where(from_prior, prior_draws(key_prior, prior, belief.support, attempts), informed)
 
 
 def update(

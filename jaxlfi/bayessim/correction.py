@@ -42,10 +42,12 @@ class Correction:
     Attributes:
         row_weights: (task, dataset, proposals, round, defensive fraction) -> weight of each row in the loss, shape [C].
         change: (task, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
+        accounts_for_prior: whether the task's own prior is in p-hat whatever was proposed.
     """
 
     row_weights: Callable[[Task, Dataset, Belief, Array, Array], Array]
     change: Callable[[Task, GaussianMixture, Belief], tuple[GaussianMixture, Array]]
+    accounts_for_prior: bool = False
 
 
 def equal_weights(
@@ -157,8 +159,8 @@ def gaussian_prior(prior) -> GaussianMixture:
 
 CORRECTIONS: dict[str, Correction] = {
     "none": Correction(equal_weights, unchanged),
-    "paper": Correction(equal_weights, times_reference),
+    "paper": Correction(equal_weights, times_reference, accounts_for_prior=True),
     "quotient": Correction(equal_weights, divided_by_proposal),
-    "importance": Correction(importance_weights, unchanged),
+    "importance": Correction(importance_weights, unchanged, accounts_for_prior=True),
 }
 """Corrections by name."""

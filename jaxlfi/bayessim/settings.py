@@ -52,6 +52,12 @@ class Settings(Checked):
     )
     predictive: bool = option(True, help="simulate 20 draws of each round's posterior, to compare with the observation")
 
+    @property
+    def accounts_for_prior(self) -> bool:
+        """Whether posteriors have a task's own prior in them without its being a factor of the proposals."""
+        by_weights = CORRECTIONS[self.correction].accounts_for_prior
+        return self.rounds == 1 or by_weights or self.estimator.accounts_for_prior
+
     def check(self) -> "Settings":
         """Refuse settings that cannot work, by name; returns the settings."""
         if not isinstance(self.estimator, Estimator):

@@ -1,5 +1,7 @@
 """Belief: a posterior mixture and the support it lives on, in one pytree."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -7,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
-from jaxlfi.distributions.truncation import rejection_sample
+from jaxlfi.distributions.truncation import TRIES, rejection_sample, weighted_sample
 
 
 @struct.dataclass
@@ -42,10 +44,16 @@ def uninformed(support: Support, components: int) -> Belief:
     )
 
 
+CANDIDATES = 32_768
+"""Draws, at least, of which those that a prior makes likely are taken: in ten dimensions one in some hundreds."""
+
 Factor = Float[Array, "*batch"] | float
+LogWeight = Callable[[Float[Array, "m dim"]], Float[Array, " m"]]
 
 
-def clipped(key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0) -> Array:
+def clipped(
+    key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0, log_weight: LogWeight | None = None
+) -> Array:
     """`n` draws of the mixture, those outside the support moved to its nearest point (the paper's choice).
 
     Clipping puts atoms of probability on the bounds; `rejected` does not.
@@ -55,16 +63,32 @@ def clipped(key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0) -> 
         belief: what is drawn from.
         n: how many.
         inflation: how many times as wide as the mixture, about its mean.
+        log_weight: logarithm of a factor of the density, such as a prior, by which draws are chosen from many more.
     """
-    return belief.support.clip(belief.mixture.inflated(inflation).sample(key, n))
+    sample = belief.mixture.inflated(inflation).sample
+    if log_weight is None:
+        return belief.support.clip(sample(key, n))
+    key_candidates, key_choice = jax.random.split(key)
+    candidates = belief.support.clip(sample(key_candidates, max(CANDIDATES, TRIES * n)))
+    return weighted_sample(key_choice, candidates, log_weight(candidates), n)
 
 
-def rejected(key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0) -> Array:
+def rejected(
+    key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0, log_weight: LogWeight | None = None
+) -> Array:
     """`n` draws of the mixture truncated to the support (`jaxlfi.distributions.truncation.rejection_sample`)."""
-    return rejection_sample(key, belief.mixture.inflated(inflation).sample, belief.support, n)
+    sample = belief.mixture.inflated(inflation).sample
+    if log_weight is None:
+        return rejection_sample(key, sample, belief.support, n)
+    key_candidates, key_choice = jax.random.split(key)
+    candidates = sample(key_candidates, max(CANDIDATES, TRIES * n))
+    weight = jnp.where(belief.support.contains(candidates), log_weight(candidates), -jnp.inf)
+    return belief.support.clip(weighted_sample(key_choice, candidates, weight, n))
 
 
-def mixed(key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0) -> Array:
+def mixed(
+    key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0, log_weight: LogWeight | None = None
+) -> Array:
     """`n` draws: as by `clipped` for the mass that the mixture has outside the support, as by `rejected` for the rest.
 
     While much of the posterior lies beyond a bound, clipped draws on that bound show the network where it wants to go.
@@ -74,7 +98,7 @@ def mixed(key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0) -> Ar
     key_posterior, key_wide = jax.random.split(key)
     draws = belief.mixture.sample(key_posterior, n)
     inside = belief.support.contains(draws)[:, None]
-    return jnp.where(inside, rejected(key_wide, belief, n, inflation), belief.support.clip(draws))
+    return jnp.where(inside, rejected(key_wide, belief, n, inflation, log_weight), belief.support.clip(draws))
 
 
 RESTRICTIONS = {"clip": clipped, "reject": rejected, "mixed": mixed}

@@ -46,6 +46,24 @@ def rejection_sample(
     return jnp.where(found[:, None], theta, (fallback or support.sample)(key_fallback, n))
 
 
+def weighted_sample(
+    key: jax.Array, candidates: Float[Array, "m dim"], log_weight: Float[Array, " m"], n: int
+) -> Float[Array, "n dim"]:
+    """`n` of the candidates, each at most once, with odds in proportion to their weights.
+
+    The n largest of log-weights with Gumbel noise (Efraimidis and Spirakis 2006). Of many more candidates than draws
+    these are draws of the candidates' distribution times the weight.
+
+    Args:
+        key: consumed.
+        candidates: shape [M, D].
+        log_weight: of each; NaN counts as no weight at all.
+        n: number of draws, at most M.
+    """
+    odds = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight) + jax.random.gumbel(key, log_weight.shape)
+    return candidates[jax.lax.top_k(odds, n)[1]]
+
+
 def first_inside(
     candidates: Float[Array, "n tries dim"], support: Support
 ) -> tuple[Float[Array, "n dim"], Bool[Array, " n"]]:

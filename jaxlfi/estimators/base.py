@@ -102,6 +102,11 @@ class Estimator(Checked, abc.ABC):
     of_summaries: ClassVar[bool] = False
     """Whether the density is that of the summary given the parameters: a likelihood, whatever was proposed."""
 
+    @property
+    def accounts_for_prior(self) -> bool:
+        """Whether posteriors have a task's own prior in them whatever was proposed."""
+        return self.of_summaries or self.loss != "likelihood"
+
     @abc.abstractmethod
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one ensemble member for D parameters."""

@@ -1,0 +1,118 @@
+"""A prior that the task brings: sequential rounds keep it in the posterior, whatever they propose."""
+
+import dataclasses
+
+import distrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxlfi import METHODS, QUICK
+from jaxlfi.bayessim import algorithm
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.mixture_algebra import product
+from jaxlfi.distributions.support import Support
+from jaxlfi.envs import gaussian_linear
+from jaxlfi.estimators.mixture_network import MixtureNetwork
+from jaxlfi.heuristics import Fixed
+from tests.small import settings, whole_runs  # noqa: F401 - a fixture
+
+CENTRE, DEVIATION = np.array([-1.0, 0.5], np.float32), np.array([0.3, 0.6], np.float32)
+PRIOR = distrax.MultivariateNormalDiag(jnp.asarray(CENTRE), jnp.asarray(DEVIATION))
+PLAIN = gaussian_linear.task()
+TASK = dataclasses.replace(PLAIN, prior=PRIOR)
+X = jnp.asarray(gaussian_linear.MIXING @ np.array([0.2, -0.6], np.float32))
+
+BELIEF = Belief(
+    GaussianMixture(jnp.zeros(1), jnp.array([[-0.4, 0.2]]), jnp.array([[[0.3, 0.0], [0.1, 0.4]]])),
+    Support([-10.0, -10.0], [10.0, 10.0]),
+    jnp.asarray(True),
+)
+
+_propose = jax.jit(algorithm.propose, static_argnums=1)
+_product = jax.jit(lambda a, b: product(a, b)[0])
+
+
+def gaussian(mean, covariance) -> GaussianMixture:
+    return GaussianMixture(jnp.zeros(1), jnp.asarray(mean)[None], jnp.linalg.cholesky(jnp.asarray(covariance))[None])
+
+
+AS_MIXTURE = gaussian(CENTRE, np.diag(DEVIATION**2))
+EXACT = _product(gaussian_linear.posterior(X), AS_MIXTURE)
+
+
+@pytest.mark.parametrize("restriction", ["clip", "reject", "mixed"])
+def test_proposals_are_the_wide_posterior_times_the_prior(restriction, key):
+    drawn = settings(inflation=2.0, restriction=restriction, simulation_budget=4000)
+    theta = np.asarray(_propose(key, TASK, drawn, BELIEF))
+    expected = _product(BELIEF.mixture.inflated(2.0), AS_MIXTURE)
+    for d in range(2):
+        marginal = stats.norm(float(expected.mean[d]), float(jnp.sqrt(expected.covariance[d, d])))
+        # 4,000 of 128,000 without replacement, of which about a fifth are likely: nearly independent
+        assert stats.kstest(theta[:, d], marginal.cdf).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("restriction", ["clip", "reject", "mixed"])
+def test_they_stay_in_the_support(restriction, key):
+    box = Support([-0.5, 0.0], [0.5, 0.3])
+    drawn = settings(inflation=2.0, restriction=restriction, simulation_budget=500)
+    theta = np.asarray(_propose(key, TASK, drawn, BELIEF.replace(support=box)))
+    assert theta.shape == (500, 2) and ((theta >= np.asarray(box.low)) & (theta <= np.asarray(box.high))).all()
+
+
+@pytest.mark.parametrize(
+    "accounting",
+    [
+        settings(correction="importance", inflation=2.0),
+        settings(correction="paper"),
+        settings(rounds=1),
+        METHODS["apt"](QUICK),
+        METHODS["npe"](QUICK),
+        METHODS["snle"](QUICK),
+    ],
+    ids=["importance", "paper", "one round", "apt", "npe", "snle"],
+)
+def test_what_accounts_for_the_prior_by_itself_proposes_as_without_one(accounting, key):
+    accounting = accounting.replace(defensive=0.0)
+    theta = [_propose(jax.random.clone(key), task, accounting, BELIEF) for task in (TASK, PLAIN)]
+    np.testing.assert_array_equal(*theta)
+
+
+def test_rounds_settle_at_the_exact_mean_and_three_quarters_of_the_variance():
+    likelihood = gaussian_linear.posterior(X)
+    q = EXACT
+    for _ in range(40):
+        q = _product(likelihood, _product(q.inflated(2.0), AS_MIXTURE))
+    np.testing.assert_allclose(q.mean, EXACT.mean, atol=1e-4)
+    np.testing.assert_allclose(q.covariance, 0.75 * EXACT.covariance, rtol=1e-3)
+
+
+def test_a_sequential_run_keeps_the_prior():
+    """In the middle of five runs; a run that forgets the prior is at the likelihood's mean, four deviations away."""
+    network = MixtureNetwork(
+        hidden=(16,),
+        components=1,
+        epochs=0,
+        steps=600,
+        batch_size=100,
+        learning_rate=5e-3,
+        schedule="cosine",
+        warm_start=False,
+    )
+    sequential = settings(
+        estimator=network,
+        rounds=6,
+        simulations_per_round=200,
+        simulation_budget=200,
+        inflation=2.0,
+        restriction="mixed",
+    )
+    run = lambda key: algorithm.run(key, TASK, sequential, Fixed(), X, TASK.support("ok"), lambda *_: ())[0].belief
+    mixtures = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(3), 5)).mixture
+    deviation = np.sqrt(np.diag(EXACT.covariance))
+    off = (np.median(jax.vmap(lambda mixture: mixture.mean)(mixtures), axis=0) - EXACT.mean) / deviation
+    without = (np.asarray(gaussian_linear.posterior(X).mean) - EXACT.mean) / deviation
+    assert np.abs(off).max() < 0.5 and np.abs(without).max() > 2.0
