@@ -73,11 +73,10 @@ def all_rounds(settings: Settings) -> Settings:
 def apt(settings: Settings) -> Settings:
     """Automatic posterior transformation, SNPE-C: flows, the atomic loss, proposals from the truncated posterior.
 
-    Two flows, of which one starts from a linear regression, are better than one, and cost twice as much; steps of
-    twice as many simulations pay for part of it.
+    Two flows, of which one starts from a linear regression, are better than one, and take twice as long.
     """
     return all_rounds(settings).replace(
-        estimator=FLOW.replace(ensemble_size=2, regression=1, batch_size=100), restriction="reject", inflation=1.0
+        estimator=FLOW.replace(ensemble_size=2, regression=1), restriction="reject", inflation=1.0
     )
 
 
