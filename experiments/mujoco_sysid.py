@@ -255,9 +255,11 @@ def judged(task: Task, found: dict[str, np.ndarray], arrays: dict[str, np.ndarra
     for own, series in zip(np.asarray(task.space.to_natural(best)), found["held_out"], strict=True):
         clean, _ = backwards(task)(own[None])
         held_out.append(np.sqrt(np.mean(((clean[0] - series) / simulator.noise) ** 2)))
+    with np.errstate(invalid="ignore"):  # of no interval at all, from -inf to -inf
+        half = 0.5 * (interval[..., 1] - interval[..., 0]) / width
     return {
         "error": np.abs(point - truth) / width,
-        "half": 0.5 * (interval[..., 1] - interval[..., 0]) / width,
+        "half": half,
         "held": (interval[..., 0] <= truth) & (truth <= interval[..., 1]),
         "held_out": np.array(held_out),
     }
