@@ -542,6 +542,11 @@ def test_points_and_posteriors_of_mujoco_models():
     assert found("puck", "right", "scipy") == 0
 
 
+@pytest.mark.parametrize("task", ["gaussian_linear"])
+def test_several_trials(task):
+    assert_printed((RESULTS / "trials" / task / "table.md").read_text().splitlines())
+
+
 BOXES = ("right", "wrong")
 
 
