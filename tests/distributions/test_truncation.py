@@ -17,6 +17,7 @@ from jaxlfi.distributions.truncation import (
     mass_inside,
     rejection_sample,
     truncated_log_prob,
+    weighted_sample,
 )
 
 BOX = Support([0.5, -1.0], [2.0, 1.5])
@@ -136,3 +137,15 @@ def test_the_truncated_density_is_one_in_all_inside_and_nothing_outside():
 def test_the_density_stays_finite_where_no_draw_was_inside():
     log_prob = truncated_log_prob(jnp.float32(-3.0), BOX.low, BOX, jnp.float32(0.0))
     assert float(log_prob) == pytest.approx(-3.0 - np.log(MIN_MASS), rel=1e-6)
+
+
+def test_weighted_draws_are_in_proportion_and_none_twice(key):
+    """Of many more candidates than draws; those of no weight, or of one that is not a number, are never taken."""
+    weight = np.array([1.0, 2.0, 5.0, 0.0, np.nan])
+    kind = np.tile(np.arange(5), 20_000)
+    candidates = jnp.stack([jnp.asarray(kind, jnp.float32), jnp.arange(len(kind), dtype=jnp.float32)], axis=1)
+    draws = np.asarray(weighted_sample(key, candidates, jnp.log(jnp.asarray(weight[kind])), 800))
+    assert len(np.unique(draws[:, 1])) == 800
+    counts = np.bincount(draws[:, 0].astype(int), minlength=5)
+    assert counts[3] == counts[4] == 0
+    assert stats.chisquare(counts[:3], 800 * weight[:3] / 8).pvalue > 1e-3
