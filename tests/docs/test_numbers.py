@@ -198,12 +198,14 @@ def test_mg1_unmirrored(name):
     assert row in README.replace("**", "")
 
 
-BASELINES = sorted(path.stem for path in (RESULTS / "baselines").glob("*.npz"))
+BASELINES = sorted(
+    (folder, path.stem) for folder in ("baselines", "baselines-prior") for path in (RESULTS / folder).glob("*.npz")
+)
 
 
-@pytest.mark.parametrize("name", BASELINES)
-def test_baselines(name):
-    kept, edge = arrays(f"baselines/{name}"), arrays("baselines/misspecified+edge")
+@pytest.mark.parametrize(("folder", "name"), BASELINES)
+def test_baselines(folder, name):
+    kept, edge = arrays(f"{folder}/{name}"), arrays(f"{folder}/misspecified+edge")
     error = kept["theta_error"]
     gap = "" if name == "misspecified+edge" else with_interval(error - edge["theta_error"], median=False)
     success = np.mean(kept["succeeded"].sum(axis=-1) / kept["attempted"].sum(axis=-1))
