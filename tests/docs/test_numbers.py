@@ -544,7 +544,7 @@ def test_points_and_posteriors_of_mujoco_models():
     assert found("puck", "right", "scipy") == 0
 
 
-@pytest.mark.parametrize("task", ["gaussian_linear"])
+@pytest.mark.parametrize("task", ["gaussian_linear", "lotka_volterra"])
 def test_several_trials(task):
     assert_printed((RESULTS / "trials" / task / "table.md").read_text().splitlines())
 
