@@ -42,7 +42,7 @@ class Correction:
     Attributes:
         row_weights: (task, dataset, proposals, round, defensive fraction) -> weight of each row in the loss, shape [C].
         change: (task, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
-        accounts_for_prior: whether the task's own prior is in p-hat whatever was proposed.
+        accounts_for_prior: whether it does all that is done for a task's own prior; else proposals do.
     """
 
     row_weights: Callable[[Task, Dataset, Belief, Array, Array], Array]
@@ -159,6 +159,7 @@ def gaussian_prior(prior) -> GaussianMixture:
 
 CORRECTIONS: dict[str, Correction] = {
     "none": Correction(equal_weights, unchanged),
+    # To the letter, which draws from the posterior itself (line 8) and divides by the prior (line 11).
     "paper": Correction(equal_weights, times_reference, accounts_for_prior=True),
     "quotient": Correction(equal_weights, divided_by_proposal),
     "importance": Correction(importance_weights, unchanged, accounts_for_prior=True),

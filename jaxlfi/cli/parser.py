@@ -38,7 +38,11 @@ FILE_WIDTH = 120
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """A parser whose errors are one line."""
+    """A parser whose errors are one line, and whose flags are written out: `--seed 3` is not `--seeds 3`."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        """As argparse's."""
+        super().__init__(*args, allow_abbrev=False, **kwargs)
 
     def error(self, message: str) -> NoReturn:
         """One line on stderr, and exit status 2."""

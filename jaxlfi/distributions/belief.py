@@ -93,7 +93,7 @@ def mixed(
 
     While much of the posterior lies beyond a bound, clipped draws on that bound show the network where it wants to go.
     Once all of it is inside, wide proposals are wanted, and would pile up on the bounds if they were clipped. The mass
-    outside is that of the mixture itself, as wide as it is.
+    outside is that of the mixture itself, as wide as it is and whatever the weight.
     """
     key_posterior, key_wide = jax.random.split(key)
     draws = belief.mixture.sample(key_posterior, n)

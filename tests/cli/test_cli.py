@@ -84,6 +84,7 @@ BAD = {
     "unknown heuristic": (["infer", TASK, "--heuristic", "x"], "heuristic: expected one of"),
     "unknown preset": (["infer", TASK, "--preset", "x"], "invalid choice: 'x'"),
     "unknown flag": (["infer", TASK, "--nonsense"], "unrecognized arguments"),
+    "abbreviated flag": (["infer", TASK, "--seed", "3"], "unrecognized arguments: --seed"),
     "no end of networks": (["infer", TASK, "--ensemble-size", 2**63 - 1], "ensemble_size: expected a whole number in"),
     "not a number": (["infer", TASK, "--rounds", "x"], "invalid int value: 'x'"),
     "reversed": (["infer", TASK, "--support-low", "1", "1", "--support-high", "0", "2"], "low < high"),
