@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 from jaxlfi.estimators.base import SCHEDULES, Network
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.losses import LOSSES
+from jaxlfi.estimators.shuffling import shuffled
 
 STEPS_PER_EPOCH = 50
 """Maximum gradient steps in an epoch, where steps are counted; the validation loss is computed after each epoch."""
@@ -102,7 +103,7 @@ def _fit_one(key, estimator, params, data, size, expected_size):
     adam = optax.adamw(rate, weight_decay=estimator.weight_decay)
 
     key_split, key_epochs = jax.random.split(key)
-    rows = _shuffled(key_split, jnp.arange(capacity), size)
+    rows = shuffled(key_split, jnp.arange(capacity), size)
     held_out = jnp.floor(estimator.validation * size).astype(jnp.int32)
     training = jnp.maximum(size - held_out, 1)
     held_out_places = jnp.arange(max(2, int(estimator.validation * capacity)))
@@ -160,7 +161,7 @@ def _fit_one(key, estimator, params, data, size, expected_size):
 
     def body(carry):
         index, training_state, curves = carry
-        order = _shuffled(jax.random.fold_in(key_epochs, index), rows, training)
+        order = shuffled(jax.random.fold_in(key_epochs, index), rows, training)
         training_state, seen = one_epoch(training_state, index, order)
         return index + 1, training_state, jax.tree.map(lambda curve, now: curve.at[index].set(now), curves, seen)
 
@@ -177,9 +178,3 @@ def _fit_one(key, estimator, params, data, size, expected_size):
 def _where(condition, new, old):
     """One of two pytrees."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
-
-
-def _shuffled(key: jax.Array, rows: Int[Array, " cap"], count: Int[Array, ""]) -> Int[Array, " cap"]:
-    """The first `count` rows in random order, the others behind them."""
-    rank = jnp.where(jnp.arange(rows.shape[0]) < count, jax.random.uniform(key, rows.shape), 2.0)
-    return rows[jnp.argsort(rank)]
