@@ -331,6 +331,30 @@ def test_several_rollouts(name):
     )
 
 
+def reference_objects(dlo: str, rollouts: str) -> list[dict[str, str]]:
+    """The runs of one object from one rollout or from four."""
+    with (RESULTS / "rollouts/objects.csv").open(newline="") as file:
+        return [row for row in csv.DictReader(file) if (row["object"], row["rollouts"]) == (dlo, rollouts)]
+
+
+@pytest.mark.parametrize("rollouts", ["1", "4 mean"])
+@pytest.mark.parametrize("dlo", ["dlo-0", "dlo-1", "dlo-2", "dlo-3"])
+def test_several_rollouts_of_the_reference_objects(dlo, rollouts):
+    runs = reference_objects(dlo, rollouts)
+    length, modulus = (", ".join(row[name] for row in runs) for name in ("length [mm]", "E [kPa]"))
+    held = sum(row["holds E by sag"] == "True" for row in runs)
+    assert_printed([f"| {rollouts.removesuffix(' mean')} | {length} | {modulus} | {held} of {len(runs)} |"])
+
+
+@pytest.mark.parametrize("dlo", ["dlo-2", "dlo-3"])
+def test_mean_moduli_of_the_reference_objects(dlo):
+    one, four = (
+        np.mean([float(row["E [kPa]"].split()[0]) for row in reference_objects(dlo, rollouts)])
+        for rollouts in ("1", "4 mean")
+    )
+    assert_printed([f"from {one:.1f} to {four:.1f} kPa"])
+
+
 def test_engines_of_the_whip():
     measured = json.loads((RESULTS / "whip-engines/speed.json").read_text())["measured"]
     for printed, name in (
