@@ -68,6 +68,21 @@ def test_all_directions_settle_alike():
     np.testing.assert_allclose(q.mean, LIKELIHOOD.mean, rtol=1e-4)
 
 
+def test_of_two_widths_the_larger_is_lost():
+    """A posterior that is narrow and wide at once, as docs/calibration.md has it: one round leaves 1 % wide."""
+    deviations, mean = (0.1, 1.0), jnp.array([0.7, -1.2])
+    likelihood = GaussianMixture(
+        jnp.zeros(2), jnp.stack([mean, mean]), jnp.stack([deviation * jnp.eye(2) for deviation in deviations])
+    )
+    after = _product(likelihood, _inflated(likelihood, 2.0))
+    # A product of two Gaussians with one mean has the density that N(0, a + b) has at 0, in two dimensions 1 / (a + b).
+    variances = [Fraction(1, 100), Fraction(1)]
+    parts = {(a, b): 1 / (a + 4 * b) for a in variances for b in variances}
+    wide = parts[1, 1] / sum(parts.values())
+    assert round(float(wide), 2) == 0.01
+    np.testing.assert_allclose(after.weights[after.marginal_scales[:, 0] > 0.5], [float(wide)], rtol=1e-4)
+
+
 def test_a_direction_without_information_fills_up():
     """The likelihood is flat along the second axis: there the posterior becomes as wide as its proposals."""
     ridge = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.array([[[0.5, 0.0], [0.0, 1e6]]]))
