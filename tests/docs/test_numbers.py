@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import mujoco_sysid, widths
+from experiments import embedding, mujoco_sysid, widths
 from experiments.policies import report
 from experiments.policies import results as policies
 from experiments.sota import rows as sota
@@ -60,6 +60,23 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
 )
 def test_widths(line):
     assert " ".join(line.split()) in README
+
+
+EMBEDDING = RESULTS / "embedding/lotka_volterra/misspecified+edge"
+
+
+@pytest.mark.parametrize("line", embedding.table(EMBEDDING).splitlines()[2:])
+def test_embeddings(line):
+    assert " ".join(line.split()) in README
+
+
+def test_runs_that_embeddings_lose():
+    lost = {
+        name: int(np.sum(arrays(f"embedding/lotka_volterra/misspecified+edge/{name}-own")["error"] > widths.LOST))
+        for name in embedding.NAMES
+    }
+    assert lost["series"] == lost["summaries"] == 1
+    assert_printed([f"`raw` loses {lost['raw']} runs of 10 and `mlp` {lost['mlp']}"])
 
 
 def test_widths_near_bounds():
