@@ -129,9 +129,9 @@ def test_a_flow_runs_in_the_same_loop_and_repeats(flow_run):
     same = lambda run: (run.belief, run.network, run.dataset, run.history | {"seconds": None})
     chex.assert_trees_all_equal(same(again), same(first))
     chex.assert_tree_all_finite(first.belief)
-    assert first.belief.mixture.means.shape == (estimator.components, 2)
+    assert first.belief.mixture.means.shape == (estimator.ensemble_size * estimator.components, 2)
     loss, mass = first.history["loss"], first.history["mass_inside"]
-    assert loss.shape == (2, 1, estimator.epochs) and np.isfinite(loss).all()
+    assert loss.shape == (2, estimator.ensemble_size, estimator.epochs) and np.isfinite(loss).all()
     assert np.all((mass > 0) & (mass <= 1))
 
 
