@@ -47,6 +47,7 @@ from jaxlfi.envs.whip.rules import ACTION_LIMIT, HIT_DISTANCE, STEPS
 from jaxlfi.envs.whip.vision.camera import Camera
 from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS, ON_DLO
 from jaxlfi.io import files as atomic
+from jaxlfi.io.formats import require_version
 
 SCHEMA, VERSION = "jaxlfi.whip.recording", 1
 SOURCES = ("simulated", "real")
@@ -251,8 +252,7 @@ def checked(described: Any, where: str) -> dict[str, Any]:
     """
     if not isinstance(described, dict) or described.get("schema") != SCHEMA:
         raise ValueError(f"schema: expected {SCHEMA!r} in {where}, got another kind of file")
-    if described.get("version") != VERSION:
-        raise ValueError(f"version: expected {VERSION}, got {described.get('version')!r}")
+    require_version(where, SCHEMA, VERSION, described.get("version"))
     for name, kind in {**_DESCRIBED, "units": dict, "keypoints": list}.items():
         if name not in described:
             raise ValueError(f"{name}: expected in {where}, got none")

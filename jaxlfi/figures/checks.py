@@ -15,6 +15,8 @@ from jaxlfi.figures.predictive import QUANTILES
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
 from jaxlfi.io import files
 
+CURVE = ("level", "pointwise", "simultaneous")
+"""Arrays of a curve's levels and bands."""
 REACH = 8.0
 """Standard deviations beyond which a summary is drawn at the edge of the panel."""
 
@@ -33,16 +35,20 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
         ValueError: for a folder whose diagnostics.npz or diagnostics.json is missing or damaged.
     """
     folder = Path(folder)
-    arrays = read_arrays(folder / "diagnostics.npz", ("names", "units"))
+    path = folder / "diagnostics.npz"
+    arrays = read_arrays(path, ("names", "units"), [name for needed, *_ in PICTURES.values() for name in needed])
     found = _read(folder / "diagnostics.json")
     pictures = []
+    drawable = {name: maker for name, maker in PICTURES.items() if maker[0][0] in arrays}
+    for needed, *_ in drawable.values():
+        if missing := [name for name in needed if name not in arrays]:
+            raise ValueError(f"{path}: expected {', '.join(needed)}; missing {', '.join(missing)}")
     with style.context():
-        for name, (needed, size, draw, title, caption) in PICTURES.items():
-            if needed in arrays:
-                figure = style.new_figure(*size(arrays))
-                draw(figure, arrays)
-                path = style.save(figure, folder / "figures" / f"{name}.png", dpi)
-                pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
+        for name, (_, size, draw, title, caption) in drawable.items():
+            figure = style.new_figure(*size(arrays))
+            draw(figure, arrays)
+            path = style.save(figure, folder / "figures" / f"{name}.png", dpi)
+            pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
     text = page.render_diagnostics(found, pictures)
     index = folder / "report.html"
     files.write_bytes(index, text.encode(errors="replace"))
@@ -114,32 +120,33 @@ def _widths_size(arrays: Arrays) -> tuple[float, float]:
     return TEXT_WIDTH, intervals.height(arrays)
 
 
-Maker = tuple[str, Callable[[Arrays], tuple[float, float]], Callable[[Figure, Arrays], None], str, str]
+Maker = tuple[tuple[str, ...], Callable[[Arrays], tuple[float, float]], Callable[[Figure, Arrays], None], str, str]
 
 PICTURES: dict[str, Maker] = {
     "widths": (
-        "widths_held", _widths_size, intervals.draw, "Intervals",
+        ("widths_held", "widths_regions_held", "widths_level", "widths_factor"), _widths_size, intervals.draw, "Intervals",
         "Left: the fraction of truths that intervals of each parameter, and densest regions of all parameters together "
         "(last row), held; they should hold 50 % and 90 % (lines). Right: the factor by which the width of 90 % "
         "intervals would have to be multiplied for them to hold 90 %. Bars are confidence intervals, of 95 % for all "
         "parameters together.",
     ),
     "ranks": (
-        "bin_count", _ranks_size, calibration.draw_ranks, "Ranks (simulation-based calibration)",
+        ("bin_count", "bin_edges", "bin_band", "level", "ranks_fraction", "ranks_simultaneous"), _ranks_size, calibration.draw_ranks, "Ranks (simulation-based calibration)",
         "The rank of each truth among draws of its posterior, for truths over the support. U-shaped: too narrow; a "
         "hill: too wide; a slope: biased.",
     ),
     "coverage": (
-        COVERAGE, _square, calibration.draw_coverage, "Coverage of densest regions",
+        (COVERAGE, *CURVE), _square, calibration.draw_coverage, "Coverage of densest regions",
         "For truths over the support. Below the diagonal: over-confident.",
     ),
     "tarp": (
-        DISTANCE, _square, calibration.draw_tarp, "Coverage from random points (TARP)",
+        (DISTANCE, *CURVE), _square, calibration.draw_tarp, "Coverage from random points (TARP)",
         "The same with regions around random points, which sees what densities do not.",
     ),
     "predictive": (
-        "predictive_x", _predictive_size, draw, "Posterior predictive",
+        ("predictive_x", "observed_x", "predictive_distances", "observed_distance", "predictive_p_value"),
+        _predictive_size, draw, "Posterior predictive",
         "The run's own observation among simulations of its own posterior.",
     ),
 }  # fmt: skip
-"""By file name: an array the picture needs, its size in inches, the function that draws it, its title and caption."""
+"""By file name: the arrays of numbers it needs (drawn where the first is there), its size in inches, the function that draws it, its title and caption."""

@@ -1,7 +1,7 @@
 """History: the saved arrays of one inference run, as the figures use them."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,26 @@ REQUIRED = (
 )
 """Arrays of history.npz that a run must have to be drawn."""
 
-TEXTS = ("axes", "channels", "names", "parameters", "reasons", "record_label", "summaries", "units")
-"""Arrays of texts, in any file."""
+NUMBERS = (
+    *REQUIRED,
+    "loss",
+    "validation_loss",
+    "sample_theta_error",
+    "sample_trajectory_error",
+    "attempted",
+    "failed",
+    "seconds",
+    "final_trajectory",
+    "final_x",
+    "trajectory",
+    "times",
+    "x",
+    "truth",
+    "round",
+    "draws",
+    "log",
+)
+"""Arrays of a run's files that figures calculate with; what else a file holds, texts among it, is no business of theirs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,7 +215,7 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     config = read_config(folder)
     if config["format"] != "jaxlfi-run":
         raise ValueError(f"{folder}: expected config.json of format 'jaxlfi-run', got {config['format']!r}")
-    arrays = read_arrays(folder / "history.npz", REQUIRED)
+    arrays = read_arrays(folder / "history.npz", REQUIRED, NUMBERS)
     observation, posterior, dataset = (
         _arrays_if_there(folder / f"{name}.npz") for name in ("observation", "posterior", "dataset")
     )
@@ -259,16 +277,21 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def read_arrays(path: Path, required: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
+def read_arrays(path: Path, required: Sequence[str] = (), numbers: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """All arrays of an npz file.
 
+    Args:
+        path: the file.
+        required: names of arrays that it must have.
+        numbers: names of arrays that must not be texts, where it has them.
+
     Raises:
-        ValueError: if it is missing, damaged, or lacks one of the required arrays.
+        ValueError: if it is missing, damaged, lacks a required array or has texts in place of numbers.
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected the file, found none (has the run ended a round?)")
     arrays = files.read_arrays(path)
-    if texts := [name for name, array in arrays.items() if array.dtype.kind in "SU" and name not in TEXTS]:
+    if texts := [name for name in numbers if name in arrays and arrays[name].dtype.kind in "SU"]:
         raise ValueError(f"{path}: expected numbers, got texts as {', '.join(texts)}")
     if missing := [name for name in required if name not in arrays]:
         raise ValueError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
@@ -286,7 +309,7 @@ def robust_sd(x: np.ndarray) -> np.ndarray:
 
 
 def _arrays_if_there(path: Path) -> dict[str, np.ndarray]:
-    return read_arrays(path) if path.exists() else {}
+    return read_arrays(path, numbers=NUMBERS) if path.exists() else {}
 
 
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

@@ -94,13 +94,13 @@ def load(folder: Path) -> Grid:
         raise ValueError(
             f"{folder}: expected a finished grid, found no grid.npz: continue with 'jaxlfi resume {folder}'"
         )
-    arrays = read_arrays(folder / "grid.npz", ("axes", *measures))
+    arrays = read_arrays(folder / "grid.npz", ("axes", *measures), measures)
     try:
         names = tuple(str(name) for name in arrays["axes"])
         defaults = {axis["name"]: axis["default"] for axis in config["axes"]}
         return Grid(
             names,
-            tuple(tuple(arrays[f"values/{name}"].tolist()) for name in names),
+            tuple(tuple(arrays[f"values/{name}"].astype(float).tolist()) for name in names),
             tuple(float(defaults[name]) for name in names),
             {name: arrays[name] for name in measures},
             heuristic_name(config["heuristic"]),

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from jaxlfi.io import files
+from jaxlfi.io.formats import require_version
 from jaxlfi.io.rollout import Rollout, Signal, array, numbers
 
 VERSION = "v3.0"
@@ -371,8 +372,9 @@ def _own(text: str | None) -> dict[str, Any]:
         complete = all({"times", "values", "duration"} <= set(signal) for signal in signals.values())
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"expected JSON of jaxlfi in the column {COLUMN!r} of the episodes, got another") from error
-    if version != COLUMN_VERSION or not complete:
-        raise ValueError(f"expected version {COLUMN_VERSION} in the column {COLUMN!r} of the episodes, got {version}")
+    require_version(f"column {COLUMN!r} of the episodes", COLUMN, COLUMN_VERSION, version)
+    if not complete:
+        raise ValueError(f"expected JSON of jaxlfi in the column {COLUMN!r} of the episodes, got incomplete signals")
     return own
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from jaxlfi.io import files
+from jaxlfi.io.formats import require_version
 from jaxlfi.io.rollout import Rollout, Signal, array, numbers
 
 SCHEMA, RECORD, VERSION = "jaxlfi.Signal", "jaxlfi.rollout", 1
@@ -143,8 +144,8 @@ def _rollout(messages: list[tuple[Any, Any, bytes]], records: Mapping[str, Mappi
         except ValueError as error:
             raise ValueError(f"{channel.topic}: {error}") from error
     record = records.get(RECORD, {"version": str(VERSION)})
-    if record.get("version") != str(VERSION):
-        raise ValueError(f"expected a record {RECORD} of version {VERSION}, got {record.get('version')}")
+    version = record.get("version")
+    require_version("record", RECORD, VERSION, int(version) if str(version).isdecimal() else version)
     try:
         metadata = json.loads(record.get("metadata", "{}"))
         return Rollout(signals, dict(metadata), record.get("task", ""))

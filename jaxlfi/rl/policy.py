@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from jaxlfi.io import files
+from jaxlfi.io.formats import require_version
 
 FORMAT, VERSION = "jaxlfi-policy", 1
 ONE = np.float32(1)
@@ -162,8 +163,9 @@ def read(path: str | Path, kind: str, version: int) -> tuple[dict[str, np.ndarra
         got, its_version = schema.pop("format"), schema.pop("version")
     except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path}: expected a policy that jaxlfi saved, got an .npz without its schema") from error
-    if (got, its_version) != (kind, version):
+    if got != kind:
         raise ValueError(f"{path}: expected {kind} of version {version}, got {got} of version {its_version}")
+    require_version(path, kind, version, its_version, schema)
     return arrays, schema
 
 

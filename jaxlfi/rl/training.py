@@ -24,6 +24,7 @@ from jax.sharding import Mesh
 
 from jaxlfi.bayessim.programs import side_by_side
 from jaxlfi.io import files, serialise, trees
+from jaxlfi.io.formats import require_version
 from jaxlfi.io.processes import ALONE, Partition, Processes
 from jaxlfi.rl import ppo
 from jaxlfi.rl.domains import POOL, Domain, Draw
@@ -208,8 +209,12 @@ def read_config(out: Path) -> dict[str, Any]:
         raise StoreError(
             f"expected the folder of a training, got {str(out)!r} without a readable config.json"
         ) from error
-    if not isinstance(config, dict) or (config.get("format"), config.get("version")) != (FORMAT, VERSION):
-        raise StoreError(f"expected the folder of a training of this version, got {str(out)!r}")
+    if not isinstance(config, dict) or config.get("format") != FORMAT:
+        raise StoreError(f"expected the folder of a training, got {str(out)!r}, whose config.json is not one's")
+    try:
+        require_version(out / "config.json", FORMAT, VERSION, config.get("version"), config)
+    except ValueError as error:
+        raise StoreError(str(error)) from error
     try:
         settings_of(config)
         domains, seeds = zip(*((one["domain"], one["seed"]) for one in config["trainings"]), strict=True)

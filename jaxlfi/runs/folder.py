@@ -32,6 +32,7 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.widths import expected_widths
 from jaxlfi.io import files as atomic
 from jaxlfi.io import trees
+from jaxlfi.io.formats import require_version
 from jaxlfi.io.serialise import json_safe
 from jaxlfi.runs import describe
 from jaxlfi.tasks import priors, summaries
@@ -42,7 +43,11 @@ if TYPE_CHECKING:  # runs know how to save themselves
 
 RUN, RUNS, COMPARE = "jaxlfi-run", "jaxlfi-runs", "jaxlfi-compare"
 VERSION = 2
-"""Of the format of all folders; it rises whenever an older one could be misread."""
+"""Of the format of all folders; it rises whenever an older one could be misread.
+
+What is added to a folder without a new number, readers must do without: a new setting's default is what was done before
+there was the setting. `tests/golden/formats/` has a folder of each number, and of each state of one.
+"""
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "distrax", "numpy")
 TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")
 
@@ -184,11 +189,10 @@ def check_version(path: Path, config: Mapping[str, Any]) -> None:
     Raises:
         StoreError: in one line.
     """
-    if config.get("version") != VERSION:
-        raise StoreError(
-            f"{path}: expected version {VERSION} of the format, got {config.get('version')}: the folder was written by "
-            "another version of jaxlfi; run its command again"
-        )
+    try:
+        require_version(path, str(config.get("format")), VERSION, config.get("version"), config)
+    except ValueError as error:
+        raise StoreError(f"{error}; or run its command again") from error
 
 
 def append_ledger(folder: Path, index: int, row: Mapping[str, np.ndarray], reasons: Sequence[str], seconds: float):
@@ -321,6 +325,6 @@ def read_table(path: Path) -> list[dict[str, Any]]:
     """The table of a comparison; what was unknown is NaN."""
     with path.open(newline="") as file:
         return [
-            {name: value if name == "configuration" else float(value or "nan") for name, value in line.items()}
+            {name: line[name] if name == "configuration" else float(line[name] or "nan") for name in TABLE_COLUMNS}
             for line in csv.DictReader(file)
         ]

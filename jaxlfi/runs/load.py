@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.bayessim.keys import key_of
+from jaxlfi.bayessim.record import FINAL
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
@@ -26,10 +27,6 @@ from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks import registry
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.task import Task
-
-LABELS = ("reasons", "names")
-"""Arrays of history.npz that are texts, not records."""
-
 
 def load(folder: str | Path, task: Task | None = None) -> Run:
     """Read a finished run back: what `infer`, `run.save` and the command line wrote, of one seed.
@@ -83,9 +80,7 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
     layout = tuple(map(int, observation.get("layout", (len(x), 1))))
     return Run(
         belief=_belief(folder / "posterior.npz", space),
-        history={
-            name: value for name, value in _arrays(folder / "history.npz", ("theta",)).items() if name not in LABELS
-        },
+        history=_history(folder / "history.npz"),
         dataset=_dataset(folder / "dataset.npz", settings),
         network=_network(folder / "network.npz", settings, layout, feasible, space, prior),
         observed=observed,
@@ -145,6 +140,17 @@ def _belief(path: Path, space: Space) -> Belief:
     if not (low < high).all():
         raise StoreError(f"{path}: expected support_low below support_high, got others")
     return Belief(GaussianMixture(logits, means, scale_tril), Support(low, high), jnp.asarray(True))
+
+
+def _history(path: Path) -> dict[str, np.ndarray]:
+    """What every round did; arrays that are no numbers, or none of rounds, are not of the record."""
+    arrays = _arrays(path, ("theta",))
+    rounds = arrays["theta"].shape[:1]
+    return {
+        name: array
+        for name, array in arrays.items()
+        if array.dtype.kind not in "SU" and (name.startswith(FINAL) or array.shape[:1] == rounds)
+    }
 
 
 def _dataset(path: Path, settings: Settings) -> Dataset:

@@ -259,7 +259,7 @@ SPOILED = {
     ),
     "later column": (
         lambda path: changed(path, "jaxlfi", lambda text: text.replace('"version": 1', '"version": 2')),
-        "expected version 1 in the column 'jaxlfi' of the episodes, got 2",
+        "column 'jaxlfi' of the episodes: expected jaxlfi of version 1, got version 2",
     ),
     "rows that were edited": (
         other_rows,

@@ -120,7 +120,7 @@ FOREIGN = {
     "type": ([with_state({"dtype": "object"})], {}, "/observation/state: expected an array of object"),
     "names": ([with_state({"names": '["a"]'})], {}, "/observation/state: names: expected 2"),
     "no list": ([with_state({"names": "a, b"})], {}, "/observation/state: expected names as a JSON list"),
-    "version": ([STATE], {"version": "2"}, "expected a record jaxlfi.rollout of version 1, got 2"),
+    "version": ([STATE], {"version": "2"}, "expected jaxlfi.rollout of version 1, got version 2, which a newer"),
     "metadata": ([STATE], {"version": "1", "metadata": "3"}, "expected a JSON object as metadata"),
 }
 

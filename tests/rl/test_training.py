@@ -154,7 +154,7 @@ def test_what_cannot_be_gone_on_with_is_refused(finished, tmp_path):
         training.read_config(tmp_path)
     config = json.loads((out / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(config | {"version": 0}))
-    with pytest.raises(StoreError, match=r"of this version"):
+    with pytest.raises(StoreError, match="expected jaxlfi-training of version 1, got version 0"):
         training.read_config(tmp_path)
     (tmp_path / "config.json").write_text(json.dumps(config | {"environment_name": "whip"}))
     with pytest.raises(StoreError, match="expected a training of line, got one of whip"):

@@ -248,7 +248,7 @@ SPOILED = {
     "parameters": (lambda _, config: config.update(names=["a", "b"]), "got changed ones"),
     "missing part": (lambda _, config: config.pop("axes"), "complete description"),
     "an older version": (lambda _, config: config.update(version=1), "by another version of jaxlfi"),
-    "version": (lambda _, config: config.update(version=9), "expected version 2 of the format, got 9"),
+    "version": (lambda _, config: config.update(version=9), "expected jaxlfi-grid of version 2, got version 9"),
     "observation": (_truncate("observation.npz"), "expected a whole .npz"),
     "damaged chunk": (_truncate("chunks/001.npz"), "delete it, and resuming computes it again"),
     "chunk of another grid": (_chunk_of_another, "got one of another"),

@@ -19,6 +19,7 @@ from PIL import Image
 
 from jaxlfi.envs.whip.frames import COLOURS
 from jaxlfi.io import files
+from jaxlfi.io.formats import require_version
 
 SCHEMA, VERSION = "jaxlfi-whip-pictures", 1
 LABELS = ("background", *COLOURS, "dlo")
@@ -163,7 +164,11 @@ def _header(folder: Path) -> dict[str, Any]:
         raise PicturesError(f"expected a folder of pictures, got {folder}, without a readable {HEADER}") from error
     if not isinstance(header, dict) or header.get("schema") != SCHEMA or "count" not in header:
         raise PicturesError(f"{folder / HEADER}: expected the schema {SCHEMA!r}, got another kind of file")
-    for name, expected in (("version", VERSION), ("size", SIZE), ("labels", list(LABELS))):
+    try:
+        require_version(folder / HEADER, SCHEMA, VERSION, header.get("version"))
+    except ValueError as error:
+        raise PicturesError(str(error)) from error
+    for name, expected in (("size", SIZE), ("labels", list(LABELS))):
         if header.get(name) != expected:
             raise PicturesError(f"{folder / HEADER}: {name}: expected {expected}, got {header.get(name)}")
     return header

@@ -13,6 +13,7 @@ import numpy as np
 from jaxlfi.envs.whip.vision.segmenter import BLOCK, Segmenter
 from jaxlfi.envs.whip.vision.transporter import SIZE, Transporter
 from jaxlfi.io import files, trees
+from jaxlfi.io.formats import require_version
 
 FORMAT, VERSION = "jaxlfi-whip-vision", 1
 DATA = Path(__file__).parents[1] / "data"
@@ -80,11 +81,15 @@ def load(path: Path, kind: str) -> Weights:
         found = header["format"], header["version"], header["kind"]
     except (KeyError, TypeError, ValueError) as error:
         raise WeightsError(f"{path}: expected the weights of a {kind}, got a missing or damaged file") from error
-    if found != (FORMAT, VERSION, kind):
+    if found[::2] != (FORMAT, kind):
         raise WeightsError(
             f"{path}: expected the weights of a {kind}, {FORMAT} version {VERSION}, got {found[0]} version {found[1]} "
             f"of a {found[2]}"
         )
+    try:
+        require_version(path, FORMAT, VERSION, found[1], header.get("about", {}))
+    except ValueError as error:
+        raise WeightsError(str(error)) from error
     try:
         settings = {
             name: tuple(value) if isinstance(value, list) else value for name, value in header["module"].items()

@@ -80,8 +80,9 @@ def read_plan(path: Path) -> dict[str, Any]:
         found = atomic.read_json(path)
     except ValueError as error:
         raise StoreError(f"{path}: expected a plan, got a damaged one: {error}") from error
-    if not isinstance(found, dict) or (found.get("format"), found.get("version")) != (FORMAT, VERSION):
-        raise StoreError(f"{path}: expected format {FORMAT!r}, version {VERSION}, got another")
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise StoreError(f"{path}: expected format {FORMAT!r}, got another")
+    run_store.check_version(path, found)
     return found
 
 

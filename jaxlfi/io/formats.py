@@ -1,0 +1,49 @@
+"""Versions of file formats: one is read, and of any other it is said which jaxlfi reads it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+NOTHING: Mapping[str, Any] = {}
+
+
+def require_version(where: Any, kind: str, wanted: int, got: Any, record: Mapping[str, Any] = NOTHING) -> None:
+    """Refuse a file of another version of its format, in one line that names the jaxlfi which reads it.
+
+    Args:
+        where: the file, for the error.
+        kind: name of the format.
+        wanted: the version that is read.
+        got: the version that the file says.
+        record: what the file says of its origin: `versions` of packages by name, and when it was `started`.
+
+    Raises:
+        ValueError: for another version.
+
+    Example:
+        >>> record = {"versions": {"jaxlfi": "0.1.0"}, "started": "2026-11-22T14:00:00+00:00"}
+        >>> require_version("run/config.json", "jaxlfi-run", 2, 1, record)
+        Traceback (most recent call last):
+        ValueError: run/config.json: expected jaxlfi-run of version 2, got version 1, which jaxlfi 0.1.0 of 2026-11-22 \
+wrote and reads
+    """
+    if type(got) is int and got == wanted:
+        return
+    text = f"{where}: expected {kind} of version {wanted}, got version {got!r}"
+    if type(got) is not int or got < 1:
+        raise ValueError(text)
+    if author := written_by(record):
+        raise ValueError(f"{text}, which {author} wrote and reads")
+    raise ValueError(f"{text}, which {'a newer' if got > wanted else 'an older'} jaxlfi wrote and reads")
+
+
+def written_by(record: Mapping[str, Any]) -> str:
+    """Which jaxlfi wrote a file, and when, as its record of `versions` and `started` says; "" where it says nothing.
+
+    The date is a part of it, as development versions share a number.
+    """
+    versions = record.get("versions")
+    version = versions.get("jaxlfi") if isinstance(versions, Mapping) else None
+    if not isinstance(version, str):
+        return ""
+    started = record.get("started")
+    return f"jaxlfi {version} of {started[:10]}" if isinstance(started, str) else f"jaxlfi {version}"
