@@ -14,10 +14,12 @@ import io
 import json
 import re
 import shutil
+import types
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -68,12 +70,38 @@ def a_whip_policy(place: Path, patch: pytest.MonkeyPatch) -> None:
     """The file of a policy, and in place of the objects' simulation one that moves nothing but the gripper."""
     from envs_whip import Rig, a_policy, found
 
-    from jaxlfi.envs.whip.reference_objects import repetitions, robot
+    from jaxlfi.envs.whip.reference_objects import film, repetitions, robot
 
     a_policy(place / "policy.npz")
+    patch.setattr(film, "SIZE", 64)
     patch.setattr(robot, "ReferenceRig", Rig)
     patch.setattr(robot, "_found", found)
     patch.setattr(repetitions, "processors", lambda: 1)
+
+
+def a_whip_camera(place: Path, patch: pytest.MonkeyPatch) -> None:
+    """In place of the objects' simulation and of its pictures, frames in which only the gripper moves."""
+    from envs_whip import EVERYWHERE, Rig
+
+    from jaxlfi.envs.whip.reference_objects import observation
+    from jaxlfi.envs.whip.reference_objects.scene import PLACE
+    from jaxlfi.envs.whip.vision import commands
+
+    class Camera(Rig):
+        def __init__(self, dlo):
+            super().__init__(dlo, PLACE)
+            self.dlo, self.place = dlo, PLACE
+
+        def rollout(self, actions):
+            first = jax.tree.map(lambda leaf: leaf[None], self.reset())
+            frames = jax.tree.map(lambda *leaves: np.concatenate(leaves), first, *map(self.step, actions))
+            return observation.FRAME_INTERVAL * np.arange(len(frames.gripper)), frames
+
+    def found(function, key, camera, frames, cube_side):
+        return np.stack([EVERYWHERE] * len(frames.gripper)), np.ones((len(frames.gripper), 10), bool)
+
+    patch.setattr(commands, "ReferenceRig", Camera)
+    patch.setattr(observation, "in_every_frame", found)
 
 
 def small_whip(place: Path, patch: pytest.MonkeyPatch) -> None:
@@ -129,7 +157,7 @@ def stages(place: Path, patch: pytest.MonkeyPatch) -> None:
         return 0
 
     patch.setattr(r2s2r.train, "main", train)
-    patch.setattr(r2s2r.command_line, "main", infer)
+    patch.setattr(r2s2r, "command_line", types.SimpleNamespace(main=infer))
     patch.setattr(r2s2r, "REPETITIONS", 2)
 
 
@@ -176,7 +204,7 @@ EXAMPLES = {
     "report": Example("report @grid", needs=("grid",), writes=(".html", ".png")),
     "train": Example(f"{LINE} --out @train", writes=(".png",), extra="brax", slow=True),
     "evaluate": Example(
-        "evaluate rl.toy:Line @train --domain median --episodes 4 --out @evaluate.csv",
+        "evaluate rl.toy:Line @train/uniform/seed_000/policy.npz --domain median --episodes 4 --out @evaluate.csv",
         needs=("train",), extra="brax", slow=True,
     ),
     "export": Example("export @train --out @export.npz", needs=("train",), writes=(".npz",), extra="brax", slow=True),
@@ -198,15 +226,20 @@ EXAMPLES = {
     "whip convert": Example(
         "whip convert @control.npz @converted.mcap", needs=("whip control",), writes=(".mcap",), **WHIP
     ),
-    "whip record": Example("whip record --object dlo-0 --out @recorded.npz", writes=(".npz",), **WHIP),
+    "whip record": Example(
+        "whip record --object dlo-0 --out @recorded.npz", writes=(".npz",), before=a_whip_camera, **WHIP
+    ),
     "whip pictures": Example("whip pictures --count 2 --out @pictures", before=small_vision, **WHIP),
     "whip import-pictures": Example(
         "whip import-pictures --coco @coco.json --images @images --out @imported", before=small_vision, **WHIP
     ),
-    "whip train-vision": Example("whip train-vision --out @vision", writes=(".npz",), before=small_vision, **WHIP),
+    "whip train-vision": Example(
+        "whip train-vision --only segmenter --pictures @pictures --out @vision",
+        needs=("whip pictures",), writes=(".npz",), before=small_vision, **WHIP,
+    ),
     "whip export-vision": Example(
         "whip export-vision --weights @vision --out @segmenter.onnx", needs=("whip train-vision",), writes=(".onnx",),
-        before=small_vision, **WHIP,
+        **WHIP,
     ),
     "r2s2r": Example("r2s2r --object dlo-0 --out @loop", needs=("infer",), writes=(".html",), before=stages, **WHIP),
 }  # fmt: skip
@@ -232,7 +265,7 @@ def test_every_command_has_an_example():
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
-    """A function that runs an example, and before it what it needs, once: what it printed, and where its results are."""
+    """A function that runs an example once, after those it needs: what it printed, and where its results are."""
     place, printed = tmp_path_factory.mktemp("commands"), {}
     save = style.save
 
@@ -261,14 +294,14 @@ def run(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
 )
 def test_a_command_names_what_it_wrote_and_all_of_it_can_be_opened(name, run):
     output, place = run(name)
-    named = [Path(path) for path in re.findall(rf"{re.escape(str(place))}[^\s,;]*", output)]
-    named = [path for path in named if "DOMAIN" not in path.parts]
-    assert {path.suffix for path in named} >= set(EXAMPLES[name].writes), output
-    for path in named:
-        assert path.exists(), output
-        for file in path.rglob("*") if path.is_dir() else [path]:
-            if file.is_file():
-                OPENED.get(file.suffix, lambda file: None)(file)
+    lines = [line for line in output.splitlines() if not line.startswith("│")]  # a table cuts long names
+    found = re.findall(rf"{re.escape(str(place))}[^\s,;:]*", "\n".join(lines))
+    named = [path for path in map(Path, found) if "DOMAIN" not in path.parts]
+    assert all(path.exists() for path in named), output
+    written = {file for path in named for file in (path, *path.rglob("*")) if file.is_file()}
+    assert {path.suffix for path in written} >= set(EXAMPLES[name].writes), output
+    for file in written:
+        OPENED.get(file.suffix, lambda file: None)(file)
 
 
 class Page(HTMLParser):
