@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from jaxlfi.figures import calibration, intervals, page, style
 from jaxlfi.figures.calibration import BAND, COLOUR, COVERAGE, DISTANCE, Arrays
+from jaxlfi.figures.extent import extent
 from jaxlfi.figures.history import read_arrays, robust_sd
 from jaxlfi.figures.page import Picture
 from jaxlfi.figures.predictive import QUANTILES
@@ -97,7 +98,8 @@ def draw(figure: Figure, arrays: Arrays) -> None:
     left.xaxis.get_major_locator().set_params(integer=True)
     left.set_title("each summary: observed (dots), 50 % and 90 % of simulations (bars)")
     left.grid(True, axis="y")
-    right.hist(arrays["predictive_distances"], bins=20, color=BAND, alpha=0.6, gid="simulated")
+    distances = arrays["predictive_distances"]
+    right.hist(distances, bins=20, range=extent(distances), color=BAND, alpha=0.6, gid="simulated")
     right.axvline(float(arrays["observed_distance"]), color=COLOUR, gid="observed")
     right.set(xlabel="Mahalanobis distance (line: observed)", ylabel="number of simulations")
     right.set_title(f"all summaries (p = {float(arrays['predictive_p_value']):.2g})")

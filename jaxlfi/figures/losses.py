@@ -8,6 +8,7 @@ from matplotlib.ticker import NullFormatter
 from jaxlfi.figures import statistics
 from jaxlfi.figures.bands import draw_band
 from jaxlfi.figures.collection import Runs, seed_count
+from jaxlfi.figures.extent import extent
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import of_configurations
 from jaxlfi.figures.style import integer_ticks, iteration_bar, iteration_colours, iterations_axis, looks
@@ -94,11 +95,11 @@ def draw_epochs(axes: Axes, history: History, panel: str) -> None:
 
 
 def _limit(panels: list[Axes], values: list[np.ndarray]) -> None:
-    """Limits that leave out the highest 1 % of losses, which would flatten all other lines."""
+    """Limits that leave out a few losses far above the others, which would flatten all lines."""
     every = np.concatenate([v[np.isfinite(v)] for v in values])
     if not every.size:
         return
-    low, high = np.quantile(every, [0.0, 0.99])
-    margin = 0.06 * (high - low) or 1.0
+    low, high = min(every), extent(every)[1]
+    margin = 0.06 * (high - low)
     for axes in panels:
         axes.set_ylim(low - margin, high + margin)

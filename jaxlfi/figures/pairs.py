@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
+from jaxlfi.figures.extent import cells, extent
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import below
 from jaxlfi.figures.style import (
@@ -32,7 +33,10 @@ MAX_PARAMETERS = 6
 FRACTIONS = (0.95, 0.8, 0.5)
 """Fractions of the draws that the contours enclose, from the outermost contour on."""
 _SHADES = (0.68, 0.3, -0.2)
-_BINS = 48
+_CELLS = {"per_half": 8.6, "fewest": 48, "most": 192}
+"""Of a density of two parameters, along each axis."""
+_BINS = {"per_half": 5.9, "fewest": 24, "most": 96}
+"""Of a histogram."""
 _TRUTH_POINT = TRUTH | {"markersize": 5.5, "markeredgewidth": 0.5}
 _POINT = {"markersize": 4, "markeredgewidth": 0.5, "markeredgecolor": "white", "linewidth": 1.3}
 _MARKERS = "DsvP^X<>"
@@ -101,39 +105,42 @@ def cloud_of(history: History, look: Look) -> Cloud:
 
 
 def window(clouds: Sequence[Cloud], d: int, points: Sequence[Point] = ()) -> tuple[float, float]:
-    """Axis limits of a parameter: the central 99.4 % of the draws, truth and points, and bounds that are near them."""
-    ends = np.concatenate([np.quantile(cloud.draws[:, d], [0.003, 0.997]) for cloud in clouds])
+    """Axis limits of a parameter: the draws but for a few far away, truth and points, and bounds that are near them."""
+    ends = np.concatenate([extent(cloud.draws[:, d]) for cloud in clouds])
     ends = np.concatenate([ends, [cloud.truth[d] for cloud in clouds if np.isfinite(cloud.truth[d])]])
     marked = np.array([end for point in points for end in (point.value[d], *point.interval[d])])
     ends = np.concatenate([ends, marked[np.isfinite(marked)]])
     low, high = float(ends.min()), float(ends.max())
     bounds = np.array([bound[d] for cloud in clouds for box, _ in cloud.boxes for bound in box])
-    width = (high - low) or float(np.ptp(bounds) if bounds.size else 0.0) or 0.1 * abs(low) or 1.0
-    near = bounds[(bounds >= low - 0.35 * width) & (bounds <= high + 0.35 * width)]
+    reach = 0.35 * (high - low)
+    near = bounds[(bounds >= low - reach) & (bounds <= high + reach)]
     low, high = min([low, *near]), max([high, *near])
-    margin = 0.06 * ((high - low) or width)
+    margin = 0.06 * (high - low)
     return low - margin, high + margin
 
 
 def smoothed(draws: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A density estimate from draws of two parameters: their histogram, smoothed by a normal kernel.
 
-    The histogram ends at the bounds of the box, and what the kernel would move beyond them is reflected.
+    The histogram ends at the bounds of the box, and what the kernel would move beyond them is reflected. It does not
+    reach to a few draws that are far away: of the fractions, these are missing.
 
     Args:
         draws: shape [n, 2].
-        box: lower and upper bounds of the two, shape [2, 2]; infinite where there are none.
+        box: lower and upper bounds of the two, shape [2, 2]; infinite where there are none. Draws beyond them are drawn
+            as if there were no bounds.
 
     Returns:
-        Two axes of cell centres, [B] each, and the fraction of draws in each cell, [B, B], the second parameter first.
+        Two axes of cell centres, [B] and [B'], and the fraction of draws in each cell, [B', B], the second parameter
+        first.
     """
-    low, high = np.quantile(draws, [0.002, 0.998], axis=0)
-    width = box[1] - box[0]
-    # Draws that are all in one place are given a width to be drawn with.
-    single = np.where(high > low, 0.0, np.where(low == 0, 1.0, np.abs(low)))
-    margin = 0.15 * np.maximum(high - low, 0.02 * np.where(np.isfinite(width), width, single))
-    low, high = np.maximum(low - margin, box[0]), np.minimum(high + margin, box[1])
-    counts, *edges = np.histogram2d(*draws.T, bins=_BINS, range=list(zip(low, high, strict=True)))
+    low, high = np.transpose([extent(column) for column in draws.T])
+    margin = 0.15 * (high - low)
+    inside = ((draws >= box[0]) & (draws <= box[1])).all(0)
+    low = np.where(inside, np.maximum(low - margin, box[0]), low - margin)
+    high = np.where(inside, np.minimum(high + margin, box[1]), high + margin)
+    bins = [cells(*one, **_CELLS) for one in zip(draws.T, high - low, strict=True)]
+    counts, *edges = np.histogram2d(*draws.T, bins=bins, range=list(zip(low, high, strict=True)))
     reach = np.arange(-8, 9)
     kernel = np.exp(-0.5 * (reach / 2.2) ** 2)
     kernel /= kernel.sum()
@@ -141,18 +148,29 @@ def smoothed(draws: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray
     for axis in (0, 1):
         fraction = np.apply_along_axis(np.convolve, axis, fraction, kernel, mode="valid")
     x, y = ((e[1:] + e[:-1]) / 2 for e in edges)
-    return x, y, fraction.T / fraction.sum()
+    return x, y, fraction.T * (counts.sum() / len(draws) / fraction.sum())
 
 
 def levels(fraction: np.ndarray, enclosed: Sequence[float] = FRACTIONS) -> np.ndarray:
     """The lowest density inside the smallest region that holds each of some fractions of the draws.
 
     Args:
-        fraction: of the draws in each cell, any shape, of sum 1.
+        fraction: of the draws in each cell, any shape, of sum 1, or less where some draws are in none.
         enclosed: the fractions, in (0, 1).
     """
     ordered = np.sort(fraction, axis=None)[::-1]
     return ordered[np.searchsorted(np.cumsum(ordered), enclosed).clip(max=ordered.size - 1)]
+
+
+def histogram(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The density of draws [n] in bins over their `extent`, shape [B], and the bins' edges, [B + 1].
+
+    Draws beyond it count too: the densities of all bins integrate to one less their fraction.
+    """
+    low, high = extent(draws)
+    bins = cells(draws, high - low, **_BINS | {"most": max(_BINS["fewest"], min(_BINS["most"], len(draws) // 10))})
+    counts, edges = np.histogram(draws, bins, (low, high))
+    return counts / (len(draws) * (edges[1] - edges[0])), edges
 
 
 def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int, points: Sequence[Point] = ()) -> None:
@@ -164,16 +182,16 @@ def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int, points: Sequence[
         d: index of the parameter.
         points: with their intervals, one above the other.
     """
-    highest = 0.0
-    for cloud in clouds:
+    found = [histogram(cloud.draws[:, d]) for cloud in clouds]
+    highest = max(heights.max() for heights, _ in found)
+    for cloud, (heights, edges) in zip(clouds, found, strict=True):
         look = cloud.look
         fill = {"color": shade(look.colour, 0.45)} if len(clouds) == 1 else {"color": look.colour, "alpha": 0.25}
-        common = {"bins": 24, "density": True}
-        heights, _, _ = axes.hist(cloud.draws[:, d], histtype="stepfilled", gid="marginal", **common, **fill)
+        drawn = {"x": (edges[1:] + edges[:-1]) / 2, "bins": edges, "weights": heights / highest}
+        axes.hist(histtype="stepfilled", gid="marginal", **drawn, **fill)
         if len(clouds) > 1:
             line = {"color": look.colour, "linestyle": look.linestyle, "linewidth": 0.9}
-            axes.hist(cloud.draws[:, d], histtype="step", **common, **line)
-        highest = max(highest, heights.max())
+            axes.hist(histtype="step", **drawn, **line)
     for bounds, style in _boxes(clouds):
         for bound in bounds:
             axes.axvline(bound[d], **style)
@@ -181,9 +199,9 @@ def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int, points: Sequence[
         if np.isfinite(truth[d]):
             axes.axvline(truth[d], gid="truth", **TRUTH_LINE)
     for row, point in enumerate(points):
-        height = (1.12 + 0.12 * row) * highest
+        height = 1.12 + 0.12 * row
         _draw_point(axes, point, row, [(point.value[d], height)], [(point.interval[d], [height] * 2)])
-    axes.set_ylim(0, (1.12 + 0.12 * len(points)) * highest)
+    axes.set_ylim(0, 1.12 + 0.12 * len(points))
     axes.set_yticks([])
 
 

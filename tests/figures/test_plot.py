@@ -144,6 +144,87 @@ def test_draws_that_do_not_vary_are_in_sight(place):
     assert low < outline[:, 0].min() < place < outline[:, 0].max() < high
 
 
+def marginal_of(axes) -> tuple[np.ndarray, np.ndarray]:
+    """Edges and heights of the bins of a marginal that are in view."""
+    corners = next(patch for patch in axes.patches if patch.get_gid() == "marginal").get_xy()
+    edges = np.unique(corners[:, 0])
+    heights = [corners[(corners[:, 0] == left), 1].max() for left in edges]
+    low, high = axes.get_xlim()
+    assert np.all((edges >= low) & (edges <= high))
+    return edges, np.array(heights)
+
+
+NORMAL = np.random.default_rng(3).normal(size=(2000, 2))
+FAR = {
+    "one": [[1e6, -1e6]],
+    "one as far as numbers reach": [[1e300, -1e300]],
+    "one in one parameter": [[1e6, 0.0]],
+    "half a percent over a wide box": np.random.default_rng(4).uniform(-1000, 1000, (10, 2)),
+    "a percent and a half on one side": np.random.default_rng(5).uniform(100, 1e5, (20, 2)),
+}
+
+
+@pytest.mark.parametrize("far", FAR)
+@pytest.mark.parametrize("support", [None, ([-1e6, -1e6], [1e6, 1e6])], ids=["", "with a box"])
+def test_a_bell_stays_a_bell_where_a_few_draws_are_far_away(far, support):
+    support = None if far == "one as far as numbers reach" else support
+    draws = np.vstack([NORMAL, FAR[far]])
+    grid = panels(plot.pairs(draws, support=support))
+    near = panels(plot.pairs(NORMAL))
+    for d in range(2):
+        edges, heights = marginal_of(grid[d, d])
+        low, high = grid[d, d].get_xlim()
+        assert -6 < low < -2 and 2 < high < 6
+        middle = (edges[1:] + edges[:-1]) / 2
+        bell = np.exp(-(middle**2) / 2)
+        np.testing.assert_allclose(heights[1:], bell, atol=0.25)  # scaled to the highest bin
+        assert np.count_nonzero(heights > 0.5) > 5
+    # Contours enclose what they enclose without the far ones.
+    areas = [contour_areas(own[1, 0]) for own in (grid, near)]
+    np.testing.assert_allclose(*areas, rtol=0.12)
+
+
+def contour_areas(axes) -> list[float]:
+    """Areas that the filled contours enclose, the outermost first."""
+    (filled,) = axes.collections
+    extents = [path.get_extents() for path in filled.get_paths()]
+    return [extent.width * extent.height for extent in extents]
+
+
+def test_two_narrow_modes_and_a_tail_are_all_in_view():
+    """What many draws agree on is never left out, however far from the densest half."""
+    rng = np.random.default_rng(0)
+    modes = np.where(rng.random((1000, 1)) < 0.5, -300.0, 300.0) + 0.01 * rng.normal(size=(1000, 1))
+    rare = np.where(rng.random((2000, 1)) < 0.03, 30.0, 0.0) + 0.1 * rng.normal(size=(2000, 1))
+    for draws, tops in ((modes, (-300.0, 300.0)), (rare, (0.0, 30.0)), (rng.exponential(size=(2000, 1)), (0.1, 5.0))):
+        low, high = plot.pairs(draws).axes[0].get_xlim()
+        assert low < tops[0] and tops[1] < high
+
+
+def test_draws_of_widths_and_offsets_of_all_kinds_have_bins_that_resolve_them():
+    rng = np.random.default_rng(1)
+    narrow = rng.normal(size=(2000, 1))
+    figure = plot.pairs({"narrow": narrow, "wide": 1000 * narrow})
+    assert all(len(np.unique(patch.get_xy()[:, 0])) > 24 for patch in marked(figure.axes[0], "marginal"))
+    offset = plot.pairs(1e6 + 1e-3 * narrow).axes[0]
+    edges, heights = marginal_of(offset)
+    assert np.ptp(offset.get_xlim()) < 0.02 and np.count_nonzero(heights > 0.5) > 5
+    for place in (0.0, 3.0, -1e-6, 1e6):  # all in one place: one bin
+        edges, heights = marginal_of(plot.pairs(np.full((30, 1), place)).axes[0])
+        assert np.count_nonzero(heights) <= 2 and edges[0] < place < edges[-1]
+    neighbours = np.where(rng.random((50, 2)) < 0.5, 1e6, np.nextafter(1e6, np.inf))
+    assert plot.pairs(neighbours).axes[0].get_xlim()[0] < 1e6
+    bound = np.where(rng.random((1000, 2)) < 0.7, 1.0, rng.random((1000, 2)))
+    edges, heights = marginal_of(panels(plot.pairs(bound, support=([0, 0], [1, 1])))[0, 0])
+    assert edges[-1] == 1.0 and heights[-2] == pytest.approx(1.0)  # most of them lie on the bound
+
+
+def test_draws_beyond_the_support_are_drawn_where_they_are():
+    grid = panels(plot.pairs(NORMAL + 10.0, support=([-1.0, -1.0], [1.0, 1.0])))
+    (low, bottom), (high, top) = grid[1, 0].collections[0].get_paths()[0].get_extents().get_points()
+    assert 6 < low < 9 < 11 < high < 14 and 6 < bottom < top < 14
+
+
 def samples_with(value) -> np.ndarray:
     """The draws with one value changed."""
     changed = DRAWS.copy()
