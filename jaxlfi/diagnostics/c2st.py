@@ -4,9 +4,13 @@ import itertools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
+
+from jaxlfi.diagnostics.arguments import numbers
+from jaxlfi.distributions.arguments import is_concrete
 
 FOLDS = 5
 UNITS_A_DIMENSION = 10
@@ -29,7 +33,9 @@ class _Training:
     idle: Int[Array, ""]
 
 
-def c2st(key: jax.Array, first: Float[Array, "n dim"], second: Float[Array, "n dim"]) -> Float[Array, ""]:
+def c2st(
+    key: jax.Array, first: Float[Array | np.ndarray, "n dim"], second: Float[Array | np.ndarray, "n dim"]
+) -> Float[Array, ""]:
     """Accuracy of a classifier on held-out rows of two samples: 0.5 where it cannot tell them apart, 1 where it can.
 
     As benchmarks of likelihood-free inference define it (Lueckmann et al. 2021): a multilayer perceptron of two ReLU
@@ -43,7 +49,8 @@ def c2st(key: jax.Array, first: Float[Array, "n dim"], second: Float[Array, "n d
     folds have as many rows of either sample, row i of both in the same: rows that belong together, such as two
     parameters of one observation, are then held out together. Up to four rows are left out.
 
-    Jit it: all folds are trained together. The same key gives the same folds, starts and so the same number.
+    All folds are trained together. The same key gives the same folds, starts and so the same number. Under jit,
+    where values are not known, numbers that are not finite give NaN; else samples are scaled in double precision.
 
     Args:
         key: consumed.
@@ -51,16 +58,32 @@ def c2st(key: jax.Array, first: Float[Array, "n dim"], second: Float[Array, "n d
         second: shape [N, D].
 
     Raises:
-        ValueError: for shapes that differ, or fewer than ten rows.
+        ValueError: for shapes that differ, fewer than ten rows, numbers that are not finite, or a sample of which no
+            column varies.
     """
-    if first.ndim != 2 or first.shape != second.shape or len(first) < 2 * FOLDS:
+    first, second = numbers("first", first, "ND"), numbers("second", second, "ND")
+    if first.shape != second.shape or len(first) < 2 * FOLDS:
         raise ValueError(
             f"first, second: expected two samples of the same shape [N, D], N at least {2 * FOLDS}, "
             f"got {list(first.shape)} and {list(second.shape)}"
         )
+    concrete = is_concrete((first, second))
+    for name, sample in {"first": first, "second": second}.items() if concrete else ():
+        if not np.ptp(sample, axis=0).any():
+            raise ValueError(f"{name}: expected rows that vary, got {len(sample)} that are all the same")
+    xp = np if concrete else jnp
+    scale = xp.std(first, axis=0, ddof=1)
+    scale = xp.where(scale > 0, scale, 1.0)
+    scaled = [jnp.asarray((sample - first.mean(axis=0)) / scale, jnp.float32) for sample in (first, second)]
+    accuracy = jax.jit(_held_out)(key, *scaled)
+    finite = jnp.isfinite(scaled[0]).all() & jnp.isfinite(scaled[1]).all()
+    return jnp.where(finite, accuracy, jnp.nan)
+
+
+def _held_out(key: jax.Array, *scaled: Float[Array, "n dim"]) -> Float[Array, ""]:
+    """Accuracy on the rows of each fold, by a classifier that was trained on the others."""
     key_folds, key_train = jax.random.split(key)
-    scale = jnp.std(first, axis=0, ddof=1)
-    scaled = [(sample - jnp.mean(first, axis=0)) / jnp.where(scale > 0, scale, 1.0) for sample in (first, second)]
+    first, _ = scaled
     size = len(first) // FOLDS
     folds = jax.random.permutation(key_folds, len(first))[: FOLDS * size].reshape(FOLDS, size)
 
@@ -98,7 +121,7 @@ def _train(key: jax.Array, rows: Array, labels: Array) -> list:
         places = jnp.resize(order, (batches, batch))
         (params, moments), losses = jax.lax.scan(step, (state.params, state.moments), places)
         loss = jnp.mean(losses)
-        idle = jnp.where(loss > state.least - TOLERANCE, state.idle + 1, 0)
+        idle = jnp.where(loss <= state.least - TOLERANCE, 0, state.idle + 1)  # NaN is no progress
         return _Training(params, moments, state.epochs + 1, jnp.minimum(loss, state.least), idle)
 
     start = _Training(params, adam.init(params), jnp.asarray(0), jnp.asarray(jnp.inf), jnp.asarray(0))

@@ -13,6 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxlfi.diagnostics.arguments import Draws, Truths, checked_ranks, numbers, truths_and_draws
+from jaxlfi.distributions.arguments import is_concrete
+
 SIGNIFICANCE = 0.01
 """p-value below which a check fails: of five checks of a calibrated posterior, one fails in one run out of twenty."""
 POINTWISE = 0.95
@@ -21,6 +24,8 @@ POINTS = 50
 """Maximum number of points at which a calibration curve is evaluated."""
 NULL_DRAWS = 10_000
 """Number of simulated calibrated curves that the simultaneous band and the p-value are computed from."""
+NO_RANK = -1
+"""In place of a rank among numbers that are NaN, where they are not known when a rank is asked for (under jit)."""
 OK = "ok"
 OVER, UNDER = "miscalibrated: over-confident", "miscalibrated: under-confident"
 LOW, HIGH = "miscalibrated: biased low", "miscalibrated: biased high"
@@ -73,13 +78,12 @@ class Histogram:
     band: Float[np.ndarray, "2 bins"]
 
 
-def ranks(
-    key: jax.Array, truths: Float[Array | np.ndarray, "n dim"], draws: Float[Array | np.ndarray, "n draws dim"]
-) -> Int[Array, "n dim"]:
+def ranks(key: jax.Array, truths: Truths, draws: Draws) -> Int[Array, "n dim"]:
     """How many of L draws are below the truth, for each parameter: simulation-based calibration (Talts et al. 2018).
 
-    Draws equal to the truth, as clipping to a bound makes them, are put below it or above it at random: the rank of a
-    calibrated posterior stays uniform then, which that of the middle of the ties would not.
+    Draws equal to the truth, as of a whole number or of what was clipped to a bound, are put below it or above it at
+    random: the rank of a calibrated posterior stays uniform then, which that of the middle of the ties would not.
+    Known numbers are compared in the precision they come in.
 
     Args:
         key: consumed.
@@ -90,15 +94,15 @@ def ranks(
         Ranks from 0 to L.
 
     Raises:
-        ValueError: for shapes that do not fit.
+        ValueError: for shapes that do not fit, numbers that are not finite, or draws that do not vary.
     """
-    if draws.ndim != 3 or truths.shape != (draws.shape[0], draws.shape[2]):
-        raise ValueError(
-            f"truths, draws: expected shapes [N, D] and [N, L, D], got {list(truths.shape)} and {list(draws.shape)}"
-        )
-    below = jnp.sum(draws < truths[:, None], axis=1)
-    equal = jnp.sum(draws == truths[:, None], axis=1)
-    return below + jax.random.randint(key, below.shape, 0, equal + 1)
+    return _ranks(key, *truths_and_draws(truths, draws))
+
+
+def _ranks(key: jax.Array, truths: Truths, draws: Draws):
+    below, equal = (draws < truths[:, None]).sum(axis=1), (draws == truths[:, None]).sum(axis=1)
+    rank = below + jax.random.randint(key, below.shape, 0, equal + 1)
+    return jnp.where(jnp.isnan(truths) | jnp.isnan(draws).any(axis=1), NO_RANK, rank)
 
 
 def density_ranks(
@@ -113,14 +117,24 @@ def density_ranks(
         key: consumed, for ties.
         truth_log_prob: log-density of each truth, up to a constant of its observation; -inf outside the support.
         log_prob: of the draws, shape [N, L].
+
+    Raises:
+        ValueError: for shapes that do not fit, or NaN.
     """
-    return ranks(key, -truth_log_prob[:, None], -log_prob[..., None])[:, 0]
+    truth_log_prob = numbers("truth_log_prob", truth_log_prob, "N", nan_only=True)
+    log_prob = numbers("log_prob", log_prob, "NL", nan_only=True)
+    if len(truth_log_prob) != len(log_prob):
+        raise ValueError(
+            f"truth_log_prob, log_prob: expected shapes [N] and [N, L], got {list(truth_log_prob.shape)} and "
+            f"{list(log_prob.shape)}"
+        )
+    return _ranks(key, -truth_log_prob[:, None], -log_prob[..., None])[:, 0]
 
 
 def distance_ranks(
     key: jax.Array,
-    truths: Float[Array | np.ndarray, "n dim"],
-    draws: Float[Array | np.ndarray, "n draws dim"],
+    truths: Truths,
+    draws: Draws,
     low: Float[Array | np.ndarray, " dim"],
     high: Float[Array | np.ndarray, " dim"],
 ) -> Int[Array, " n"]:
@@ -134,11 +148,24 @@ def distance_ranks(
         draws: shape [N, L, D].
         low: lower bounds of the prior's box, shape [D].
         high: upper bounds, shape [D].
+
+    Raises:
+        ValueError: for shapes that do not fit, numbers that are not finite, draws that do not vary, or an empty box.
     """
+    truths, draws = truths_and_draws(truths, draws)
+    low, high = numbers("low", low, "D"), numbers("high", high, "D")
+    if not low.shape == high.shape == truths.shape[1:]:
+        raise ValueError(
+            f"low, high: expected shapes [{truths.shape[1]}], got {list(low.shape)} and {list(high.shape)}"
+        )
+    if is_concrete((low, high)) and not (low < high).all():
+        raise ValueError(f"low, high: expected low < high, got {low.tolist()} and {high.tolist()}")
     key_point, key_ties = jax.random.split(key)
-    point = low + (high - low) * jax.random.uniform(key_point, truths.shape)
-    distance = lambda theta, point: jnp.linalg.norm((theta - point) / (high - low), axis=-1)
-    return ranks(key_ties, distance(truths, point)[:, None], distance(draws, point[:, None])[..., None])[:, 0]
+    place = jax.random.uniform(key_point, truths.shape)
+    place = np.asarray(place, np.float64) if is_concrete((place, truths, draws, low, high)) else place
+    point = low + (high - low) * place
+    distance = lambda theta, point: ((((theta - point) / (high - low)) ** 2).sum(axis=-1)) ** 0.5
+    return _ranks(key_ties, distance(truths, point)[:, None], distance(draws, point[:, None])[..., None])[:, 0]
 
 
 def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) -> Uniformity:
@@ -156,15 +183,12 @@ def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) 
             Bonferroni.
 
     Raises:
-        ValueError: for ranks that are not among 0 to L, or too few.
+        ValueError: for ranks that are no whole numbers from 0 to L, or too few.
     """
-    rank = np.asarray(rank)
+    rank = checked_ranks(rank, draws)
     count = len(rank)
-    if count < 2 or draws < 2 or rank.min() < 0 or rank.max() > draws:
-        raise ValueError(
-            f"rank, draws: expected at least two ranks from 0 to the number of draws, at least 2, got {count} ranks "
-            f"and {draws} draws"
-        )
+    if tests < 1:
+        raise ValueError(f"tests: expected at least 1, got {tests}")
     edges = _edges(draws)
     level = edges / (draws + 1)
     below = np.sum(rank[:, None] < edges, axis=0)
@@ -187,8 +211,12 @@ def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) 
 
 
 def histogram(rank: Int[Array | np.ndarray, " n"], draws: int) -> Histogram:
-    """A histogram of ranks from 0 to L with its binomial band, of some ten truths a bin and at most 20 bins."""
-    rank = np.asarray(rank)
+    """A histogram of ranks from 0 to L with its binomial band, of some ten truths a bin and at most 20 bins.
+
+    Raises:
+        ValueError: for ranks that are no whole numbers from 0 to L, or too few.
+    """
+    rank = checked_ranks(rank, draws)
     bins = int(np.clip(len(rank) // 10, 2, min(20, draws + 1)))
     edges = np.round(np.linspace(0, draws + 1, bins + 1)).astype(int)
     probability = np.diff(edges) / (draws + 1)

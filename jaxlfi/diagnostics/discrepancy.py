@@ -98,7 +98,14 @@ def trajectory_distance(trajectory: Array, observed: Array) -> Float[Array, ""]:
     Each channel is divided by its observed standard deviation, and the square root of the mean square is taken over
     records and channels: a distance of 1 is as far as the observed trajectory is from its own mean. The plain
     Euclidean distance that the paper names would make exp(-distance) zero for any two trajectories of a population.
+
+    Raises:
+        ValueError: for trajectories of different shapes.
     """
+    if trajectory.size != observed.size or trajectory.shape[:1] != observed.shape[:1]:
+        raise ValueError(
+            f"trajectory, observed: expected the same shapes, got {list(trajectory.shape)} and {list(observed.shape)}"
+        )
     observed = observed.reshape(observed.shape[0], -1)
     deviation = jnp.std(observed, axis=0)
     scale = jnp.where(deviation > 0, deviation, 1.0)

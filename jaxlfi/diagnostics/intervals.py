@@ -13,6 +13,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxlfi.diagnostics.arguments import Draws, Truths, checked_ranks, truths_and_draws
 from jaxlfi.diagnostics.calibration import SIGNIFICANCE
 
 LEVELS = (0.5, 0.9)
@@ -23,6 +24,10 @@ TOLERANCE = 1.5
 """Intervals are honest only if their widths are known to be right to within this factor, up or down."""
 LEAST_HELD = 0.75
 """Densest regions of the last level, which have no width, are honest only if they are known to hold as much."""
+FEWEST_DRAWS = 19
+"""The next draw lies between the least and the greatest of so many with the probability of the last level."""
+APART = 1e-3
+"""How far numbers that are the same are drawn apart, in units of the distance to the next one."""
 HONEST, NARROW, WIDE, UNDECIDED = "honest", "too narrow", "too wide", "undecided"
 BIASED_LOW, BIASED_HIGH = "biased low", "biased high"
 """Words of a verdict; one that is too narrow or too wide may be biased besides."""
@@ -62,7 +67,7 @@ class Intervals:
     verdict: str
 
 
-def check_intervals(truths: Float[np.ndarray, "n dim"], draws: Float[np.ndarray, "n draws dim"]) -> list[Intervals]:
+def check_intervals(truths: Truths, draws: Draws) -> list[Intervals]:
     """Judge the intervals of each parameter.
 
     A parameter is *too narrow* (*too wide*) where the confidence interval of its factor lies above (below) 1, and
@@ -71,15 +76,20 @@ def check_intervals(truths: Float[np.ndarray, "n dim"], draws: Float[np.ndarray,
     1 / `TOLERANCE` and `TOLERANCE`, and *undecided* where there are too few truths to tell. No parameter of calibrated
     posteriors is found too narrow, too wide or biased with a probability of at least `CONFIDENCE` - `SIGNIFICANCE`.
 
+    Where a truth equals draws, as of whole numbers or of what was clipped to a bound, it is put below or above each of
+    them at random (the same each time): intervals of calibrated posteriors hold as many truths as they say then, too,
+    and as many truths lie above the median as below.
+
     Args:
-        truths: parameters that an observation was simulated at, in inference space, shape [N, D].
-        draws: from the posterior of each observation, shape [N, L, D].
+        truths: parameters that an observation was simulated at, in inference space, shape [N, D], N >= 2.
+        draws: from the posterior of each observation, shape [N, L, D], L >= `FEWEST_DRAWS`.
 
     Returns:
         One a parameter.
 
     Raises:
-        ValueError: for shapes that do not fit.
+        ValueError: for shapes that do not fit, too few truths or draws, numbers that are not finite, or draws that do
+            not vary.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -88,12 +98,13 @@ def check_intervals(truths: Float[np.ndarray, "n dim"], draws: Float[np.ndarray,
         >>> check_intervals(centre + rng.normal(size=(100, 1)), narrow)[0].verdict
         'too narrow'
     """
-    truths, draws = np.asarray(truths, float), np.asarray(draws, float)
-    if draws.ndim != 3 or truths.shape != (draws.shape[0], draws.shape[2]):
+    truths, draws = truths_and_draws(truths, draws)
+    if len(truths) < 2 or draws.shape[1] < FEWEST_DRAWS:
         raise ValueError(
-            f"truths, draws: expected shapes [N, D] and [N, L, D], got {list(truths.shape)} and {list(draws.shape)}"
+            f"truths, draws: expected at least 2 truths and {FEWEST_DRAWS} draws of each, got {len(truths)} and "
+            f"{draws.shape[1]}"
         )
-    distances = [distances_from_median(truths, draws, level) for level in LEVELS]
+    distances = [_shared_out(truths, draws, level) for level in LEVELS]
     return [_one([signed[:, d] for signed in distances], truths.shape[1]) for d in range(truths.shape[1])]
 
 
@@ -101,10 +112,13 @@ def check_regions(rank: Int[np.ndarray, " n"], draws: int) -> Intervals:
     """Judge densest regions of all parameters together, which have no width and no direction.
 
     Args:
-        rank: of `density_ranks`, shape [N].
-        draws: L.
+        rank: of `density_ranks`, shape [N], N >= 2.
+        draws: L, at least `FEWEST_DRAWS`.
+
+    Raises:
+        ValueError: for ranks that are no whole numbers from 0 to L, and too few truths or draws.
     """
-    rank = np.asarray(rank)
+    rank = checked_ranks(rank, draws, FEWEST_DRAWS)
     held = _held([(rank + 0.5) / (draws + 1) <= level for level in LEVELS], 1 - CONFIDENCE)
     last = held[-1]
     otherwise = HONEST if last.low >= LEAST_HELD else UNDECIDED
@@ -126,6 +140,22 @@ def distances_from_median(
     half = np.where(beyond < 0, middle - low, high - middle)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(beyond == 0, 0.0, beyond / half)
+
+
+def _shared_out(
+    truths: Float[np.ndarray, "n dim"], draws: Float[np.ndarray, "n draws dim"], level: float
+) -> Float[np.ndarray, "n dim"]:
+    """`distances_from_median`, where numbers that are the same were drawn apart at random, by next to nothing."""
+    values = np.concatenate([truths[:, None], draws], axis=1)
+    gaps = np.diff(np.sort(values, axis=1), axis=1)
+    exact = distances_from_median(truths, draws, level)
+    if (gaps > 0).all():
+        return exact
+    nearest = np.min(np.where(gaps > 0, gaps, np.inf), axis=1)
+    nearest = np.where(np.isfinite(nearest), nearest, 1.0)[:, None]
+    values = values + APART * nearest * np.random.default_rng(0).uniform(-0.5, 0.5, values.shape)
+    # A truth beside a posterior without width stays infinitely many widths away.
+    return np.where(np.isinf(exact), exact, distances_from_median(values[:, 0], values[:, 1:], level))
 
 
 def binomial_interval(count: int, trials: int, error: float) -> tuple[float, float]:

@@ -51,7 +51,7 @@ def predictive_check(
 
     Raises:
         ValueError: for shapes that do not fit, an observation that is not finite, or too few
-            finite rows (`MIN_SIMULATIONS`).
+            finite rows (`MIN_SIMULATIONS`), or none that differs from the others.
     """
     simulated, observed = np.asarray(simulated, np.float64), np.asarray(observed, np.float64)
     if simulated.ndim != 2 or observed.shape != simulated.shape[1:] or not np.isfinite(observed).all():
@@ -65,6 +65,8 @@ def predictive_check(
         raise ValueError(
             f"simulated: expected at least {MIN_SIMULATIONS} finite rows, got {len(used)} of {len(simulated)}"
         )
+    if not np.ptp(used, axis=0).any():
+        raise ValueError(f"simulated: expected summaries that vary, got the same in all of {len(used)} rows")
     below, above = np.sum(used <= observed, axis=0), np.sum(used >= observed, axis=0)
     tails = np.minimum(1.0, 2 * (1 + np.minimum(below, above)) / (1 + len(used)))
     distances = _distances(np.concatenate([observed[None], used]))

@@ -126,14 +126,16 @@ Maker = tuple[tuple[str, ...], Callable[[Arrays], tuple[float, float]], Callable
 
 PICTURES: dict[str, Maker] = {
     "widths": (
-        ("widths_held", "widths_regions_held", "widths_level", "widths_factor"), _widths_size, intervals.draw, "Intervals",
+        ("widths_held", "widths_regions_held", "widths_level", "widths_factor"),
+        _widths_size, intervals.draw, "Intervals",
         "Left: the fraction of truths that intervals of each parameter, and densest regions of all parameters together "
         "(last row), held; they should hold 50 % and 90 % (lines). Right: the factor by which the width of 90 % "
         "intervals would have to be multiplied for them to hold 90 %. Bars are confidence intervals, of 95 % for all "
         "parameters together.",
     ),
     "ranks": (
-        ("bin_count", "bin_edges", "bin_band", "level", "ranks_fraction", "ranks_simultaneous"), _ranks_size, calibration.draw_ranks, "Ranks (simulation-based calibration)",
+        ("bin_count", "bin_edges", "bin_band", "level", "ranks_fraction", "ranks_simultaneous"),
+        _ranks_size, calibration.draw_ranks, "Ranks (simulation-based calibration)",
         "The rank of each truth among draws of its posterior, for truths over the support. U-shaped: too narrow; a "
         "hill: too wide; a slope: biased.",
     ),
@@ -151,4 +153,5 @@ PICTURES: dict[str, Maker] = {
         "The run's own observation among simulations of its own posterior.",
     ),
 }  # fmt: skip
-"""By file name: the arrays of numbers it needs (drawn where the first is there), its size in inches, the function that draws it, its title and caption."""
+"""By file name: the arrays of numbers that a picture needs (it is drawn where the first of them is there), its size in
+inches, the function that draws it, its title and caption."""

@@ -44,7 +44,7 @@ NUMBERS = (
     "draws",
     "log",
 )
-"""Arrays of a run's files that figures calculate with; what else a file holds, texts among it, is no business of theirs."""
+"""Arrays of a run's files that figures calculate with. What else a file holds, texts among it, they leave alone."""
 
 
 @dataclasses.dataclass(frozen=True)

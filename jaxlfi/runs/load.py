@@ -28,6 +28,7 @@ from jaxlfi.tasks import registry
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.task import Task
 
+
 def load(folder: str | Path, task: Task | None = None) -> Run:
     """Read a finished run back: what `infer`, `run.save` and the command line wrote, of one seed.
 

@@ -1,5 +1,7 @@
 """The classifier two-sample test: closed forms, scikit-learn's, and the contracts of a pure function."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -66,3 +68,26 @@ def test_the_same_key_gives_the_same_number():
 def test_samples_that_cannot_be_compared_are_refused(first, second):
     with pytest.raises(Exception, match=r"same shape \[N, D\], N at least 10|dim|n"):
         c2st(jax.random.key(0), jnp.zeros(first), jnp.zeros(second))
+
+
+def test_samples_that_say_nothing_are_refused():
+    """Under jit, where numbers are not known, there is no number."""
+    first, second = samples(1.0)
+    for wrong in (np.nan, np.inf):
+        spoilt = second.copy()
+        spoilt[3, 1] = wrong
+        with pytest.raises(ValueError, match="second: expected finite numbers, got 1 others of 800"):
+            c2st(jax.random.key(0), first, spoilt)
+    assert np.isnan(compiled(jax.random.key(0), first, spoilt))
+    for one, other in ((first, np.ones_like(first)), (np.ones_like(first), first), (np.ones_like(first),) * 2):
+        with pytest.raises(ValueError, match="expected rows that vary"):
+            c2st(jax.random.key(0), one, other)
+
+
+def test_samples_far_from_zero_are_scaled_as_at_zero(monkeypatch):
+    """In single precision, columns of such an offset would be constant."""
+    module = importlib.import_module("jaxlfi.diagnostics.c2st")
+    monkeypatch.setattr(module, "_held_out", lambda key, first, second: second.mean() + first.std())
+    first, second = (sample.astype(float) for sample in samples(3.0))
+    here, there = (float(c2st(jax.random.key(0), offset + first, offset + second)) for offset in (0.0, 1e9))
+    assert here == pytest.approx(there, rel=1e-3) and here > 2

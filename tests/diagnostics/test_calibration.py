@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from jaxlfi import diagnostics
 from jaxlfi.diagnostics import (
     OK,
     SIGNIFICANCE,
@@ -64,6 +65,65 @@ def test_shapes_that_do_not_fit_are_refused(truths, draws):
         ranks(jax.random.key(0), np.zeros(truths), np.zeros(draws))
 
 
+def test_whole_numbers_have_uniform_ranks_of_all_kinds():
+    """Ties of values, of densities and of distances are shared out: an exact discrete posterior passes every check."""
+    rng = np.random.default_rng(0)
+    probability = np.array([0.1, 0.2, 0.4, 0.2, 0.1])
+    truths = rng.choice(5, (600, 2), p=probability)
+    draws = rng.choice(5, (600, 30, 2), p=probability)
+    density = lambda values: np.log(probability[values]).sum(-1)
+    found = [
+        *np.asarray(diagnostics.ranks(jax.random.key(0), truths, draws)).T,
+        diagnostics.density_ranks(jax.random.key(1), density(truths), density(draws)),
+        diagnostics.distance_ranks(jax.random.key(2), truths, draws, np.full(2, -0.5), np.full(2, 4.5)),
+    ]
+    for rank in found:
+        assert stats.chisquare(np.bincount(rank, minlength=31)).pvalue > 1e-3
+        assert uniformity(rank, 30).p_value > 1e-3
+
+
+def test_known_numbers_are_compared_in_their_own_precision():
+    """In single precision draws at such an offset would all be the same."""
+    rng = np.random.default_rng(1)
+    truths, draws = rng.normal(size=(300, 1)), 0.3 * rng.normal(size=(300, 50, 1))
+    here, there = (np.asarray(diagnostics.ranks(jax.random.key(0), s + truths, s + draws)) for s in (0.0, 1e9))
+    np.testing.assert_array_equal(here, there)
+    box = np.array([[-4.0], [4.0]])
+    here, there = (diagnostics.distance_ranks(jax.random.key(0), s + truths, s + draws, *(s + box)) for s in (0.0, 1e9))
+    assert np.mean(np.asarray(here) == np.asarray(there)) > 0.98
+
+
+GOOD = {
+    "ranks": (np.arange(6.0).reshape(3, 2), np.arange(60.0).reshape(3, 10, 2)),
+    "density_ranks": (np.arange(3.0), np.arange(30.0).reshape(3, 10)),
+    "distance_ranks": (np.arange(6.0).reshape(3, 2), np.arange(60.0).reshape(3, 10, 2), np.zeros(2), np.full(2, 60.0)),
+}
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_what_has_no_rank_is_refused(name):
+    good = GOOD[name]
+    kind = lambda *arrays: getattr(diagnostics, name)(jax.random.key(0), *arrays)
+    assert kind(*good).shape[0] == 3
+    for place in range(len(good)):
+        spoilt = [array.copy() for array in good]
+        spoilt[place][..., -1] = np.nan
+        with pytest.raises(ValueError, match="expected"):
+            kind(*spoilt)
+        with pytest.raises(Exception, match=r"expected|beartype|Float"):
+            kind(*good[:place], good[place][:0], *good[place + 1 :])
+    spoilt = [array.copy() for array in good]
+    spoilt[1][1] = np.nan
+    rank = np.asarray(jax.jit(getattr(diagnostics, name))(jax.random.key(0), *spoilt)).reshape(3, -1)
+    assert np.all(rank[1] < 0) and np.all(rank[::2] >= 0)  # which no verdict is drawn from
+    if name != "density_ranks":  # a uniform posterior has one density
+        with pytest.raises(ValueError, match="draws that vary"):
+            kind(np.ones((3, 2)), np.ones((3, 10, 2)), *good[2:])
+    if name == "distance_ranks":
+        with pytest.raises(ValueError, match="low < high"):
+            kind(*good[:2], np.zeros(2), np.zeros(2))
+
+
 # -------------------------------------------------------------------------------------------- bands and p-values
 
 
@@ -117,8 +177,12 @@ def test_the_simultaneous_band_is_the_test():
 
 @pytest.mark.parametrize(("rank", "draws"), [([3, 11], 10), ([-1, 3], 10), ([3], 10), ([0, 1], 1)])
 def test_ranks_of_other_draws_are_refused(rank, draws):
-    with pytest.raises(ValueError, match="at least two ranks from 0 to the number of draws"):
-        uniformity(np.array(rank), draws)
+    for judge in (uniformity, histogram):
+        with pytest.raises(ValueError, match="at least two ranks from 0 to the number of draws"):
+            judge(np.array(rank), draws)
+    for wrong in (np.array([1.5, 2.0]), np.array([np.nan, 2.0])):
+        with pytest.raises(Exception, match=r"expected|Int"):
+            uniformity(wrong, 10)
 
 
 # --------------------------------------------------------------------------------------------------------- laws

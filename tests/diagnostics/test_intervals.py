@@ -127,10 +127,81 @@ def test_too_few_truths_leave_it_undecided():
 
 def test_posteriors_without_width_and_truths_far_away():
     truths, _ = case(0, 1.0, 0.0, 60, 1)
-    (point,) = check_intervals(truths, np.zeros((60, 50, 1)))
+    points = np.repeat(np.linspace(-3, 3, 60)[:, None, None], 50, axis=1)
+    (point,) = check_intervals(truths, points)
     assert point.verdict == "too narrow" and point.factor.low == np.inf and point.held[1].value == 0
-    (right,) = check_intervals(np.zeros((60, 1)), np.zeros((60, 50, 1)))
-    assert right.factor.value == 0
+
+
+def whole_numbers(rng, kinds, truths=400, draws=200):
+    """Exact posteriors of whole numbers: truths and draws from the same distribution, another for each truth."""
+    probability = rng.dirichlet(np.full(kinds, 0.7), truths)
+    pick = lambda size: np.array([rng.choice(kinds, size, p=own) for own in probability], float)
+    return pick(1), pick(draws)[..., None]
+
+
+def clipped(rng, kinds, truths=400, draws=200):
+    """Exact posteriors of which a part was clipped to a bound, as the truths were."""
+    centre = rng.normal(size=(truths, 1))
+    clip = lambda values: np.clip(values, -0.7, 1.5)
+    return clip(centre + rng.normal(size=(truths, 1))), clip(centre[:, None] + rng.normal(size=(truths, draws, 1)))
+
+
+@pytest.mark.parametrize("make", [whole_numbers, clipped])
+@pytest.mark.parametrize("kinds", [2, 3, 5, 12])
+def test_ties_are_shared_out(make, kinds):
+    """Exact posteriors of discrete parameters are neither narrow nor wide, and lie on no side of their truths."""
+    found = [check_intervals(*make(np.random.default_rng([kinds, seed]), kinds))[0] for seed in range(8)]
+    truths = sum(one.truths for one in found)
+    for estimates, share in (
+        ([one.above for one in found], 0.5),
+        ([one.held[0] for one in found], 0.5),
+        ([one.held[1] for one in found], 0.9),
+    ):
+        count = round(sum(one.value * 400 for one in estimates))
+        assert scipy.stats.binomtest(count, truths, share).pvalue > 1e-3
+    assert sum(one.verdict in ("honest", "undecided") for one in found) >= 7
+
+
+def test_whole_numbers_that_are_off_are_called_so():
+    rng = np.random.default_rng(0)
+    truths, draws = rng.integers(1, 6, (400, 1)), rng.integers(1, 6, (400, 200, 1))
+    assert check_intervals(truths, draws)[0].verdict == "honest"
+    assert "biased high" in check_intervals(truths, np.minimum(draws + 1, 6))[0].verdict
+    assert "biased low" in check_intervals(truths + 1, draws)[0].verdict
+    assert "too narrow" in check_intervals(truths, np.where(draws == 3, draws, 3 + (draws > 4)))[0].verdict
+    # What does not depend on ties does not depend on a chance either.
+    again = [check_intervals(truths, draws)[0] for _ in range(2)]
+    assert again[0] == again[1]
+
+
+NOTHING = {
+    "NaN": lambda truths, draws: (truths, np.where(draws > 3, np.nan, draws)),
+    "NaN truth": lambda truths, draws: (np.where(truths > 1, np.nan, truths), draws),
+    "infinite": lambda truths, draws: (truths, np.where(draws > 3, np.inf, draws)),
+    "one row": lambda truths, draws: (truths[:1], draws[:1]),
+    "few draws": lambda truths, draws: (truths, draws[:, :18]),
+    "no draws": lambda truths, draws: (truths, draws[:, :0]),
+    "no rows": lambda truths, draws: (truths[:0], draws[:0]),
+    "constants": lambda truths, draws: (np.ones_like(truths), np.ones_like(draws)),
+    "one constant parameter": lambda truths, draws: (truths, draws * [1.0, 0.0]),
+    "exact": lambda truths, draws: (truths, np.repeat(truths[:, None], 200, axis=1)),
+}
+
+
+@pytest.mark.parametrize("change", NOTHING)
+def test_what_says_nothing_is_refused(change):
+    with pytest.raises(ValueError, match="expected") as refused:
+        check_intervals(*NOTHING[change](*case(0, 1.0, 0.0)))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("rank", "draws"),
+    [([1, 60], 50), ([1], 50), ([], 50), ([1, 2], 10), ([0.5, 2], 50), ([np.nan, 2], 50), ([1, 2], 50.5)],
+)
+def test_ranks_that_are_none_are_refused(rank, draws):
+    with pytest.raises(Exception, match=r"expected|Int"):
+        check_regions(np.array(rank), draws)
 
 
 def test_regions():

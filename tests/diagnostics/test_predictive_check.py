@@ -81,6 +81,7 @@ def test_a_summary_that_never_varies():
     [
         (np.zeros((30, 2)), np.zeros(3), "expected shapes"),
         (np.zeros((30, 2)), np.array([0.0, np.nan]), "a finite observation"),
+        (np.ones((30, 2)), np.ones(2), "expected summaries that vary"),
         (np.full((30, 2), np.nan), np.zeros(2), f"at least {MIN_SIMULATIONS} finite rows, got 0 of 30"),
     ],
 )

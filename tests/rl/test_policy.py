@@ -53,7 +53,10 @@ def test_it_is_saved_and_loaded(policy, tmp_path):
     [
         (lambda arrays: {}, "without its schema"),
         (lambda arrays: arrays | {"schema": np.asarray("[]")}, "without its schema"),
-        (lambda arrays: arrays | {"schema": np.asarray('{"format": "jaxlfi-policy", "version": 9}')}, "got version 9, which a newer"),
+        (
+            lambda arrays: arrays | {"schema": np.asarray('{"format": "jaxlfi-policy", "version": 9}')},
+            "got version 9, which a newer",
+        ),
         (lambda arrays: {name: one for name, one in arrays.items() if name != "bias_1"}, "expected a whole policy"),
         (lambda arrays: arrays | {"weight_0": np.zeros((5, 3))}, "expected layers from 2 observations to 1 actions"),
     ],

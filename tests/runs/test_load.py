@@ -181,7 +181,10 @@ def replaced(name, **arrays):
         (cut("config.json"), "without a readable config.json"),
         (config_with(format="other"), "config.json is not of jaxlfi"),
         (config_with(format="jaxlfi-grid"), "config.json is of format 'jaxlfi-grid'"),
-        (config_with(version=1), r"expected jaxlfi-run of version 2, got version 1, which jaxlfi 0.* reads; or run its command again"),
+        (
+            config_with(version=1),
+            r"expected jaxlfi-run of version 2, got version 1, which jaxlfi 0.* reads; or run its command again",
+        ),
         (config_with(status="running"), "expected a finished run; go on with it by 'jaxlfi resume'"),
         (lambda folder: (folder / "posterior.npz").unlink(), "expected a finished run"),
         (without("settings"), "config.json: expected a complete description of the run"),

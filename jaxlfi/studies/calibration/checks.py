@@ -90,7 +90,6 @@ def calibration(
     return lines, arrays
 
 
-@jax.jit
 def _all_ranks(key, theta, draws, truth_log_prob, log_prob, low, high):
     key_ranks, key_density, key_distance = jax.random.split(key, 3)
     return (
@@ -151,7 +150,7 @@ def _classifier_check(run: Run, plan: CalibrationPlan, truths: Mapping[str, np.n
 
 
 def _accuracy(key: jax.Array, first: np.ndarray, second: np.ndarray) -> float:
-    return float(jax.jit(diagnostics.c2st)(key, jnp.asarray(first), jnp.asarray(second)))
+    return float(diagnostics.c2st(key, first, second))
 
 
 def predictive(run: Run, plan: CalibrationPlan) -> tuple[Check, dict[str, np.ndarray]]:

@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxlfi import diagnostics
@@ -74,12 +73,9 @@ def measured(
     plan: CalibrationPlan, names: Sequence[str], truths: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]
 ) -> Widths:
     """Compare truths with the intervals of their posteriors."""
-    rank = jax.device_get(_density_ranks(plan.key(TIES), found["truth_log_prob"], found["log_prob"]))
+    rank = np.asarray(diagnostics.density_ranks(plan.key(TIES), found["truth_log_prob"], found["log_prob"]))
     parameters = diagnostics.check_intervals(truths["theta"], found["draws"])
     return Widths(plan, names, parameters, diagnostics.check_regions(rank, plan.draws))
-
-
-_density_ranks = jax.jit(diagnostics.density_ranks)
 
 
 def sentence(name: str, found: Intervals) -> str:

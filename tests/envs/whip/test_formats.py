@@ -203,7 +203,10 @@ WRONG = {
         lambda one: dataclasses.replace(one, metadata={}),
         "schema: expected 'jaxlfi.whip.recording' in the rollout's metadata",
     ),
-    "later version": (lambda one: described(one, version=2), "jaxlfi.whip.recording of version 1, got version 2, which a newer"),
+    "later version": (
+        lambda one: described(one, version=2),
+        "jaxlfi.whip.recording of version 1, got version 2, which a newer",
+    ),
     "large actions": (
         lambda one: changed(one, "action", values=np.full((16, 2), 0.1)),
         "of at most 0.06 m, got one of",

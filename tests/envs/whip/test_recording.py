@@ -116,7 +116,10 @@ SPOILED = {
     "pickles": (lambda path: with_array(path, "seen", np.array([{}])), "expected a whole .npz file"),
     "foreign": (lambda path: described(path, schema="lerobot"), "schema: expected 'jaxlfi.whip.recording'"),
     "a list": (lambda path: path.with_suffix(".json").write_text("[]"), "schema: expected"),
-    "later version": (lambda path: described(path, version=2), "jaxlfi.whip.recording of version 1, got version 2, which a newer"),
+    "later version": (
+        lambda path: described(path, version=2),
+        "jaxlfi.whip.recording of version 1, got version 2, which a newer",
+    ),
     "missing key": (lambda path: described(path, control_interval=None), "control_interval: expected in one.json"),
     "text for a number": (lambda path: described(path, frame_rate="60"), "frame_rate: expected a float, got '60'"),
     "millimetres": (lambda path: described(path, units={**UNITS, "gripper": "mm"}), "units: expected .*'gripper': 'm'"),
