@@ -49,7 +49,7 @@ def pairs(
         dpi: resolution of a .png.
 
     Returns:
-        A matplotlib figure that pyplot does not hold on to.
+        A matplotlib figure that pyplot does not hold on to; a notebook shows it where it is the last value of a cell.
 
     Raises:
         ValueError: for samples that are no finite [n, D] array or too few, or for other arguments that do not fit them.

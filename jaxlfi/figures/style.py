@@ -24,6 +24,8 @@ COLUMN_WIDTH = 3.5
 """Width of a paper's column in inches."""
 TEXT_WIDTH = 7.16
 """Width of a paper's two columns in inches."""
+NOTEBOOK_DPI = 150
+"""Resolution of a figure that shows itself in a notebook."""
 
 STYLE = {
     "font.family": "DejaVu Sans",
@@ -295,17 +297,35 @@ def context() -> Iterator[None]:
         yield
 
 
+class SelfShowing(Figure):
+    """A figure that a notebook shows as the last value of a cell, though pyplot does not know it.
+
+    IPython asks a value for `_repr_png_`. Where `%matplotlib inline` has taught it a way to show every `Figure`, it
+    takes that way in place of this one, so that the figure is shown once.
+    """
+
+    def _repr_png_(self) -> bytes:
+        with context():
+            return png(self, NOTEBOOK_DPI)
+
+
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of a size in inches, laid out without overlaps, that pyplot does not hold on to."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = SelfShowing(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def save(figure: Figure, path: Path, dpi: float) -> Path:
     """Write a figure as png and return the path."""
+    content = png(figure, dpi)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.write_bytes(path, content)
+    return path
+
+
+def png(figure: Figure, dpi: float) -> bytes:
+    """A figure as the content of a .png file."""
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=dpi)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    files.write_bytes(path, content.getvalue())
-    return path
+    return content.getvalue()

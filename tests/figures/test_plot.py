@@ -1,5 +1,6 @@
 """Pair plots of anybody's arrays: what is drawn is what was given, and what cannot be drawn is refused in one line."""
 
+import io
 import subprocess
 import sys
 import types
@@ -7,9 +8,12 @@ import types
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
+from PIL import Image
 
 from jaxlfi import plot
+from jaxlfi.figures import style
 
 NAMES, UNITS = ("stiffness", "cost_$", "friction"), ("N/m", "", "1")
 RNG = np.random.default_rng(7)
@@ -142,6 +146,34 @@ def test_draws_that_do_not_vary_are_in_sight(place):
     low, high = axes.get_xlim()
     outline = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
     assert low < outline[:, 0].min() < place < outline[:, 0].max() < high
+
+
+def shown(value, type_printers) -> list[bytes]:
+    """What IPython's display formatter makes a png of: by a printer for a type, else by the value's own method.
+
+    As `IPython.core.formatters.BaseFormatter.__call__` looks it up.
+    """
+    printers = [type_printers[kind] for kind in type(value).__mro__ if kind in type_printers]
+    own = getattr(type(value), "_repr_png_", None)
+    return [(printers or [own])[0](value)] if printers or own else []
+
+
+@pytest.mark.parametrize("inline", [False, True])
+def test_a_notebook_shows_a_figure_once(inline):
+    """Also where `%matplotlib inline` has registered a printer of figures, and shows all that pyplot holds."""
+    before = dict(matplotlib.rcParams)
+    figure = plot.pairs(DRAWS)
+    (content,) = shown(figure, {Figure: lambda figure: style.png(figure, 72)} if inline else {})
+    with Image.open(io.BytesIO(content)) as image:
+        assert image.format == "PNG"
+        assert image.width == pytest.approx((72 if inline else style.NOTEBOOK_DPI) * style.TEXT_WIDTH, abs=1)
+    assert figure._repr_html_() is None and dict(matplotlib.rcParams) == before
+
+
+def test_ipython_shows_a_figure():
+    formatters = pytest.importorskip("IPython.core.formatters")
+    data, _ = formatters.DisplayFormatter().format(plot.pairs(DRAWS[:, :1]))
+    assert data["image/png"] and "text/html" not in data
 
 
 def marginal_of(axes) -> tuple[np.ndarray, np.ndarray]:
