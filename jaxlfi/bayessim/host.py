@@ -18,6 +18,7 @@ from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
+from jaxlfi.distributions.precision import single
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.simulation import Simulations, simulate_batch, simulate_in_waves
@@ -136,7 +137,7 @@ class HostEngine(BatchEngine):
         return compared(self.task, theta, *map(jnp.asarray, simulated), observed)
 
 
-_check_draws = jax.jit(jax.vmap(check_draws))
+_check_draws = jax.jit(single(jax.vmap(check_draws)))
 
 
 def _call(many: Any, *arguments: Any) -> Any:

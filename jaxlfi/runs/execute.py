@@ -20,6 +20,7 @@ from jaxlfi.bayessim.memory import budget, state_bytes
 from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.shared import SharedEngine
+from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
 from jaxlfi.io.processes import ALONE, Partition, Processes
 from jaxlfi.runs import describe
@@ -136,7 +137,7 @@ def _require_memory(plan: BatchPlan, given: Observed, processes: Processes) -> N
     inputs, _ = stack_inputs([spec], observed, given.x[:1])
     first = None if given.first is None else len(given.first.theta)
     one = jax.tree.map(lambda leaf: leaf[0], inputs)
-    state = jax.eval_shape(functools.partial(start_one, plan.task, first), plan.settings, one)
+    state = jax.eval_shape(single(functools.partial(start_one, plan.task, first)), plan.settings, one)
     needed, free = len(plan.specs) * state_bytes(state), budget() * jax.local_device_count() * processes.count
     if needed > free:
         raise ValueError(

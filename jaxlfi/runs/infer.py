@@ -19,6 +19,7 @@ from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.record import FINAL
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.arguments import is_concrete, require_key
+from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import SpaceName
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset
@@ -263,5 +264,6 @@ def _traced(key, task: Task, observation, support: Support, heuristic, settings:
 
 
 @functools.partial(jax.jit, static_argnums=0)
+@single
 def _scan(task: Task, settings: Settings, inputs: RunInputs):
     return run_one(task, settings, inputs)

@@ -18,6 +18,7 @@ from jaxlfi.diagnostics.bounds import bound_warnings
 from jaxlfi.distributions.arguments import is_concrete
 from jaxlfi.distributions.belief import Belief, uninformed
 from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network
@@ -199,6 +200,7 @@ def _finite(values: jax.Array, what: str = "finite numbers") -> jax.Array:
 
 
 @functools.partial(jax.jit, static_argnums=0)
+@single
 def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
     prior = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
     mixture = network.condition(x, support, key).mixture
@@ -207,8 +209,8 @@ def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
     return posterior_after(belief, network, x)
 
 
-_posterior_after = jax.jit(posterior_after)
-_truncated = jax.jit(truncated, static_argnums=3)
+_posterior_after = jax.jit(single(posterior_after))
+_truncated = jax.jit(single(truncated), static_argnums=3)
 
 
 def _require_one(run: Run, what: str) -> None:

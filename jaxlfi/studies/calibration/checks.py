@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxlfi import diagnostics
 from jaxlfi.diagnostics.predictive import MIN_SIMULATIONS
+from jaxlfi.distributions.precision import single
 from jaxlfi.estimators.normaliser import fit_normaliser
 from jaxlfi.io import files
 from jaxlfi.runs.run import Run
@@ -91,6 +92,7 @@ def calibration(
 
 
 @jax.jit
+@single
 def _all_ranks(key, theta, draws, truth_log_prob, log_prob, low, high):
     key_ranks, key_density, key_distance = jax.random.split(key, 3)
     return (

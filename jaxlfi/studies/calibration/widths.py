@@ -20,6 +20,7 @@ from jaxlfi.diagnostics.intervals import (
     Estimate,
     Intervals,
 )
+from jaxlfi.distributions.precision import single
 from jaxlfi.studies.calibration.plan import TIES, CalibrationPlan
 
 _LEVEL = f"{100 * LEVELS[-1]:.0f} %"
@@ -79,7 +80,7 @@ def measured(
     return Widths(plan, names, parameters, diagnostics.check_regions(rank, plan.draws))
 
 
-_density_ranks = jax.jit(diagnostics.density_ranks)
+_density_ranks = jax.jit(single(diagnostics.density_ranks))
 
 
 def sentence(name: str, found: Intervals) -> str:

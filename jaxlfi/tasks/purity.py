@@ -1,0 +1,138 @@
+"""Whether a simulator in JAX draws its noise by its key: what NumPy or Python draw is drawn once, as JAX traces it.
+
+Found by tracing alone: such numbers are constants of the traced program, and others when it is traced again.
+"""
+
+import inspect
+import random
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.extend
+import numpy as np
+
+from jaxlfi.tasks.errors import SimulatorError, SimulatorWarning
+
+PATIENCE = 1.0
+"""Seconds of tracing beyond which a simulator is traced again only where something is suspicious."""
+RANDOM = ("random_", "threefry", "rng_")
+"""How the names of JAX's operations begin that draw numbers or make keys."""
+
+
+def shapes(simulate: Callable[..., Any], key: Any, theta: Any) -> Any:
+    """The shapes that a simulator gives, as `jax.eval_shape` tells them, after a look at where its noise is from.
+
+    Args:
+        simulate: `simulate(key, theta)`.
+        key: its shape.
+        theta: its shape.
+
+    Raises:
+        SimulatorError: where it takes random numbers, or a time, from elsewhere than its key.
+    """
+    function = _unwrapped(simulate)
+    before, began = _state(), time.perf_counter()
+    program, result = jax.make_jaxpr(lambda *given: function(*given), return_shape=True)(key, theta)
+    quick, drawn = time.perf_counter() - began < PATIENCE, _state() != before
+    ignored = not _depends(program.jaxpr, {program.jaxpr.invars[0]})
+    if quick or drawn or ignored:
+        before = _state()
+        again = jax.make_jaxpr(lambda *given: function(*given))(key, theta)
+        drawn = _state() != before  # what the first trace imported may have drawn numbers of its own
+        if not _same(list(_constants(program)), list(_constants(again))):
+            raise SimulatorError(
+                "simulate: expected all noise by jax.random from its key, got numbers of NumPy's or Python's (random, "
+                "time) that JAX draws once for all simulations: use the key, or jaxlfi.HostSimulator for a simulator "
+                "of NumPy's"
+            )
+    if ignored and (drawn or any(name.startswith(RANDOM) for name in _operations(program.jaxpr))):
+        warnings.warn(
+            "simulate: draws random numbers, but none of them by the key it is given: all simulations have the same "
+            "noise",
+            SimulatorWarning,
+            stacklevel=2,
+        )
+    return result
+
+
+def _unwrapped(simulate: Callable[..., Any]) -> Callable[..., Any]:
+    """The function itself of one that is jitted, which may have been traced before."""
+    return inspect.unwrap(simulate, stop=lambda function: not isinstance(function, _JITTED))
+
+
+_JITTED = type(jax.jit(lambda: None))
+
+
+def _state() -> tuple:
+    """Of the generators that NumPy and Python have for all."""
+    kind, words, *rest = np.random.get_state()
+    return kind, words.tobytes(), *rest, random.getstate()
+
+
+def _depends(jaxpr: Any, on: set) -> bool:
+    """Whether any result of a traced function depends on some of its variables."""
+    return bool(_reached(jaxpr, on) & {out for out in jaxpr.outvars if not _is_literal(out)})
+
+
+def _reached(jaxpr: Any, on: set) -> set:
+    """The variables that depend on others."""
+    reached = set(on)
+    for equation in jaxpr.eqns:
+        hit = [not _is_literal(variable) and variable in reached for variable in equation.invars]
+        if not any(hit):
+            continue
+        inner = getattr(equation.params.get("jaxpr"), "jaxpr", None)
+        if equation.primitive.name in ("jit", "pjit") and inner is not None:
+            within = _reached(inner, {variable for variable, is_hit in zip(inner.invars, hit, strict=True) if is_hit})
+            outs = zip(equation.outvars, inner.outvars, strict=True)
+            reached |= {out for out, source in outs if not _is_literal(source) and source in within}
+        else:
+            reached |= set(equation.outvars)
+    return reached
+
+
+def _operations(jaxpr: Any) -> Iterator[str]:
+    """Names of all operations."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for inner in _inner(equation.params.values()):
+            yield from _operations(getattr(inner, "jaxpr", inner))
+
+
+def _constants(program: Any) -> Iterator[Any]:
+    """All numbers that a traced function has in it."""
+    yield from getattr(program, "consts", ())
+    for equation in getattr(program, "jaxpr", program).eqns:
+        yield from (variable.val for variable in equation.invars if _is_literal(variable))
+        for inner in _inner(equation.params.values()):
+            yield from _constants(inner)
+
+
+def _inner(values: Any) -> Iterator[Any]:
+    """Traced functions among the parameters of an operation."""
+    for value in values:
+        if isinstance(value, tuple | list):
+            yield from _inner(value)
+        elif hasattr(value, "eqns"):
+            yield value
+
+
+def _is_literal(variable: Any) -> bool:
+    return isinstance(variable, jax.extend.core.Literal)
+
+
+def _same(first: list[Any], second: list[Any]) -> bool:
+    """Whether two traces have the same numbers; those that are traced themselves are taken to be."""
+    return len(first) == len(second) and all(map(_equal, first, second))
+
+
+def _equal(a: Any, b: Any) -> bool:
+    if a is b or isinstance(a, jax.core.Tracer) or isinstance(b, jax.core.Tracer):
+        return True
+    if jax.dtypes.issubdtype(getattr(a, "dtype", np.float32), jax.dtypes.prng_key):
+        a, b = jax.random.key_data(a), jax.random.key_data(b)
+    a, b = np.asarray(a), np.asarray(b)
+    return a.shape == b.shape and a.tobytes() == b.tobytes()
