@@ -106,12 +106,14 @@ class HostEngine(BatchEngine):
 
     def _simulated(self, theta: jax.Array, keys: jax.Array, settled: np.ndarray) -> Simulations:
         shape, wanted = self.inputs.observed.shape[1:], self.settings.simulations_per_round
-        return _stacked(
-            [
+        made = []
+        for run, (key, own, over) in enumerate(zip(keys, theta, settled, strict=True)):
+            self.journal.run = run
+            made.append(
                 self._nothing(own) if over else simulate_in_waves(key, self.task, own, wanted, shape, self.journal)
-                for key, own, over in zip(keys, theta, settled, strict=True)
-            ]
-        )
+            )
+        self.journal.run = None
+        return _stacked(made)
 
     def _nothing(self, theta: jax.Array) -> Simulations:
         """No simulations of the parameters [A, D]: of a run at its end."""

@@ -8,6 +8,8 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from jaxlfi.distributions.precision import single
+
 FOLDS = 5
 UNITS_A_DIMENSION = 10
 BATCH = 200
@@ -29,6 +31,7 @@ class _Training:
     idle: Int[Array, ""]
 
 
+@single
 def c2st(key: jax.Array, first: Float[Array, "n dim"], second: Float[Array, "n dim"]) -> Float[Array, ""]:
     """Accuracy of a classifier on held-out rows of two samples: 0.5 where it cannot tell them apart, 1 where it can.
 

@@ -32,6 +32,7 @@ from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Origin, Run, SupportWarning
 from jaxlfi.tasks.executors import one_by_one
+from jaxlfi.tasks.failures import Told
 from jaxlfi.tasks.observation import observe, trials_of
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.priors import require_mass
@@ -171,7 +172,8 @@ def _executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Cal
         def each(index: int, row: dict[str, np.ndarray]) -> None:
             bar.advance()
             if callback is not None:
-                callback(index, executing.run_row(row, 0, None))
+                own = executing.run_row(row, 0, None)
+                callback(index, {name: np.array(value) for name, value in own.items()})  # theirs to change
 
         (run,) = executing.execute(plan, observed, out, each, bar.compiled, bar.simulated)
     return run
@@ -260,6 +262,7 @@ def _traced(key, task: Task, observation, support: Support, heuristic, settings:
         task=task,
         origin=Origin(),
         units=tuple(task.units),
+        told=Told(task.reasons),
     )
 
 

@@ -23,7 +23,7 @@ from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.run import Origin, Run
-from jaxlfi.tasks import registry
+from jaxlfi.tasks import failures, registry
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.task import Task
 
@@ -80,12 +80,11 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
     prior = _prior(folder, config, task, settings)
     observation = _arrays(folder / "observation.npz", ("trajectory", "x"))
     observed, x = jnp.asarray(observation["trajectory"]), jnp.asarray(observation["x"])
+    history = _arrays(folder / "history.npz", ("theta",))
     layout = tuple(map(int, observation.get("layout", (len(x), 1))))
     return Run(
         belief=_belief(folder / "posterior.npz", space),
-        history={
-            name: value for name, value in _arrays(folder / "history.npz", ("theta",)).items() if name not in LABELS
-        },
+        history={name: value for name, value in history.items() if name not in LABELS},
         dataset=_dataset(folder / "dataset.npz", settings),
         network=_network(folder / "network.npz", settings, layout, feasible, space, prior),
         observed=observed,
@@ -99,7 +98,15 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         task=task,
         origin=origin,
         units=units,
+        told=_told(folder, history),
     )
+
+
+def _told(folder: Path, history: dict[str, np.ndarray]) -> failures.Told:
+    try:
+        return failures.Told(map(str, history.get("reasons", ())), failures.read(folder))
+    except ValueError as error:
+        raise StoreError(str(error)) from error
 
 
 def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space) -> Task | None:

@@ -185,8 +185,7 @@ class HostSimulator:
             outcome = owned.outcomes(outcome)
         except ValueError as error:
             raise SimulatorError(
-                f"simulate: expected an outcome for each of {rows} simulations, "
-                f"got {owned.described(np.asarray(outcome))}: {error}"
+                f"simulate: expected an outcome for each of {rows} simulations, got {owned.described(outcome)}: {error}"
             ) from error
         if outcome.shape != (rows,):
             raise SimulatorError(

@@ -72,9 +72,10 @@ def outcomes(value: Any) -> np.ndarray:
         >>> outcomes([0, 2]).tolist(), outcomes(True).tolist()
         ([0, 2], True)
     """
-    found = np.array(value)
-    if np.ma.is_masked(value) or found.dtype.kind not in "biu":
-        got = f"{found.dtype} of shape {list(found.shape)}" if found.ndim else repr(found.item())
+    missed = missing(value) > 0
+    found = np.array(0.0 if missed else value)
+    if found.dtype.kind not in "biu":
+        got = described(value) if missed or found.ndim else repr(found.item())
         raise ValueError(f"expected true or false, or a whole number (0: valid), as outcome, got {got}")
     if found.dtype == bool:
         return found
@@ -104,8 +105,11 @@ def require_own_rows(value: Any) -> None:
         )
 
 
-def described(found: np.ndarray) -> str:
-    """Its type and shape in words."""
+def described(value: Any) -> str:
+    """The type and shape of an array in words."""
+    if missing(value):
+        return "a masked array"
+    found = np.asarray(value)
     return f"{found.dtype} of shape {list(found.shape)}"
 
 

@@ -3,7 +3,7 @@
 Found by tracing alone: such numbers are constants of the traced program, and others when it is traced again.
 """
 
-import inspect
+import functools
 import random
 import time
 import warnings
@@ -33,22 +33,24 @@ def shapes(simulate: Callable[..., Any], key: Any, theta: Any) -> Any:
     Raises:
         SimulatorError: where it takes random numbers, or a time, from elsewhere than its key.
     """
-    function = _unwrapped(simulate)
-    before, began = _state(), time.perf_counter()
+    function, start = _unwrapped(simulate), _state()
+    began = time.perf_counter()
     program, result = jax.make_jaxpr(lambda *given: function(*given), return_shape=True)(key, theta)
-    quick, drawn = time.perf_counter() - began < PATIENCE, _state() != before
+    quick, drawn = time.perf_counter() - began < PATIENCE, _state() != start
     ignored = not _depends(program.jaxpr, {program.jaxpr.invars[0]})
     if quick or drawn or ignored:
-        before = _state()
+        # From another state, as a simulator may set it. What the first trace imported may have drawn numbers, too.
+        other = np.random.random(), random.random(), _state()  # noqa: NPY002
         again = jax.make_jaxpr(lambda *given: function(*given))(key, theta)
-        drawn = _state() != before  # what the first trace imported may have drawn numbers of its own
+        drawn = _state() != other[-1]
+        _restore(start)
         if not _same(list(_constants(program)), list(_constants(again))):
             raise SimulatorError(
                 "simulate: expected all noise by jax.random from its key, got numbers of NumPy's or Python's (random, "
                 "time) that JAX draws once for all simulations: use the key, or jaxlfi.HostSimulator for a simulator "
                 "of NumPy's"
             )
-    if ignored and (drawn or any(name.startswith(RANDOM) for name in _operations(program.jaxpr))):
+    if ignored and (drawn or _draws_apart(program.jaxpr, {program.jaxpr.invars[0]})):
         warnings.warn(
             "simulate: draws random numbers, but none of them by the key it is given: all simulations have the same "
             "noise",
@@ -58,18 +60,27 @@ def shapes(simulate: Callable[..., Any], key: Any, theta: Any) -> Any:
     return result
 
 
-def _unwrapped(simulate: Callable[..., Any]) -> Callable[..., Any]:
+def _unwrapped(function: Any) -> Any:
     """The function itself of one that is jitted, which may have been traced before."""
-    return inspect.unwrap(simulate, stop=lambda function: not isinstance(function, _JITTED))
+    if isinstance(function, functools.partial):
+        named = {name: _unwrapped(value) for name, value in function.keywords.items()}
+        return functools.partial(_unwrapped(function.func), *map(_unwrapped, function.args), **named)
+    return function.__wrapped__ if isinstance(function, _JITTED) else function
 
 
 _JITTED = type(jax.jit(lambda: None))
 
 
-def _state() -> tuple:
-    """Of the generators that NumPy and Python have for all."""
-    kind, words, *rest = np.random.get_state()
-    return kind, words.tobytes(), *rest, random.getstate()
+def _state() -> tuple[tuple, tuple]:
+    """Of the generators that NumPy and Python have for all: a simulator may draw from them."""
+    kind, words, *rest = np.random.get_state()  # noqa: NPY002
+    return (kind, words.tobytes(), *rest), random.getstate()
+
+
+def _restore(state: tuple[tuple, tuple]) -> None:
+    (kind, words, *rest), own = state
+    np.random.set_state((kind, np.frombuffer(words, np.uint32), *rest))  # noqa: NPY002
+    random.setstate(own)
 
 
 def _depends(jaxpr: Any, on: set) -> bool:
@@ -92,6 +103,19 @@ def _reached(jaxpr: Any, on: set) -> set:
         else:
             reached |= set(equation.outvars)
     return reached
+
+
+def _draws_apart(jaxpr: Any, key: set) -> bool:
+    """Whether random numbers are drawn by a key that does not come from the given one."""
+    reached = _reached(jaxpr, key)
+    for equation in jaxpr.eqns:
+        inner = [getattr(one, "jaxpr", one) for one in _inner(equation.params.values())]
+        if not reached.isdisjoint(variable for variable in equation.invars if not _is_literal(variable)):
+            continue
+        names = {equation.primitive.name, *(name for one in inner for name in _operations(one))}
+        if any(name.startswith(RANDOM) for name in names):
+            return True
+    return False
 
 
 def _operations(jaxpr: Any) -> Iterator[str]:

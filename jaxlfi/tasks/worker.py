@@ -5,6 +5,7 @@ process: `jaxlfi.tasks.guard` starts it, sends it the simulator and then one req
 (`jaxlfi.io.records`) for each.
 """
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -68,7 +69,9 @@ class CrashError(RuntimeError):
 
 def failed(reason: str, message: str = "") -> Answer:
     """A failure for one of `REASONS`."""
-    return Answer(-1 - REASONS.index(reason), message=" ".join(message.split())[:LONGEST_MESSAGE])
+    words = " ".join(message.split())[:LONGEST_MESSAGE]
+    printable = "".join(letter if letter.isprintable() else "?" for letter in words)  # no colours of a terminal
+    return Answer(-1 - REASONS.index(reason), message=printable)
 
 
 def generator(words: Sequence[int], index: int) -> np.random.Generator:
@@ -119,7 +122,7 @@ def code_of(outcome: Any) -> int:
         ValueError: for anything but one boolean or whole number.
     """
     if np.ndim(outcome) > 0:
-        raise ValueError(f"expected a scalar outcome, got {owned.described(np.asarray(outcome))}")
+        raise ValueError(f"expected a scalar outcome, got {owned.described(outcome)}")
     outcome = owned.outcomes(outcome)
     code = int(not outcome) if outcome.dtype == bool else int(outcome)
     return max(code, 0) or int(code < 0)
@@ -135,8 +138,10 @@ class OneOfBatch:
         """One simulation."""
         result = self.function(rng, theta[None])
         if isinstance(result, tuple) and len(result) == 2:
-            (trajectory,), outcomes = result
-            return trajectory, np.reshape(outcomes, ()) if np.size(outcomes) == 1 else outcomes
+            (trajectory,), outcome = result
+            with contextlib.suppress(TypeError):  # it is no list, and is refused for what it is
+                (outcome,) = outcome
+            return trajectory, outcome
         (trajectory,) = result
         return trajectory
 
