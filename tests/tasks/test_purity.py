@@ -84,7 +84,7 @@ PURE = {
     ),
     "none, but a key is split": lambda key, theta: theta + 0 * jax.random.split(key)[0].size,
     "by folding": lambda key, theta: (
-        theta + jax.random.normal(jax.random.fold_in(jax.random.key(3), key_bits(key)), (2,))
+        theta + jax.random.normal(jax.random.fold_in(jax.random.key(3), jax.random.bits(key)), (2,))
     ),
     "in a loop": lambda key, theta: jax.lax.scan(
         lambda x, own: (x + jax.random.normal(own, (2,)), None), theta, jax.random.split(key, 3)
@@ -95,9 +95,9 @@ PURE = {
 
 @pytest.mark.parametrize("made", [*map(task, PURE.values()), gaussian_linear.task(), mg1.task()])
 def test_others_pass_without_a_word(made):
-    before = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002
+    before = np.random.get_state()[1].tolist()  # noqa: NPY002
     with warnings.catch_warnings(), jax.debug_key_reuse(False):  # the checker takes a scan under vmap for a reuse
         warnings.simplefilter("error")
         simulator_shapes(made)
         simulator_shapes(repeated(made, 2))
-    assert before == (random.getstate(), np.random.get_state()[1].tolist())  # noqa: NPY002
+    assert before == np.random.get_state()[1].tolist()  # noqa: NPY002
