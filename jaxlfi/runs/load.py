@@ -164,7 +164,9 @@ def _dataset(path: Path, settings: Settings) -> Dataset:
     first = int(np.sum(arrays["round"] == 0))
     room = max(first, settings.simulations_per_round) + (settings.rounds - 1) * settings.simulations_per_round
     filled = {
-        name: jnp.asarray(np.concatenate([arrays[name], np.zeros((max(room - size, 0), *arrays[name].shape[1:]))]))
+        name: jnp.asarray(
+            np.concatenate([arrays[name], np.zeros((max(room - size, 0), *arrays[name].shape[1:]))]), jnp.float32
+        )
         for name in ("theta", "x", "weight")
     }
     rounds = np.concatenate([arrays["round"], np.zeros(max(room - size, 0), arrays["round"].dtype)])
