@@ -97,7 +97,9 @@ def observed_shapes(task: Task, observation: np.ndarray) -> Shapes:
 
 def _summary_size(task: Task, shape: tuple[int, ...]) -> int:
     try:
-        summary = jax.eval_shape(task.summary, jax.ShapeDtypeStruct(shape, jnp.float32))
+        summary = purity.summary_shape(task.summary, jax.ShapeDtypeStruct(shape, jnp.float32))
+    except SimulatorError:
+        raise
     except Exception as error:
         raise SimulatorError(
             f"summary: expected a function of one trajectory {list(shape)} that JAX can trace, "

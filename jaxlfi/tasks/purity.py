@@ -1,4 +1,4 @@
-"""Whether a simulator in JAX draws its noise by its key: what NumPy or Python draw is drawn once, as JAX traces it.
+"""Whether simulators and summaries in JAX are pure: what NumPy or Python draw is drawn as JAX traces them, and frozen.
 
 Found by tracing alone: such numbers are constants of the traced program, and others when it is traced again.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from jaxlfi.tasks.errors import SimulatorError, SimulatorWarning
 
 PATIENCE = 1.0
-"""Seconds of tracing beyond which a simulator is traced again only where something is suspicious."""
+"""Seconds of tracing beyond which a function is traced again only where numbers were drawn meanwhile."""
 RANDOM = ("random_", "threefry", "rng_")
 """How the names of JAX's operations begin that draw numbers or make keys."""
 
@@ -33,24 +33,14 @@ def shapes(simulate: Callable[..., Any], key: Any, theta: Any) -> Any:
     Raises:
         SimulatorError: where it takes random numbers, or a time, from elsewhere than its key.
     """
-    function, start = _unwrapped(simulate), _state()
-    began = time.perf_counter()
-    program, result = jax.make_jaxpr(lambda *given: function(*given), return_shape=True)(key, theta)
-    quick, drawn = time.perf_counter() - began < PATIENCE, _state() != start
-    ignored = not _depends(program.jaxpr, {program.jaxpr.invars[0]})
-    if quick or drawn or ignored:
-        # From another state, as a simulator may set it. What the first trace imported may have drawn numbers, too.
-        other = np.random.random(), random.random(), _state()  # noqa: NPY002
-        again = jax.make_jaxpr(lambda *given: function(*given))(key, theta)
-        drawn = _state()[0] != other[-1][0]  # Python's own is drawn from by checkers of types, too
-        _restore(start)
-        if not _same(list(_constants(program)), list(_constants(again))):
-            raise SimulatorError(
-                "simulate: expected all noise by jax.random from its key, got numbers of NumPy's or Python's (random, "
-                "time) that JAX draws once for all simulations: use the key, or jaxlfi.HostSimulator for a simulator "
-                "of NumPy's"
-            )
-    if ignored and (drawn or _draws_apart(program.jaxpr, {program.jaxpr.invars[0]})):
+    program, result, drawn = _traced(
+        simulate,
+        (key, theta),
+        "simulate: expected all noise by jax.random from its key, got numbers of NumPy's or Python's (random, time) "
+        "that JAX draws once for all simulations: use the key, or jaxlfi.HostSimulator for a simulator of NumPy's",
+    )
+    given = {program.jaxpr.invars[0]}
+    if not _depends(program.jaxpr, given) and (drawn or _draws_apart(program.jaxpr, given)):
         warnings.warn(
             "simulate: draws random numbers, but none of them by the key it is given: all simulations have the same "
             "noise",
@@ -58,6 +48,38 @@ def shapes(simulate: Callable[..., Any], key: Any, theta: Any) -> Any:
             stacklevel=2,
         )
     return result
+
+
+def summary_shape(summary: Callable[..., Any], trajectory: Any) -> Any:
+    """The shape that a summary gives, of a trajectory of some shape.
+
+    Raises:
+        SimulatorError: where it has other numbers in it each time, so that observation and simulations differ in it.
+    """
+    _, result, _ = _traced(
+        summary,
+        (trajectory,),
+        "summary: expected the same function whenever JAX traces it, got numbers of NumPy's or Python's (random, time) "
+        "that are others each time: draw them once, outside of it",
+    )
+    return result
+
+
+def _traced(function: Callable[..., Any], given: tuple, refused: str) -> tuple[Any, Any, bool]:
+    """A traced function, the shapes of its results, and whether it drew from the generator that NumPy has for all."""
+    function, start = _unwrapped(function), _state()
+    began = time.perf_counter()
+    program, result = jax.make_jaxpr(lambda *given: function(*given), return_shape=True)(*given)
+    drawn = _state() != start
+    if time.perf_counter() - began < PATIENCE or drawn:
+        # From another state, as a function may set it. What the first trace imported may have drawn numbers, too.
+        other = np.random.random(), random.random(), _state()  # noqa: NPY002
+        again = jax.make_jaxpr(lambda *given: function(*given))(*given)
+        drawn = _state()[0] != other[-1][0]  # Python's own is drawn from by checkers of types, too
+        _restore(start)
+        if not _same(list(_constants(program)), list(_constants(again))):
+            raise SimulatorError(refused)
+    return program, result, drawn
 
 
 def _unwrapped(function: Any) -> Any:

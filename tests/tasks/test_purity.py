@@ -60,6 +60,17 @@ def test_a_jitted_one_is_found_though_it_was_traced_before():
         simulator_shapes(task(simulate))
 
 
+def test_a_summary_with_other_numbers_each_time_is_refused():
+    draw = lambda trajectory: np.random.default_rng().normal(size=(3, 2)) @ trajectory
+    for summary in (draw, jax.jit(draw), lambda trajectory: trajectory + np.random.normal()):  # noqa: NPY002
+        made = Task(lambda key, theta: theta, ("a", "b"), {"box": BOX}, BOX, summary=summary)
+        for one in (made, repeated(made, 2)):
+            with pytest.raises(SimulatorError, match=r"^summary: expected the same function whenever JAX traces it"):
+                simulator_shapes(one)
+    fixed = Task(lambda key, theta: theta, ("a", "b"), {"box": BOX}, BOX, summary=lambda trajectory: FIXED @ trajectory)
+    assert simulator_shapes(fixed).summary == 2
+
+
 SAME_NOISE = {
     "a key of its own": lambda key, theta: theta + jax.random.normal(jax.random.key(0), (2,)),
     "in a function": lambda key, theta: jax.jit(lambda x: x + jax.random.normal(jax.random.key(7), (2,)))(theta),
