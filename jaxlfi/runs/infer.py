@@ -71,9 +71,9 @@ def infer(
     Args:
         key: consumed.
         task: simulator, names and bounds.
-        observation: the real trajectory, in the shape the simulator produces; or a list of several, independent trials
-            of the same parameters, which are believed together (`jaxlfi.repeated`). By default the task's own, or,
-            where the truth is known, a fresh simulation at the truth.
+        observation: the real trajectory, in the shape the simulator produces, without missing numbers; or a list of
+            several, independent trials of the same parameters, which are believed together (`jaxlfi.repeated`). By
+            default the task's own, or, where the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
             box they fill.
         heuristic: how the support is adapted. Components that it compares are matched first (`jaxlfi.Matched`) where

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
-import jax.extend
 import numpy as np
 
 from jaxlfi.tasks.errors import SimulatorError, SimulatorWarning
@@ -167,7 +166,8 @@ def _inner(values: Any) -> Iterator[Any]:
 
 
 def _is_literal(variable: Any) -> bool:
-    return isinstance(variable, jax.extend.core.Literal)
+    """Whether it is a number in its place; their class is in a package that takes long to import."""
+    return hasattr(variable, "val")
 
 
 def _same(first: list[Any], second: list[Any]) -> bool:

@@ -53,9 +53,9 @@ class Task:
 
     Attributes:
         simulate: one simulation, `simulate(key, theta[D]) -> trajectory` or `-> (trajectory, outcome)`, in JAX and
-            pure. `outcome` is a boolean (true: valid) or an integer (0: valid, i: failed for the reason
-            `failures[i - 1]`; any other integer counts as the first of them). A simulator that JAX cannot trace is
-            wrapped in `jaxlfi.HostSimulator`.
+            pure: all noise is drawn from the key. `outcome` is a boolean (true: valid) or an integer (0: valid, i:
+            failed for the reason `failures[i - 1]`; any other integer counts as the first of them), and nothing else.
+            A simulator that JAX cannot trace is wrapped in `jaxlfi.HostSimulator`.
         names: one name for each of the D parameters.
         supports: boxes Theta_0 by name; the first is the default. One that is wider than Phi, like the paper's
             "broadest", is allowed here and widens Phi for its own run.
