@@ -28,9 +28,9 @@ class HostSimulator:
 
     Attributes:
         function: `function(rng, theta[N, D]) -> trajectories [N, ...]` or `-> (trajectories, outcomes [N])`, with a
-            `numpy.random.Generator` and N parameter vectors in natural units; outcomes as in `jaxlfi.Task`. Both
-            arrays are copies: it may change its parameters, and use the memory of its trajectories again. Masked
-            entries are missing, so that their simulations fail as not finite.
+            `numpy.random.Generator` and N parameter vectors in natural units; outcomes as in `jaxlfi.Task`. Its
+            parameters are a copy that it may change, and what it returns is copied, so that it may use the memory
+            again in the next call. A simulation with masked entries fails as one that is not finite.
         each: whether it makes one simulation instead, `function(rng, theta[D]) -> trajectory` or `-> (trajectory,
             outcome)`. Each then has a generator of its own, and one that raises, gives another shape, takes too long
             or ends its process is a failure for that reason (`REASONS`), and no end of the run.
@@ -185,7 +185,8 @@ class HostSimulator:
             outcome = owned.outcomes(outcome)
         except ValueError as error:
             raise SimulatorError(
-                f"simulate: expected an outcome for each of {rows} simulations, got {owned.described(outcome)}: {error}"
+                f"simulate: expected an outcome for each of {rows} simulations, got {owned.described(outcome)}: "
+                "outcomes are booleans (true: valid) or whole numbers (0: valid)"
             ) from error
         if outcome.shape != (rows,):
             raise SimulatorError(

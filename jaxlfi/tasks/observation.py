@@ -194,13 +194,13 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
 
 def _numbers(observation: Any) -> np.ndarray:
     """A copy of what was given, of real numbers and none of them missing."""
-    told = textwrap.shorten(repr(observation), 200)
+    told = lambda: textwrap.shorten(repr(observation), 200)
     try:
         array, missing = owned.array(observation), owned.missing(observation)
     except ValueError as error:
-        raise ValueError(f"observation: expected an array, got rows of several shapes in {told}") from error
+        raise ValueError(f"observation: expected an array, got rows of several shapes in {told()}") from error
     if array.dtype.kind not in "biuf":
-        raise ValueError(f"observation: expected an array of numbers, got {told}")
+        raise ValueError(f"observation: expected an array of numbers, got {told()}")
     if missing:
         raise ValueError(
             f"observation: expected a number in every place, got {missing} of {array.size} that are missing (masked): "
