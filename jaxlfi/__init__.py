@@ -31,6 +31,7 @@ _HOMES = {
     "Run": "jaxlfi.runs.run",
     "Settings": "jaxlfi.bayessim.settings",
     "SimulatorError": "jaxlfi.tasks.errors",
+    "SimulatorWarning": "jaxlfi.tasks.errors",
     "SplineFlow": "jaxlfi.estimators.flow_estimators",
     "Support": "jaxlfi.distributions.support",
     "SupportWarning": "jaxlfi.runs.run",

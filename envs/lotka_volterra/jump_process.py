@@ -34,6 +34,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Key
 
+from jaxlfi.distributions.precision import single
 from jaxlfi.envs.lotka_volterra import counter_rng
 from jaxlfi.tasks import summaries
 
@@ -379,7 +380,7 @@ def make_simulator(process: JumpProcess = JumpProcess(), schedule: Schedule = Sc
         failure the trajectory is finite and otherwise unspecified.
     """
     # Calls outside a jit of the caller's would compile the loops anew each time.
-    process_queue = jax.jit(functools.partial(_process_queue, process, schedule))
+    process_queue = jax.jit(single(functools.partial(_process_queue, process, schedule)))
 
     @jax.custom_batching.custom_vmap
     def simulate_queue(seeds, log_rates):

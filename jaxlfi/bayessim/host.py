@@ -18,6 +18,7 @@ from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
+from jaxlfi.distributions.precision import single
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.simulation import Simulations, simulate_batch, simulate_in_waves
@@ -105,12 +106,14 @@ class HostEngine(BatchEngine):
 
     def _simulated(self, theta: jax.Array, keys: jax.Array, settled: np.ndarray) -> Simulations:
         shape, wanted = self.inputs.observed.shape[1:], self.settings.simulations_per_round
-        return _stacked(
-            [
+        made = []
+        for run, (key, own, over) in enumerate(zip(keys, theta, settled, strict=True)):
+            self.journal.run = run
+            made.append(
                 self._nothing(own) if over else simulate_in_waves(key, self.task, own, wanted, shape, self.journal)
-                for key, own, over in zip(keys, theta, settled, strict=True)
-            ]
-        )
+            )
+        self.journal.run = None
+        return _stacked(made)
 
     def _nothing(self, theta: jax.Array) -> Simulations:
         """No simulations of the parameters [A, D]: of a run at its end."""
@@ -136,7 +139,7 @@ class HostEngine(BatchEngine):
         return compared(self.task, theta, *map(jnp.asarray, simulated), observed)
 
 
-_check_draws = jax.jit(jax.vmap(check_draws))
+_check_draws = jax.jit(single(jax.vmap(check_draws)))
 
 
 def _call(many: Any, *arguments: Any) -> Any:

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from jaxlfi.distributions.precision import single
+
 KEPT = 64
 """Number of jitted functions that are kept, and number of their compiled versions for some shapes of arguments."""
 
@@ -40,6 +42,7 @@ def side_by_side(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, 
     """
     mapped = jax.vmap(one, in_axes=in_axes)
 
+    @single
     def many(*arguments):
         return _alone(one, in_axes, arguments) if _runs(in_axes, arguments) == 1 else mapped(*arguments)
 
@@ -72,7 +75,12 @@ _EXECUTABLES: dict[Any, Any] = {}
 def compiled(many: Any, arguments: tuple) -> Any:
     """A jitted function compiled for arguments of these shapes: ahead of its first call, and once."""
     leaves, structure = jax.tree.flatten(arguments)
-    signature = many, structure, tuple((np.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves)
+    signature = (
+        many,
+        jax.config.jax_enable_x64,
+        structure,
+        tuple((np.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves),
+    )
     if signature not in _EXECUTABLES:
         while len(_EXECUTABLES) >= KEPT:
             del _EXECUTABLES[next(iter(_EXECUTABLES))]

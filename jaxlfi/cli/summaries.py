@@ -15,6 +15,10 @@ from jaxlfi.runs import execute as executing
 from jaxlfi.runs.execute import BatchPlan
 from jaxlfi.runs.run import Run
 from jaxlfi.studies import calibration, grid
+from jaxlfi.tasks import failures
+
+COMMONEST = 3
+"""Reasons of failed simulations that are printed, at most."""
 
 
 def summary_table(plan: BatchPlan, runs: Sequence[Run]) -> Table:
@@ -51,6 +55,17 @@ def _with_interval(values: np.ndarray) -> str:
         return f"{values[0]:.2f}"
     low, high = bootstrap_interval(values)
     return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}]"
+
+
+def failure_lines(runs: Sequence[Run]) -> list[str]:
+    """How many simulations failed, and the commonest reasons; nothing where none did."""
+    found = failures.together([(run.told, run.history["failed"]) for run in runs])
+    attempted = sum(int(np.sum(run.history["attempted"])) for run in runs)
+    if not found:
+        return []
+    head = f"failed: {sum(one.count for one in found)} of {attempted} simulations"
+    lines = [f"  {one.count} {one.reason}{': ' if one.message else ''}{one.message}" for one in found[:COMMONEST]]
+    return [head + ("; the commonest reasons:" if len(found) > COMMONEST else ":"), *lines]
 
 
 def rounds_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.support import Support
 
 MASS_BEYOND = 0.2
@@ -68,7 +69,7 @@ def bound_evidence(belief: Belief) -> tuple[Float[Array, " dim"], Float[Array, "
     return edge_mass(belief, 0.0)
 
 
-_evidence = jax.jit(lambda belief: jnp.stack(bound_evidence(belief)))
+_evidence = jax.jit(single(lambda belief: jnp.stack(bound_evidence(belief))))
 
 
 def bound_warnings(

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.diagnostics.arguments import numbers
 from jaxlfi.distributions.arguments import is_concrete
+from jaxlfi.distributions.precision import single
 
 FOLDS = 5
 UNITS_A_DIMENSION = 10
@@ -75,11 +76,13 @@ def c2st(
     scale = xp.std(first, axis=0, ddof=1)
     scale = xp.where(scale > 0, scale, 1.0)
     scaled = [jnp.asarray((sample - first.mean(axis=0)) / scale, jnp.float32) for sample in (first, second)]
-    accuracy = jax.jit(_held_out)(key, *scaled)
+    accuracy = _held_out(key, *scaled)
     finite = jnp.isfinite(scaled[0]).all() & jnp.isfinite(scaled[1]).all()
     return jnp.where(finite, accuracy, jnp.nan)
 
 
+@jax.jit
+@single
 def _held_out(key: jax.Array, *scaled: Float[Array, "n dim"]) -> Float[Array, ""]:
     """Accuracy on the rows of each fold, by a classifier that was trained on the others."""
     key_folds, key_train = jax.random.split(key)

@@ -37,6 +37,9 @@ class Support:
             low, high = _checked_bounds(self.low, self.high)
             object.__setattr__(self, "low", jnp.asarray(low))
             object.__setattr__(self, "high", jnp.asarray(high))
+        for name in ("low", "high"):
+            if isinstance(bound := getattr(self, name), np.ndarray):  # who made it may go on to change it
+                object.__setattr__(self, name, bound.copy())
 
     @property
     def width(self) -> Float[Array | np.ndarray, "*batch dim"]:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_fit import fit_mixture
+from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Estimator, Network
 from jaxlfi.estimators.losses import Rows
@@ -194,4 +195,4 @@ class LikelihoodPosterior(Posterior):
         return _condition(self.density.network, self.density.x, support)
 
 
-_condition = jax.jit(lambda network, x, support: network.condition(x, support))
+_condition = jax.jit(single(lambda network, x, support: network.condition(x, support)))

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxlfi.distributions.arguments import require_count, require_key
 from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncated_mixture import truncated_mixture_draws
@@ -115,11 +116,13 @@ def truncated(density: Density, mixture: GaussianMixture, support: Support, spac
 
 
 @functools.partial(jax.jit, static_argnums=2)
+@single
 def _sample(key: jax.Array, posterior: Posterior, n: int) -> Array:
     return posterior.inner_draws(key, n)
 
 
 @functools.partial(jax.jit, static_argnums=2)
+@single
 def _log_prob(posterior: Posterior, theta: Array, natural: bool) -> Array:
     """Log-density over natural units or over inference space, at a point in the same."""
     box, space = posterior.support, posterior.space
@@ -137,6 +140,7 @@ def _log_prob(posterior: Posterior, theta: Array, natural: bool) -> Array:
 
 
 @functools.partial(jax.jit, static_argnums=2)
+@single
 def _maximum(posterior: Posterior, draws: Array, natural: bool) -> Array:
     """The maximum of the density over natural units or over inference space, by ascent from the best of some draws."""
     box = posterior.support

@@ -186,9 +186,9 @@ class _Episode:
         sent, slot, unusable, fault = start - loop.period, 0, 0, None
         while True:
             if observation is not None:
-                unusable, values = 0, np.asarray(observation.values)
+                unusable, values = 0, observation.values
                 self.seen.append((clock.now() - start - observation.age, values, observation.extras))
-                if self.over is None and loop.over(values):
+                if self.over is None and loop.over(values.copy()):
                     self.over = slot
                 self.stopped = self._outside(values)
             else:
@@ -204,7 +204,7 @@ class _Episode:
             seconds = min(loop.period, now - sent)
             displacement, target = loop.limits.applied(target, asked if asking else np.zeros(len(target)), seconds)
             with self.interrupts.calling():
-                self.robot.act(Command(slot, displacement, target))
+                self.robot.act(Command(slot, displacement.copy(), target.copy()))
             sent = clock.now()  # so that the next command is no closer to this one than its length allows
             self.slots.append((asked, displacement, target, observation is None, now - start - slot * loop.period))
             self._wait_until(start + (slot + 1) * loop.period)
@@ -232,9 +232,7 @@ class _Episode:
         """Where the set-points are before the first command."""
         limits = self.loop.limits
         reported = observation.target
-        target = np.asarray(
-            np.asarray(observation.values)[list(self.loop.moved)] if reported is None else reported, float
-        )
+        target = np.array(observation.values[list(self.loop.moved)] if reported is None else reported, float)
         if target.shape != (len(self.loop.moved),) or not np.isfinite(target).all():
             raise ValueError(f"robot: expected {len(self.loop.moved)} set-points, got {target.tolist()}")
         if (target < limits.low).any() or (target > limits.high).any():
@@ -252,7 +250,7 @@ class _Episode:
         if observation is None or (self.last is not None and observation.number <= self.last):
             fault = "missing"
         else:
-            values = np.asarray(observation.values)
+            values = np.array(observation.values)  # a driver may measure into the same array again
             if values.shape != (loop.size,):
                 raise ValueError(f"robot: expected observations of {loop.size} numbers, got shape {list(values.shape)}")
             if not observation.age <= (loop.period if loop.max_age is None else loop.max_age):  # NaN is late, too
@@ -266,11 +264,12 @@ class _Episode:
         if self.seen and shapes != (first := {name: np.shape(value) for name, value in self.seen[0][2].items()}):
             raise ValueError(f"robot: expected extras of shapes {first} as before, got {shapes}")
         self.last = observation.number
-        return observation, ""
+        extras = {name: np.array(value) for name, value in observation.extras.items()}
+        return dataclasses.replace(observation, values=values, extras=extras), ""
 
     def _asked(self, values: np.ndarray) -> np.ndarray:
         with self.interrupts.calling():
-            asked = np.asarray(self.act(values), float)
+            asked = np.array(self.act(values.copy()), float)
         if asked.shape != (len(self.loop.moved),) or not np.isfinite(asked).all():
             raise ValueError(f"policy: expected {len(self.loop.moved)} finite displacements, got {asked.tolist()}")
         return asked

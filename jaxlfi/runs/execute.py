@@ -20,6 +20,7 @@ from jaxlfi.bayessim.memory import budget, state_bytes
 from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.shared import SharedEngine
+from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
 from jaxlfi.io.processes import ALONE, Partition, Processes
 from jaxlfi.runs import describe
@@ -27,8 +28,9 @@ from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import Checkpoint
 from jaxlfi.runs.folder import COMPARE, RUN, RUNS, StoreError
 from jaxlfi.runs.run import Origin, Run
-from jaxlfi.tasks import priors, registry
+from jaxlfi.tasks import failures, priors, registry
 from jaxlfi.tasks.executors import one_by_one
+from jaxlfi.tasks.failures import Message, Told
 from jaxlfi.tasks.journal import Journal, OnSimulation
 from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.simulation import Simulations
@@ -136,7 +138,7 @@ def _require_memory(plan: BatchPlan, given: Observed, processes: Processes) -> N
     inputs, _ = stack_inputs([spec], observed, given.x[:1])
     first = None if given.first is None else len(given.first.theta)
     one = jax.tree.map(lambda leaf: leaf[0], inputs)
-    state = jax.eval_shape(functools.partial(start_one, plan.task, first), plan.settings, one)
+    state = jax.eval_shape(single(functools.partial(start_one, plan.task, first)), plan.settings, one)
     needed, free = len(plan.specs) * state_bytes(state), budget() * jax.local_device_count() * processes.count
     if needed > free:
         raise ValueError(
@@ -179,8 +181,10 @@ def execute(
     engine = engine_for(plan.task, plan.settings, inputs, observed.first, journal, processes)
     done = 0 if checkpoint is None else checkpoint.rounds_done()
     rows, seconds, final = ([], [], {}) if checkpoint is None else checkpoint.read_rounds(done)
+    told: list[list[Message]] = [[] for _ in plan.specs]
     if checkpoint is not None:
         _complete_ledgers(folder, plan, rows, seconds, places)
+        told = [failures.cut(folder / name, done) for name in plan.folders()]
 
     def keep(index: int, state: State, row: dict[str, np.ndarray], elapsed: float) -> None:
         nonlocal final
@@ -188,6 +192,11 @@ def execute(
         if not processes.writes:
             return
         seconds.append(elapsed / len(plan.specs))
+        for run, found in journal.failures().items():
+            messages = [Message(index, *failure) for failure in found]
+            told[run] += messages
+            if folder is not None:  # before the checkpoint: they are taken back where the round is made again
+                failures.append(folder / plan.folders()[run], messages)
         if checkpoint is not None:
             checkpoint.write_round(index, whole, row, seconds[-1])
             journal.clear()
@@ -207,7 +216,9 @@ def execute(
     if not processes.writes:
         return []
     return [
-        _run(plan, spec, jax.tree.map(lambda leaf, i=i: leaf[i], state), observed, i, rows, seconds, final, places[i])
+        _run(
+            plan, spec, jax.tree.map(lambda leaf, i=i: leaf[i], state), observed, i, rows, seconds, final, places[i]
+        ).replace(told=Told(plan.task.reasons, told[i]))
         for i, spec in enumerate(plan.specs)
     ]
 

@@ -1,6 +1,7 @@
 """Run folders: what a run leaves behind, in plain files (JSON, .npz without pickles, CSV).
 
 One run:        config.json ledger.jsonl posterior.npz dataset.npz history.npz observation.npz
+                failures.jsonl, where simulations say why they failed
 Several seeds:  config.json seed_000/ seed_001/ ...                   each one a run folder
 A comparison:   config.json table.csv CONFIGURATION/seed_000/ ...     each one a run folder
 
@@ -35,7 +36,7 @@ from jaxlfi.io import trees
 from jaxlfi.io.formats import require_version
 from jaxlfi.io.serialise import json_safe
 from jaxlfi.runs import describe
-from jaxlfi.tasks import priors, summaries
+from jaxlfi.tasks import failures, priors, summaries
 from jaxlfi.tasks.task import Task
 
 if TYPE_CHECKING:  # runs know how to save themselves
@@ -259,6 +260,7 @@ def save(run: "Run", folder: Path) -> Path:
         for index, seconds in enumerate(np.asarray(run.history["seconds"])):
             row = {name: value[index] for name, value in run.history.items() if not name.startswith(FINAL)}
             append_ledger(staging, index, jax.device_get(row), run.task.reasons, seconds)
+        failures.append(staging, run.told.messages)
         write_run(staging, run)
 
     if run.task is None:

@@ -19,6 +19,7 @@ from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.record import FINAL
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.arguments import is_concrete, require_key
+from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import SpaceName
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset
@@ -31,6 +32,7 @@ from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Origin, Run, SupportWarning
 from jaxlfi.tasks.executors import one_by_one
+from jaxlfi.tasks.failures import Told
 from jaxlfi.tasks.observation import observe, trials_of
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.priors import require_mass
@@ -69,9 +71,9 @@ def infer(
     Args:
         key: consumed.
         task: simulator, names and bounds.
-        observation: the real trajectory, in the shape the simulator produces; or a list of several, independent trials
-            of the same parameters, which are believed together (`jaxlfi.repeated`). By default the task's own, or,
-            where the truth is known, a fresh simulation at the truth.
+        observation: the real trajectory, in the shape the simulator produces, without missing numbers; or a list of
+            several, independent trials of the same parameters, which are believed together (`jaxlfi.repeated`). By
+            default the task's own, or, where the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
             box they fill.
         heuristic: how the support is adapted. Components that it compares are matched first (`jaxlfi.Matched`) where
@@ -170,7 +172,8 @@ def _executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Cal
         def each(index: int, row: dict[str, np.ndarray]) -> None:
             bar.advance()
             if callback is not None:
-                callback(index, executing.run_row(row, 0, None))
+                own = executing.run_row(row, 0, None)
+                callback(index, {name: np.array(value) for name, value in own.items()})  # theirs to change
 
         (run,) = executing.execute(plan, observed, out, each, bar.compiled, bar.simulated)
     return run
@@ -259,9 +262,11 @@ def _traced(key, task: Task, observation, support: Support, heuristic, settings:
         task=task,
         origin=Origin(),
         units=tuple(task.units),
+        told=Told(task.reasons),
     )
 
 
 @functools.partial(jax.jit, static_argnums=0)
+@single
 def _scan(task: Task, settings: Settings, inputs: RunInputs):
     return run_one(task, settings, inputs)

@@ -24,7 +24,7 @@ from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.run import Origin, Run
-from jaxlfi.tasks import registry
+from jaxlfi.tasks import failures, registry
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.task import Task
 
@@ -78,10 +78,11 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
     prior = _prior(folder, config, task, settings)
     observation = _arrays(folder / "observation.npz", ("trajectory", "x"))
     observed, x = jnp.asarray(observation["trajectory"]), jnp.asarray(observation["x"])
+    history = _arrays(folder / "history.npz", ("theta",))
     layout = tuple(map(int, observation.get("layout", (len(x), 1))))
     return Run(
         belief=_belief(folder / "posterior.npz", space),
-        history=_history(folder / "history.npz"),
+        history=_records(history),
         dataset=_dataset(folder / "dataset.npz", settings),
         network=_network(folder / "network.npz", settings, layout, feasible, space, prior),
         observed=observed,
@@ -95,7 +96,15 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         task=task,
         origin=origin,
         units=units,
+        told=_told(folder, history),
     )
+
+
+def _told(folder: Path, history: dict[str, np.ndarray]) -> failures.Told:
+    try:
+        return failures.Told(map(str, history.get("reasons", ())), failures.read(folder))
+    except ValueError as error:
+        raise StoreError(str(error)) from error
 
 
 def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space) -> Task | None:
@@ -143,9 +152,8 @@ def _belief(path: Path, space: Space) -> Belief:
     return Belief(GaussianMixture(logits, means, scale_tril), Support(low, high), jnp.asarray(True))
 
 
-def _history(path: Path) -> dict[str, np.ndarray]:
+def _records(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """What every round did; arrays that are no numbers, or none of rounds, are not of the record."""
-    arrays = _arrays(path, ("theta",))
     rounds = arrays["theta"].shape[:1]
     return {
         name: array
@@ -164,7 +172,9 @@ def _dataset(path: Path, settings: Settings) -> Dataset:
     first = int(np.sum(arrays["round"] == 0))
     room = max(first, settings.simulations_per_round) + (settings.rounds - 1) * settings.simulations_per_round
     filled = {
-        name: jnp.asarray(np.concatenate([arrays[name], np.zeros((max(room - size, 0), *arrays[name].shape[1:]))]))
+        name: jnp.asarray(
+            np.concatenate([arrays[name], np.zeros((max(room - size, 0), *arrays[name].shape[1:]))]), jnp.float32
+        )
         for name in ("theta", "x", "weight")
     }
     rounds = np.concatenate([arrays["round"], np.zeros(max(room - size, 0), arrays["round"].dtype)])

@@ -18,6 +18,7 @@ from jaxlfi.diagnostics.bounds import bound_warnings
 from jaxlfi.distributions.arguments import is_concrete
 from jaxlfi.distributions.belief import Belief, uninformed
 from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network
@@ -25,6 +26,8 @@ from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Heuristic
 from jaxlfi.runs import folder as folders
+from jaxlfi.tasks import failures, owned
+from jaxlfi.tasks.failures import Failure, Told
 from jaxlfi.tasks.task import Task
 
 DRAWS = 1000
@@ -75,6 +78,7 @@ class Run:
         task: what was inferred; None for a loaded run whose task cannot be found.
         origin: how the run is described in its config.json: task, configuration, support's name, preset.
         units: of the parameters; None where its folder does not say.
+        told: what its simulations say of their failures (`failures`).
     """
 
     belief: Belief
@@ -92,6 +96,7 @@ class Run:
     task: Task | None = struct.field(pytree_node=False)
     origin: Origin = struct.field(pytree_node=False)
     units: tuple[str, ...] | None = struct.field(pytree_node=False, default=None)
+    told: Told = struct.field(pytree_node=False, default=Told())
 
     @property
     def posterior(self) -> Posterior:
@@ -150,6 +155,17 @@ class Run:
         return [warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in found]
 
     @property
+    def failures(self) -> list[Failure]:
+        """Why simulations failed, the commonest first; messages that differ in numbers only are counted as one.
+
+        Example:
+            >>> run.failures  # doctest: +SKIP
+            [Failure(reason='error', message='sim: exit status 3: mesh inverted at a=2.31', count=41)]
+        """
+        _require_one(self, "failures")
+        return failures.together([(self.told, self.history["failed"])])
+
+    @property
     def spec(self) -> RunSpec:
         """The run among those of a batch."""
         return RunSpec(
@@ -176,7 +192,9 @@ class Run:
         return folders.save(self, Path(path))
 
     def _summary(self, observation: Any) -> jax.Array:
-        observation = jnp.asarray(observation, jnp.float32)
+        if missing := owned.missing(observation):
+            raise ValueError(f"observation: expected a number in every place, got {missing} missing (masked)")
+        observation = jnp.array(observation, jnp.float32)
         if observation.shape == self.observed.shape and self.task is not None:
             return _finite(self.task.summary(_finite(observation)), "a summary of finite numbers")
         if observation.shape == self.x.shape:
@@ -199,6 +217,7 @@ def _finite(values: jax.Array, what: str = "finite numbers") -> jax.Array:
 
 
 @functools.partial(jax.jit, static_argnums=0)
+@single
 def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
     prior = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
     mixture = network.condition(x, support, key).mixture
@@ -207,8 +226,8 @@ def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
     return posterior_after(belief, network, x)
 
 
-_posterior_after = jax.jit(posterior_after)
-_truncated = jax.jit(truncated, static_argnums=3)
+_posterior_after = jax.jit(single(posterior_after))
+_truncated = jax.jit(single(truncated), static_argnums=3)
 
 
 def _require_one(run: Run, what: str) -> None:

@@ -7,3 +7,7 @@ class SimulatorError(ValueError):
 
 class ExecutorError(SimulatorError):
     """Processes or a cluster that simulations went through and that are lost; what was simulated before is kept."""
+
+
+class SimulatorWarning(UserWarning):
+    """A simulator that can be used, but is hardly what was meant."""

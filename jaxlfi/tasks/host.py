@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from jaxlfi.distributions.arguments import is_concrete
+from jaxlfi.tasks import owned
 from jaxlfi.tasks.each import alive, here, simulate_each, stacked, through
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.journal import Journal
@@ -27,7 +28,9 @@ class HostSimulator:
 
     Attributes:
         function: `function(rng, theta[N, D]) -> trajectories [N, ...]` or `-> (trajectories, outcomes [N])`, with a
-            `numpy.random.Generator` and N parameter vectors in natural units; outcomes as in `jaxlfi.Task`.
+            `numpy.random.Generator` and N parameter vectors in natural units; outcomes as in `jaxlfi.Task`. Its
+            parameters are a copy that it may change, and what it returns is copied, so that it may use the memory
+            again in the next call. A simulation with masked entries fails as one that is not finite.
         each: whether it makes one simulation instead, `function(rng, theta[D]) -> trajectory` or `-> (trajectory,
             outcome)`. Each then has a generator of its own, and one that raises, gives another shape, takes too long
             or ends its process is a failure for that reason (`REASONS`), and no end of the run.
@@ -158,13 +161,14 @@ class HostSimulator:
                 raise SimulatorError("simulate: expected a known shape of trajectories, got none")
             return stacked(self.some(key, theta, shape), shape)
         rng = key if isinstance(key, np.random.Generator) else numpy_generator(key)
+        rows = len(theta)
         try:
-            result = self.function(rng, theta)
-            trajectory, outcome = result if isinstance(result, tuple) and len(result) == 2 else (result, None)
-            trajectory = np.asarray(trajectory)
+            result = self.function(rng, np.array(theta))
+            paired = isinstance(result, tuple) and len(result) == 2
+            given, outcome = result if paired else (result, np.zeros(rows, int))
+            trajectory = owned.array(given)
         except Exception as error:
             raise SimulatorError(f"simulate: {type(error).__name__}: {error}") from error
-        rows = len(theta)
         wanted = f"of shape {[rows, *shape]}" if shape is not None else f"of shape [{rows}, ...]"
         fits = trajectory.ndim >= 2 and len(trajectory) == rows
         if fits and shape is not None:
@@ -177,13 +181,44 @@ class HostSimulator:
             )
         if shape is not None:
             trajectory = trajectory.reshape(rows, *shape)
-        outcome = np.zeros(rows, int) if outcome is None else np.asarray(outcome)
-        if outcome.shape != (rows,) or outcome.dtype.kind not in "biu":
+        try:
+            outcome = owned.outcomes(outcome)
+        except ValueError as error:
             raise SimulatorError(
-                f"simulate: expected an outcome for each of {rows} simulations, "
-                f"got {outcome.dtype} of shape {list(outcome.shape)}"
+                f"simulate: expected an outcome for each of {rows} simulations, got {owned.described(outcome)}: "
+                "outcomes are booleans (true: valid) or whole numbers (0: valid)"
+            ) from error
+        if outcome.shape != (rows,):
+            raise SimulatorError(
+                f"simulate: expected an outcome for each of {rows} simulations, got {owned.described(outcome)}"
             )
-        return trajectory, np.where(outcome, 0, 1) if outcome.dtype == bool else outcome
+        outcome = np.where(outcome, 0, 1) if outcome.dtype == bool else outcome
+        _require_own(given, theta, trajectory, outcome)
+        return trajectory, outcome
+
+
+def _require_own(given: Any, theta: np.ndarray, trajectory: np.ndarray, outcome: np.ndarray) -> None:
+    """Refuse a list with one work array for simulations of several parameter vectors, or for all of their records.
+
+    One array may stand for all simulations that failed.
+
+    Raises:
+        SimulatorError: that says to copy.
+    """
+    rows: dict[Any, int] = {}
+    for row, place in enumerate(owned.places(given)):
+        if outcome[row] != 0 or not np.isfinite(trajectory[row]).all():
+            continue
+        try:
+            owned.require_own_rows(given[row])
+        except ValueError as error:
+            raise SimulatorError(f"simulate: {error}") from error
+        first = rows.setdefault(place, row) if place is not None else row
+        if not np.array_equal(theta[first], theta[row]):
+            raise SimulatorError(
+                f"simulate: expected an array of its own for each simulation, got the same one for rows {first} and "
+                f"{row}, with the numbers of the last: append a copy"
+            )
 
 
 def numpy_generator(key: jax.Array) -> np.random.Generator:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from jaxlfi.io import records
+from jaxlfi.tasks.failures import KEPT, Failure, Tally
 from jaxlfi.tasks.worker import REASONS, Answer, Request
 
 OnSimulation = Callable[[int, int], object]
@@ -15,6 +16,7 @@ class Journal:
 
     Attributes:
         examples: the first message of each reason of failure.
+        run: of a batch, which the simulations are for whose failures are counted; None counts them for none.
     """
 
     def __init__(self, path: Path | None = None, on_simulation: OnSimulation = lambda done, wanted: None):
@@ -25,6 +27,8 @@ class Journal:
             on_simulation: called for every simulation.
         """
         self.examples: dict[str, str] = {}
+        self.run: int | None = None
+        self._failures: dict[int, Tally] = {}
         self._path, self._on_simulation = path, on_simulation
         self._known: dict[tuple, Answer] = {}
         self._done, self._wanted, self._file = 0, 0, None
@@ -49,7 +53,7 @@ class Journal:
         if answer is not None and answer.outcome >= 0 and answer.trajectory.shape != tuple(request.shape or ()):
             return None
         if answer is not None:
-            self._count(answer)
+            self._count(request, answer)
         return answer
 
     def add(self, request: Request, answer: Answer) -> None:
@@ -60,7 +64,13 @@ class Journal:
             self._file = self._file or self._path.open("ab")
             self._file.write(records.encoded(fields, answer.trajectory))
             self._file.flush()
-        self._count(answer)
+        self._count(request, answer)
+
+    def failures(self) -> dict[int, list[Failure]]:
+        """The commonest failures that are told of since this was asked last, by the run."""
+        found = {run: tally.commonest()[:KEPT] for run, tally in self._failures.items()}
+        self._failures = {}
+        return found
 
     def clear(self) -> None:
         """Forget all: the round that they were made for is kept as a whole."""
@@ -75,10 +85,13 @@ class Journal:
             self._file.close()
             self._file = None
 
-    def _count(self, answer: Answer) -> None:
+    def _count(self, request: Request, answer: Answer) -> None:
         self._done += 1
         if answer.outcome < 0:
-            self.examples.setdefault(REASONS[-1 - answer.outcome], answer.message)
+            reason = REASONS[-1 - answer.outcome]
+            self.examples.setdefault(reason, answer.message)
+            if self.run is not None:
+                self._failures.setdefault(self.run, Tally()).add(reason, answer.message, request.index)
         self._on_simulation(self._done, self._wanted)
 
 

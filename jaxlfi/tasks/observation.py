@@ -3,6 +3,8 @@
 import csv
 import dataclasses
 import functools
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.distributions.arguments import is_concrete
+from jaxlfi.distributions.precision import single
 from jaxlfi.io import files
+from jaxlfi.tasks import owned, purity
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.simulation import trajectory_and_outcome, with_outcome
@@ -46,42 +50,64 @@ def simulator_shapes(task: Task) -> Shapes:
             outcome).
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
-    theta = jax.ShapeDtypeStruct((task.dim,), jnp.float32)
+    theta = jax.ShapeDtypeStruct((task.dim,), jnp.zeros(()).dtype)
     # A simulator is foreign code; what it raises while traced is reported in one line.
     try:
-        result = jax.eval_shape(task.simulate, key, theta)
+        result = purity.shapes(task.simulate, key, theta)
+    except SimulatorError:
+        raise
     except Exception as error:
         raise SimulatorError(
             f"simulate: expected a function JAX can trace (wrap a NumPy simulator in jaxlfi.HostSimulator), "
             f"got {type(error).__name__}: {files.first_line(error)}"
         ) from error
-    trajectory, outcome = result if isinstance(result, tuple) and len(result) == 2 else (result, None)
-    if not isinstance(trajectory, jax.ShapeDtypeStruct) or trajectory.ndim == 0:
+    trajectory, *outcome = result if isinstance(result, tuple) and len(result) == 2 else (result,)
+    if not isinstance(trajectory, jax.ShapeDtypeStruct) or trajectory.ndim == 0 or trajectory.size == 0:
         raise SimulatorError(
             f"simulate: expected one array [T] or [T, C], or (array, outcome), got {jax.tree.map(_shape, result)}"
         )
-    if outcome is not None and getattr(outcome, "shape", None) != ():
-        raise SimulatorError(f"simulate: expected a scalar outcome, got {jax.tree.map(_shape, outcome)}")
+    _require_real(trajectory, "simulate")
+    for code in outcome:
+        if getattr(code, "shape", None) != () or not (code.dtype == bool or jnp.issubdtype(code.dtype, jnp.integer)):
+            got = code.dtype if getattr(code, "shape", None) == () else jax.tree.map(_shape, code)
+            raise SimulatorError(
+                f"simulate: expected a scalar outcome, a boolean (true: valid) or a whole number (0: valid), got {got}"
+            )
     return Shapes(trajectory.shape, _summary_size(task, trajectory.shape))
+
+
+def _require_real(array: jax.ShapeDtypeStruct, name: str) -> None:
+    """Refuse complex numbers, keys and the like; booleans and whole numbers are real numbers, too."""
+    if not (array.dtype == bool or any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.floating, jnp.integer))):
+        parts = " (stack its real and imaginary parts)" if jnp.issubdtype(array.dtype, jnp.complexfloating) else ""
+        raise SimulatorError(f"{name}: expected real numbers, got {array.dtype}{parts}")
 
 
 def observed_shapes(task: Task, observation: np.ndarray) -> Shapes:
     """The shapes of a host simulator, which only its observation shows before it has run."""
     if observation.ndim == 0:
         raise ValueError("observation: expected a trajectory [T] or [T, C], got a single number")
+    if observation.size == 0:
+        raise ValueError(
+            f"observation: expected a trajectory [T] or [T, C] of at least one number, "
+            f"got shape {list(observation.shape)}"
+        )
     return Shapes(observation.shape, _summary_size(task, observation.shape))
 
 
 def _summary_size(task: Task, shape: tuple[int, ...]) -> int:
     try:
-        summary = jax.eval_shape(task.summary, jax.ShapeDtypeStruct(shape, jnp.float32))
+        summary = purity.summary_shape(task.summary, jax.ShapeDtypeStruct(shape, jnp.float32))
+    except SimulatorError:
+        raise
     except Exception as error:
         raise SimulatorError(
             f"summary: expected a function of one trajectory {list(shape)} that JAX can trace, "
             f"got {type(error).__name__}: {files.first_line(error)}"
         ) from error
-    if getattr(summary, "ndim", None) != 1:
+    if getattr(summary, "ndim", None) != 1 or summary.size == 0:
         raise SimulatorError(f"summary: expected a vector [S] of one trajectory, got {jax.tree.map(_shape, summary)}")
+    _require_real(summary, "summary")
     return summary.shape[0]
 
 
@@ -98,7 +124,7 @@ def checked(observation, shapes: Shapes) -> jax.Array:
         )
     if not isinstance(observation, jax.core.Tracer) and not np.isfinite(np.asarray(observation, float)).all():
         raise ValueError("observation: expected finite numbers, got some that are not")
-    return jnp.asarray(observation, jnp.float32)
+    return jnp.array(observation, jnp.float32)  # a copy: the given array may be changed later
 
 
 def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
@@ -135,7 +161,7 @@ def _at_truth(key: jax.Array, task: Task, journal: Journal):
     return with_outcome(task, jnp.asarray(trajectory), jnp.asarray(outcome))
 
 
-_simulate_jit = jax.jit(trajectory_and_outcome, static_argnums=0)
+_simulate_jit = jax.jit(single(trajectory_and_outcome), static_argnums=0)
 
 
 def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True) -> tuple[jax.Array, jax.Array]:
@@ -153,7 +179,7 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
     if observation is None:
         observation = task.observation
     if is_concrete(observation) and observation is not None:
-        _require_numbers(observation)
+        observation = _numbers(observation)
     if observation is None:
         simulate = simulate_observation if concrete else trace_observation
         observation = simulate(key, task)
@@ -166,27 +192,60 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
     return observed, x
 
 
-def _require_numbers(observation: Any) -> None:
+def _numbers(observation: Any) -> np.ndarray:
+    """A copy of what was given, of real numbers and none of them missing."""
+    told = lambda: textwrap.shorten(repr(observation), 200)
     try:
-        kind = np.asarray(observation).dtype.kind
+        array, missing = owned.array(observation), owned.missing(observation)
     except ValueError as error:
-        raise ValueError(f"observation: expected an array, got rows of several shapes in {observation!r}") from error
-    if kind not in "biuf":
-        raise ValueError(f"observation: expected an array of numbers, got {observation!r}")
+        raise ValueError(f"observation: expected an array, got rows of several shapes in {told()}") from error
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"observation: expected an array of numbers, got {told()}")
+    if missing:
+        raise ValueError(
+            f"observation: expected a number in every place, got {missing} of {array.size} that are missing (masked): "
+            "leave their places out of what the simulator gives, too"
+        )
+    return array
 
 
 def trials_of(task: Task, observation: Any, pooling: str = "moments") -> tuple[Task, Any]:
-    """The task and observation of an inference: where a list of trajectories is given, of all of them together."""
+    """The task and observation of an inference: where a list of trajectories is given, of all of them together.
+
+    A simulator in JAX tells whether a list holds trajectories or the records of one. What a host simulator gives is
+    not known yet: for it a list of lists is one trajectory, and a list of arrays [T, C] are trials.
+
+    Raises:
+        ValueError: for a list of vectors that may be either.
+    """
     if not isinstance(observation, list | tuple) or not observation:
         return task, observation
     if is_concrete(observation):
         for one in observation:
-            _require_numbers(one)
+            _numbers(one)
     first = np.shape(observation[0])
-    trials = hasattr(observation[0], "shape") if task.on_host else first == simulator_shapes(task).trajectory
+    if task.on_host:
+        trials = hasattr(observation[0], "shape") and (len(first) != 1 or _vectors_are_trials(task, observation))
+    else:
+        trials = first == simulator_shapes(task).trajectory
     if not trials or first == ():
         return task, observation
     return repeated(task, len(observation), pooling), together(observation)
+
+
+def _vectors_are_trials(task: Task, vectors: Sequence[Any]) -> bool:
+    """Whether vectors are trials [T], as the task's times and channels tell, and not the records [C] of one trial."""
+    count, length = len(vectors), len(vectors[0])
+    steps, channels = 0 if task.times is None else len(task.times), len(task.channels)
+    as_records = steps in (0, count) and channels in (0, length)
+    as_trials = steps in (0, length) and channels in (0, 1)
+    if as_records == as_trials:
+        raise ValueError(
+            f"observation: expected one array for a host simulator, got a list of {count} of shape [{length}]: pass "
+            f"np.stack(...) for {count} records of one trajectory, or np.concatenate(...) with the task "
+            f"jaxlfi.repeated(task, {count}) for {count} trials"
+        )
+    return as_trials
 
 
 def read(path: str | Path) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxlfi.distributions.support import Support
 from jaxlfi.io import files
+from jaxlfi.tasks import owned
 from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.simulation import Simulations, summarised_batch
 from jaxlfi.tasks.task import Task
@@ -37,7 +38,7 @@ def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None 
 
     Without a density they count as uniform over their box. With one, each is weighted by the prior divided by the
     density it was drawn from; weights are limited to sqrt(n) times their mean (Ionides 2008). Simulations that are not
-    finite count as failures.
+    finite count as failures, as do those with masked entries.
 
     Args:
         task: for names, summary and prior.
@@ -125,7 +126,7 @@ def _array(arrays: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) 
 
 def _numbers(value: Any, name: str) -> np.ndarray:
     try:
-        array = np.asarray(value)
+        array = owned.array(value)
     except ValueError:  # rows of several lengths
         array = np.zeros(0, object)
     if array.dtype.kind not in "biuf":

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import MASS_DRAWS, mass_inside, rejection_sample
@@ -106,7 +107,7 @@ def require_mass(prior: Any, support: Support, label: str) -> float:
 
 
 def _prior_mass(prior: Any, support: Support) -> Array:
-    return jax.jit(functools.partial(prior_mass, prior))(support)
+    return jax.jit(single(functools.partial(prior_mass, prior)))(support)
 
 
 def _sampler(prior: Any):

@@ -9,6 +9,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlfi.distributions.precision import own, single
+from jaxlfi.tasks import owned
 from jaxlfi.tasks.each import stacked
 from jaxlfi.tasks.host import numpy_generator
 from jaxlfi.tasks.journal import Journal
@@ -55,9 +57,19 @@ def trajectory_and_outcome(
     task: Task, key: jax.Array, theta: Float[Array | np.ndarray, " dim"]
 ) -> tuple[Array, Int[Array, ""]]:
     """One simulation at theta [D] in inference space: its trajectory and 0, or the code of the reason it failed for."""
-    result = task.simulate(key, task.space.to_natural(theta))
-    trajectory, outcome = result if isinstance(result, tuple) else (result, jnp.asarray(0))
-    return with_outcome(task, jnp.asarray(trajectory), jnp.asarray(outcome))
+    natural = task.space.to_natural(theta)
+    with own():
+        result = task.simulate(key, jnp.asarray(natural, float))
+        trajectory, outcome = result if isinstance(result, tuple) else (result, jnp.asarray(0))
+        trajectory, outcome = jnp.asarray(trajectory).astype(jnp.float32), _code(jnp.asarray(outcome))
+    return with_outcome(task, trajectory, outcome)
+
+
+def _code(outcome: Array) -> Array:
+    """An outcome in 32 bits, in which no large number becomes a small one."""
+    if outcome.dtype.itemsize < 8:
+        return outcome
+    return jnp.clip(outcome, -1 if jnp.issubdtype(outcome.dtype, jnp.signedinteger) else 0, owned.CODES).astype("int32")
 
 
 def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, Int[Array, ""]]:
@@ -75,7 +87,9 @@ def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, 
 
 def summarised(task: Task, trajectory: Array, failure: Int[Array, ""]) -> tuple[Float[Array, " obs"], Int[Array, ""]]:
     """The summary of one trajectory; one that is not finite turns a success into the failure "non_finite"."""
-    x = task.summary(jnp.where(failure == 0, trajectory, jnp.ones_like(trajectory)))
+    seen = jnp.where(failure == 0, trajectory, jnp.ones_like(trajectory))
+    with own():
+        x = task.summary(seen).astype(jnp.float32)
     broken = (failure == 0) & ~jnp.all(jnp.isfinite(x))
     failure = jnp.where(broken, len(task.reasons), failure)
     return jnp.where(failure == 0, x, 0.0), failure
@@ -155,11 +169,13 @@ def _on_host(task: Task, key: jax.Array, natural: np.ndarray, shape: Sequence[in
 
 
 @functools.partial(jax.jit, static_argnums=0)
+@single
 def _simulate_batch(task: Task, keys: jax.Array, theta: Array):
     return jax.vmap(lambda key, theta: _with_summary(task, *trajectory_and_outcome(task, key, theta)))(keys, theta)
 
 
 @functools.partial(jax.jit, static_argnums=0)
+@single
 def summarised_batch(task: Task, trajectories: Array, outcomes: Array) -> tuple[Array, Array, Array]:
     """What a host simulator gave, as trajectories [N, ...], summaries [N, S] and failure codes [N]."""
     return jax.vmap(lambda *one: _with_summary(task, *with_outcome(task, *one)))(trajectories, outcomes)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxlfi.distributions.arguments import require_texts
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support, check_within
-from jaxlfi.tasks import priors, summaries
+from jaxlfi.tasks import owned, priors, summaries
 from jaxlfi.tasks.command import Command
 from jaxlfi.tasks.host import HostSimulator
 
@@ -53,9 +53,9 @@ class Task:
 
     Attributes:
         simulate: one simulation, `simulate(key, theta[D]) -> trajectory` or `-> (trajectory, outcome)`, in JAX and
-            pure. `outcome` is a boolean (true: valid) or an integer (0: valid, i: failed for the reason
-            `failures[i - 1]`; any other integer counts as the first of them). A simulator that JAX cannot trace is
-            wrapped in `jaxlfi.HostSimulator`.
+            pure: all noise is drawn from the key. `outcome` is a boolean (true: valid) or an integer (0: valid, i:
+            failed for the reason `failures[i - 1]`; any other integer counts as the first of them), and nothing else.
+            A simulator that JAX cannot trace is wrapped in `jaxlfi.HostSimulator`.
         names: one name for each of the D parameters.
         supports: boxes Theta_0 by name; the first is the default. One that is wider than Phi, like the paper's
             "broadest", is allowed here and widens Phi for its own run.
@@ -152,6 +152,8 @@ class Task:
         if self.prior is not None:
             priors.check_prior(self.prior, len(names))
         is_natural(self.prior_space)
+        for field in ("observation", "times"):  # who made them may go on to change them
+            store(field, owned.copied(getattr(self, field)))
 
     @classmethod
     def from_command(
@@ -314,7 +316,7 @@ def _same(a: Any, b: Any) -> bool:
 
 def _vector(value: Any, length: int, name: str) -> np.ndarray:
     try:
-        vector = np.asarray(value, np.float32)
+        vector = np.array(owned.array(value), np.float32)
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"{name}: expected {length} finite numbers, got {value!r}") from error
     if vector.shape != (length,) or not np.isfinite(vector).all():

@@ -105,7 +105,7 @@ def together(trials: Sequence[Any]) -> np.ndarray:
     Raises:
         ValueError: for none, or trajectories of different shapes.
     """
-    arrays = [np.asarray(trial, np.float32) for trial in trials]
+    arrays = [np.array(trial, np.float32) for trial in trials]
     shapes = sorted({array.shape for array in arrays})
     if len(shapes) != 1 or shapes[0] == ():
         raise ValueError(f"observation: expected trials of one shape [T, ...], got {[list(shape) for shape in shapes]}")

@@ -5,6 +5,7 @@ process: `jaxlfi.tasks.guard` starts it, sends it the simulator and then one req
 (`jaxlfi.io.records`) for each.
 """
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -18,6 +19,7 @@ import cloudpickle
 import numpy as np
 
 from jaxlfi.io import records
+from jaxlfi.tasks import owned
 
 REASONS = ("error", "wrong_shape", "timeout", "crash")
 """Why a simulation that is made by itself can fail, besides the task's own reasons."""
@@ -67,7 +69,9 @@ class CrashError(RuntimeError):
 
 def failed(reason: str, message: str = "") -> Answer:
     """A failure for one of `REASONS`."""
-    return Answer(-1 - REASONS.index(reason), message=" ".join(message.split())[:LONGEST_MESSAGE])
+    words = " ".join(message.split())[:LONGEST_MESSAGE]
+    printable = "".join(letter if letter.isprintable() else "?" for letter in words)  # no colours of a terminal
+    return Answer(-1 - REASONS.index(reason), message=printable)
 
 
 def generator(words: Sequence[int], index: int) -> np.random.Generator:
@@ -79,7 +83,9 @@ def simulated(function: Callable[..., Any], request: Request) -> Answer:
     """Make one simulation by `function(rng, theta[D])`, and check what comes of it."""
     try:
         result = function(generator(request.words, request.index), np.asarray(request.theta, np.float32))
-        trajectory, outcome = map(np.asarray, with_outcome(result))
+        trajectory, outcome = with_outcome(result)
+        owned.require_own_rows(trajectory)
+        trajectory = owned.array(trajectory)
     except CrashError as error:
         return failed("crash", str(error))
     except (Exception, SystemExit) as error:
@@ -87,7 +93,7 @@ def simulated(function: Callable[..., Any], request: Request) -> Answer:
     return checked(trajectory, outcome, request.shape)
 
 
-def checked(trajectory: np.ndarray, outcome: np.ndarray, shape: Sequence[int] | None) -> Answer:
+def checked(trajectory: np.ndarray, outcome: Any, shape: Sequence[int] | None) -> Answer:
     """The answer of a simulator, or the failure "wrong_shape". Axes of length one are added or dropped."""
     wanted = "[T] or [T, C]" if shape is None else list(shape)
     long = lambda lengths: [length for length in lengths if length != 1]
@@ -97,9 +103,11 @@ def checked(trajectory: np.ndarray, outcome: np.ndarray, shape: Sequence[int] | 
             "wrong_shape",
             f"expected numbers of shape {wanted}, got {trajectory.dtype} of shape {list(trajectory.shape)}",
         )
-    if outcome.shape != () or outcome.dtype.kind not in "biu":
-        return failed("wrong_shape", f"expected a scalar outcome, got {outcome.dtype} of shape {list(outcome.shape)}")
-    return Answer(code_of(outcome), trajectory if shape is None else trajectory.reshape(shape))
+    try:
+        code = code_of(outcome)
+    except ValueError as error:
+        return failed("wrong_shape", str(error))
+    return Answer(code, trajectory if shape is None else trajectory.reshape(shape))
 
 
 def with_outcome(result: Any) -> tuple[Any, Any]:
@@ -108,8 +116,14 @@ def with_outcome(result: Any) -> tuple[Any, Any]:
 
 
 def code_of(outcome: Any) -> int:
-    """An outcome as 0 or the number of the task's reason; one below 0 counts as the first."""
-    outcome = np.asarray(outcome)
+    """An outcome as 0 or the number of the task's reason; one below 0 counts as the first.
+
+    Raises:
+        ValueError: for anything but one boolean or whole number.
+    """
+    if np.ndim(outcome) > 0:
+        raise ValueError(f"expected a scalar outcome, got {owned.described(outcome)}")
+    outcome = owned.outcomes(outcome)
     code = int(not outcome) if outcome.dtype == bool else int(outcome)
     return max(code, 0) or int(code < 0)
 
@@ -124,7 +138,9 @@ class OneOfBatch:
         """One simulation."""
         result = self.function(rng, theta[None])
         if isinstance(result, tuple) and len(result) == 2:
-            (trajectory,), (outcome,) = result
+            (trajectory,), outcome = result
+            with contextlib.suppress(TypeError):  # it is no list, and is refused for what it is
+                (outcome,) = outcome
             return trajectory, outcome
         (trajectory,) = result
         return trajectory
@@ -142,9 +158,13 @@ class Trials:
 
     def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> Any:
         """All trials of one parameter vector: their trajectories along the first axis."""
-        results = [with_outcome(self.function(rng, theta)) for _ in range(self.trials)]
-        failures = (code for _, outcome in results if (code := code_of(outcome)))
-        return np.concatenate([np.asarray(trajectory) for trajectory, _ in results]), next(failures, 0)
+        trajectories, codes = [], []
+        for _ in range(self.trials):
+            trajectory, outcome = with_outcome(self.function(rng, theta.copy()))
+            owned.require_own_rows(trajectory)
+            trajectories.append(owned.array(trajectory))  # at once: the next trial may use the same memory
+            codes.append(code_of(outcome))
+        return np.concatenate(trajectories), next(filter(None, codes), 0)
 
 
 def main() -> None:

@@ -62,6 +62,37 @@ def old(plain):
     return dataclasses.replace(plain, number=0)
 
 
+class Reusing(Robot):
+    """Measures into the same arrays again and again, and spoils the commands that it was given."""
+
+    def __init__(self):
+        super().__init__()
+        self.values, self.extra = np.zeros(5), np.zeros(1)
+
+    def observe(self):
+        plain = super().observe()
+        self.values[:], self.extra[:] = plain.values, self.number
+        return dataclasses.replace(plain, values=self.values, extras={"number": self.extra})
+
+    def act(self, command):
+        super().act(dataclasses.replace(command, target=command.target.copy()))
+        command.target[:] = command.displacement[:] = np.nan
+
+
+def test_what_is_measured_into_one_array_is_logged_as_it_was():
+    def act(observation):
+        asked[:] = observation[[1, 3]] / 20 * [1, -1]
+        observation[:] = np.nan  # a policy may scale it in place
+        return asked
+
+    asked = np.zeros(2)
+    plain = run(Robot(), lambda observation: observation[[1, 3]] / 20 * [1, -1])
+    log = run(Reusing(), act)
+    for name in ("observations", "asked", "actions", "targets"):
+        np.testing.assert_array_equal(getattr(log, name), getattr(plain, name))
+    assert log.extras["number"].ravel().tolist() == list(range(17))
+
+
 def test_it_is_as_the_policy_was_trained():
     made = Loop.of(a_policy())
     assert made.limits == LIMITS and made.moved == (1, 3) and made.size == 5

@@ -16,6 +16,7 @@ import pytest
 import jaxlfi
 from jaxlfi.io import files as atomic
 from jaxlfi.runs.folder import read_ledger
+from jaxlfi.tasks import failures
 from jaxlfi.tasks.executors import workers
 from tests.small import FLAGS, SETTINGS, command, whole_runs  # noqa: F401 - a fixture
 from tests.troubled import calls, task
@@ -70,6 +71,9 @@ def test_failures_are_in_the_ledger_by_reason(whole):
     assert all(set(line["failed"]) == {"failed", *REASONS} for line in lines)
     assert sum(line["failed"]["crash"] + line["failed"]["error"] for line in lines) >= 1
     assert all(line["attempted"] == line["succeeded"] + sum(line["failed"].values()) for line in lines)
+    said = {(one.round, one.reason): one.count for one in failures.read(whole[2])}  # each reason has one message here
+    counts = {(line["round"], reason): line["failed"][reason] for line in lines for reason in ("error", "crash")}
+    assert said == {place: count for place, count in counts.items() if count}
 
 
 def test_a_run_that_was_killed_repeats_no_finished_simulation(whole, tmp_path):
@@ -85,6 +89,7 @@ def test_a_run_that_was_killed_repeats_no_finished_simulation(whole, tmp_path):
     assert WANTED // 2 <= began < WANTED
     assert command("resume", out, "--workers", "3", "--no-figures") == 0
     assert results(out) == whole[0]
+    assert (out / failures.FILE).read_text() == (whole[2] / failures.FILE).read_text()
     assert whole[1] <= calls(folder) <= whole[1] + 2  # those that were under way as it was killed
     assert not (out / "checkpoint").exists()
 

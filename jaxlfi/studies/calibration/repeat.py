@@ -15,6 +15,7 @@ from jaxlfi.bayessim.batch import RunInputs, posterior_after, stack, start_one
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.memory import PROGRAM_PER_STATE, budget, even_length, state_bytes
+from jaxlfi.distributions.precision import single
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.io import files as atomic
 from jaxlfi.io.progress import RoundProgress
@@ -111,6 +112,7 @@ def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) ->
 
 
 @functools.partial(jax.jit, static_argnums=4)
+@single
 @functools.partial(jax.vmap, in_axes=(None, 0, 0, 0, None))
 def _by_network(run: Run, key: jax.Array, truth: jax.Array, x: jax.Array, draws: int):
     key_condition, key_draw = jax.random.split(key)
@@ -118,6 +120,7 @@ def _by_network(run: Run, key: jax.Array, truth: jax.Array, x: jax.Array, draws:
 
 
 @functools.partial(jax.jit, static_argnums=4)
+@single
 @functools.partial(jax.vmap, in_axes=(0, 0, 0, 0, None))
 def _by_states(key: jax.Array, truth: jax.Array, x: jax.Array, state: Any, draws: int):
     return described(key, truth, posterior_after(state.belief, state.network, x), draws)

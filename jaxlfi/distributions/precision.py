@@ -1,0 +1,63 @@
+"""Single precision inside, whatever the process has switched on; a user's own functions in the process's precision.
+
+Simulators that integrate differential equations need double precision at times (`jax_enable_x64`). Inference does not:
+it is compiled in single precision as always, and such a simulator in double precision within it.
+"""
+
+import contextlib
+import contextvars
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+_DOUBLE = contextvars.ContextVar("double", default=False)
+"""Whether double precision was on where a function in single precision was entered."""
+_NARROW = {"float64": jnp.float32, "int64": jnp.int32, "uint64": jnp.uint32, "complex128": jnp.complex64}
+
+
+def single(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that is traced in single precision, for `jax.jit` to compile; the same where double precision is off.
+
+    What it calls is traced so too, but for what lies within `own`. Only what is compiled may hold such parts: `jax.jit`
+    goes around it, not inside of it.
+
+    Example:
+        >>> jax.jit(single(lambda x: x + jnp.ones(2)))(jnp.zeros(2)).dtype
+        dtype('float32')
+    """
+
+    @functools.wraps(function)
+    def traced(*arguments: Any, **named: Any) -> Any:
+        if not jax.config.jax_enable_x64:
+            return function(*arguments, **named)
+        token = _DOUBLE.set(True)
+        try:
+            with jax.enable_x64(False):
+                arguments, named = jax.tree.map(_narrowed, (arguments, named))
+                return function(*arguments, **named)
+        finally:
+            _DOUBLE.reset(token)
+
+    return traced
+
+
+@contextlib.contextmanager
+def own() -> Iterator[None]:
+    """The precision of the process, for a function of the user's within `single`."""
+    if not _DOUBLE.get():
+        yield
+        return
+    token = _DOUBLE.set(False)
+    try:
+        with jax.enable_x64(True):
+            yield
+    finally:
+        _DOUBLE.reset(token)
+
+
+def _narrowed(leaf: Any) -> Any:
+    kind = _NARROW.get(str(getattr(leaf, "dtype", "")))
+    return leaf if kind is None else leaf.astype(kind)

@@ -1,0 +1,153 @@
+"""Why simulations failed, in their own words: counted, with messages that differ in numbers only taken together."""
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxlfi.io import files
+
+FILE = "failures.jsonl"
+"""In a run folder, where anything is known of failures: a `Message` a line."""
+KEPT = 20
+"""Messages that are kept of a round, at most; failures with others are counted by their reason alone."""
+MANY = 1000
+"""Messages that are counted in a round, at most."""
+_NUMBER = re.compile(r"0x[0-9a-fA-F]+|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|\b[-+]?(?:nan|inf)\b")
+
+
+class Failure(NamedTuple):
+    """Simulations that failed for one reason, with one message.
+
+    Attributes:
+        reason: a name in `Task.reasons`.
+        message: of the first of them, such as an exception's text or the last line that a program wrote on standard
+            error; "" where nothing is known.
+        count: how many.
+    """
+
+    reason: str
+    message: str
+    count: int
+
+
+class Message(NamedTuple):
+    """Failures with one message in one round."""
+
+    round: int
+    reason: str
+    message: str
+    count: int
+
+
+class Told:
+    """What the simulations of a run say of their failures.
+
+    Part of the structure of `Run`, a pytree: any two are equal, as other messages make no other structure.
+
+    Attributes:
+        reasons: names, in the order of their codes from 1.
+        messages: by rounds.
+    """
+
+    def __init__(self, reasons: Sequence[str] = (), messages: Iterable[Message] = ()):
+        """Keep them."""
+        self.reasons, self.messages = tuple(reasons), tuple(messages)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Told)
+
+    def __hash__(self) -> int:
+        return hash(Told)
+
+
+class Tally:
+    """Counts failures by reason and message."""
+
+    def __init__(self):
+        """Nothing has failed."""
+        self._found: dict[tuple[str, str], list] = {}
+
+    def add(self, reason: str, message: str, place: int, count: int = 1) -> None:
+        """Count some; of messages that differ in numbers only, that of the first place is kept."""
+        group = reason, _NUMBER.sub("#", message)
+        if group not in self._found and len(self._found) >= MANY:
+            return
+        known = self._found.setdefault(group, [place, message, 0])
+        known[2] += count
+        if place < known[0]:
+            known[:2] = place, message
+
+    def commonest(self) -> list[Failure]:
+        """All that are known, the commonest first."""
+        found = [(-count, place, reason, message) for (reason, _), (place, message, count) in self._found.items()]
+        return [Failure(reason, message, -count) for count, _, reason, message in sorted(found)]
+
+
+def together(parts: Iterable[tuple[Told, np.ndarray]]) -> list[Failure]:
+    """Failures of some runs, the commonest first.
+
+    Args:
+        parts: of each run, what is told, and failures by round and reason, shape [rounds, R].
+
+    Example:
+        >>> told = Told(("error", "non_finite"), [Message(0, "error", "at 1.5", 2), Message(1, "error", "at 2.5", 1)])
+        >>> together([(told, np.array([[2, 0], [2, 5]]))])
+        [Failure(reason='non_finite', message='', count=5), Failure(reason='error', message='at 1.5', count=3), \
+Failure(reason='error', message='', count=1)]
+    """
+    tally = Tally()
+    for told, failed in parts:
+        left = dict(zip(told.reasons, np.sum(failed, axis=0).tolist(), strict=True))
+        for one in told.messages:
+            tally.add(one.reason, one.message, one.round, one.count)
+            left[one.reason] = left.get(one.reason, 0) - one.count
+        for reason, count in left.items():
+            if count > 0:
+                tally.add(reason, "", 0, count)
+    return tally.commonest()
+
+
+def append(folder: Path, messages: Iterable[Message]) -> None:
+    """Add a round's messages to a run folder."""
+    for message in messages:
+        files.append_line(folder / FILE, files.json_line(message._asdict()))
+
+
+def read(folder: Path) -> list[Message]:
+    """The messages of a run folder; none where it has no file of them.
+
+    Raises:
+        ValueError: for a damaged file.
+    """
+    path = folder / FILE
+    if not path.exists():
+        return []
+    try:
+        return [_message(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path}: expected messages of failures, got a damaged file") from error
+
+
+def cut(folder: Path, rounds: int) -> list[Message]:
+    """Take back the messages of rounds that are made again, and of a line that was not finished; those that stay."""
+    path = folder / FILE
+    if not path.exists():
+        return []
+    kept = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            message = _message(json.loads(line))
+        except (ValueError, KeyError, TypeError, RecursionError):
+            break
+        if message.round < rounds:
+            kept.append(message)
+    files.write_bytes(path, "".join(files.json_line(message._asdict()) for message in kept).encode())
+    return kept
+
+
+def _message(line: Mapping[str, Any]) -> Message:
+    return Message(int(line["round"]), str(line["reason"]), str(line["message"]), int(line["count"]))
