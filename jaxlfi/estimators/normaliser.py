@@ -82,6 +82,7 @@ def fit_normaliser(
     x = jnp.where(valid[:, None], x, x[jnp.argmax(valid)])
     some = some_rows(x, valid)
     origin, unit = likeliest_asinh(some) if name == "asinh" else (_quantile(some, 0.5), _range(x))
+    unit = jnp.where(varies(x), unit, 1.0)
     mean, deviation = _moments(TRANSFORMS[name]((x - origin) / unit), valid)
     fitted = Normaliser(mean, jnp.where(varies(x), deviation, jnp.inf), name, origin, unit)
     return jax.tree.map(lambda known, nothing: jnp.where(jnp.any(valid), known, nothing), fitted, identity(size, name))
@@ -150,9 +151,8 @@ def _quantile(x: Float[Array, "n obs"], place: float) -> Float[Array, " obs"]:
 
 
 def _range(x: Float[Array, "n obs"]) -> Float[Array, " obs"]:
-    """The range of each column; 1 where it is 0."""
-    range_ = jnp.max(x, axis=0) - jnp.min(x, axis=0)
-    return jnp.where(range_ > 0, range_, 1.0)
+    """The range of each column."""
+    return jnp.max(x, axis=0) - jnp.min(x, axis=0)
 
 
 def _moments(values: Float[Array, "n obs"], valid: Bool[Array, " n"]) -> tuple[Array, Array]:

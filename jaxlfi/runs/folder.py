@@ -41,7 +41,7 @@ if TYPE_CHECKING:  # runs know how to save themselves
     from jaxlfi.runs.run import Origin, Run
 
 RUN, RUNS, COMPARE = "jaxlfi-run", "jaxlfi-runs", "jaxlfi-compare"
-VERSION = 2
+VERSION = 3
 """Of the format of all folders; it rises whenever an older one could be misread."""
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "distrax", "numpy")
 TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")
@@ -241,7 +241,8 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
             "channels": np.asarray(task.channels, dtype=str),
             "times": np.arange(len(run.observed)) if task.times is None else task.times,
             "record_label": np.asarray(task.record_label or ("record" if task.times is None else "time")),
-        },
+        }
+        | ({} if run.reference is None else {"reference": run.reference}),
         durable=True,
     )
     if keep_network or run.amortised or not run.settings.estimator.closed_form:

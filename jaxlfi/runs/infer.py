@@ -197,7 +197,9 @@ def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
 
 def _require_observation(out: Path, recorded: Any, observed: Any) -> None:
     """Refuse to go on in the folder of a run with another observation; one that was simulated may be rounded anew."""
-    if np.shape(recorded) != np.shape(observed) or not np.allclose(recorded, observed, rtol=1e-4, atol=1e-6):
+    recorded, observed = np.asarray(recorded, float), np.asarray(observed, float)
+    allowed = 1e-4 * np.ptp(recorded) + 1e-6 * np.max(np.abs(recorded), initial=0.0)
+    if recorded.shape != observed.shape or np.max(np.abs(recorded - observed), initial=0.0) > allowed:
         raise _of_another_run(out, ["observation"])
 
 

@@ -461,7 +461,7 @@ def test_leaves_do_not_recompile():
 
 REFUSED = [
     ({"activation": "gelu"}, r"^activation: expected one of relu, tanh, silu, got 'gelu'"),
-    ({"normaliser": "log"}, r"^normaliser: expected one of none, zscore, asinh, fitted-asinh, got 'log'"),
+    ({"normaliser": "log"}, r"^normaliser: expected one of none, zscore, asinh, got 'log'"),
     ({"schedule": "linear"}, r"^schedule: expected one of constant, cosine, got 'linear'"),
     ({"loss": "hinge"}, r"^loss: expected one of likelihood, atomic, combined, got 'hinge'"),
     ({"components": 0}, r"^components: expected a whole number in \[1, 1e\+06\], got 0"),
