@@ -20,7 +20,7 @@ from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.tasks.journal import Journal
-from jaxlfi.tasks.precision import counted_from, reference_of
+from jaxlfi.tasks.reference import counted_from, reference_of
 from jaxlfi.tasks.simulation import Simulations, simulate_batch, simulate_in_waves
 from jaxlfi.tasks.summaries import layout
 from jaxlfi.tasks.task import Task
@@ -76,7 +76,7 @@ class HostEngine(BatchEngine):
         self._propose_many, self._update_many = part(propose_one), part(update_one, 0)
 
     def load(self, inputs: RunInputs) -> None:
-        """Take the inputs of a batch, whose summaries are counted from the observed ones (`jaxlfi.tasks.precision`)."""
+        """Take the inputs of a batch, whose summaries are counted from the observed ones (`jaxlfi.tasks.reference`)."""
         self.observed = np.asarray(inputs.observed)
         self.references = _references(self.task, self.settings, self.observed, np.asarray(inputs.x, float))
         super().load(inputs.replace(x=counted_from(self.references, inputs.x)))

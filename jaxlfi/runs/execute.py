@@ -31,7 +31,7 @@ from jaxlfi.tasks import priors, registry
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.journal import Journal, OnSimulation
 from jaxlfi.tasks.observation import observe
-from jaxlfi.tasks.precision import raw
+from jaxlfi.tasks.reference import raw
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.summaries import layout
 from jaxlfi.tasks.task import Task

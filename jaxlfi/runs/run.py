@@ -27,7 +27,7 @@ from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Heuristic
 from jaxlfi.runs import folder as folders
-from jaxlfi.tasks.precision import counted_from, summaries_in_double
+from jaxlfi.tasks.reference import counted_from, summaries_in_double
 from jaxlfi.tasks.task import Task
 
 DRAWS = 1000
@@ -79,7 +79,7 @@ class Run:
         origin: how the run is described in its config.json: task, configuration, support's name, preset.
         units: of the parameters; None where its folder does not say.
         reference: what the network's summaries are counted from, shape [S], in double precision; None for zero
-            (`jaxlfi.tasks.precision`). `x` and those of the dataset are counted from zero.
+            (`jaxlfi.tasks.reference`). `x` and those of the dataset are counted from zero.
     """
 
     belief: Belief

@@ -14,7 +14,7 @@ from jaxlfi.distributions.arguments import is_concrete
 from jaxlfi.io import files
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.journal import Journal
-from jaxlfi.tasks.precision import summaries_in_double
+from jaxlfi.tasks.reference import summaries_in_double
 from jaxlfi.tasks.simulation import failure_code, trajectory_and_outcome
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.trials import repeated, together

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlfi.tasks.each import stacked
 from jaxlfi.tasks.host import numpy_generator
 from jaxlfi.tasks.journal import Journal
-from jaxlfi.tasks.precision import counted_from, summaries_in_double
+from jaxlfi.tasks.reference import counted_from, summaries_in_double
 from jaxlfi.tasks.task import Task
 
 
@@ -217,7 +217,7 @@ def simulate_in_waves(
         wanted: how many successes.
         shape: of a trajectory.
         journal: of simulations that are made one by one.
-        reference: what summaries are counted from, shape [S] (`jaxlfi.tasks.precision`); by default from zero.
+        reference: what summaries are counted from, shape [S] (`jaxlfi.tasks.reference`); by default from zero.
     """
     natural = np.asarray(task.space.to_natural(theta))
     budget, each = len(natural), task.simulate.each
