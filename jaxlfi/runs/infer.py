@@ -197,16 +197,23 @@ def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
 
 def _require_observation(out: Path, recorded: Any, observed: Any) -> None:
     """Refuse to go on in the folder of a run with another observation; one that was simulated may be rounded anew."""
-    recorded, observed = np.asarray(recorded, float), np.asarray(observed, float)
-    allowed = 1e-4 * np.ptp(recorded) + 1e-6 * np.max(np.abs(recorded), initial=0.0)
-    if recorded.shape != observed.shape or np.max(np.abs(recorded - observed), initial=0.0) > allowed:
+    if not _same(recorded, observed):
         raise _of_another_run(out, ["observation"])
 
 
 def _require_simulations(out: Path, recorded: np.ndarray, given: np.ndarray) -> None:
     """Refuse to go on in the folder of a run that began with other simulations."""
-    if not np.array_equal(recorded, given):
+    if not _same(recorded, given):
         raise _of_another_run(out, ["first round (simulations)"])
+
+
+def _same(first: Any, second: Any) -> bool:
+    """Whether arrays are the same but for rounding: to a small fraction of the range of each column."""
+    first, second = np.asarray(first, float), np.asarray(second, float)
+    if first.shape != second.shape or not first.size:
+        return first.shape == second.shape
+    allowed = 1e-4 * np.ptp(first, axis=0) + 1e-6 * np.max(np.abs(first), axis=0)
+    return bool(np.all(np.abs(first - second) <= allowed))
 
 
 def _kept(given: Simulations | None) -> np.ndarray:

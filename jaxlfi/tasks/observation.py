@@ -258,7 +258,7 @@ def _read_npz(path: Path) -> np.ndarray:
     array = arrays.get("trajectory", next(iter(arrays.values())))
     if array.dtype.kind not in "biuf":
         raise ValueError(f"expected real numbers, got an array of type {array.dtype}")
-    return array
+    return np.asarray(array, float)
 
 
 def _is_time(heading: str) -> bool:

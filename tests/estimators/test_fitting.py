@@ -388,7 +388,7 @@ def test_a_warm_start_keeps_its_normaliser_and_a_cold_one_takes_the_datas():
     kept = fitted(SMALL, shifted, network=network)[0].normaliser
     chex.assert_trees_all_equal(kept, jax.device_get(network.normaliser))
     anew = fitted(COLD, shifted, network=network)[0].normaliser
-    np.testing.assert_allclose(anew.mean - kept.mean, [100, -50], rtol=1e-3)
+    np.testing.assert_allclose(anew.origin - kept.origin, [100, -50], rtol=1e-3)
 
 
 def test_networks_of_an_ensemble_are_trained_apart_and_pooled(overfitted):
