@@ -72,8 +72,8 @@ class RunInputs:
     key: jax.Array
     support: Support
     heuristic: Heuristic
-    observed: Float[Array, "*shape"]
-    x: Float[Array, "*batch obs"]
+    observed: Float[Array | np.ndarray, "*shape"]
+    x: Float[Array | np.ndarray, "*batch obs"]
 
 
 def stack_heuristics(rules: Sequence[Heuristic]) -> tuple[Heuristic, list[int | None]]:
@@ -109,7 +109,7 @@ def stack_inputs(specs: Sequence[RunSpec], observed: np.ndarray, x: np.ndarray) 
     heuristic, places = stack_heuristics([spec.heuristic for spec in specs])
     keys = jnp.stack([key_of(spec.seed) for spec in specs])
     support = stack([spec.support for spec in specs])
-    return RunInputs(keys, support, heuristic, jnp.asarray(observed), jnp.asarray(x)), places
+    return RunInputs(keys, support, heuristic, np.asarray(observed), np.asarray(x)), places
 
 
 def posterior_after(belief: Belief, network: Network, x: Float[Array, " obs"]) -> Posterior:
@@ -191,7 +191,12 @@ class BatchEngine:
     """A batch as one compiled program: a `vmap` over runs, sharded over the local devices.
 
     Engines of equal tasks share their compiled programs: a second run of the same shapes compiles nothing.
+
+    Attributes:
+        references: what the summaries of each run are counted from, shape [L, S]; None for zero.
     """
+
+    references: np.ndarray | None = None
 
     def __init__(
         self,
@@ -214,8 +219,8 @@ class BatchEngine:
         devices = tuple(devices or jax.local_devices())[: self.runs]
         self.mesh = Mesh(np.asarray(devices), (AXIS,))
         self._padded = len(devices) * math.ceil(self.runs / len(devices))
-        self.inputs = self.place(inputs)
         self.first = first
+        self.load(inputs)
 
     @property
     def known_failures(self) -> str:

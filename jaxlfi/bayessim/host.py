@@ -21,7 +21,9 @@ from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
 from jaxlfi.distributions.precision import single
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.tasks.journal import Journal
+from jaxlfi.tasks.reference import counted_from, reference_of
 from jaxlfi.tasks.simulation import Simulations, simulate_batch, simulate_in_waves
+from jaxlfi.tasks.summaries import layout
 from jaxlfi.tasks.task import Task
 
 
@@ -69,11 +71,23 @@ class HostEngine(BatchEngine):
         journal: Journal | None = None,
     ):
         """Prepare, without compiling; see `BatchEngine` and `engine_for`."""
-        super().__init__(task, settings, inputs, devices=jax.local_devices()[:1], first=first)
         self.journal = journal or Journal()
         part = lambda one, *axes: program(functools.partial(one, task), self.mesh, (None, 0, 0, None, *axes))
+        super().__init__(task, settings, inputs, devices=jax.local_devices()[:1], first=first)
         self._propose_many, self._update_many = part(propose_one), part(update_one, 0)
-        self._last_seen: list[Discrepancy | None] = [None] * len(inputs.x)
+
+    def load(self, inputs: RunInputs) -> None:
+        """Take the inputs of a batch, whose summaries are counted from the observed ones (`jaxlfi.tasks.reference`)."""
+        self.observed = np.asarray(inputs.observed)
+        self.references = _references(self.task, self.settings, self.observed, np.asarray(inputs.x, float))
+        super().load(inputs.replace(x=counted_from(self.references, inputs.x)))
+        self._last_seen: list[Discrepancy | None] = [None] * self.runs
+
+    def first_round(self) -> Simulations:
+        """The given simulations, for every run."""
+        given = jax.tree.map(lambda leaf: np.stack([leaf] * self.runs), self.first)
+        x = np.where(given.kept[..., None], counted_from(self.references[:, None], given.x), 0.0)
+        return self.place(given.replace(x=x))
 
     @property
     def known_failures(self) -> str:
@@ -109,9 +123,8 @@ class HostEngine(BatchEngine):
         made = []
         for run, (key, own, over) in enumerate(zip(keys, theta, settled, strict=True)):
             self.journal.run = run
-            made.append(
-                self._nothing(own) if over else simulate_in_waves(key, self.task, own, wanted, shape, self.journal)
-            )
+            simulate = functools.partial(simulate_in_waves, key, self.task, own, wanted, shape, self.journal)
+            made.append(self._nothing(own) if over else simulate(self.references[run]))
         self.journal.run = None
         return _stacked(made)
 
@@ -129,14 +142,23 @@ class HostEngine(BatchEngine):
             if settled[run] and last is not None:
                 self._last_seen[run] = last.replace(simulated=jnp.zeros_like(last.simulated))
             else:
-                self._last_seen[run] = self._discrepancy(key, own, self.inputs.observed[run])
+                self._last_seen[run] = self._discrepancy(key, own, self.observed[run])
         return _stacked(self._last_seen)
 
-    def _discrepancy(self, key: jax.Array, theta: jax.Array, observed: jax.Array) -> Discrepancy:
+    def _discrepancy(self, key: jax.Array, theta: jax.Array, observed: np.ndarray) -> Discrepancy:
         if not self.settings.predictive:
             return not_simulated(self.task, theta, observed, self.inputs.x.shape[-1])
         simulated = simulate_batch(key, self.task, theta, observed.shape, journal=self.journal)
-        return compared(self.task, theta, *map(jnp.asarray, simulated), observed)
+        return compared(self.task, theta, *simulated, observed)
+
+
+def _references(task: Task, settings: Settings, observed: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """What the summaries of each run are counted from, shape [L, S]; zero where networks see them as they are."""
+    estimator = settings.estimator
+    if estimator.normaliser == "none":
+        return np.zeros_like(x)
+    record_size = estimator.reading(layout(task.summary, observed.shape[1:], x.shape[1])).record_size
+    return np.stack([reference_of(own, record_size) for own in x])
 
 
 _check_draws = jax.jit(single(jax.vmap(check_draws)))

@@ -54,7 +54,7 @@ FLOW = SplineFlow(
     validation=0.1,
     patience=20,
     warm_start=True,
-    normaliser="fitted-asinh",
+    normaliser="asinh",
 )
 """Sequential neural posterior estimation as it is commonly set up (Greenberg et al. 2019; the paper's appendix A).
 
@@ -105,7 +105,7 @@ LIKELIHOOD = MixtureLikelihood(
     epochs=0,
     steps=1000,
     learning_rate=1e-3,
-    **(ENSEMBLE | {"normaliser": "fitted-asinh"}),
+    **ENSEMBLE,
 )
 """Four networks of two Gaussians over the summaries; hardly tuned."""
 

@@ -22,7 +22,7 @@ class SharedEngine:
     A device steps the same runs by the same program as one of as many devices in a single process.
     """
 
-    known_failures = BatchEngine.known_failures
+    known_failures, references = BatchEngine.known_failures, BatchEngine.references
 
     def __init__(
         self,

@@ -68,9 +68,11 @@ def compared(
         failure: 0 where the simulation succeeded and its summary is finite, shape [N].
         observed: the real trajectory.
     """
-    error = jnp.where(failure == 0, jax.vmap(lambda t: trajectory_distance(t, observed))(trajectory), jnp.nan)
+    # A difference is taken before it is rounded: trajectories from the host are in double precision.
+    difference, spread = jnp.asarray(trajectory - observed), jnp.asarray(observed - observed[:1])
+    error = jnp.where(failure == 0, jax.vmap(lambda one: _distance(one, spread))(difference), jnp.nan)
     x = jnp.where((failure == 0)[:, None], x, jnp.nan)
-    return Discrepancy(theta, _theta_error(task, theta), error, trajectory, x, jnp.asarray(len(theta)))
+    return Discrepancy(theta, _theta_error(task, theta), error, jnp.asarray(trajectory), x, jnp.asarray(len(theta)))
 
 
 def not_simulated(task: Task, theta: Float[Array, "samples dim"], observed: Array, obs: int) -> Discrepancy:
@@ -106,7 +108,12 @@ def trajectory_distance(trajectory: Array, observed: Array) -> Float[Array, ""]:
         raise ValueError(
             f"trajectory, observed: expected the same shapes, got {list(trajectory.shape)} and {list(observed.shape)}"
         )
-    observed = observed.reshape(observed.shape[0], -1)
-    deviation = jnp.std(observed, axis=0)
+    return _distance(trajectory.reshape(observed.shape) - observed, observed - observed[:1])
+
+
+def _distance(difference: Array, spread: Array) -> Float[Array, ""]:
+    """The same from the difference, and the observed trajectory less its first record."""
+    spread = spread.reshape(len(spread), -1)
+    deviation = jnp.std(spread, axis=0)
     scale = jnp.where(deviation > 0, deviation, 1.0)
-    return jnp.sqrt(jnp.mean(((trajectory.reshape(observed.shape) - observed) / scale) ** 2))
+    return jnp.sqrt(jnp.mean((difference.reshape(spread.shape) / scale) ** 2))

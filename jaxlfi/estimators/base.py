@@ -18,7 +18,7 @@ from jaxlfi.estimators.dataset import Dataset, empty
 from jaxlfi.estimators.density import Density, EnsembleDensity
 from jaxlfi.estimators.embeddings import EMBEDDINGS, Embedded
 from jaxlfi.estimators.losses import LOSSES, Rows
-from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser
+from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser, standardiser
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.fields import Checked, check_fields, hyperparameter, option
 
@@ -53,8 +53,8 @@ class Estimator(Checked, abc.ABC):
         warm_start: continue from the last round's weights, or start anew each round (reading C).
         loss: "likelihood", or "atomic" or "combined", which need no correction for the proposals
             (`jaxlfi.estimators.losses.LOSSES`).
-        normaliser: "zscore", "asinh", "fitted-asinh" or "none" (`jaxlfi.estimators.normaliser`): what is done to the
-            raw summaries. It belongs to the network: computed where the network starts and kept while it is trained on.
+        normaliser: "zscore", "asinh" or "none" (`jaxlfi.estimators.normaliser`): how raw summaries are normalised. It
+            belongs to the network: computed where the network starts and kept while it is trained on.
         embedding: "none", or a network before the family's own that makes a few features of a long summary and is
             trained with it (`jaxlfi.estimators.embeddings`): "mlp" of any summary, "series" of a raw trajectory,
             "trials" of records in no order. With the last two, numbers at the same place of all records are
@@ -86,7 +86,7 @@ class Estimator(Checked, abc.ABC):
         choices=tuple(LOSSES),
         help="likelihood; atomic, combined: no correction for the proposals needed",
     )
-    normaliser: str = option("zscore", choices=tuple(TRANSFORMS), help="what is done to the summaries")
+    normaliser: str = option("zscore", choices=tuple(TRANSFORMS), help="how summaries are normalised")
     embedding: str = option(
         "none",
         choices=("none", *EMBEDDINGS),
@@ -293,4 +293,4 @@ def _normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tupl
     of_x = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid, estimator.record_size)
     if estimator.closed_form:
         return of_x, None
-    return of_x, fit_normaliser("zscore", scale.to_unit(dataset.theta), dataset.valid)
+    return of_x, standardiser(scale.to_unit(dataset.theta), dataset.valid)

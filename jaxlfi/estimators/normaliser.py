@@ -1,4 +1,8 @@
-"""Normalisers: raw summaries as a network sees them, from the simulations at hand."""
+"""Normalisers: raw summaries as a network sees them, from the simulations at hand.
+
+A posterior must not depend on the unit that a summary comes in, nor on a constant added to it. So values are counted
+from a reference among them before anything is summed, and no threshold is absolute.
+"""
 
 from collections.abc import Callable
 
@@ -9,29 +13,36 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 UNITS = np.logspace(-3, 2, 11).astype(np.float32)
-"""Units of asinh that are tried, relative to the median of a summary's absolute values."""
+"""Units of asinh that are tried, relative to the median distance from the origin that is tried."""
+ORIGINS = (0.0, 0.5, 1.0)
+"""Origins of asinh that are tried: quantiles of a summary. From the least, asinh is a logarithm of an upper tail."""
+ROWS = 256
+"""Simulations that origin and unit are chosen by, at most; the moments are those of all."""
+RESOLVED = 8.0
+"""Spread of a summary, in units of the last place of its largest value, below which it does not vary."""
 
 
 @struct.dataclass
 class Normaliser:
-    """A fixed elementwise transform, then centre and scale of each summary.
+    """A fixed elementwise transform between two changes of origin and unit.
 
     Attributes:
         mean: of the transformed summaries, shape [S].
-        scale: shape [S], positive.
+        scale: their standard deviation, shape [S]; infinite for a summary that does not vary, which becomes 0.
         name: of the transform (`TRANSFORMS`).
-        unit: what summaries are divided by before they are transformed, shape [S]; None for 1.
+        origin: value that summaries are counted from, in their own unit, shape [S].
+        unit: what they are then divided by, positive, shape [S].
     """
 
     mean: Float[Array, "*batch obs"]
     scale: Float[Array, "*batch obs"]
     name: str = struct.field(pytree_node=False)
-    unit: Float[Array, "*batch obs"] | None = None
+    origin: Float[Array, "*batch obs"]
+    unit: Float[Array, "*batch obs"]
 
     def __call__(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n obs"]:
         """Raw summaries as a network sees them."""
-        x = x if self.unit is None else x / self.unit
-        return (TRANSFORMS[self.name](x) - self.mean) / self.scale
+        return (TRANSFORMS[self.name]((x - self.origin) / self.unit) - self.mean) / self.scale
 
 
 def untouched(x: Array) -> Array:
@@ -39,27 +50,20 @@ def untouched(x: Array) -> Array:
     return x
 
 
-TRANSFORMS: dict[str, Callable[[Array], Array]] = {
-    "none": untouched,
-    "zscore": untouched,
-    "asinh": jnp.arcsinh,
-    "fitted-asinh": jnp.arcsinh,
-}
-"""What is done to each summary before it is centred and scaled, by the normaliser's name.
+TRANSFORMS: dict[str, Callable[[Array], Array]] = {"none": untouched, "zscore": untouched, "asinh": jnp.arcsinh}
+"""What is done to each summary between the two changes of origin and unit, by the normaliser's name.
 
-"asinh" is linear near zero and logarithmic in the tails: summaries of stochastic simulators (a mean population, say)
-can span many orders of magnitude, and then a plain z-score squeezes everything like the observation into one point.
-What is near zero depends on the units that a summary comes in; "fitted-asinh" finds a unit for each (`likeliest_unit`),
-and leaves as it is, but for centre and scale, what has no tails.
+"asinh" is linear near its origin and logarithmic in the tails: summaries of stochastic simulators (a mean population,
+say) can span many orders of magnitude, and then a plain z-score squeezes everything like the observation into one
+point. Its origin and unit are found for each summary (`likeliest_asinh`); what has no tails stays as it is, but for its
+mean and standard deviation. "none" leaves the unit to the simulator.
 """
 
 
 def fit_normaliser(
     name: str, x: Float[Array, "cap obs"], valid: Bool[Array, " cap"], record_size: int = 0
 ) -> Normaliser:
-    """Mean and standard deviation of each transformed summary over the valid rows; (0, 1) for "none".
-
-    A summary that does not vary is centred only.
+    """Origin, unit, mean and standard deviation of each summary over the valid rows; the identity for "none".
 
     Args:
         name: of the transform.
@@ -74,36 +78,85 @@ def fit_normaliser(
         one = fit_normaliser(name, x.reshape(-1, record_size), jnp.repeat(valid, count))
         return jax.tree.map(lambda leaf: jnp.tile(leaf, count), one)
     if name == "none":
-        return Normaliser(jnp.zeros(size), jnp.ones(size), name)
-    unit = likeliest_unit(x, valid) if name == "fitted-asinh" else None
-    values = TRANSFORMS[name](x if unit is None else x / unit)
-    mean, variance = _moments(values, valid)
-    scale = jnp.sqrt(variance)
-    return Normaliser(mean, jnp.where(scale > 1e-6 * (1 + jnp.abs(mean)), scale, 1.0), name, unit)
+        return identity(size)
+    x = jnp.where(valid[:, None], x, x[jnp.argmax(valid)])
+    some = some_rows(x, valid)
+    origin, unit = likeliest_asinh(some) if name == "asinh" else (_quantile(some, 0.5), _range(x))
+    unit = jnp.where(varies(x), unit, 1.0)
+    mean, deviation = _moments(TRANSFORMS[name]((x - origin) / unit), valid)
+    fitted = Normaliser(mean, jnp.where(varies(x), deviation, jnp.inf), name, origin, unit)
+    return jax.tree.map(lambda known, nothing: jnp.where(jnp.any(valid), known, nothing), fitted, identity(size, name))
 
 
-def likeliest_unit(x: Float[Array, "cap obs"], valid: Bool[Array, " cap"]) -> Float[Array, " obs"]:
-    """The unit s for each summary by which asinh(x / s) is most like a normal variable.
+def identity(size: int, name: str = "none") -> Normaliser:
+    """The normaliser that neither moves nor scales its S summaries."""
+    zeros, ones = jnp.zeros(size), jnp.ones(size)
+    return Normaliser(zeros, ones, name, zeros, ones)
 
-    Of `UNITS` the one of maximum likelihood (Burbidge, Magee and Robb 1988): for a summary of many orders of magnitude
-    it is small, and asinh nearly a logarithm; for one without tails it is large, and asinh nearly linear.
+
+def standardiser(values: Float[Array, "cap dim"], valid: Bool[Array, " cap"]) -> Normaliser:
+    """Mean and standard deviation of values of order one, such as parameters in [-1, 1]^D; 1 where they do not vary."""
+    mean, deviation = _moments(values, valid)
+    return identity(values.shape[-1], "zscore").replace(mean=mean, scale=jnp.where(deviation > 1e-6, deviation, 1.0))
+
+
+def varies(x: Float[Array, "n obs"]) -> Bool[Array, " obs"]:
+    """Which summaries vary by more than the rounding of their values; the others tell nothing of the parameters."""
+    last_place = jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x), axis=0)
+    return jnp.max(x, axis=0) - jnp.min(x, axis=0) > RESOLVED * last_place
+
+
+def some_rows(x: Float[Array, "cap obs"], valid: Bool[Array, " cap"]) -> Float[Array, "rows obs"]:
+    """At most `ROWS` of the valid rows, spread evenly whatever period the rows have (by the golden ratio)."""
+    count = min(ROWS, len(x))
+    places = np.modf(np.arange(count) * (np.sqrt(5) - 1) / 2)[0].astype(np.float32)
+    (rows,) = jnp.nonzero(valid, size=len(x), fill_value=0)
+    return x[rows[(places * jnp.sum(valid)).astype(jnp.int32)]]
+
+
+def likeliest_asinh(x: Float[Array, "n obs"]) -> tuple[Float[Array, " obs"], Float[Array, " obs"]]:
+    """Origin c and unit s for each summary by which asinh((x - c) / s) is most like a normal variable.
+
+    Of `ORIGINS` and `UNITS` those of maximum likelihood (Burbidge, Magee and Robb 1988). For a summary of many orders
+    of magnitude the unit is small, and asinh nearly a logarithm of the distance from the origin, which is then one end
+    of the summary's range, or its middle where both ends have tails; for one without tails the unit is large, and
+    asinh nearly linear.
     """
-    x = jnp.where(valid[:, None], x, 0.0)
-    middle = jnp.nan_to_num(jnp.nanmedian(jnp.where(valid[:, None], jnp.abs(x), jnp.nan), axis=0))
-    units = jnp.where(middle > 0, middle, 1.0) * UNITS[:, None]
+    origins = jnp.stack([_quantile(x, place) for place in ORIGINS])
 
-    def log_likelihood(unit):
-        _, variance = _moments(jnp.arcsinh(x / unit), valid)
-        # d asinh(x / s) / dx = 1 / sqrt(s^2 + x^2)
-        log_slope, _ = _moments(-jnp.log(jnp.hypot(unit, x)), valid)
-        return log_slope - 0.5 * jnp.log(jnp.maximum(variance, 1e-12))
+    def tried(origin):
+        distance = jnp.abs(x - origin)
+        middle = _quantile(distance, 0.5)
+        middle = jnp.where(middle > 0, middle, jnp.mean(distance, axis=0))
+        return jnp.where(middle > 0, middle, 1.0) * UNITS[:, None]
 
-    best = jnp.argmax(jax.vmap(log_likelihood)(units), axis=0)
-    return jnp.take_along_axis(units, best[None], axis=0)[0]
+    def log_likelihood(origin, unit):
+        z = (x - origin) / unit
+        _, deviation = _moments(jnp.arcsinh(z), jnp.ones(len(x), bool))
+        # d asinh((x - c) / s) / dx = 1 / (s sqrt(1 + z^2))
+        log_slope = -jnp.log(unit) - jnp.mean(jnp.log(jnp.hypot(1.0, z)), axis=0)
+        return log_slope - jnp.log(jnp.maximum(deviation, 1e-6))
+
+    units = jax.vmap(tried)(origins)  # [origin, unit, S]
+    each_unit = jax.vmap(log_likelihood, in_axes=(None, 0))
+    heights = jax.vmap(each_unit)(origins, units).reshape(-1, x.shape[-1])
+    best = jnp.argmax(heights, axis=0)
+    take = lambda values: jnp.take_along_axis(values.reshape(-1, x.shape[-1]), best[None], axis=0)[0]
+    return take(jnp.broadcast_to(origins[:, None], units.shape)), take(units)
 
 
-def _moments(values: Float[Array, "cap obs"], valid: Bool[Array, " cap"]) -> tuple[Array, Array]:
-    """Mean and variance of each column over the valid rows."""
+def _quantile(x: Float[Array, "n obs"], place: float) -> Float[Array, " obs"]:
+    """A quantile of each column, one of its values: what is counted from it is free of rounding."""
+    return jnp.quantile(x, place, axis=0, method="lower")
+
+
+def _range(x: Float[Array, "n obs"]) -> Float[Array, " obs"]:
+    """The range of each column."""
+    return jnp.max(x, axis=0) - jnp.min(x, axis=0)
+
+
+def _moments(values: Float[Array, "n obs"], valid: Bool[Array, " n"]) -> tuple[Array, Array]:
+    """Mean and standard deviation of each column over the valid rows."""
     count = jnp.maximum(jnp.sum(valid), 1)
     mean = jnp.sum(values, axis=0, where=valid[:, None]) / count
-    return mean, jnp.sum((values - mean) ** 2, axis=0, where=valid[:, None]) / count
+    return mean, jnp.sqrt(jnp.sum((values - mean) ** 2, axis=0, where=valid[:, None]) / count)

@@ -26,7 +26,16 @@ def settings_from_json(description: Mapping[str, Any]) -> Settings:
         ValueError: for a description of anything else, of values that cannot work, or of an estimator that is not
             installed.
     """
-    return made_of(Settings, "settings", description, _loader(estimators)).check()
+    return made_of(Settings, "settings", _renamed(description), _loader(estimators)).check()
+
+
+def _renamed(description: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The settings of the second format, in which a normaliser that finds its units had a name of its own."""
+    estimator = description.get("estimator") if isinstance(description, Mapping) else None
+    fields = estimator.get("hyperparameters") if isinstance(estimator, Mapping) else None
+    if not isinstance(fields, Mapping) or fields.get("normaliser") != "fitted-asinh":
+        return description
+    return description | {"estimator": estimator | {"hyperparameters": fields | {"normaliser": "asinh"}}}
 
 
 def heuristic_to_json(heuristic: Heuristic) -> dict[str, Any]:

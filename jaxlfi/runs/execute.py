@@ -33,6 +33,7 @@ from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.failures import Message, Told
 from jaxlfi.tasks.journal import Journal, OnSimulation
 from jaxlfi.tasks.observation import observe
+from jaxlfi.tasks.reference import raw
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.summaries import layout
 from jaxlfi.tasks.task import Task
@@ -215,9 +216,11 @@ def execute(
     state = engine.fetch(state)
     if not processes.writes:
         return []
+    references = [None] * len(plan.specs) if engine.references is None else engine.references
     return [
         _run(
-            plan, spec, jax.tree.map(lambda leaf, i=i: leaf[i], state), observed, i, rows, seconds, final, places[i]
+            *(plan, spec, jax.tree.map(lambda leaf, i=i: leaf[i], state), observed, i),
+            *(rows, seconds, final, places[i], references[i]),
         ).replace(told=Told(plan.task.reasons, told[i]))
         for i, spec in enumerate(plan.specs)
     ]
@@ -232,7 +235,7 @@ def _state(engine: BatchEngine | SharedEngine, checkpoint: Checkpoint | None, do
     return engine.place(like if checkpoint is None else checkpoint.read_state(like))
 
 
-def _run(plan, spec, state, observed, index, rows, seconds, final, place) -> Run:
+def _run(plan, spec, state, observed, index, rows, seconds, final, place, reference) -> Run:
     """One run of a batch out of the arrays of all."""
     history = stacked_rounds([run_row(row, index, place) for row in rows])
     return Run(
@@ -240,7 +243,7 @@ def _run(plan, spec, state, observed, index, rows, seconds, final, place) -> Run
         history=history
         | {"seconds": np.asarray(seconds)}
         | {name: value[index] for name, value in final.items() if name.startswith(FINAL)},
-        dataset=state.dataset,
+        dataset=state.dataset.replace(x=raw(state.dataset.x, int(state.dataset.size), reference)),
         network=state.network,
         observed=observed.trajectory[index],
         x=observed.x[index],
@@ -253,6 +256,7 @@ def _run(plan, spec, state, observed, index, rows, seconds, final, place) -> Run
         task=plan.task,
         origin=plan.origin(spec, observed.first),
         units=tuple(plan.task.units),
+        reference=reference,
     )
 
 

@@ -43,12 +43,14 @@ if TYPE_CHECKING:  # runs know how to save themselves
     from jaxlfi.runs.run import Origin, Run
 
 RUN, RUNS, COMPARE = "jaxlfi-run", "jaxlfi-runs", "jaxlfi-compare"
-VERSION = 2
+VERSION = 3
 """Of the format of all folders; it rises whenever an older one could be misread.
 
 What is added to a folder without a new number, readers must do without: a new setting's default is what was done before
 there was the setting. `tests/golden/formats/` has a folder of each number, and of each state of one.
 """
+READ = (2,)
+"""Older versions of which finished runs are read. In 2, normalisers counted from zero (`jaxlfi.runs.load`)."""
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "distrax", "numpy")
 TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")
 
@@ -185,11 +187,14 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def check_version(path: Path, config: Mapping[str, Any]) -> None:
-    """Refuse a folder of another version of the format.
+    """Refuse a folder of another version of the format, but for finished runs of some older ones.
 
     Raises:
         StoreError: in one line.
     """
+    runs = config.get("format") in (RUN, RUNS, COMPARE) and config.get("status", "finished") == "finished"
+    if runs and config.get("version") in READ:
+        return
     try:
         require_version(path, str(config.get("format")), VERSION, config.get("version"), config)
     except ValueError as error:
@@ -246,7 +251,8 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
             "channels": np.asarray(task.channels, dtype=str),
             "times": np.arange(len(run.observed)) if task.times is None else task.times,
             "record_label": np.asarray(task.record_label or ("record" if task.times is None else "time")),
-        },
+        }
+        | ({} if run.reference is None else {"reference": run.reference}),
         durable=True,
     )
     if keep_network or run.amortised or not run.settings.estimator.closed_form:

@@ -200,14 +200,23 @@ def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
 
 def _require_observation(out: Path, recorded: Any, observed: Any) -> None:
     """Refuse to go on in the folder of a run with another observation; one that was simulated may be rounded anew."""
-    if np.shape(recorded) != np.shape(observed) or not np.allclose(recorded, observed, rtol=1e-4, atol=1e-6):
+    if not _same(recorded, observed):
         raise _of_another_run(out, ["observation"])
 
 
 def _require_simulations(out: Path, recorded: np.ndarray, given: np.ndarray) -> None:
     """Refuse to go on in the folder of a run that began with other simulations."""
-    if not np.array_equal(recorded, given):
+    if not _same(recorded, given):
         raise _of_another_run(out, ["first round (simulations)"])
+
+
+def _same(first: Any, second: Any) -> bool:
+    """Whether arrays are the same but for rounding: to a small fraction of the range of each column."""
+    first, second = np.asarray(first, float), np.asarray(second, float)
+    if first.shape != second.shape or not first.size:
+        return first.shape == second.shape
+    allowed = 1e-4 * np.ptp(first, axis=0) + 1e-6 * np.max(np.abs(first), axis=0)
+    return bool(np.all(np.abs(first - second) <= allowed))
 
 
 def _kept(given: Simulations | None) -> np.ndarray:

@@ -1,7 +1,7 @@
 """load: a run folder as the run that `infer` returned."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -77,14 +77,14 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
     task = _task(folder, config, task, space)
     prior = _prior(folder, config, task, settings)
     observation = _arrays(folder / "observation.npz", ("trajectory", "x"))
-    observed, x = jnp.asarray(observation["trajectory"]), jnp.asarray(observation["x"])
     history = _arrays(folder / "history.npz", ("theta",))
+    observed, x = _precise(observation["trajectory"]), _precise(observation["x"])
     layout = tuple(map(int, observation.get("layout", (len(x), 1))))
     return Run(
         belief=_belief(folder / "posterior.npz", space),
         history=_records(history),
         dataset=_dataset(folder / "dataset.npz", settings),
-        network=_network(folder / "network.npz", settings, layout, feasible, space, prior),
+        network=_network(folder / "network.npz", settings, layout, feasible, space, prior, config["version"]),
         observed=observed,
         x=x,
         key=key,
@@ -97,6 +97,7 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         origin=origin,
         units=units,
         told=_told(folder, history),
+        reference=observation.get("reference"),
     )
 
 
@@ -105,6 +106,11 @@ def _told(folder: Path, history: dict[str, np.ndarray]) -> failures.Told:
         return failures.Told(map(str, history.get("reasons", ())), failures.read(folder))
     except ValueError as error:
         raise StoreError(str(error)) from error
+
+
+def _precise(array: np.ndarray) -> Any:
+    """An array as JAX takes it, but for numbers of a host simulator that are in double precision."""
+    return array if array.dtype == np.float64 else jnp.asarray(array)
 
 
 def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space) -> Task | None:
@@ -171,18 +177,14 @@ def _dataset(path: Path, settings: Settings) -> Dataset:
             raise StoreError(f"{path}: expected {size} rows of numbers as {name}, got {list(array.shape)}")
     first = int(np.sum(arrays["round"] == 0))
     room = max(first, settings.simulations_per_round) + (settings.rounds - 1) * settings.simulations_per_round
-    filled = {
-        name: jnp.asarray(
-            np.concatenate([arrays[name], np.zeros((max(room - size, 0), *arrays[name].shape[1:]))]), jnp.float32
-        )
-        for name in ("theta", "x", "weight")
-    }
-    rounds = np.concatenate([arrays["round"], np.zeros(max(room - size, 0), arrays["round"].dtype)])
-    return Dataset(round=jnp.asarray(rounds), size=jnp.asarray(size, jnp.int32), **filled)
+    empty = max(room - size, 0)
+    padded = lambda array: np.concatenate([array, np.zeros((empty, *array.shape[1:]), array.dtype)])
+    filled = {name: _precise(padded(arrays[name])) for name in ("theta", "x", "weight")}
+    return Dataset(round=jnp.asarray(padded(arrays["round"])), size=jnp.asarray(size, jnp.int32), **filled)
 
 
 def _network(
-    path: Path, settings: Settings, layout: tuple[int, ...], feasible: Support, space: Space, prior: Any
+    path: Path, settings: Settings, layout: tuple[int, ...], feasible: Support, space: Space, prior: Any, version: int
 ) -> Network | None:
     """The trained network; None where a mixture density network was not kept.
 
@@ -195,11 +197,21 @@ def _network(
     make: Callable[[], Network] = lambda: untrained(jax.random.key(0), estimator, obs, feasible, space, prior)
     template = jax.eval_shape(make)
     expected = trees.named_leaves(template)
-    arrays = _arrays(path, tuple(expected))
+    counted = {} if version > 2 else _counted_from_zero(expected)
+    arrays = counted | _arrays(path, tuple(name for name in expected if name not in counted))
     for name, leaf in expected.items():
         if arrays[name].shape != leaf.shape:
             raise StoreError(f"{path}: expected shape {leaf.shape} at {name}, got {arrays[name].shape}")
     return jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(arrays[name]) for name in expected])
+
+
+def _counted_from_zero(expected: Mapping[str, jax.ShapeDtypeStruct]) -> dict[str, np.ndarray]:
+    """What normalisers of the second format lack: they count from zero, in the summaries' units where no other is."""
+    return {
+        name: np.full(leaf.shape, name.endswith("unit"), leaf.dtype)
+        for name, leaf in expected.items()
+        if name.endswith(("normaliser.origin", "normaliser.unit"))
+    }
 
 
 def _arrays(path: Path, needed: tuple[str, ...]) -> dict[str, np.ndarray]:

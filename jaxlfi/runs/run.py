@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -15,6 +16,7 @@ from jaxlfi.bayessim.correction import CORRECTIONS
 from jaxlfi.bayessim.keys import run_keys, seed_of
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.bounds import bound_warnings
+from jaxlfi.diagnostics.resolution import resolution_warnings
 from jaxlfi.distributions.arguments import is_concrete
 from jaxlfi.distributions.belief import Belief, uninformed
 from jaxlfi.distributions.mixture import GaussianMixture
@@ -28,6 +30,7 @@ from jaxlfi.heuristics import Heuristic
 from jaxlfi.runs import folder as folders
 from jaxlfi.tasks import failures, owned
 from jaxlfi.tasks.failures import Failure, Told
+from jaxlfi.tasks.reference import counted_from, summaries_in_double
 from jaxlfi.tasks.task import Task
 
 DRAWS = 1000
@@ -79,14 +82,16 @@ class Run:
         origin: how the run is described in its config.json: task, configuration, support's name, preset.
         units: of the parameters; None where its folder does not say.
         told: what its simulations say of their failures (`failures`).
+        reference: what the network's summaries are counted from, shape [S], in double precision; None for zero
+            (`jaxlfi.tasks.reference`). `x` and those of the dataset are counted from zero.
     """
 
     belief: Belief
     history: dict[str, Array]
     dataset: Dataset
     network: Network | None
-    observed: Float[Array, "*shape"]
-    x: Float[Array, "*batch obs"]
+    observed: Float[Array | np.ndarray, "*shape"]
+    x: Float[Array | np.ndarray, "*batch obs"]
     key: jax.Array
     support: Support
     feasible: Support
@@ -97,13 +102,14 @@ class Run:
     origin: Origin = struct.field(pytree_node=False)
     units: tuple[str, ...] | None = struct.field(pytree_node=False, default=None)
     told: Told = struct.field(pytree_node=False, default=Told())
+    reference: np.ndarray | None = None
 
     @property
     def posterior(self) -> Posterior:
         """The posterior of the observation, truncated to the support the run ended with."""
         if self.network is None:
             return _truncated(self.belief.mixture, self.belief.mixture, self.belief.support, self.space)
-        return _posterior_after(self.belief, self.network, self.x)
+        return _posterior_after(self.belief, self.network, self.counted(self.x))
 
     @property
     def amortised(self) -> bool:
@@ -128,11 +134,15 @@ class Run:
             )
         if self.network is None:
             raise ValueError("posterior_of: expected a run whose network was kept (--keep-network), got none")
-        return self.conditioned(self._summary(observation))
+        return self.conditioned(self.counted(self._summary(observation)))
 
     def conditioned(self, x: Float[Array, " obs"], key: jax.Array | None = None) -> Posterior:
-        """The posterior of a summary that a run of one round would have ended with."""
+        """The posterior of a summary, `counted`, that a run of one round would have ended with."""
         return _conditioned(self.task, self.settings, self.heuristic, self.network, self.support, self.feasible, x, key)
+
+    def counted(self, x: Any) -> Any:
+        """Summaries [..., S] as the run's network takes them: counted from its reference."""
+        return counted_from(self.reference, x)
 
     @property
     def mixture(self) -> GaussianMixture:
@@ -152,7 +162,14 @@ class Run:
         """
         _require_one(self, "warnings")
         found = bound_warnings(self.space.labels, self.belief, self.feasible, grows=self.heuristic.grows)
-        return [warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in found]
+        found = [warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in found]
+        return found + resolution_warnings(self.summary_names, np.asarray(self.dataset.x)[: int(self.dataset.size)])
+
+    @property
+    def summary_names(self) -> tuple[str, ...]:
+        """Names of the summary's numbers; x_1 to x_S where the task does not name them."""
+        size = self.x.shape[-1]
+        return tuple(f"x_{s + 1}" for s in range(size)) if self.task is None else self.task.named_summaries(size)
 
     @property
     def failures(self) -> list[Failure]:
@@ -194,9 +211,12 @@ class Run:
     def _summary(self, observation: Any) -> jax.Array:
         if missing := owned.missing(observation):
             raise ValueError(f"observation: expected a number in every place, got {missing} missing (masked)")
-        observation = jnp.array(observation, jnp.float32)
+        on_host = self.task is not None and self.task.on_host
+        observation = np.array(observation, float) if on_host else jnp.array(observation, jnp.float32)
         if observation.shape == self.observed.shape and self.task is not None:
-            return _finite(self.task.summary(_finite(observation)), "a summary of finite numbers")
+            _finite(observation)
+            x = summaries_in_double(self.task, observation[None])[0] if on_host else self.task.summary(observation)
+            return _finite(x, "a summary of finite numbers")
         if observation.shape == self.x.shape:
             return _finite(observation)
         if self.task is None:

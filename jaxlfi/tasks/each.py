@@ -139,7 +139,7 @@ def _lost(error: BaseException) -> ExecutorError:
 
 def stacked(answers: Sequence[Answer], shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Trajectories [N, *shape], zero where there is none, and outcomes [N]."""
-    trajectories = np.zeros((len(answers), *shape), np.float32)
+    trajectories = np.zeros((len(answers), *shape))
     for place, answer in enumerate(answers):
         if answer.outcome >= 0:
             trajectories[place] = answer.trajectory

@@ -18,7 +18,8 @@ from jaxlfi.io import files
 from jaxlfi.tasks import owned, purity
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.journal import Journal
-from jaxlfi.tasks.simulation import trajectory_and_outcome, with_outcome
+from jaxlfi.tasks.reference import summaries_in_double
+from jaxlfi.tasks.simulation import failure_code, trajectory_and_outcome
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.trials import repeated, together
 
@@ -111,7 +112,7 @@ def _summary_size(task: Task, shape: tuple[int, ...]) -> int:
     return summary.shape[0]
 
 
-def checked(observation, shapes: Shapes) -> jax.Array:
+def checked(observation, shapes: Shapes) -> Any:
     """An observation in the shape that the simulator produces.
 
     Raises:
@@ -124,7 +125,7 @@ def checked(observation, shapes: Shapes) -> jax.Array:
         )
     if not isinstance(observation, jax.core.Tracer) and not np.isfinite(np.asarray(observation, float)).all():
         raise ValueError("observation: expected finite numbers, got some that are not")
-    return jnp.array(observation, jnp.float32)  # a copy: the given array may be changed later
+    return observation
 
 
 def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
@@ -158,14 +159,14 @@ def _at_truth(key: jax.Array, task: Task, journal: Journal):
     if not task.on_host:
         return _simulate_jit(task, key, truth)
     trajectory, outcome = task.simulate(key, np.asarray(task.space.to_natural(truth)), journal)
-    return with_outcome(task, jnp.asarray(trajectory), jnp.asarray(outcome))
+    return trajectory, failure_code(task, np.isfinite(trajectory).all(), np.asarray(outcome), np)
 
 
 _simulate_jit = jax.jit(single(trajectory_and_outcome), static_argnums=0)
 
 
-def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True) -> tuple[jax.Array, jax.Array]:
-    """The observed trajectory, checked, and its summary.
+def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True) -> tuple[Any, Any]:
+    """The observed trajectory, checked, and its summary; of a simulator on the host in double precision.
 
     Args:
         key: simulates it, where none is given and the task has none.
@@ -183,9 +184,12 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
     if observation is None:
         simulate = simulate_observation if concrete else trace_observation
         observation = simulate(key, task)
-    shapes = observed_shapes(task, np.asarray(observation)) if task.on_host else simulator_shapes(task)
-    observed = checked(observation, shapes)
-    x = jnp.asarray(task.summary(observed), jnp.float32)
+    if task.on_host:
+        observed = np.array(checked(observation, observed_shapes(task, np.asarray(observation))), float)
+        x = summaries_in_double(task, observed[None])[0]
+    else:
+        observed = jnp.array(checked(observation, simulator_shapes(task)), jnp.float32)
+        x = jnp.asarray(task.summary(observed), jnp.float32)
     if not isinstance(x, jax.core.Tracer) and not np.isfinite(np.asarray(x)).all():
         raise ValueError(f"observation: expected a finite summary, got {np.asarray(x).tolist()}")
     task.named_summaries(x.shape[-1])  # refuses names that are not the summary's
@@ -302,7 +306,7 @@ def _read_csv(path: Path) -> np.ndarray:
             raise ValueError(f"expected {width} numbers in row {number}, got {','.join(row)!r}")
     if has_heading and len(rows) == 1:
         raise ValueError("expected at least one row of numbers, got headings only")
-    table = np.array([[float(cell) for cell in row] for row in rows[has_heading:]], np.float32)
+    table = np.array([[float(cell) for cell in row] for row in rows[has_heading:]])
     return table[:, 1:] if has_heading and _is_time(rows[0][0]) and width > 1 else table
 
 
@@ -313,7 +317,7 @@ def _read_npz(path: Path) -> np.ndarray:
     array = arrays.get("trajectory", next(iter(arrays.values())))
     if array.dtype.kind not in "biuf":
         raise ValueError(f"expected real numbers, got an array of type {array.dtype}")
-    return np.asarray(array, np.float32)
+    return np.asarray(array, float)
 
 
 def _is_time(heading: str) -> bool:

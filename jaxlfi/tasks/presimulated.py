@@ -57,7 +57,7 @@ def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None 
         raise ValueError(f"simulations: expected a mapping of arrays, or an .npz file, got {arrays!r}")
     if unknown := sorted(set(arrays) - set(ARRAYS)):
         raise ValueError(f"simulations: expected arrays among {', '.join(ARRAYS)}, got {', '.join(unknown)}")
-    theta = _array(arrays, "theta", (None, task.dim))
+    theta = _array(arrays, "theta", (None, task.dim)).astype(np.float32)
     rows = len(theta)
     if rows < MIN_ROWS:
         raise ValueError(f"simulations: expected at least {MIN_ROWS}, got {rows}")
@@ -70,16 +70,19 @@ def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None 
         support = task.support(Support(low.tolist(), high.tolist()))
     x, failure = _summaries(task, arrays, rows)
     inside = np.asarray(support.contains(inner))
-    kept = inside & (np.asarray(failure) == 0)
+    kept = inside & (failure == 0)
     if not kept.any():
         raise ValueError(f"simulations: expected some inside the support, got {inside.sum()} of {rows}, none finite")
     return (
-        Simulations(inner, x, failure, jnp.asarray(inside), jnp.asarray(kept), _weights(task, arrays, inner, kept)),
+        Simulations(
+            *(inner, x, jnp.asarray(failure), jnp.asarray(inside), jnp.asarray(kept)),
+            weight=_weights(task, arrays, inner, kept),
+        ),
         support,
     )
 
 
-def _summaries(task: Task, arrays: Mapping[str, Any], rows: int) -> tuple[jax.Array, jax.Array]:
+def _summaries(task: Task, arrays: Mapping[str, Any], rows: int) -> tuple[np.ndarray, np.ndarray]:
     if ("x" in arrays) == ("trajectory" in arrays):
         raise ValueError("simulations: expected either 'trajectory' or 'x' (summaries), got both or neither")
     if "trajectory" in arrays:
@@ -91,11 +94,10 @@ def _summaries(task: Task, arrays: Mapping[str, Any], rows: int) -> tuple[jax.Ar
                 f"simulations: expected trajectories of shape {list(shape)}, as the task's simulator makes, "
                 f"got {list(trajectory.shape[1:])}"
             )
-        _, x, failure = summarised_batch(task, jnp.asarray(trajectory), jnp.zeros(rows, jnp.int32))
-        return x, failure
-    x = jnp.asarray(_array(arrays, "x", (rows, None)))
-    finite = jnp.all(jnp.isfinite(x), axis=1)
-    return jnp.where(finite[:, None], x, 0.0), jnp.where(finite, 0, len(task.reasons)).astype(jnp.int32)
+        return summarised_batch(task, trajectory, np.zeros(rows, np.int32))
+    x = _array(arrays, "x", (rows, None))
+    finite = np.isfinite(x.astype(np.float32)).all(axis=1)
+    return np.where(finite[:, None], x, 0.0), np.where(finite, 0, len(task.reasons)).astype(np.int32)
 
 
 def _weights(task: Task, arrays: Mapping[str, Any], inner: jax.Array, kept: np.ndarray) -> jax.Array:
@@ -131,4 +133,4 @@ def _numbers(value: Any, name: str) -> np.ndarray:
         array = np.zeros(0, object)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"simulations: expected numbers {name}, got an array of type {array.dtype}")
-    return array.astype(np.float32)
+    return array.astype(float)

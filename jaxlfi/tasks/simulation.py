@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from jaxlfi.tasks import owned
 from jaxlfi.tasks.each import stacked
 from jaxlfi.tasks.host import numpy_generator
 from jaxlfi.tasks.journal import Journal
+from jaxlfi.tasks.reference import counted_from, summaries_in_double
 from jaxlfi.tasks.task import Task
 
 
@@ -31,7 +33,7 @@ class Simulations:
     """
 
     theta: Float[Array, "*batch attempts dim"]
-    x: Float[Array, "*batch attempts obs"]
+    x: Float[Array | np.ndarray, "*batch attempts obs"]
     failure: Int[Array, "*batch attempts"]
     counted: Bool[Array, "*batch attempts"]
     kept: Bool[Array, "*batch attempts"]
@@ -74,15 +76,26 @@ def _code(outcome: Array) -> Array:
 
 def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, Int[Array, ""]]:
     """Turn what a simulator says of one trajectory into a failure code; non-finite numbers are a failure too."""
-    failure = jnp.where(outcome, 0, 1) if outcome.dtype == bool else outcome
+    trajectory = trajectory.astype(jnp.float32)
+    return trajectory, failure_code(task, jnp.all(jnp.isfinite(trajectory)), outcome)
+
+
+def failure_code(task: Task, finite: Any, outcome: Any, numpy: Any = jnp) -> Any:
+    """The code of the reason for which a simulation failed, 0 for success.
+
+    Args:
+        task: for the reasons.
+        finite: whether its trajectory is.
+        outcome: what the simulator says of it.
+        numpy: the module to calculate with.
+    """
+    failure = numpy.where(outcome, 0, 1) if outcome.dtype == bool else outcome
     # The simulator's own reasons, from -1 downwards, come after the task's (`HostSimulator.reasons`).
-    own, others = len(task.failures), len(task.reasons) - len(task.failures) - 1
+    named, others = len(task.failures), len(task.reasons) - len(task.failures) - 1
     # A code that stands for no reason is still a failure, and must be counted as one.
-    failure = jnp.where((failure < -others) | (failure > own), 1, failure)
-    failure = jnp.where(failure < 0, own - failure, failure)
-    finite = jnp.all(jnp.isfinite(trajectory))
-    failure = jnp.where((failure == 0) & ~finite, len(task.reasons), failure).astype(jnp.int32)
-    return trajectory.astype(jnp.float32), failure
+    failure = numpy.where((failure < -others) | (failure > named), 1, failure)
+    failure = numpy.where(failure < 0, named - failure, failure)
+    return numpy.where((failure == 0) & ~finite, len(task.reasons), failure).astype(numpy.int32)
 
 
 def summarised(task: Task, trajectory: Array, failure: Int[Array, ""]) -> tuple[Float[Array, " obs"], Int[Array, ""]]:
@@ -147,17 +160,18 @@ def simulate_batch(
         journal: of simulations that are made one by one.
 
     Returns:
-        Trajectories [N, ...], summaries [N, S] (zero where failed) and failure codes [N], 0 for success.
+        Trajectories [N, ...], summaries [N, S] (zero where failed) and failure codes [N], 0 for success; of a simulator
+        on the host in double precision.
 
     Raises:
         SimulatorError: from a host simulator that breaks its contract.
     """
     if task.on_host:
         rows = np.ones(len(theta), bool) if wanted is None else wanted
-        trajectories, outcomes = np.zeros((len(theta), *shape), np.float32), np.ones(len(theta), int)
+        trajectories, outcomes = np.zeros((len(theta), *shape)), np.ones(len(theta), int)
         natural = np.asarray(task.space.to_natural(theta))
         trajectories[rows], outcomes[rows] = _on_host(task, key, natural, shape, rows, journal)
-        return jax.device_get(summarised_batch(task, trajectories, outcomes))
+        return trajectories, *summarised_batch(task, trajectories, outcomes)
     return jax.device_get(_simulate_batch(task, jax.random.split(key, len(theta)), theta))
 
 
@@ -174,11 +188,22 @@ def _simulate_batch(task: Task, keys: jax.Array, theta: Array):
     return jax.vmap(lambda key, theta: _with_summary(task, *trajectory_and_outcome(task, key, theta)))(keys, theta)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-@single
-def summarised_batch(task: Task, trajectories: Array, outcomes: Array) -> tuple[Array, Array, Array]:
-    """What a host simulator gave, as trajectories [N, ...], summaries [N, S] and failure codes [N]."""
-    return jax.vmap(lambda *one: _with_summary(task, *with_outcome(task, *one)))(trajectories, outcomes)
+def summarised_batch(task: Task, trajectories: np.ndarray, outcomes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Summaries [N, S] of what a host simulator gave, in double precision and zero where failed, and failure codes [N].
+
+    Numbers that single precision cannot hold count as not finite.
+    """
+    finite = lambda values: np.isfinite(_rounded(values)).reshape(len(values), -1).all(axis=1)
+    failure = failure_code(task, finite(trajectories), outcomes, np)
+    valid = (failure == 0).reshape(-1, *[1] * (trajectories.ndim - 1))
+    x = summaries_in_double(task, np.where(valid, trajectories, 1.0))
+    failure = np.where((failure == 0) & ~finite(x), len(task.reasons), failure)
+    return np.where((failure == 0)[:, None], x, 0.0), failure
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
 
 
 def _with_summary(task: Task, trajectory: Array, failure: Array):
@@ -192,6 +217,7 @@ def simulate_in_waves(
     wanted: int,
     shape: Sequence[int],
     journal: Journal | None = None,
+    reference: np.ndarray | None = None,
 ) -> Simulations:
     """Simulate on the host, in the order of theta, until enough have succeeded or all are spent.
 
@@ -206,10 +232,11 @@ def simulate_in_waves(
         wanted: how many successes.
         shape: of a trajectory.
         journal: of simulations that are made one by one.
+        reference: what summaries are counted from, shape [S] (`jaxlfi.tasks.reference`); by default from zero.
     """
     natural = np.asarray(task.space.to_natural(theta))
     budget, each = len(natural), task.simulate.each
-    trajectories = np.zeros((budget, *shape), np.float32)
+    trajectories = np.zeros((budget, *shape))
     outcomes = np.full(budget, 1)  # what was not attempted is no success
     rng = None if each else numpy_generator(key)
     done, successes = 0, 0
@@ -221,7 +248,8 @@ def simulate_in_waves(
         else:
             wave = slice(done, min(budget, done + wanted - successes))
             trajectories[wave], outcomes[wave] = task.simulate.batch(rng, natural[wave], shape)
-        _, x, failure = summarised_batch(task, trajectories, outcomes)
+        x, failure = summarised_batch(task, trajectories, outcomes)
         done = wave.stop
-        successes = int(np.sum(np.asarray(failure)[:done] == 0))
-    return within_budget(jnp.asarray(theta), x, failure, wanted)
+        successes = int(np.sum(failure[:done] == 0))
+    x = np.where((failure == 0)[:, None], counted_from(reference, x), 0.0).astype(np.float32)
+    return within_budget(jnp.asarray(theta), jnp.asarray(x), jnp.asarray(failure), wanted)

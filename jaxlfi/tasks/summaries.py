@@ -30,8 +30,9 @@ def series(trajectory: Float[Array, "time channels"]) -> Float[Array, " obs"]:
         trajectory: shape [T, C], T >= 3.
     """
     count, channels = trajectory.shape
-    mean = jnp.mean(trajectory, axis=0)
-    centred = trajectory - mean
+    start = trajectory[0]  # counted from it, a large offset costs no precision
+    mean = jnp.mean(trajectory - start, axis=0)
+    centred = trajectory - start - mean
     variance = jnp.sum(centred**2, axis=0) / (count - 1)
     constant = jnp.all(trajectory == trajectory[0], axis=0)
     variance = jnp.where(constant, 0.0, variance)
@@ -39,7 +40,7 @@ def series(trajectory: Float[Array, "time channels"]) -> Float[Array, " obs"]:
     memory = [jnp.sum(standardised[lag:] * standardised[:-lag], axis=0) / (count - 1) for lag in (1, 2)]
     first, second = np.triu_indices(channels, 1)
     coupling = jnp.sum(standardised[:, first] * standardised[:, second], axis=0) / (count - 1)
-    return jnp.concatenate([mean, jnp.log1p(variance), jnp.stack(memory, axis=-1).ravel(), coupling])
+    return jnp.concatenate([start + mean, jnp.log1p(variance), jnp.stack(memory, axis=-1).ravel(), coupling])
 
 
 def cross_correlation(trajectory: Float[Array, "time columns"], actions: int) -> Float[Array, " obs"]:
@@ -63,7 +64,8 @@ def cross_correlation(trajectory: Float[Array, "time columns"], actions: int) ->
         raise ValueError(f"actions: expected some of the {trajectory.shape[-1]} columns, got {actions}")
     states, applied = jnp.split(trajectory, [trajectory.shape[-1] - actions], axis=-1)
     products = jnp.einsum("ti,tj->ij", states, applied)
-    return jnp.concatenate([products.ravel(), jnp.mean(states, axis=0), jnp.std(states, axis=0)])
+    spread = states - states[0]  # counted from the first, a large offset costs no precision
+    return jnp.concatenate([products.ravel(), states[0] + jnp.mean(spread, axis=0), jnp.std(spread, axis=0)])
 
 
 def one_after_another(summary: Summary, trials: int, trajectory: Float[Array, "..."]) -> Float[Array, " obs"]:

@@ -105,7 +105,7 @@ def together(trials: Sequence[Any]) -> np.ndarray:
     Raises:
         ValueError: for none, or trajectories of different shapes.
     """
-    arrays = [np.array(trial, np.float32) for trial in trials]
+    arrays = [np.array(trial) for trial in trials]
     shapes = sorted({array.shape for array in arrays})
     if len(shapes) != 1 or shapes[0] == ():
         raise ValueError(f"observation: expected trials of one shape [T, ...], got {[list(shape) for shape in shapes]}")
@@ -113,8 +113,8 @@ def together(trials: Sequence[Any]) -> np.ndarray:
 
 
 STATISTICS: dict[str, Callable[[Array], Array]] = {
-    "mean": functools.partial(jnp.mean, axis=0),
-    "sd": functools.partial(jnp.std, axis=0, ddof=1),
+    "mean": lambda each: each[0] + jnp.mean(each - each[0], axis=0),
+    "sd": lambda each: jnp.std(each - each[0], axis=0, ddof=1),  # exact where the trials are nearly equal
 }
 """Statistics of the trials' summaries [n, S], each a vector [S]."""
 

@@ -14,7 +14,7 @@ from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.base import untrained
 from jaxlfi.estimators.flow_estimators import MaskedFlow, SplineFlow
 from jaxlfi.estimators.mixture_network import MixtureNetwork
-from jaxlfi.estimators.normaliser import Normaliser
+from jaxlfi.estimators.normaliser import identity
 from jaxlfi.estimators.posterior import Posterior, truncated
 
 X = jnp.array([0.4, 0.5, -0.7])
@@ -63,10 +63,12 @@ def perturbed(name: str) -> Posterior:
         noisy = [leaf + 0.3 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
         network = network.replace(
             params=jax.tree.unflatten(structure, noisy),
-            normaliser=Normaliser(jnp.array([1.0, 0.0, -1.0]), jnp.array([2.0, 1.0, 0.5]), "zscore"),
+            normaliser=identity(3, "zscore").replace(
+                mean=jnp.array([1.0, 0.0, -1.0]), scale=jnp.array([2.0, 1.0, 0.5])
+            ),
         )
         if network.theta_normaliser is not None:
-            narrow = Normaliser(jnp.array([0.2, -0.3]), jnp.array([0.15, 0.5]), "zscore")
+            narrow = identity(2, "zscore").replace(mean=jnp.array([0.2, -0.3]), scale=jnp.array([0.15, 0.5]))
             network = network.replace(theta_normaliser=narrow)
         return network.condition(X, box)
 

@@ -1,4 +1,4 @@
-"""Normalisers, against NumPy over the valid rows."""
+"""Normalisers, against NumPy over the valid rows; what units and offsets of a summary must not change."""
 
 import jax
 import jax.numpy as jnp
@@ -8,33 +8,82 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from jaxlfi.estimators.normaliser import TRANSFORMS, UNITS, Normaliser, fit_normaliser
+from jaxlfi.estimators.normaliser import (
+    ORIGINS,
+    TRANSFORMS,
+    UNITS,
+    Normaliser,
+    fit_normaliser,
+    identity,
+    some_rows,
+    standardiser,
+)
 from tests.strategies import vectors
 
 NUMPY = {"zscore": lambda x: x, "asinh": np.arcsinh}
+ROWS = 400
+DRAWN = {
+    "normal": lambda g: g.normal(50.0, 2.0, ROWS),
+    "uniform": lambda g: g.uniform(-10.0, 10.0, ROWS),
+    "upwards": lambda g: g.lognormal(0.0, 2.0, ROWS),
+    "downwards": lambda g: -g.lognormal(0.0, 2.0, ROWS),
+    "both sides": lambda g: g.standard_cauchy(ROWS),
+    "counts": lambda g: g.poisson(3.0, ROWS).astype(float),
+    "often zero": lambda g: np.where(g.uniform(size=ROWS) < 0.3, 0.0, g.lognormal(3.0, 2.0, ROWS)),
+}
+fit = jax.jit(fit_normaliser, static_argnums=(0, 3))
+
+
+def drawn(name, seed=0):
+    return DRAWN[name](np.random.default_rng(seed))
+
+
+def seen(name, x):
+    """A summary as a network sees it, in single precision throughout; all rows count."""
+    x = jnp.asarray(x, jnp.float32)[:, None]
+    return np.asarray(fit(name, x, jnp.ones(len(x), bool))(x))[:, 0]
 
 
 def test_all_transforms_are_tested():
-    assert set(TRANSFORMS) == {*NUMPY, "none", "fitted-asinh"}
+    assert set(TRANSFORMS) == {*NUMPY, "none"}
 
 
 @pytest.mark.parametrize("name", NUMPY)
 @given(x=vectors(-50.0, 900.0, 12, 3), size=st.integers(1, 12), junk=st.sampled_from([0.0, 1e30, np.nan, np.inf]))
 def test_against_numpy_over_valid_rows_only(name, x, size, junk):
-    values = NUMPY[name](x[:size].astype(np.float64))
-    mean, scale = values.mean(0), values.std(0)
     filled = x.copy()
     filled[size:] = junk
-    normaliser = fit_normaliser(name, jnp.asarray(filled), jnp.arange(12) < size)
-    np.testing.assert_allclose(normaliser.mean, mean, rtol=1e-5, atol=1e-4)
+    normaliser = fit(name, jnp.asarray(filled), jnp.arange(12) < size)
+    origin, unit = np.asarray(normaliser.origin, float), np.asarray(normaliser.unit, float)
+    assert (unit > 0).all() and (normaliser.scale > 0).all()
+    values = NUMPY[name]((x[:size] - origin) / unit)
+    np.testing.assert_allclose(normaliser.mean, values.mean(0), rtol=1e-4, atol=1e-4 * np.abs(values).max() + 1e-30)
     for d in range(3):
-        if scale[d] > 1e-3 * (1 + abs(mean[d])):
-            np.testing.assert_allclose(normaliser.scale[d], scale[d], rtol=1e-2)
-        elif scale[d] == 0:
-            # A constant summary is centred only (rounding of the mean may leave a residue, but no division by
-            # it).
-            assert float(normaliser.scale[d]) == 1.0
-    assert bool(jnp.all(normaliser.scale > 0))
+        if np.ptp(x[:size, d]) > 1e-3 * np.abs(x[:size, d]).max():
+            np.testing.assert_allclose(normaliser.scale[d], values[:, d].std(), rtol=1e-2)
+        elif np.ptp(x[:size, d]) == 0:
+            assert normaliser.scale[d] == np.inf
+
+
+@pytest.mark.parametrize("name", NUMPY)
+@given(
+    kind=st.sampled_from(sorted(DRAWN)),
+    power=st.integers(-12, 12),
+    sign=st.sampled_from([-1, 1]),
+    digits=st.integers(0, 3),
+    seed=st.integers(0, 9),
+)
+def test_neither_unit_nor_offset_of_a_summary_changes_what_a_network_sees(name, kind, power, sign, digits, seed):
+    """The offset has so many digits more than the spread of most values; single precision leaves four for that."""
+    x = drawn(kind, seed)
+    middle = np.subtract(*np.quantile(x, [0.75, 0.25]))
+    plain = seen(name, x)
+    other = seen(name, 10.0**power * sign * x)
+    np.testing.assert_allclose(other, sign * plain, atol=2e-3 * np.abs(plain).max())
+    moved = seen(name, 10.0**power * (x + 10.0**digits * middle))
+    inner = np.argsort(x)[ROWS // 8 : -ROWS // 8]  # a rounded offset may swap what lies close together at a sharp end
+    assert np.corrcoef(moved, plain)[0, 1] > 0.99
+    np.testing.assert_allclose(moved[inner], plain[inner], atol=0.05)
 
 
 def test_normalised_rows_have_zero_mean_and_unit_spread():
@@ -46,18 +95,15 @@ def test_normalised_rows_have_zero_mean_and_unit_spread():
     assert np.corrcoef(z[:, 0], x[:, 0])[0, 1] > 0.999
 
 
-def test_a_constant_summary_is_centred_only():
-    x = jnp.stack([jnp.full(5, 7.0), jnp.arange(5.0)], axis=1)
-    normaliser = fit_normaliser("zscore", x, jnp.ones(5, bool))
-    np.testing.assert_allclose(normaliser.scale, [1.0, np.sqrt(2.0)], rtol=1e-6)
-    np.testing.assert_allclose(normaliser(jnp.array([9.0, 2.0])), [2.0, 0.0], atol=1e-6)
-
-
-def test_asinh_is_applied_before_centring():
-    normaliser = Normaliser(jnp.array([1.0, 0.0]), jnp.array([2.0, 1.0]), "asinh")
-    x = jnp.array([1e6, -3.0])
-    expected = [(np.arcsinh(1e6) - 1) / 2, -np.arcsinh(3.0)]
-    np.testing.assert_allclose(normaliser(x), expected, rtol=1e-6)
+@pytest.mark.parametrize("name", NUMPY)
+@pytest.mark.parametrize("value", [0.0, 7.1, -1e-12, 101325.0, 3e12])
+def test_a_summary_that_does_not_vary_says_nothing_whatever_is_observed(name, value):
+    rounding = value * np.array([1.0, 1 + 1e-7, 1.0, 1 - 1e-7, 1.0])
+    x = jnp.asarray(np.stack([rounding, np.arange(5.0)], axis=1), jnp.float32)
+    normaliser = fit_normaliser(name, x, jnp.ones(5, bool))
+    for observed in (value, value + 10, -1e20):
+        z = np.asarray(normaliser(jnp.array([observed, 4.0])))
+        assert z[0] == 0 and abs(z[1]) > 1
 
 
 def test_none_changes_nothing():
@@ -67,60 +113,68 @@ def test_none_changes_nothing():
 
 
 def test_a_normaliser_is_a_pytree_that_knows_its_transform():
-    normaliser = fit_normaliser("asinh", jnp.array([[5.0], [9.0]]), jnp.ones(2, bool))
-    assert [leaf.shape for leaf in jax.tree.leaves(normaliser)] == [(1,), (1,)]
+    normaliser = Normaliser(*jnp.array([[1.0], [2.0]]), "asinh", *jnp.array([[5.0], [4.0]]))
+    assert [leaf.shape for leaf in jax.tree.leaves(normaliser)] == [(1,)] * 4
     doubled = jax.tree.map(lambda leaf: 2 * leaf, normaliser)
     assert doubled.name == "asinh"
     x = jnp.array([[3.0]])
+    np.testing.assert_allclose(normaliser(x), (np.arcsinh((3.0 - 5.0) / 4.0) - 1.0) / 2.0, rtol=1e-6)
     np.testing.assert_allclose(jax.jit(lambda n, x: n(x))(doubled, x), doubled(x), rtol=1e-6)
-    np.testing.assert_allclose(doubled(x), (np.arcsinh(3.0) - doubled.mean[None]) / doubled.scale, rtol=1e-6)
 
 
-def test_no_rows_at_all_leave_summaries_as_they_are():
-    normaliser = fit_normaliser("zscore", jnp.full((3, 2), 5.0), jnp.zeros(3, bool))
-    np.testing.assert_array_equal(normaliser.mean, [0, 0])
-    np.testing.assert_array_equal(normaliser.scale, [1, 1])
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_no_rows_at_all_leave_summaries_as_they_are(name):
+    normaliser = fit_normaliser(name, jnp.full((3, 2), jnp.nan), jnp.zeros(3, bool))
+    assert jax.tree.structure(normaliser) == jax.tree.structure(identity(2, name))
+    for leaf, expected in zip(jax.tree.leaves(normaliser), jax.tree.leaves(identity(2, name)), strict=True):
+        np.testing.assert_array_equal(leaf, expected)
 
 
-def log_likelihood(x, unit):
+def log_likelihood(x, origin, unit):
     """Of one summary's values, as normal variables after asinh, up to a constant: density by change of variables."""
-    values = np.arcsinh(x / unit)
-    density = stats.norm(values.mean(), values.std()).logpdf(values) - 0.5 * np.log(unit**2 + x**2)
+    values = np.arcsinh((x - origin) / unit)
+    density = stats.norm(values.mean(), values.std()).logpdf(values) - 0.5 * np.log(unit**2 + (x - origin) ** 2)
     return density.mean()
 
 
-TAILS = {
-    "normal": lambda g: g.normal(50.0, 2.0, 400),
-    "uniform": lambda g: g.uniform(-10.0, 10.0, 400),
-    "positive": lambda g: g.lognormal(0.0, 2.0, 400),
-    "both sides": lambda g: g.standard_cauchy(400),
-}
+@pytest.mark.parametrize("kind", ["normal", "uniform", "upwards", "downwards", "both sides"])
+def test_origin_and_unit_of_asinh_are_the_likeliest(kind):
+    x = drawn(kind).astype(np.float32)
+    some = np.asarray(some_rows(jnp.asarray(x[:, None]), jnp.ones(ROWS, bool)), float)[:, 0]
+    heights = [
+        log_likelihood(some, origin, unit)
+        for origin in np.quantile(some, ORIGINS, method="lower")
+        for unit in np.quantile(np.abs(some - origin), 0.5, method="lower") * UNITS
+    ]
+    found = fit("asinh", jnp.asarray(x[:, None]), jnp.ones(ROWS, bool))
+    np.testing.assert_allclose(
+        log_likelihood(some, float(found.origin[0]), float(found.unit[0])), max(heights), atol=1e-3
+    )
 
 
-@pytest.mark.parametrize("name", TAILS)
-@pytest.mark.parametrize("factor", [1.0, 1e-4, 1e5])
-def test_the_unit_of_asinh_is_the_likeliest_whatever_the_units_of_a_summary(name, factor):
-    x = factor * TAILS[name](np.random.default_rng(0))
-    filled = np.concatenate([x, np.full(100, np.nan)]).astype(np.float32)
-    found = fit_normaliser("fitted-asinh", jnp.asarray(filled[:, None]), jnp.arange(500) < 400)
-    units = np.median(np.abs(x)) * UNITS
-    best = max(log_likelihood(x, unit) for unit in units)
-    np.testing.assert_allclose(log_likelihood(x, float(found.unit[0])), best, atol=1e-3)
-    seen = np.asarray(found(jnp.asarray(filled[:400, None])))[:, 0]
-    expected = np.arcsinh(x / float(found.unit[0]))
-    np.testing.assert_allclose(seen, (expected - expected.mean()) / expected.std(), atol=2e-3)
-    tails = found.unit[0] / np.median(np.abs(x))
-    assert tails >= 10 if name in ("normal", "uniform") else tails < 5
+@pytest.mark.parametrize(("kind", "most"), [("upwards", 0.3), ("downwards", 0.3), ("both sides", 0.5), ("normal", 0.5)])
+def test_what_has_tails_becomes_about_normal(kind, most):
+    values = seen("asinh", drawn(kind))
+    assert abs(stats.skew(values)) < most and abs(stats.kurtosis(values)) < 2
 
 
-def test_a_fitted_unit_survives_summaries_that_do_not_vary_and_no_rows():
-    for x, valid in [(jnp.zeros((5, 1)), jnp.ones(5, bool)), (jnp.full((5, 1), jnp.nan), jnp.zeros(5, bool))]:
-        normaliser = fit_normaliser("fitted-asinh", x, valid)
-        np.testing.assert_array_equal(normaliser(jnp.zeros(1)), 0)
-        assert np.isfinite(normaliser(jnp.ones(1))).all()
+def test_rows_are_chosen_evenly_among_the_valid_ones_whatever_their_period():
+    valid = np.arange(1000) % 3 == 0
+    rows = np.asarray(some_rows(jnp.arange(1000.0)[:, None], jnp.asarray(valid)))[:, 0]
+    assert valid[rows.astype(int)].all()
+    assert stats.kstest(rows / 1000, "uniform").statistic < 0.02
+    assert len(np.unique(rows // 3 % 8)) == 8
 
 
-def test_records_have_one_fitted_unit():
+def test_records_have_one_normaliser():
     x = jnp.asarray(np.random.default_rng(1).lognormal(0.0, 1.0, (30, 6)), jnp.float32)
-    unit = np.asarray(fit_normaliser("fitted-asinh", x, jnp.ones(30, bool), record_size=2).unit)
-    np.testing.assert_array_equal(unit, np.tile(unit[:2], 3))
+    normaliser = fit_normaliser("asinh", x, jnp.ones(30, bool), 2)
+    for leaf in jax.tree.leaves(normaliser):
+        np.testing.assert_array_equal(leaf, np.tile(leaf[:2], 3))
+
+
+def test_parameters_are_standardised_also_where_they_do_not_vary():
+    values = jnp.array([[0.5, -0.2], [0.5, 0.4], [9.0, 9.0]])
+    normaliser = standardiser(values, jnp.array([True, True, False]))
+    np.testing.assert_allclose(normaliser.mean, [0.5, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(normaliser.scale, [1.0, 0.3], rtol=1e-6)

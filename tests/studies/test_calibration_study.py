@@ -20,7 +20,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.base import untrained
 from jaxlfi.estimators.mixture_network import MixtureNetwork
-from jaxlfi.estimators.normaliser import Normaliser
+from jaxlfi.estimators.normaliser import identity
 from jaxlfi.figures import calibration, checks, intervals, page, style
 from jaxlfi.figures.collection import Collection
 from jaxlfi.figures.history import History
@@ -61,7 +61,8 @@ def make(out, support: str, heuristic, rounds: int, scale: float = 1.0, shift: f
         empty = {"theta": nothing, "x": nothing, "round": np.zeros(0, np.int32), "weight": np.zeros(0, np.float32)}
         atomic.write_arrays(beside / "dataset.npz", empty)
         network = untrained(jax.random.key(0), FAST, len(X), task.inference.feasible, task.space)
-        wrong = Normaliser(np.full(2, shift, np.float32), np.full(2, scale, np.float32), network.normaliser.name)
+        moments = {"mean": np.full(2, shift, np.float32), "scale": np.full(2, scale, np.float32)}
+        wrong = identity(2, network.normaliser.name).replace(**moments)
         atomic.write_arrays(beside / "network.npz", trees.to_arrays(network.replace(normaliser=wrong)))
 
     run_store.create(out, config, fill)

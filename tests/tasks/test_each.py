@@ -173,7 +173,7 @@ def test_trials_are_made_together():
     _, outcome = Trials(lambda rng, theta: (theta, next(later)), 3)(None, np.zeros(2))
     assert outcome == 3  # the first failure's
     own = generator(np.asarray(jax.random.key_data(KEY)).tolist(), 0)
-    np.testing.assert_array_equal(trajectories[0, :2], Troubled()(own, np.asarray(THETA[0])).astype(np.float32))
+    np.testing.assert_array_equal(trajectories[0, :2], Troubled()(own, np.asarray(THETA[0])))
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ def test_arrays_are_read_as_they_are(tmp_path):
     }.items():
         np.savez(tmp_path / f"{name}.npz", **arrays)
         got = read(tmp_path / f"{name}.npz")
-        assert got.dtype == np.float32
+        assert got.dtype == np.float64
         np.testing.assert_array_equal(got, next(iter(arrays.values())))
 
 
@@ -192,7 +192,6 @@ def test_summaries_that_are_no_vectors_are_reported_in_one_line(summary):
 def test_observations_have_the_simulators_shape_and_are_finite():
     shapes = simulator_shapes(task())
     taken = checked(VALUES.astype(np.float64), shapes)
-    assert taken.dtype == jnp.float32
     np.testing.assert_array_equal(taken, VALUES)
     for wrong in (COLUMN, VALUES[:3], 1.0):
         with pytest.raises(ValueError, match=r"^observation: expected the shape the simulator produces, \[4\], got"):

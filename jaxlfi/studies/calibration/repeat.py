@@ -59,7 +59,7 @@ def run_inputs(run: Run, plan: CalibrationPlan, observed: jax.Array, x: jax.Arra
     """
     support = jax.tree.map(jnp.asarray, run.support)
     support, heuristic = (stack([tree] * len(x)) for tree in (support, run.heuristic))
-    return RunInputs(_keys(plan, RUNS, first, len(x)), support, heuristic, jnp.asarray(observed), jnp.asarray(x))
+    return RunInputs(_keys(plan, RUNS, first, len(x)), support, heuristic, observed, x)
 
 
 def described(key: jax.Array, truth: jax.Array, posterior: Posterior, draws: int) -> dict[str, jax.Array]:
@@ -86,7 +86,8 @@ def amortised_chunks(run: Run, plan: CalibrationPlan) -> Chunk:
     def chunk(truths: Mapping[str, np.ndarray], first: int):
         began = time.perf_counter()
         keys = _keys(plan, DRAWS, first, len(truths["x"]))
-        found = jax.device_get(_by_network(run, keys, truths["theta"], truths["x"], plan.draws))
+        x = run.counted(truths["x"])
+        found = jax.device_get(_by_network(run, keys, truths["theta"], x, plan.draws))
         return found, time.perf_counter() - began
 
     return chunk
@@ -101,8 +102,8 @@ def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) ->
         compiled = lambda seconds: progress.compiled(seconds) if first == 0 else None
         rounds = range(run.settings.rounds)
         state = drive(engine, engine.start(), rounds, lambda *_: progress.advance(), compiled)
-        keys = _keys(plan, DRAWS, first, len(truths["x"]))
-        found = jax.device_get(_by_states(keys, truths["theta"], truths["x"], engine.fetch(state), plan.draws))
+        keys, x = _keys(plan, DRAWS, first, len(truths["x"])), np.asarray(engine.inputs.x)[: len(truths["x"])]
+        found = jax.device_get(_by_states(keys, truths["theta"], x, engine.fetch(state), plan.draws))
         return found, time.perf_counter() - began
 
     return chunk

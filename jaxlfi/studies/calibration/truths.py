@@ -65,10 +65,11 @@ def _simulated(
 ) -> dict[str, np.ndarray]:
     """Truths by any way to draw them, each with a simulation."""
     missing = np.ones(count, bool)
+    precision = np.float64 if task.on_host else np.float32
     arrays = {
         "theta": np.zeros((count, task.dim), np.float32),
-        "observed": np.zeros((count, *shapes.trajectory), np.float32),
-        "x": np.zeros((count, shapes.summary), np.float32),
+        "observed": np.zeros((count, *shapes.trajectory), precision),
+        "x": np.zeros((count, shapes.summary), precision),
     }
     failed = np.zeros(len(task.reasons), int)
     for attempt in range(TRIES):

@@ -1,0 +1,54 @@
+"""Summaries in double precision, as differences from a reference that single precision can hold.
+
+Networks are trained in single precision, of which seven digits may be too few: a mains frequency near 50 Hz that varies
+by 0.1 mHz, a pressure near 101,325 Pa that varies by 0.01 Pa. What a simulator on the host gives has more digits. Its
+summaries are computed in double precision and the observed one is subtracted before they are rounded.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxlfi.tasks.task import Task
+
+
+def summaries_in_double(task: Task, trajectories: np.ndarray) -> np.ndarray:
+    """Summaries of trajectories [N, ...] as float64, shape [N, S]; as precise as `task.summary` calculates."""
+    try:
+        with jax.enable_x64(True):
+            return np.asarray(_summaries(task.summary, np.asarray(trajectories, np.float64)), np.float64)
+    except TypeError:  # of a summary that mixes types by functions of jax.lax: it takes single precision only
+        return np.asarray(_summaries(task.summary, np.asarray(trajectories, np.float32)), np.float64)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _summaries(summary: Any, trajectories: jax.Array) -> jax.Array:
+    return jax.vmap(summary)(trajectories)
+
+
+def reference_of(x: np.ndarray, record_size: int = 0) -> np.ndarray:
+    """What summaries are counted from: the observed one.
+
+    Args:
+        x: the observed summary, shape [S].
+        record_size: where it is not 0, the summary is records of so many numbers that are counted from the same, their
+            mean (`Normaliser`).
+    """
+    x = np.asarray(x, np.float64)
+    if not 0 < record_size < x.size:
+        return x
+    return np.tile(x.reshape(-1, record_size).mean(axis=0), x.size // record_size)
+
+
+def raw(x: Any, size: int, reference: np.ndarray | None) -> Any:
+    """Summaries [C, S] counted from a reference as the simulator gave them, of which the first `size` are filled."""
+    if reference is None:
+        return x
+    return np.where(np.arange(len(x))[:, None] < size, np.asarray(x, np.float64) + reference, 0.0)
+
+
+def counted_from(reference: np.ndarray | None, x: Any) -> Any:
+    """Summaries less a reference, rounded to single precision; as they are where there is no reference."""
+    return x if reference is None else np.asarray(np.asarray(x, np.float64) - reference, np.float32)
