@@ -188,14 +188,15 @@ def check_effect(spec: mujoco.MjSpec, one: Edit, support: tuple[float, float]) -
             raise ValueError(
                 f"parameters: {one.name!r}: MuJoCo refuses a model with {number:g}: {' '.join(str(error).split())}"
             ) from error
-    if _bytes(compiled[0]) == _bytes(compiled[1]):
+    if saved(compiled[0]) == saved(compiled[1]):
         raise ValueError(
             f"parameters: {one.name!r}: expected a number that the model depends on: it is the same with "
             f"{support[0]:g} and {support[1]:g} (another attribute may override it, as an explicit inertial a density)"
         )
 
 
-def _bytes(model: mujoco.MjModel) -> bytes:
+def saved(model: mujoco.MjModel) -> bytes:
+    """All of a compiled model."""
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()

@@ -21,7 +21,9 @@ from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.worker import OneOfBatch
 
 CHUNK = 128
-"""Models that are rolled out in one call, which bounds the memory of their states."""
+"""Models that are rolled out in one call, at most."""
+BYTES = 2**27
+"""Of states, sensors and controls in one call, about; where a single model needs more, it is rolled out alone."""
 UNSTABLE, REFUSED = 1, 2
 """Why a simulation fails, as `FAILURES` numbers it."""
 FAILURES = ("unstable", "refused by MuJoCo")
@@ -194,8 +196,9 @@ class Simulator:
         lacking = np.zeros((len(theta), 0)) if lacking is None else lacking
         rows, outcome = np.zeros((len(theta), *self.observation.shape)), np.zeros(len(theta), int)
         with _LOCK, quietly():
-            for first in range(0, len(theta), CHUNK):
-                part = slice(first, first + CHUNK)
+            chunk = self._chunk()
+            for first in range(0, len(theta), chunk):
+                part = slice(first, first + chunk)
                 rows[part], outcome[part] = self._rolled(theta[part], lacking[part])
         for signal, d in self.does.biases:
             rows[:, :, signal] += theta[:, d, None]
@@ -218,6 +221,13 @@ class Simulator:
         with _LOCK, quietly():
             states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self.model), start, controls)
         return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
+
+    def _chunk(self) -> int:
+        """Models in one call, so that long recordings need no more memory than short ones."""
+        model = self.model
+        numbers = mujoco.mj_stateSize(model, STATE) + model.nsensordata + model.nu
+        steps = max(len(self.grid(times)) for times in self.times)
+        return int(np.clip(BYTES // (8 * numbers * steps), 1, CHUNK))
 
     def _rolled(self, theta: np.ndarray, lacking: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         models = [self._made(*rows) for rows in zip(theta, lacking, strict=True)]
