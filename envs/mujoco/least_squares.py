@@ -58,7 +58,7 @@ class Fit:
         interval: 90 % interval of each parameter, in natural units, within the box; NaN where the recording does not
             inform it. Shape [D, 2].
         uninformed: directions in inference space that the recording does not inform, shape [D, K].
-        at_bound: which parameters ended on a bound of the box, shape [D].
+        at_bound: which parameters ended on a bound of the box, of those that the simulation depends on, shape [D].
         discrepancies: of each signal: what the model, by its own integrator, gets wrong at the point.
         unmodelled_force: how large forces besides the model's own would leave such residuals, those of its own
             integrator, as a fraction of what acts on each joint at the centre of Theta_0.
@@ -182,7 +182,8 @@ def fit(task: Task, start: Sequence[float], box: Support | None = None, observat
     discrepancies = _discrepancies(residuals, found.fun - defect)
     interval = intervals(residuals, found.x, np.sqrt(np.diagonal(covariance)), uninformed, low, high)
     margin = 10 * STEP * (high - low)
-    at_bound = ((found.x - low < margin) | (high - found.x < margin)) & np.isfinite(interval).all(axis=1)
+    moved = informed.untouched(uninformed_directions(found.jac, high - low).T / (high - low))
+    at_bound = moved & ((found.x - low < margin) | (high - found.x < margin))
     misfit = float(np.sqrt(np.mean(found.fun**2)))
     added = float(np.sqrt(np.mean(defect**2)))
     return Fit(

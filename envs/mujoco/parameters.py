@@ -3,6 +3,7 @@
 | name | what |
 |---|---|
 | `joint/hinge/damping`, `geom/foot/friction[0]`, `actuator/motor/gear[0]` | attributes of elements |
+| `actuator/0/gear[0]` | of the model's first actuator, which needs no name |
 | `body/link/mass`, `body/link/inertia[1]`, `body/link/ipos[0]` | of a body as a whole, though its geoms make it up |
 | `option/gravity[0]` | of all of it |
 | `initial/hinge/qpos`, `initial/hinge/qvel`, `initial/box/qpos[2]` | the state that episodes begin in |
@@ -119,6 +120,8 @@ def _found(spec: mujoco.MjSpec, element: str, name: str) -> Any:
     if kind not in KINDS or not own:
         raise ValueError(f"parameters: {name!r}: expected one that begins with {near(kind, [*KINDS, 'option'])}")
     found = getattr(spec, kind)(own)
+    if found is None and kind == "actuator" and own.isdecimal() and int(own) < len(spec.actuators):
+        return spec.actuators[int(own)]  # which need not have a name
     if found is None:
         several = {"body": "bodies", "equality": "equalities"}.get(kind, f"{kind}s")
         names = [one.name for one in getattr(spec, several) if one.name]

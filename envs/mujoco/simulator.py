@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.envs.mujoco import measured
+from jaxlfi.envs.mujoco.columns import controls_of
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import STATE, Effects
 from jaxlfi.envs.mujoco.forces import UnmodelledForces, typical
@@ -41,7 +42,7 @@ class Simulator:
         signals: that are measured, C of them.
         units: of the signals; "" where the sensor does not say.
         noise: standard deviation of each signal's noise, shape [C]; 0 where it is inferred.
-        actuators: names of the controls.
+        actuators: names of the controls (`columns`).
         places: of the signals among the model's sensor data, C of them.
         discrepancies: what the model gets wrong, by the signal's number.
         forces: that the model lacks, if any are drawn (`lacking`).
@@ -83,7 +84,7 @@ class Simulator:
         self.noise = np.array([noise[name] for name in signals])
         self.discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
         self.forces: UnmodelledForces | None = None
-        self.actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
+        self.actuators = controls_of(model)
         rows = [self._measured_rows(log) for log in logs]
         self.times = [log.times[own] for log, own in zip(logs, rows, strict=True)]
         recorded = np.concatenate(

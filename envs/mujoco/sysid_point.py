@@ -6,7 +6,7 @@ import io
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxlfi.envs.mujoco.informed import NORMAL
+from jaxlfi.envs.mujoco.informed import NORMAL, untouched
 from jaxlfi.envs.mujoco.least_squares import Residuals, intervals, uninformed_directions
 from jaxlfi.tasks.task import Task
 
@@ -61,7 +61,7 @@ def sysid_point(task: Task, observation: np.ndarray | None = None) -> SysidPoint
     half, uninformed = half_widths(left, jacobian), uninformed_directions(jacobian, high - low)
     interval = intervals(residuals, theta, half / NORMAL, uninformed, low, high)
     margin = _MARGIN * (high - low)
-    at_bound = ((theta - low < margin) | (high - theta < margin)) & np.isfinite(interval).all(axis=1)
+    at_bound = untouched(uninformed.T / (high - low)) & ((theta - low < margin) | (high - theta < margin))
     misfit = float(np.sqrt(np.mean(left**2)))
     return SysidPoint(residuals.natural(theta), misfit, interval, at_bound, residuals.simulations)
 
