@@ -145,6 +145,7 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
 
 def _product(names: Sequence[str], powers: np.ndarray) -> str:
     """As "a * b^2 / c"."""
+    powers = 2 * powers if 0.5 in np.abs(powers) else powers
     powers = powers * (1.0 if powers[np.flatnonzero(powers)[0]] > 0 else -1.0)
     power = lambda name, value: name if value == 1 else f"{name}^{value:.2g}"
     above = " * ".join(power(name, value) for name, value in zip(names, powers, strict=True) if value > 0)

@@ -21,7 +21,7 @@ import scipy.optimize
 from jaxtyping import Bool, Float
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import forces, informed
+from jaxlfi.envs.mujoco import forces, informed, noise
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy, estimated
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.simulator import simulator_of
@@ -102,10 +102,13 @@ class Residuals:
         simulator = simulator_of(task)
         self._log, self.simulator, self.simulations = np.asarray(task.space.log), simulator, 0
         self.observed = np.asarray(simulator.observation if observation is None else observation, float)
-        there = simulator.there
-        deviation = np.array([self.observed[own, c].std() for c, own in enumerate(there.T)])
-        self.noise = np.maximum(simulator.noise, _NOISELESS * deviation)
-        if constant := [name for name, noise in zip(simulator.signals, self.noise, strict=True) if not noise > 0]:
+        columns = [self.observed[own, c] for c, own in enumerate(simulator.there.T)]
+        self.noise = np.maximum(simulator.noise, [_NOISELESS * values.std() for values in columns])
+        for c, _ in simulator.does.deviations:  # whose noise inference finds
+            self.noise[c] = max(
+                self.noise[c], noise.standard_deviation(columns[c]) if len(columns[c]) >= noise.LEAST else 0
+            )
+        if constant := [name for name, own in zip(simulator.signals, self.noise, strict=True) if not own > 0]:
             raise ValueError(
                 "noise: expected standard deviations above 0 of signals that are constant in the recording, "
                 f"got none of {', '.join(constant)}"
@@ -351,8 +354,8 @@ def _discrepancies(residuals: Residuals, scaled: np.ndarray) -> tuple[Discrepanc
     values *= residuals.noise
     episodes = np.split(values, np.cumsum(lengths)[:-1])
     return tuple(
-        estimated([own[:, c] for own in episodes], residuals.simulator.times, noise)
-        for c, noise in enumerate(residuals.noise)
+        estimated([own[:, c] for own in episodes], residuals.simulator.times, deviation)
+        for c, deviation in enumerate(residuals.noise)
     )
 
 
@@ -365,8 +368,8 @@ def _form(
     total = weights.T @ weights
     begin = 0
     for length, times in zip(lengths, residuals.simulator.times, strict=True):
-        for c, (process, noise) in enumerate(zip(processes, residuals.noise, strict=True)):
+        for c, (process, deviation) in enumerate(zip(processes, residuals.noise, strict=True)):
             own = there[begin : begin + length, c]
-            total += process.form(times[own], weights[place[begin : begin + length, c][own]]) / noise**2
+            total += process.form(times[own], weights[place[begin : begin + length, c][own]]) / deviation**2
         begin += length
     return total
