@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco.mjx_ignored import refuse_ignored
+from jaxlfi.envs.mujoco.mjx_ignored import OPTIONS, refuse_ignored
 from jaxlfi.envs.mujoco.parameters import saved
 
 try:
@@ -91,7 +91,8 @@ class Models:
             except ValueError:
                 continue  # such models are failures, here as in inference
             found = self._differing(model, own, f"parameters: {name}")
-            if not found and saved(model) != saved(compiled):
+            read = [place for place in found if own[place][-1] not in OPTIONS]
+            if not read and saved(model) != saved(compiled):
                 raise ValueError(f"parameters: {name}: expected numbers that MJX reads, got one that it ignores")
             varied |= found
         self._places = sorted(varied)
