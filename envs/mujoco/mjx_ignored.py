@@ -5,6 +5,7 @@ name, unless MJX reads it or it makes no difference to the model. Options and fl
 those of a later release, are refused as well.
 """
 
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -95,6 +96,10 @@ _UNCUT = [int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")) for kind in ("FRAMELI
 """Sensors whose cutoff MJX does not apply."""
 
 
+class MjxWarning(UserWarning):
+    """MJX integrates a model otherwise than MuJoCo, where steps are long."""
+
+
 def refuse_ignored(model: mujoco.MjModel) -> None:
     """Check that MJX reads all of a model that makes a difference.
 
@@ -103,6 +108,22 @@ def refuse_ignored(model: mujoco.MjModel) -> None:
     """
     if found := [*_options(model), *_flags(model), *_elements(model), *_sensors(model)]:
         raise ValueError(f"model: MJX cannot simulate it: it ignores or misreads {', '.join(found)}")
+
+
+def warn_of_saturation(model: mujoco.MjModel) -> None:
+    """Say which actuators MJX damps, with the integrator implicitfast, while their force is at the end of its range."""
+    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        return
+    gain = (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_AFFINE)) & (model.actuator_gainprm[:, 2] != 0)
+    bias = (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)) & (model.actuator_biasprm[:, 2] != 0)
+    several = np.flatnonzero((gain | bias) & (model.actuator_forcelimited != 0))
+    if len(several):
+        warnings.warn(
+            f"model: while the force of {', '.join(_name(model, 'actuator', i) for i in several)} is at the end of its "
+            "forcerange, implicitfast of MJX damps it by its velocity gain, and MuJoCo does not: keep the step short",
+            MjxWarning,
+            stacklevel=3,
+        )
 
 
 def option_names() -> list[str]:

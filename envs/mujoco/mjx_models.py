@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco.mjx_ignored import OPTIONS, refuse_ignored
+from jaxlfi.envs.mujoco.mjx_ignored import OPTIONS, refuse_ignored, warn_of_saturation
 from jaxlfi.envs.mujoco.parameters import saved
 
 try:
@@ -77,6 +77,7 @@ class Models:
         self._build, self._dim = build, len(names)
         compiled = build(nominal)
         refuse_ignored(compiled)
+        warn_of_saturation(compiled)
         try:
             self.base = mjx.put_model(compiled)
         except (NotImplementedError, ValueError) as error:

@@ -23,8 +23,8 @@ from jaxlfi.tasks.worker import OneOfBatch
 
 CHUNK = 128
 """Models that are rolled out in one call, at most."""
-BYTES = 2**27
-"""Of states, sensors and controls in one call, about; where a single model needs more, it is rolled out alone."""
+MEMORY = 2**27
+"""Bytes that the states, sensors and controls of one call may take: of long episodes fewer models are rolled out."""
 UNSTABLE, REFUSED = 1, 2
 """Why a simulation fails, as `FAILURES` numbers it."""
 FAILURES = ("unstable", "refused by MuJoCo")
@@ -95,6 +95,7 @@ class Simulator:
         )
         self.there = np.isfinite(recorded)
         self.observation = np.where(self.there, recorded, 0.0).astype(np.float32)
+        self._chunk = int(np.clip(MEMORY // self._bytes(), 1, CHUNK))
         self._threads = threads or processors()
         self._pool: mujoco.rollout.Rollout | None = None
 
@@ -126,6 +127,7 @@ class Simulator:
             model.opt.timestep, model.opt.integrator = self.model.opt.timestep / factor, mujoco.mjtIntegrator.mjINT_RK4
             return model
 
+        finer._chunk = max(self._chunk // factor, 1)
         finer.model, finer.build = sharpened(copy.copy(self.model)), lambda theta: sharpened(build(theta))
         return finer
 
@@ -150,6 +152,11 @@ class Simulator:
         other = copy.copy(self)
         other.forces = forces
         return other
+
+    def _bytes(self) -> int:
+        """Bytes of the states, sensors and controls of a simulation of the longest episode."""
+        numbers = mujoco.mj_stateSize(self.model, STATE) + self.model.nsensordata + self.model.nu
+        return 8 * numbers * max(len(self.grid(times)) for times in self.times)
 
     def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
         """Rows of a log with a sample of anything that is measured."""
@@ -197,9 +204,8 @@ class Simulator:
         lacking = np.zeros((len(theta), 0)) if lacking is None else lacking
         rows, outcome = np.zeros((len(theta), *self.observation.shape)), np.zeros(len(theta), int)
         with _LOCK, quietly():
-            chunk = self._chunk()
-            for first in range(0, len(theta), chunk):
-                part = slice(first, first + chunk)
+            for first in range(0, len(theta), self._chunk):
+                part = slice(first, first + self._chunk)
                 rows[part], outcome[part] = self._rolled(theta[part], lacking[part])
         for signal, d in self.does.biases:
             rows[:, :, signal] += theta[:, d, None]
@@ -222,13 +228,6 @@ class Simulator:
         with _LOCK, quietly():
             states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self.model), start, controls)
         return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
-
-    def _chunk(self) -> int:
-        """Models in one call, so that long recordings need no more memory than short ones."""
-        model = self.model
-        numbers = mujoco.mj_stateSize(model, STATE) + model.nsensordata + model.nu
-        steps = max(len(self.grid(times)) for times in self.times)
-        return int(np.clip(BYTES // (8 * numbers * steps), 1, CHUNK))
 
     def _rolled(self, theta: np.ndarray, lacking: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         models = [self._made(*rows) for rows in zip(theta, lacking, strict=True)]

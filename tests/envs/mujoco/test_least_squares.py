@@ -129,7 +129,7 @@ def test_covariances_are_those_of_the_whole_matrix(monkeypatch):
 def test_memory_grows_with_the_recording_only(monkeypatch):
     """Of a fit to 24,000 numbers, of which a matrix of each with each would take 4.6 GB."""
     monkeypatch.setattr(least_squares, "CORRECTIONS", 0)
-    monkeypatch.setattr(simulator, "BYTES", 2**22)
+    monkeypatch.setattr(simulator, "MEMORY", 2**22)
     times = 0.01 * np.arange(12_000)
     signals = {"angle": 0.3 * np.cos(times), "tip[2]": np.sin(3 * times)}
     own = mujoco_task(
@@ -138,7 +138,7 @@ def test_memory_grows_with_the_recording_only(monkeypatch):
         Log(times, signals),
         noises=dict.fromkeys(signals, 1.0),
     )
-    assert simulator_of(own)._chunk() < 10
+    assert simulator_of(own)._chunk < 10
     tracemalloc.start()
     try:
         found = fit(own, [0.05])

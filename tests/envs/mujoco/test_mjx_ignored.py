@@ -1,6 +1,7 @@
 """What MJX leaves out of a model is refused by name: all options, flags and fields of MuJoCo are known."""
 
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,16 @@ import jax
 
 from jaxlfi.envs.mujoco import mjx_ignored
 from jaxlfi.envs.mujoco.logs import Log
-from jaxlfi.envs.mujoco.mjx_ignored import DISABLED, ELEMENTS, ENABLED, OPTIONS, READ, refuse_ignored
+from jaxlfi.envs.mujoco.mjx_ignored import (
+    DISABLED,
+    ELEMENTS,
+    ENABLED,
+    OPTIONS,
+    READ,
+    MjxWarning,
+    refuse_ignored,
+    warn_of_saturation,
+)
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
 
@@ -140,6 +150,18 @@ def test_every_field_of_a_model_is_known():
     assert len(read) > 150 and not set(ELEMENTS) & set(read)
     unknown = [name for name in fields if name not in read and name not in ELEMENTS and not LAYOUT.fullmatch(name)]
     assert unknown == ["geom_fluid"]  # which matters in a fluid only
+
+
+def test_saturated_servos_are_warned_of():
+    servo = {"actuator": 'biastype="affine" biasprm="0 -20 -3" gainprm="20" forcerange="-0.5 0.5"'}
+    with pytest.warns(
+        MjxWarning, match="while the force of motor is at the end of its forcerange, implicitfast of MJX"
+    ):
+        warn_of_saturation(compiled(option='integrator="implicitfast"', **servo))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_saturation(compiled(**servo))
+        warn_of_saturation(compiled(option='integrator="implicitfast"', actuator='forcerange="-0.5 0.5"'))
 
 
 @pytest.mark.slow
