@@ -46,10 +46,27 @@ def control_names(actuators: Sequence[str], sensors: Sequence[str]) -> list[str]
 
 
 def controls_of(model: mujoco.MjModel) -> list[str]:
-    """Names of a compiled model's controls."""
+    """Names of a compiled model's controls.
+
+    Raises:
+        ValueError: for actuators that have several controls, as that of an orientation.
+    """
+    require_one_control_each(model)
     return control_names(
         [model.actuator(i).name for i in range(model.nu)], [model.sensor(i).name for i in range(model.nsensor)]
     )
+
+
+def require_one_control_each(model: mujoco.MjModel) -> None:
+    """Refuse actuators of several controls, whose numbers are not those of the controls.
+
+    Raises:
+        ValueError: naming one.
+    """
+    for i in range(model.nactuator):
+        if (count := int(model.actuator_ctrlnum[i])) != 1:
+            name = model.actuator(i).name or str(i)
+            raise ValueError(f"model: expected actuators of one control each, got {count} of actuator {name}")
 
 
 def signal_name(name: str, sensors: Sequence[str]) -> str:

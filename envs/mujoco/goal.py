@@ -30,6 +30,7 @@ from jaxtyping import Array, Float
 
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import measured
+from jaxlfi.envs.mujoco.columns import require_one_control_each
 from jaxlfi.rl.environment import Signals
 
 KEYS = ("interval", "duration", "observed", "scales", "limits", "costs", "targets", "initial")
@@ -165,6 +166,7 @@ class Reading:
             units += ["", ""] if turning else [unit]
             scales += [1.0, 1.0] if turning else [goal.scales.get(name, 1.0)]
         self.observations = Signals(tuple(names), tuple(units), (0.0,) * len(names), tuple(scales))
+        require_one_control_each(model)
         self._actuators = [model.actuator(i).name or f"actuator/{i}" for i in range(model.nu)]
         limits = np.array([_limits(model, i, name, goal) for i, name in enumerate(self._actuators)]).reshape(-1, 2)
         if not len(limits):

@@ -105,6 +105,14 @@ def test_columns_of_nothing_and_of_the_same_are_refused(signals, expected):
     assert "\n" not in str(refusal.value)
 
 
+def test_actuators_of_several_controls_are_refused():
+    xml = HIPS.replace('<motor joint="hip" gear="2"/>', '<pid name="tracked" joint="hip" kp="1"/>')
+    with pytest.raises(ValueError, match="expected actuators of one control each, got 2 of actuator tracked"):
+        task(ALL, xml=xml)
+    with pytest.raises(ValueError, match="got 2 of actuator tracked"):
+        Reading(compile_spec(specification(xml)), Goal(("hip",), 0.02, 1.0, {"hip": (0.0, 1.0)}))
+
+
 def test_names_by_themselves():
     assert control_names(["a", "b", ""], ["b", ""]) == ["a", "actuator/b", "actuator/2"]
     sensors = ["imu", "", "sensor/odd"]

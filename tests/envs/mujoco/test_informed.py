@@ -10,7 +10,7 @@ pytest.importorskip("mujoco")
 import mujoco
 import small
 
-from jaxlfi.envs.mujoco import commands, informed
+from jaxlfi.envs.mujoco import commands, informed, sysid_point
 from jaxlfi.envs.mujoco.informed import sentences, untouched
 from jaxlfi.envs.mujoco.least_squares import best_fits, fit
 from jaxlfi.envs.mujoco.logs import Log
@@ -187,6 +187,20 @@ def test_a_bound_that_holds_a_point_leaves_one_side():
     assert point.at_bound.tolist() == [False, True, False] and point.informed.tolist()[2] is False
     low, high = point.interval[1]
     assert np.isnan(low) or (0.5 <= low < high <= 1.9 + 1e-6)
+
+
+def test_points_of_sysid_have_no_such_intervals_either(monkeypatch):
+    """Whose own intervals would be wide, infinite, none, or as wide as rounding has them."""
+    for name, value in (("require_sysid", lambda: None), ("solved", lambda residuals, start, low, high: start)):
+        monkeypatch.setattr(sysid_point, name, value)
+    task = cart(DAMPING, GAIN, GEAR, damping=0.5, back=0)
+    for half, known in (([0.1, 0.2, 0.3], True), ([0.1, np.inf, np.nan], True), ([5.0, 1e-9, 1e-9], False)):
+        monkeypatch.setattr(sysid_point, "half_widths", lambda left, jacobian, half=half: np.array(half))
+        found = sysid_point.sysid_point(task)
+        assert np.isnan(found.interval[1:]).all() and np.isfinite(found.interval[0]).all() == known
+        assert not found.at_bound.any()
+    centre = found.theta
+    np.testing.assert_allclose(centre, [1.05, np.sqrt(0.5 * 5.0), 4.25], rtol=1e-5)
 
 
 def test_a_signal_without_noise_that_is_constant_is_refused():
