@@ -10,7 +10,8 @@
 import dataclasses
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -86,6 +87,18 @@ def signal_name(name: str, sensors: Sequence[str]) -> str:
     if rest.isdecimal() and int(rest) < len(sensors):
         return sensor_names(sensors)[int(rest)] + index
     return name
+
+
+def by_signal(given: Mapping[str, Any] | None, sensors: Sequence[str], what: str) -> dict[str, Any]:
+    """What is given of signals, by their names (`signal_name`).
+
+    Raises:
+        ValueError: for two of one signal.
+    """
+    found = {signal_name(name, sensors): value for name, value in (given or {}).items()}
+    if len(found) < len(given or {}):
+        raise ValueError(f"{what}: expected one of each signal, got {', '.join(given or {})}")
+    return found
 
 
 def arranged(log: Log, actuators: Sequence[str], sensors: Sequence[str]) -> Log:

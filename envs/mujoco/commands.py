@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import scipy.linalg
 from rich.console import Console
 from rich.table import Table
 
@@ -143,16 +144,22 @@ def _not_informed(task: Task, best: Fit) -> list[str]:
     """Parameters without an interval, and what the recording informs of them together."""
     box = task.inference.feasible
     widths = np.asarray(box.high, float) - np.asarray(box.low, float)
-    lines = informed.sentences(task.names, task.space.log, best.theta, best.uninformed, widths)
+    noises = _noises(task)
+    others = np.where(np.isin(task.names, noises)[:, None], 0.0, best.uninformed) / widths[:, None]
+    others = scipy.linalg.orth(others) * widths[:, None]
+    lines = informed.sentences(task.names, task.space.log, best.theta, others, widths)
     named = informed.untouched(best.uninformed.T / widths)
     lines += [
         f"{name} is not informed by this recording: its interval is as wide as Phi."
         for name, known, along in zip(task.names, best.informed, named, strict=True)
         if along and not known
     ]
-    if noises := [task.names[d] for _, d in simulator_of(task).does.deviations]:
-        lines.append(f"Least squares does not estimate noise: {', '.join(noises)}; inference does.")
-    return lines
+    return [*lines, *(f"{name} is not estimated by least squares: inference does." for name in noises)]
+
+
+def _noises(task: Task) -> list[str]:
+    """Parameters that are standard deviations of noise, which least squares has to be given."""
+    return [task.names[d] for _, d in simulator_of(task).does.deviations]
 
 
 def _as_good(fits: Sequence[Fit]) -> list[Fit]:
@@ -191,6 +198,7 @@ def _table(task: Task, one: Fit | SysidPoint, title: str) -> Table:
     for name, unit, value, (low, high), bound in zip(
         task.names, units, one.theta, one.interval, one.at_bound, strict=True
     ):
-        interval = f"{low:.4g} to {high:.4g}" if np.isfinite([low, high]).all() else "not informed by this recording"
+        none = "not estimated by least squares" if name in _noises(task) else "not informed by this recording"
+        interval = f"{low:.4g} to {high:.4g}" if np.isfinite([low, high]).all() else none
         table.add_row(name, unit, f"{value:.4g}", interval, "on a bound" if bound else "")
     return table

@@ -50,6 +50,8 @@ class Discrepancy:
 
         Sums over all earlier times follow from one another, so that time and memory grow with the number of times.
         """
+        if not len(times):
+            return np.zeros((rows.shape[1], rows.shape[1]))
         bands = np.ones((2, len(times)))
         bands[1, :-1], bands[1, -1] = -np.exp(-np.diff(times) / self.time), 0.0
         half = rows.T @ scipy.linalg.solve_banded((1, 0), bands, rows)

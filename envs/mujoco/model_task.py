@@ -79,10 +79,8 @@ def mujoco_task(
     episodes = [one if isinstance(one, Log) else logs.read(Path(one)) for one in several]
     actuators, sensors = ([one.name for one in several] for several in (spec.actuators, spec.sensors))
     episodes = [columns.arranged(one, actuators, sensors) for one in episodes]
-    noises, discrepancies = (
-        {columns.signal_name(name, sensors): one for name, one in (given or {}).items()}
-        for given in (noises, discrepancies)
-    )
+    noises = columns.by_signal(noises, sensors, "noises")
+    discrepancies = columns.by_signal(discrepancies, sensors, "discrepancy")
     if measured is None:
         controls = columns.control_names(actuators, sensors)
         measured = [name for name in episodes[0].signals if name not in controls]

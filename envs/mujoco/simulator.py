@@ -156,7 +156,7 @@ class Simulator:
     def _bytes(self) -> int:
         """Bytes of the states, sensors and controls of a simulation of the longest episode."""
         numbers = mujoco.mj_stateSize(self.model, STATE) + self.model.nsensordata + self.model.nu
-        return 8 * numbers * max(len(self.grid(times)) for times in self.times)
+        return int(8 * numbers * (max(times[-1] for times in self.times) / self.model.opt.timestep + 2))
 
     def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
         """Rows of a log with a sample of anything that is measured."""

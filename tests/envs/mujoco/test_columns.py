@@ -69,6 +69,8 @@ def test_a_name_in_any_place_means_the_sensor_where_something_is_measured():
         assert biased.simulate.function.does.biases == ((1, 0),)
     given = task(ALL, ["hip", "sensor/1"], {"sensor/hip": 0.3, "sensor/1": 0.2})
     assert given.simulate.function.noise.tolist() == [0.3, 0.2]
+    with pytest.raises(ValueError, match="noises: expected one of each signal, got sensor/hip, hip"):
+        task(ALL, ["hip"], {"sensor/hip": 0.3, "hip": 0.2})
 
 
 def test_one_column_of_a_shared_name_is_the_control():

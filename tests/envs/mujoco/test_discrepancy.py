@@ -29,6 +29,7 @@ def test_forms_are_those_of_the_covariance():
         expected = rows.T @ process.covariance(TIMES) @ rows
         np.testing.assert_allclose(process.form(TIMES, rows), expected, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(PROCESS.form(TIMES[:1], rows[:1]), 0.09 * rows[:1].T @ rows[:1])
+    assert (PROCESS.form(TIMES[:0], rows[:0]) == np.zeros((3, 3))).all()
 
 
 def test_draws_inside_of_compiled_programs_have_it_too():
