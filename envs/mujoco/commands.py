@@ -6,12 +6,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import scipy.linalg
 from rich.console import Console
 from rich.table import Table
 
 import jaxlfi
 from jaxlfi import plot
-from jaxlfi.envs.mujoco import config, least_squares, sysid_point
+from jaxlfi.envs.mujoco import config, informed, least_squares, sysid_point
 from jaxlfi.envs.mujoco.least_squares import Fit
 from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.envs.mujoco.sysid_point import SysidPoint
@@ -121,10 +122,11 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
     for name, bound in zip(task.names, best.at_bound, strict=True):
         if bound:
             lines.append(f"{name} ended on a bound of Phi: widen Phi if it can be.")
+    lines += _not_informed(task, best)
     deviation = np.sqrt(np.maximum(np.diagonal(best.covariance), 1e-300))
     correlation = best.covariance / np.outer(deviation, deviation)
     for d, other in zip(*np.triu_indices(len(deviation), 1), strict=True):
-        if abs(correlation[d, other]) > ALIKE:
+        if abs(correlation[d, other]) > ALIKE and best.informed[[d, other]].all():
             both = f"{task.names[d]} and {task.names[other]}"
             lines.append(f"{both} are hardly told apart: correlation {correlation[d, other]:.3f}.")
     lines.append(
@@ -136,6 +138,28 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
     for name, one in zip(simulator_of(task).signals, best.discrepancies, strict=True):
         lines.append(f'"{name}" = {{ deviation = {one.deviation:.2g}, time = {one.time:.2g} }}')
     return lines
+
+
+def _not_informed(task: Task, best: Fit) -> list[str]:
+    """Parameters without an interval, and what the recording informs of them together."""
+    box = task.inference.feasible
+    widths = np.asarray(box.high, float) - np.asarray(box.low, float)
+    noises = _noises(task)
+    others = np.where(np.isin(task.names, noises)[:, None], 0.0, best.uninformed) / widths[:, None]
+    others = scipy.linalg.orth(others) * widths[:, None]
+    lines = informed.sentences(task.names, task.space.log, best.theta, others, widths)
+    named = informed.untouched(best.uninformed.T / widths)
+    lines += [
+        f"{name} is not informed by this recording: its interval is as wide as Phi."
+        for name, known, along in zip(task.names, best.informed, named, strict=True)
+        if along and not known
+    ]
+    return [*lines, *(f"{name} is not estimated by least squares: inference does." for name in noises)]
+
+
+def _noises(task: Task) -> list[str]:
+    """Parameters that are standard deviations of noise, which least squares has to be given."""
+    return [task.names[d] for _, d in simulator_of(task).does.deviations]
 
 
 def _as_good(fits: Sequence[Fit]) -> list[Fit]:
@@ -154,7 +178,7 @@ def _drawn(task: Task, one: Fit) -> np.ndarray:
     draws = np.random.default_rng(0).multivariate_normal(centre, one.covariance, DRAWS, method="eigh")
     feasible = task.inference.feasible
     inside = np.asarray(feasible.contains(draws))
-    if inside.sum() < plot.MIN_DRAWS:  # as where the recording does not tell a parameter at all
+    if inside.sum() < plot.MIN_DRAWS:  # as where the recording informs a parameter hardly better than the box does
         return np.asarray(task.space.to_natural(np.clip(draws, feasible.low, feasible.high)))
     return np.asarray(task.space.to_natural(draws[inside]))
 
@@ -174,5 +198,7 @@ def _table(task: Task, one: Fit | SysidPoint, title: str) -> Table:
     for name, unit, value, (low, high), bound in zip(
         task.names, units, one.theta, one.interval, one.at_bound, strict=True
     ):
-        table.add_row(name, unit, f"{value:.4g}", f"{low:.4g} to {high:.4g}", "on a bound" if bound else "")
+        none = "not estimated by least squares" if name in _noises(task) else "not informed by this recording"
+        interval = f"{low:.4g} to {high:.4g}" if np.isfinite([low, high]).all() else none
+        table.add_row(name, unit, f"{value:.4g}", interval, "on a bound" if bound else "")
     return table

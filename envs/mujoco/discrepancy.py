@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.fft
+import scipy.linalg
 from jaxtyping import Array, Float
 
 _PERSISTS = np.exp(-1.0)
@@ -43,6 +45,18 @@ class Discrepancy:
         """Of its values at some times."""
         return self.deviation**2 * np.exp(-np.abs(times[:, None] - times) / self.time)
 
+    def form(self, times: Float[np.ndarray, " time"], rows: Float[np.ndarray, "time n"]) -> Float[np.ndarray, "n n"]:
+        """`rows.T @ covariance(times) @ rows`, for increasing times, without that matrix: the process is Markov's.
+
+        Sums over all earlier times follow from one another, so that time and memory grow with the number of times.
+        """
+        if not len(times):
+            return np.zeros((rows.shape[1], rows.shape[1]))
+        bands = np.ones((2, len(times)))
+        bands[1, :-1], bands[1, -1] = -np.exp(-np.diff(times) / self.time), 0.0
+        half = rows.T @ scipy.linalg.solve_banded((1, 0), bands, rows)
+        return self.deviation**2 * (half + half.T - rows.T @ rows)
+
     def draws(self, rng: np.random.Generator, n: int, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "n time"]:
         """Independent draws of its values at increasing times, exact for any intervals."""
         keep = np.exp(-np.diff(times) / self.time)
@@ -73,9 +87,11 @@ def estimated(residuals: Sequence[np.ndarray], times: Sequence[np.ndarray], nois
         times: of the samples, in s.
         noise: the standard deviation of white noise, which is no discrepancy.
     """
-    spacing = float(np.median(np.concatenate([np.diff(own) for own in times])))
-    on_grid = [_on_grid(own, when, spacing) for own, when in zip(residuals, times, strict=True)]
-    covariances = _autocovariances(on_grid)
+    sampled = [np.isfinite(own) for own in residuals]
+    several = [(own[here], when[here]) for own, when, here in zip(residuals, times, sampled, strict=True) if here.any()]
+    gaps = np.concatenate([np.diff(when) for _, when in several]) if several else np.zeros(0)
+    spacing = float(np.median(gaps)) if len(gaps) else 1.0
+    covariances = _autocovariances([_on_grid(own, when, spacing) for own, when in several])
     variance = max(covariances[0] - noise**2, 0.0)
     fallen = np.flatnonzero(covariances[1:] < _PERSISTS * variance)
     lag = 1 + fallen[0] if len(fallen) else len(covariances)
@@ -91,10 +107,14 @@ def _on_grid(values: np.ndarray, times: np.ndarray, spacing: float) -> np.ndarra
 
 
 def _autocovariances(episodes: Sequence[np.ndarray]) -> np.ndarray:
-    """About zero, at lags up to a half of the longest episode."""
-    found = []
-    for lag in range(max(len(own) for own in episodes) // 2):
-        products = np.concatenate([own[lag:] * own[: len(own) - lag] for own in episodes if len(own) > lag])
-        products = products[np.isfinite(products)]
-        found.append(products.mean() if len(products) else 0.0)
-    return np.array(found)
+    """About zero, at lags up to a half of the longest episode; by Fourier transforms, which long recordings need."""
+    lags = max([len(own) // 2 for own in episodes] + [1])
+    sums, counts = np.zeros(lags), np.zeros(lags)
+    for own in episodes:
+        there = np.isfinite(own)
+        for total, values in ((sums, np.where(there, own, 0.0)), (counts, there.astype(float))):
+            padded = scipy.fft.next_fast_len(2 * len(own), real=True)
+            products = scipy.fft.irfft(np.abs(scipy.fft.rfft(values, padded)) ** 2, padded)[: min(lags, len(own))]
+            total[: len(products)] += products
+    counts = np.round(counts)
+    return np.divide(sums, counts, out=np.zeros(lags), where=counts > 0)

@@ -121,6 +121,7 @@ def state_place(model: mujoco.MjModel, rest: str, name: str) -> int:
 
 def _of_sensor(rest: str, name: str, signals: Sequence[str]) -> tuple[str, int]:
     signal, _, what = rest.rpartition("/")
+    signal = f"sensor/{signal}" if f"sensor/{signal}" in signals else signal  # of a sensor without a name
     if signal not in signals:
         raise ValueError(f"parameters: {name!r}: expected a signal {near(signal, signals)}, got {signal!r}")
     if what not in ("bias", "noise"):

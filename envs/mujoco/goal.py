@@ -30,6 +30,7 @@ from jaxtyping import Array, Float
 
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import measured
+from jaxlfi.envs.mujoco.columns import require_one_control_each
 from jaxlfi.rl.environment import Signals
 
 KEYS = ("interval", "duration", "observed", "scales", "limits", "costs", "targets", "initial")
@@ -165,7 +166,8 @@ class Reading:
             units += ["", ""] if turning else [unit]
             scales += [1.0, 1.0] if turning else [goal.scales.get(name, 1.0)]
         self.observations = Signals(tuple(names), tuple(units), (0.0,) * len(names), tuple(scales))
-        self._actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
+        require_one_control_each(model)
+        self._actuators = [model.actuator(i).name or f"actuator/{i}" for i in range(model.nu)]
         limits = np.array([_limits(model, i, name, goal) for i, name in enumerate(self._actuators)]).reshape(-1, 2)
         if not len(limits):
             raise ValueError("policy: expected a model with actuators, got one without")
@@ -233,4 +235,11 @@ def _limits(model: mujoco.MjModel, i: int, name: str, goal: Goal) -> tuple[float
         raise ValueError(f"policy: limits: expected those of {name}, whose actuator has no ctrlrange; got none")
     if not low < high:
         raise ValueError(f"policy: limits: {name}: expected LOW below HIGH, got {[float(low), float(high)]}")
+    least, most = model.actuator_ctrlrange[i]
+    clamps = model.actuator_ctrllimited[i] and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+    if clamps and (low < least or high > most):
+        raise ValueError(
+            f"policy: limits: {name}: expected limits within the actuator's ctrlrange, beyond which MuJoCo clamps: "
+            f"{[float(least), float(most)]}; got {[float(low), float(high)]}"
+        )
     return float(low), float(high)

@@ -7,7 +7,10 @@ that `discrepancy.estimated` reads off the residuals). What residuals cannot sho
 up for, as a pendulum's damping does for an integrator that damps. The integrator's own error is known, however: the
 point is found again with the difference that a finer one makes there (defect correction; Stetter, 1978). And forces
 that the model lacks (`forces`) are taken to be as large in the directions that parameters make up for as in those that
-residuals show.
+residuals show. What a recording does not inform has no interval (`informed`).
+
+Time and memory grow with the length of the recording, and not with its square: of covariances of all that was measured
+only their products with the parameters' few directions are made.
 """
 
 import dataclasses
@@ -18,7 +21,7 @@ import scipy.optimize
 from jaxtyping import Bool, Float
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import forces
+from jaxlfi.envs.mujoco import forces, informed, noise
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy, estimated
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.simulator import simulator_of
@@ -36,6 +39,11 @@ _FAILED = 1e3
 """Residuals of simulations that fail, in standard deviations."""
 _APART = 0.05
 """Points nearer than this fraction of the box's width, in all parameters, are the same."""
+_ALIKE = 0.3
+"""Points that differ only in what is not informed are the same where simulations are this near to one another: root
+mean square, in standard deviations of the noise."""
+_TOGETHER = 16
+"""Starts that are simulated together: a long recording of many of them would need much memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,9 +53,12 @@ class Fit:
     Attributes:
         theta: in natural units, shape [D].
         misfit: root mean square of the residuals in standard deviations of the noise; 1 for a model without error.
-        covariance: of the point's coordinates in inference space, shape [D, D].
-        interval: 90 % interval of each parameter, in natural units, within the box; shape [D, 2].
-        at_bound: which parameters ended on a bound of the box, shape [D].
+        covariance: of the point's coordinates in inference space, shape [D, D]; along what the recording does not
+            inform, that of a uniform distribution over the box.
+        interval: 90 % interval of each parameter, in natural units, within the box; NaN where the recording does not
+            inform it. Shape [D, 2].
+        uninformed: directions in inference space that the recording does not inform, shape [D, K].
+        at_bound: which parameters ended on a bound of the box, of those that the simulation depends on, shape [D].
         discrepancies: of each signal: what the model, by its own integrator, gets wrong at the point.
         unmodelled_force: how large forces besides the model's own would leave such residuals, those of its own
             integrator, as a fraction of what acts on each joint at the centre of Theta_0.
@@ -59,11 +70,17 @@ class Fit:
     misfit: float
     covariance: Float[np.ndarray, "dim dim"]
     interval: Float[np.ndarray, "dim 2"]
+    uninformed: Float[np.ndarray, "dim directions"]
     at_bound: Bool[np.ndarray, " dim"]
     discrepancies: tuple[Discrepancy, ...]
     unmodelled_force: float
     defect: float
     simulations: int
+
+    @property
+    def informed(self) -> Bool[np.ndarray, " dim"]:
+        """Which parameters the recording informs."""
+        return np.isfinite(self.interval).all(axis=1)
 
 
 class Residuals:
@@ -80,14 +97,22 @@ class Residuals:
             observation: another recording in place of the task's own, in the same rows.
 
         Raises:
-            ValueError: for a task of another kind.
+            ValueError: for a task of another kind, and signals without noise that are constant.
         """
         simulator = simulator_of(task)
         self._log, self.simulator, self.simulations = np.asarray(task.space.log), simulator, 0
         self.observed = np.asarray(simulator.observation if observation is None else observation, float)
-        there = simulator.there
-        deviation = np.array([self.observed[own, c].std() for c, own in enumerate(there.T)])
-        self.noise = np.maximum(simulator.noise, _NOISELESS * deviation)
+        columns = [self.observed[own, c] for c, own in enumerate(simulator.there.T)]
+        self.noise = np.maximum(simulator.noise, [_NOISELESS * values.std() for values in columns])
+        for c, _ in simulator.does.deviations:  # whose noise inference finds
+            self.noise[c] = max(
+                self.noise[c], noise.standard_deviation(columns[c]) if len(columns[c]) >= noise.LEAST else 0
+            )
+        if constant := [name for name, own in zip(simulator.signals, self.noise, strict=True) if not own > 0]:
+            raise ValueError(
+                "noise: expected standard deviations above 0 of signals that are constant in the recording, "
+                f"got none of {', '.join(constant)}"
+            )
         self.defect = np.zeros(self.observed.shape)
 
     def __call__(self, coordinates: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n rows"]:
@@ -112,12 +137,16 @@ class Residuals:
     def jacobian(
         self, point: Float[np.ndarray, " dim"], low: np.ndarray, high: np.ndarray
     ) -> Float[np.ndarray, "rows dim"]:
-        """By central differences within the box."""
+        """By central differences within the box; by one side's where the other fails, and 0 where both do."""
         steps = STEP * (high - low) * np.eye(len(point))
         sides = np.clip(np.concatenate([point + steps, point - steps]), low, high)
-        ahead, behind = np.split(self(sides), 2)
-        distance = np.diagonal(sides[: len(point)] - sides[len(point) :])
-        return ((ahead - behind) / distance[:, None]).T
+        values = self(sides)
+        failed = (values == _FAILED).all(axis=1)
+        if failed.any():
+            sides[failed], values[failed] = point, self(point[None])[0]
+        ahead, behind = np.split(values, 2)
+        distance = np.diagonal(sides[: len(point)] - sides[len(point) :])[:, None]
+        return np.divide(ahead - behind, distance, out=np.zeros_like(ahead), where=distance != 0).T
 
     def of_forces(
         self, point: Float[np.ndarray, " dim"], besides: UnmodelledForces
@@ -151,23 +180,66 @@ def fit(task: Task, start: Sequence[float], box: Support | None = None, observat
         residuals.correct(found.x)
         found = _solved(residuals, found.x, low, high)
     by_forces = residuals.of_forces(found.x, _typical_forces(task, residuals.natural(found.x)))
-    covariance = _covariances(residuals, _discrepancies(residuals, found.fun))
-    size, widened = forces.estimated(found.fun, found.jac, by_forces)
-    covariance += (size * widened) ** 2 * by_forces @ by_forces.T
-    covariance = _sandwich(found.jac, covariance)
     defect = (residuals.defect / residuals.noise)[residuals.simulator.there]
+    covariance, uninformed, force = _uncertainty(residuals, found, defect, by_forces, high - low)
     discrepancies = _discrepancies(residuals, found.fun - defect)
-    force, _ = forces.estimated(found.fun - defect, found.jac, by_forces)
-    reach = 1.6449 * np.sqrt(np.diagonal(covariance))
-    ends = np.clip(np.stack([found.x - reach, found.x + reach]), low, high)
-    natural = residuals.natural(np.concatenate([found.x[None], ends]))
+    interval = intervals(residuals, found.x, np.sqrt(np.diagonal(covariance)), uninformed, low, high)
     margin = 10 * STEP * (high - low)
-    at_bound = (found.x - low < margin) | (high - found.x < margin)
+    moved = informed.untouched(uninformed_directions(found.jac, high - low).T / (high - low))
+    at_bound = moved & ((found.x - low < margin) | (high - found.x < margin))
     misfit = float(np.sqrt(np.mean(found.fun**2)))
     added = float(np.sqrt(np.mean(defect**2)))
     return Fit(
-        natural[0], misfit, covariance, natural[1:].T, at_bound, discrepancies, force, added, residuals.simulations
+        theta=residuals.natural(found.x),
+        misfit=misfit,
+        covariance=covariance,
+        interval=interval,
+        uninformed=uninformed,
+        at_bound=at_bound,
+        discrepancies=discrepancies,
+        unmodelled_force=force,
+        defect=added,
+        simulations=residuals.simulations,
     )
+
+
+def intervals(
+    residuals: Residuals,
+    point: Float[np.ndarray, " dim"],
+    deviations: Float[np.ndarray, " dim"],
+    uninformed: Float[np.ndarray, "dim directions"],
+    low: Float[np.ndarray, " dim"],
+    high: Float[np.ndarray, " dim"],
+) -> Float[np.ndarray, "dim 2"]:
+    """90 % intervals in natural units; NaN where the recording does not inform a parameter.
+
+    Args:
+        residuals: of the recording.
+        point: in inference space.
+        deviations: standard deviations there.
+        uninformed: directions that the recording does not inform.
+        low: of the box, in inference space.
+        high: of the box.
+    """
+    reach = informed.NORMAL * deviations
+    ends = np.clip(np.stack([point - reach, point + reach]), low, high)
+    known = informed.untouched(uninformed.T / (high - low)) & (
+        np.ptp(ends, axis=0) < informed.LIKE_THE_BOX * (high - low)
+    )
+    return np.where(known, residuals.natural(ends), np.nan).T
+
+
+def uninformed_directions(
+    jacobian: Float[np.ndarray, "rows dim"], width: np.ndarray
+) -> Float[np.ndarray, "dim directions"]:
+    """Directions in inference space that white noise alone leaves as wide as the box.
+
+    Args:
+        jacobian: of residuals in standard deviations of the noise.
+        width: of the box, in inference space.
+    """
+    sizes, rows = informed.directions(jacobian * width)
+    return (width * rows[~_seen(sizes, rows)]).T
 
 
 def best_fits(
@@ -190,16 +262,62 @@ def best_fits(
     """
     residuals = Residuals(task, observation)
     starts = np.asarray(starts, float)
-    misfits = np.mean(residuals(np.asarray(task.space.to_inference(starts))) ** 2, axis=1)
+    places = np.asarray(task.space.to_inference(starts))
+    parts = [residuals(places[first : first + _TOGETHER]) for first in range(0, len(places), _TOGETHER)]
+    misfits = np.concatenate([np.mean(part**2, axis=1) for part in parts])
     fits = [fit(task, starts[row], box, observation) for row in counted(np.argsort(misfits)[:keep].tolist())]
-    low, high = _bounds(task, None)
     different: list[Fit] = []
     for one in sorted(fits, key=lambda one: one.misfit):
-        places = np.asarray(task.space.to_inference(np.stack([one.theta, *(other.theta for other in different)])))
-        if (np.abs(places[1:] - places[0]) > _APART * (high - low)).any(axis=1).all():
+        if not any(_same(task, residuals, one, other) for other in different):
             different.append(one)
     spent = len(starts) + sum(one.simulations for one in fits)
     return [dataclasses.replace(one, simulations=spent) for one in different]
+
+
+def _same(task: Task, residuals: Residuals, one: Fit, other: Fit) -> bool:
+    """Whether two points are one, or are joined by directions that the recording does not inform."""
+    low, high = _bounds(task, None)
+    places = np.asarray(task.space.to_inference(np.stack([one.theta, other.theta])), float)
+    apart = np.abs(places[1] - places[0]) > _APART * (high - low)
+    if not apart.any() or (apart & one.informed & other.informed).any():
+        return not apart.any()
+    simulated = residuals(places)
+    return bool(np.sqrt(np.mean((simulated[1] - simulated[0]) ** 2)) < _ALIKE)
+
+
+def _uncertainty(
+    residuals: Residuals,
+    found: scipy.optimize.OptimizeResult,
+    defect: Float[np.ndarray, " rows"],
+    by_forces: Float[np.ndarray, "rows numbers"],
+    width: Float[np.ndarray, " dim"],
+) -> tuple[Float[np.ndarray, "dim dim"], Float[np.ndarray, "dim directions"], float]:
+    """The point's covariance, what is not informed, and the size of forces that the model lacks.
+
+    That size is one of the model by its own integrator; the covariance is that of the point that was corrected.
+    """
+    jacobian, processes = found.jac * width, _discrepancies(residuals, found.fun)
+    sizes, rows = informed.directions(jacobian)
+    seen = _seen(sizes, rows)
+    while True:
+        along = jacobian @ rows[seen].T / sizes[seen]  # orthonormal
+        size, widened = forces.estimated(found.fun, along, by_forces)
+        weights = along / sizes[seen]
+        by_parameters = weights.T @ by_forces
+        spread = _form(residuals, processes, weights) + (size * widened) ** 2 * by_parameters @ by_parameters.T
+        narrow = informed.says_more(np.sqrt(np.diagonal(spread)), rows[seen])
+        if narrow.all():
+            break
+        seen[np.flatnonzero(seen)[~narrow]] = False
+    force, _ = forces.estimated(found.fun - defect, along, by_forces)
+    covariance = rows[seen].T @ spread @ rows[seen] + rows[~seen].T @ rows[~seen] / 12
+    return covariance * np.outer(width, width), (width * rows[~seen]).T, force
+
+
+def _seen(sizes: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Directions along which white noise leaves less than the box."""
+    deviations = np.divide(1.0, sizes, out=np.full(len(sizes), np.inf), where=sizes > 0)
+    return informed.says_more(deviations, rows)
 
 
 def _solved(
@@ -236,26 +354,22 @@ def _discrepancies(residuals: Residuals, scaled: np.ndarray) -> tuple[Discrepanc
     values *= residuals.noise
     episodes = np.split(values, np.cumsum(lengths)[:-1])
     return tuple(
-        estimated([own[:, c] for own in episodes], residuals.simulator.times, noise)
-        for c, noise in enumerate(residuals.noise)
+        estimated([own[:, c] for own in episodes], residuals.simulator.times, deviation)
+        for c, deviation in enumerate(residuals.noise)
     )
 
 
-def _covariances(residuals: Residuals, discrepancies: Sequence[Discrepancy]) -> Float[np.ndarray, "measured measured"]:
-    """Of all that was measured, in variances of the noise: white noise and discrepancies."""
+def _form(
+    residuals: Residuals, processes: Sequence[Discrepancy], weights: Float[np.ndarray, "measured n"]
+) -> Float[np.ndarray, "n n"]:
+    """`weights.T @ covariance @ weights`, with that of white noise and discrepancies, in variances of the noise."""
     there, lengths = residuals.simulator.there, [len(own) for own in residuals.simulator.times]
-    rows, signals = there.shape
-    whole = np.zeros((rows, signals, rows, signals))
-    for c, (process, noise) in enumerate(zip(discrepancies, residuals.noise, strict=True)):
-        begin = 0
-        for length, times in zip(lengths, residuals.simulator.times, strict=True):
-            own = slice(begin, begin + length)
-            whole[own, c, own, c] = process.covariance(times) / noise**2
-            begin += length
-    flat = whole.reshape(rows * signals, rows * signals)[there.ravel()][:, there.ravel()]
-    return flat + np.eye(len(flat))
-
-
-def _sandwich(jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    bread = np.linalg.pinv(jacobian)
-    return bread @ covariance @ bread.T
+    place = np.cumsum(there.ravel()).reshape(there.shape) - 1
+    total = weights.T @ weights
+    begin = 0
+    for length, times in zip(lengths, residuals.simulator.times, strict=True):
+        for c, (process, deviation) in enumerate(zip(processes, residuals.noise, strict=True)):
+            own = there[begin : begin + length, c]
+            total += process.form(times[own], weights[place[begin : begin + length, c][own]]) / deviation**2
+        begin += length
+    return total

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 import mujoco
 
+from jaxlfi.envs.mujoco.columns import INDEXED, sensor_names
 from jaxlfi.envs.mujoco.parameters import near
 
 JOINT = re.compile(r"joint/(?P<joint>.+)/(?P<what>qpos|qvel)")
 BODY = re.compile(r"body/(?P<body>.+)/(?P<what>pos|quat)\[(?P<index>\d)\]")
-INDEXED = re.compile(r"(?P<sensor>.+)\[(?P<index>\d+)\]")
 _OF_JOINTS = {"qpos": mujoco.mjtSensor.mjSENS_JOINTPOS, "qvel": mujoco.mjtSensor.mjSENS_JOINTVEL}
 _OF_BODIES = {"pos": mujoco.mjtSensor.mjSENS_FRAMEPOS, "quat": mujoco.mjtSensor.mjSENS_FRAMEQUAT}
 
@@ -44,10 +44,8 @@ def add_sensors(spec: mujoco.MjSpec, names: Sequence[str]) -> None:
 def signals_of(model: mujoco.MjModel) -> list[str]:
     """All numbers of a model's sensors by name, as `places` knows them, in the order of the sensor data."""
     found = []
-    for i in range(model.nsensor):
-        sensor = model.sensor(i)
-        name = sensor.name
-        found += [name] if sensor.dim[0] == 1 else [f"{name}[{k}]" for k in range(sensor.dim[0])]
+    for name, size in zip(_sensors(model), model.sensor_dim, strict=True):
+        found += [name] if size == 1 else [f"{name}[{k}]" for k in range(size)]
     return found
 
 
@@ -57,24 +55,24 @@ def places(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
     Raises:
         ValueError: for a sensor that is not in the model, and an index that it does not have.
     """
-    sensors = [model.sensor(i).name for i in range(model.nsensor)]
-    found = []
+    sensors, found = _sensors(model), []
     for name in names:
         match = INDEXED.fullmatch(name)
         sensor, index = (name, 0) if match is None or name in sensors else (match["sensor"], int(match["index"]))
         if sensor not in sensors:
             raise ValueError(f"measured: expected a sensor {near(sensor, sensors)}, got {name!r}")
-        size = model.sensor(sensor).dim[0]
+        own = model.sensor(sensors.index(sensor))
+        size = own.dim[0]
         if index >= size or (size > 1 and sensor == name):
             raise ValueError(f"measured: expected {sensor}[0] to {sensor}[{size - 1}], got {name!r}")
-        found.append(int(model.sensor(sensor).adr[0]) + index)
+        found.append(int(own.adr[0]) + index)
     return found
 
 
 def unit(model: mujoco.MjModel, name: str) -> str:
     """The unit that a signal is measured in; "" where its sensor does not say."""
-    match = INDEXED.fullmatch(name)
-    sensor = model.sensor(name if match is None or _has(model, name) else match["sensor"])
+    match, sensors = INDEXED.fullmatch(name), _sensors(model)
+    sensor = model.sensor(sensors.index(name if match is None or name in sensors else match["sensor"]))
     kind = mujoco.mjtSensor(int(sensor.type[0]))
     if kind in _OF_JOINTS.values():
         hinge = model.jnt_type[int(sensor.objid[0])] == mujoco.mjtJoint.mjJNT_HINGE
@@ -82,8 +80,8 @@ def unit(model: mujoco.MjModel, name: str) -> str:
     return _UNIT.get(kind, "")
 
 
-def _has(model: mujoco.MjModel, name: str) -> bool:
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name) >= 0
+def _sensors(model: mujoco.MjModel) -> list[str]:
+    return sensor_names([model.sensor(i).name for i in range(model.nsensor)])
 
 
 def _add(spec: mujoco.MjSpec, name: str, kind, object_kind, own: str) -> None:

@@ -23,6 +23,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs.mujoco.mjx_ignored import OPTIONS, refuse_ignored, warn_of_saturation
+from jaxlfi.envs.mujoco.parameters import saved
 
 try:
     with contextlib.redirect_stdout(io.StringIO()):  # MJX says there that Warp is not installed
@@ -74,6 +76,8 @@ class Models:
         """
         self._build, self._dim = build, len(names)
         compiled = build(nominal)
+        refuse_ignored(compiled)
+        warn_of_saturation(compiled)
         try:
             self.base = mjx.put_model(compiled)
         except (NotImplementedError, ValueError) as error:
@@ -87,7 +91,11 @@ class Models:
                 model = build(theta)
             except ValueError:
                 continue  # such models are failures, here as in inference
-            varied |= self._differing(model, own, f"parameters: {name}")
+            found = self._differing(model, own, f"parameters: {name}")
+            read = [place for place in found if own[place][-1] not in OPTIONS]
+            if not read and saved(model) != saved(compiled):
+                raise ValueError(f"parameters: {name}: expected numbers that MJX reads, got one that it ignores")
+            varied |= found
         self._places = sorted(varied)
         self._paths = [own[place] for place in self._places]
         self.varied = tuple(".".join(path) for path in self._paths)
@@ -118,6 +126,10 @@ class Models:
 
     def _differing(self, model: mujoco.MjModel, own: Sequence[tuple[str, ...]], where: str) -> set[int]:
         """Leaves of the MJX model that are others than the nominal one's."""
+        try:
+            refuse_ignored(model)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from error
         put = mjx.put_model(model)
         if jax.tree.structure(put) != self._tree:
             fixed = _static_differences(self.base, put)

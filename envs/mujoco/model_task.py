@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import logs, noise, summaries
+from jaxlfi.envs.mujoco import columns, logs, noise, summaries
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import built, effects, initial_state
 from jaxlfi.envs.mujoco.logs import Log
@@ -50,7 +50,7 @@ def mujoco_task(
         model: an MJCF file, its text, or a specification.
         parameters: what is inferred (`parameters.Parameter`).
         recorded: recordings, or their files (`logs`): one for each episode. Signals that are called as the model's
-            actuators are its controls, held between samples.
+            actuators are its controls, held between samples (`columns`).
         measured: signals that are compared: sensors of the model, and joint/NAME/qpos, joint/NAME/qvel,
             body/NAME/pos[0], body/NAME/quat[0]. By default all of the recording but its controls.
         noises: standard deviations of the signals' noise. Of others it is estimated from the first recording.
@@ -77,21 +77,27 @@ def mujoco_task(
     if not several or not parameters:
         raise ValueError("expected at least one recording and one parameter, got none")
     episodes = [one if isinstance(one, Log) else logs.read(Path(one)) for one in several]
+    actuators, sensors = ([one.name for one in several] for several in (spec.actuators, spec.sensors))
+    episodes = [columns.arranged(one, actuators, sensors) for one in episodes]
+    noises = columns.by_signal(noises, sensors, "noises")
+    discrepancies = columns.by_signal(discrepancies, sensors, "discrepancy")
     if measured is None:
-        controls = {one.name for one in spec.actuators}
+        controls = columns.control_names(actuators, sensors)
         measured = [name for name in episodes[0].signals if name not in controls]
+    measured = [columns.signal_name(name, sensors) for name in measured]
     if not measured or len(set(measured)) < len(measured):
         raise ValueError(f"measured: expected at least one signal, each once, got {', '.join(measured) or 'none'}")
     names = [one.name for one in parameters]
-    inferred = {name.split("/")[1] for name in names if name.startswith("sensor/") and name.endswith("/noise")}
-    deviations = _deviations(episodes[0], measured, noises or {}, inferred)
+    columns.require_measured(episodes[0], measured, actuators)
+    inferred = {signal for signal in measured if f"sensor/{signal.removeprefix('sensor/')}/noise" in names}
+    deviations = _deviations(episodes[0], measured, noises, inferred)
     add_sensors(spec, measured)
     compiled = compile_spec(spec)
     does = effects(spec, compiled, names, [one.support for one in parameters], measured)
 
     build = functools.partial(built, spec, does)
     starts = [initial_state(compiled, initial or {})] * len(episodes)
-    if unknown := [name for name in discrepancies or {} if name not in measured]:
+    if unknown := [name for name in discrepancies if name not in measured]:
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
     simulator = Simulator(compiled, build, episodes, measured, deviations, starts, does, discrepancies, threads)
     others = {"name": spec.modelname or "mujoco"} | others
@@ -118,6 +124,8 @@ def task_of(
     if unmodelled_force:
         centre = np.array([_centre(one) for one in parameters])
         simulator = simulator.lacking(simulator.typical_forces(centre).times(unmodelled_force))
+    for log in simulator.logs:
+        columns.warn_of_clamped(log, simulator.model, [one.name for one in parameters])
     seen = summaries.fields(summary, simulator)
     others["settings"] = seen.pop("settings", {}) | dict(others.get("settings", {}))
     supports = {"initial": _box([one.support for one in parameters])}

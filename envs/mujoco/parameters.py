@@ -3,6 +3,8 @@
 | name | what |
 |---|---|
 | `joint/hinge/damping`, `geom/foot/friction[0]`, `actuator/motor/gear[0]` | attributes of elements |
+| `actuator/0/gear[0]` | of the model's first actuator, which needs no name |
+| `actuator/servo/kp`, `actuator/servo/kv` | gains of position and velocity servos (`servos`) |
 | `body/link/mass`, `body/link/inertia[1]`, `body/link/ipos[0]` | of a body as a whole, though its geoms make it up |
 | `option/gravity[0]` | of all of it |
 | `initial/hinge/qpos`, `initial/hinge/qvel`, `initial/box/qpos[2]` | the state that episodes begin in |
@@ -21,6 +23,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
+
+from jaxlfi.envs.mujoco import servos
 
 KINDS = ("body", "joint", "geom", "site", "actuator", "tendon", "equality", "pair")
 """Elements of models whose attributes can be inferred."""
@@ -93,8 +97,12 @@ def edit(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Edit:
         raise ValueError(f"parameters: {name!r}: expected a body that moves, got the world")
     if element.startswith("body/") and attribute in INERTIAL:
         return _inertial(model, element.partition("/")[2], attribute, index, name)
+    if element.startswith("actuator/"):
+        servos.check_whole(found, attribute, index, name)
+        if attribute in servos.GAINS:
+            return Edit(name, lambda spec, number: servos.set_gain(_found(spec, element, name), attribute, number))
     value = getattr(found, attribute, None) if not attribute.startswith("_") else None
-    if isinstance(value, bool) or not isinstance(value, int | float | np.ndarray):
+    if not _is_number(value):
         known = [other for other in dir(found) if _is_number(getattr(found, other, None))]
         raise ValueError(f"parameters: {name!r}: expected an attribute {near(attribute, known)}, got {attribute!r}")
     where = place(value, index, name, first=attribute in ("damping", "stiffness"))
@@ -119,6 +127,8 @@ def _found(spec: mujoco.MjSpec, element: str, name: str) -> Any:
     if kind not in KINDS or not own:
         raise ValueError(f"parameters: {name!r}: expected one that begins with {near(kind, [*KINDS, 'option'])}")
     found = getattr(spec, kind)(own)
+    if found is None and kind == "actuator" and own.isdecimal() and int(own) < len(spec.actuators):
+        return spec.actuators[int(own)]  # which need not have a name
     if found is None:
         several = {"body": "bodies", "equality": "equalities"}.get(kind, f"{kind}s")
         names = [one.name for one in getattr(spec, several) if one.name]
@@ -188,14 +198,15 @@ def check_effect(spec: mujoco.MjSpec, one: Edit, support: tuple[float, float]) -
             raise ValueError(
                 f"parameters: {one.name!r}: MuJoCo refuses a model with {number:g}: {' '.join(str(error).split())}"
             ) from error
-    if _bytes(compiled[0]) == _bytes(compiled[1]):
+    if saved(compiled[0]) == saved(compiled[1]):
         raise ValueError(
             f"parameters: {one.name!r}: expected a number that the model depends on: it is the same with "
             f"{support[0]:g} and {support[1]:g} (another attribute may override it, as an explicit inertial a density)"
         )
 
 
-def _bytes(model: mujoco.MjModel) -> bytes:
+def saved(model: mujoco.MjModel) -> bytes:
+    """All of a compiled model."""
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.envs.mujoco import measured
+from jaxlfi.envs.mujoco.columns import controls_of
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import STATE, Effects
 from jaxlfi.envs.mujoco.forces import UnmodelledForces, typical
@@ -21,7 +22,9 @@ from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.worker import OneOfBatch
 
 CHUNK = 128
-"""Models that are rolled out in one call, which bounds the memory of their states."""
+"""Models that are rolled out in one call, at most."""
+MEMORY = 2**27
+"""Bytes that the states, sensors and controls of one call may take: of long episodes fewer models are rolled out."""
 UNSTABLE, REFUSED = 1, 2
 """Why a simulation fails, as `FAILURES` numbers it."""
 FAILURES = ("unstable", "refused by MuJoCo")
@@ -39,7 +42,7 @@ class Simulator:
         signals: that are measured, C of them.
         units: of the signals; "" where the sensor does not say.
         noise: standard deviation of each signal's noise, shape [C]; 0 where it is inferred.
-        actuators: names of the controls.
+        actuators: names of the controls (`columns`).
         places: of the signals among the model's sensor data, C of them.
         discrepancies: what the model gets wrong, by the signal's number.
         forces: that the model lacks, if any are drawn (`lacking`).
@@ -81,7 +84,7 @@ class Simulator:
         self.noise = np.array([noise[name] for name in signals])
         self.discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
         self.forces: UnmodelledForces | None = None
-        self.actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
+        self.actuators = controls_of(model)
         rows = [self._measured_rows(log) for log in logs]
         self.times = [log.times[own] for log, own in zip(logs, rows, strict=True)]
         recorded = np.concatenate(
@@ -92,6 +95,7 @@ class Simulator:
         )
         self.there = np.isfinite(recorded)
         self.observation = np.where(self.there, recorded, 0.0).astype(np.float32)
+        self._chunk = int(np.clip(MEMORY // self._bytes(), 1, CHUNK))
         self._threads = threads or processors()
         self._pool: mujoco.rollout.Rollout | None = None
 
@@ -123,6 +127,7 @@ class Simulator:
             model.opt.timestep, model.opt.integrator = self.model.opt.timestep / factor, mujoco.mjtIntegrator.mjINT_RK4
             return model
 
+        finer._chunk = max(self._chunk // factor, 1)
         finer.model, finer.build = sharpened(copy.copy(self.model)), lambda theta: sharpened(build(theta))
         return finer
 
@@ -147,6 +152,11 @@ class Simulator:
         other = copy.copy(self)
         other.forces = forces
         return other
+
+    def _bytes(self) -> int:
+        """Bytes of the states, sensors and controls of a simulation of the longest episode."""
+        numbers = mujoco.mj_stateSize(self.model, STATE) + self.model.nsensordata + self.model.nu
+        return int(8 * numbers * (max(times[-1] for times in self.times) / self.model.opt.timestep + 2))
 
     def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
         """Rows of a log with a sample of anything that is measured."""
@@ -194,8 +204,8 @@ class Simulator:
         lacking = np.zeros((len(theta), 0)) if lacking is None else lacking
         rows, outcome = np.zeros((len(theta), *self.observation.shape)), np.zeros(len(theta), int)
         with _LOCK, quietly():
-            for first in range(0, len(theta), CHUNK):
-                part = slice(first, first + CHUNK)
+            for first in range(0, len(theta), self._chunk):
+                part = slice(first, first + self._chunk)
                 rows[part], outcome[part] = self._rolled(theta[part], lacking[part])
         for signal, d in self.does.biases:
             rows[:, :, signal] += theta[:, d, None]

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from jaxlfi.envs.mujoco import noise as noises
+from jaxlfi.envs.mujoco.columns import controls_of
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import signals_of
 from jaxlfi.envs.mujoco.model_task import task_of
@@ -100,9 +101,8 @@ def _bounds(one: Any) -> tuple[np.ndarray, np.ndarray]:
 def _log(name: str, control: Any, sensed: Any, model: mujoco.MjModel, signals: Sequence[str]) -> Log:
     """A sequence as a recording; its controls and sensors may have clocks of their own."""
     times = np.unique(np.concatenate([control.times, sensed.times]))
-    actuators = [model.actuator(i).name or f"actuator[{i}]" for i in range(model.nu)]
     columns = {}
-    for names, series in ((actuators, control), (signals, sensed)):
+    for names, series in ((controls_of(model), control), (signals, sensed)):
         values = np.asarray(series.data, float).reshape(len(series.times), -1)
         if values.shape[1] != len(names):
             raise ValueError(f"{name}: expected {len(names)} numbers at a time, got {values.shape[1]}")

@@ -6,7 +6,8 @@ import io
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxlfi.envs.mujoco.least_squares import Residuals
+from jaxlfi.envs.mujoco.informed import NORMAL, untouched
+from jaxlfi.envs.mujoco.least_squares import Residuals, intervals, uninformed_directions
 from jaxlfi.tasks.task import Task
 
 LEVEL = 0.9
@@ -19,7 +20,7 @@ _MARGIN = 1e-3
 class SysidPoint:
     """What `mujoco.sysid` finds; the attributes are those of `least_squares.Fit`, as far as it has them.
 
-    Its intervals take the model to be right, and are NaN where it gives none.
+    Its intervals take the model to be right, and are NaN where the recording does not inform a parameter.
     """
 
     theta: Float[np.ndarray, " dim"]
@@ -57,12 +58,12 @@ def sysid_point(task: Task, observation: np.ndarray | None = None) -> SysidPoint
     low, high = np.asarray(box.low, float), np.asarray(box.high, float)
     theta = solved(residuals, 0.5 * (np.asarray(guess.low, float) + np.asarray(guess.high, float)), low, high)
     left, jacobian = residuals(theta[None])[0], residuals.jacobian(theta, low, high)
-    half = half_widths(left, jacobian)
-    ends = np.where(np.isnan(half), np.nan, np.clip([theta - half, theta + half], low, high))
-    natural, margin = residuals.natural(np.concatenate([theta[None], ends])), _MARGIN * (high - low)
-    at_bound = (theta - low < margin) | (high - theta < margin)
+    half, uninformed = half_widths(left, jacobian), uninformed_directions(jacobian, high - low)
+    interval = intervals(residuals, theta, half / NORMAL, uninformed, low, high)
+    margin = _MARGIN * (high - low)
+    at_bound = untouched(uninformed.T / (high - low)) & ((theta - low < margin) | (high - theta < margin))
     misfit = float(np.sqrt(np.mean(left**2)))
-    return SysidPoint(natural[0], misfit, natural[1:].T, at_bound, residuals.simulations)
+    return SysidPoint(residuals.natural(theta), misfit, interval, at_bound, residuals.simulations)
 
 
 def solved(

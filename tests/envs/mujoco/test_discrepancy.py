@@ -7,7 +7,7 @@ pytest.importorskip("mujoco")
 
 import jax
 
-from jaxlfi.envs.mujoco.discrepancy import Discrepancy, estimated
+from jaxlfi.envs.mujoco.discrepancy import Discrepancy, _autocovariances, estimated
 
 PROCESS = Discrepancy(0.3, 0.25)
 TIMES = np.cumsum(np.random.default_rng(3).uniform(0.01, 0.2, 40))
@@ -20,6 +20,16 @@ def test_draws_have_the_covariance_of_the_process():
     np.testing.assert_allclose(np.cov(draws.T), PROCESS.covariance(TIMES), atol=5 * 0.3**2 * np.sqrt(2 / 40_000))
     closed_form = [[0.09, 0.09 * np.exp(-(TIMES[7] - TIMES[2]) / 0.25)]]
     np.testing.assert_allclose(PROCESS.covariance(TIMES)[2:3, [2, 7]], closed_form)
+
+
+def test_forms_are_those_of_the_covariance():
+    """At unequal intervals, of one time, and of a process that is longer and shorter than the intervals."""
+    rows = np.random.default_rng(5).standard_normal((40, 3))
+    for process in (PROCESS, Discrepancy(0.3, 100.0), Discrepancy(2.0, 1e-3), Discrepancy(0.0, 1.0)):
+        expected = rows.T @ process.covariance(TIMES) @ rows
+        np.testing.assert_allclose(process.form(TIMES, rows), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(PROCESS.form(TIMES[:1], rows[:1]), 0.09 * rows[:1].T @ rows[:1])
+    assert (PROCESS.form(TIMES[:0], rows[:0]) == np.zeros((3, 3))).all()
 
 
 def test_draws_inside_of_compiled_programs_have_it_too():
@@ -42,6 +52,29 @@ def test_missing_samples_are_left_out():
     holes = np.where(rng.random(residuals.shape) < 0.3, np.nan, residuals)
     whole, some = (estimated(list(rows), [times] * 4, 0.0) for rows in (residuals, holes))
     assert some.deviation == pytest.approx(whole.deviation, rel=0.1) and some.time == pytest.approx(whole.time, rel=0.2)
+
+
+def test_autocovariances_are_means_of_products():
+    """Of episodes of different lengths with missing samples, by a loop over lags."""
+    rng = np.random.default_rng(6)
+    episodes = [np.where(rng.random(count) < 0.2, np.nan, rng.standard_normal(count)) for count in (50, 31, 1)]
+    expected = []
+    for lag in range(25):
+        products = np.concatenate([own[lag:] * own[: len(own) - lag] for own in episodes if len(own) > lag])
+        expected.append(np.nanmean(products))
+    np.testing.assert_allclose(_autocovariances(episodes), expected, atol=1e-12)
+    assert _autocovariances([]).tolist() == [0.0]
+
+
+def test_a_signal_has_a_clock_of_its_own():
+    """Rows that other signals add between its samples change nothing."""
+    rng, times = np.random.default_rng(7), 0.01 * np.arange(500)
+    residuals = PROCESS.draws(rng, 1, times)[0]
+    between = np.sort(np.concatenate([times, times + 1e-6]))
+    others = np.full(1000, np.nan)
+    others[::2] = residuals
+    assert estimated([others], [between], 0.1) == estimated([residuals], [times], 0.1)
+    assert estimated([np.full(3, np.nan)], [times[:3]], 0.1).deviation == 0
 
 
 def test_white_noise_is_no_discrepancy():

@@ -1,5 +1,7 @@
 """Least squares of MuJoCo tasks: closed forms, known truths, and the errors that residuals do not show."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -8,12 +10,13 @@ pytest.importorskip("mujoco")
 import mujoco
 from envs_mujoco import ARM, recorded
 
-from jaxlfi.envs.mujoco import least_squares
+from jaxlfi.envs.mujoco import least_squares, simulator
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.least_squares import Residuals, best_fits, fit
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.envs.mujoco.simulator import simulator_of
 
 DAMPING = Parameter("joint/shoulder/damping", (0.01, 0.5), unit="N m s/rad", log=True, truth=0.08)
 GEAR = Parameter("actuator/motor/gear[0]", (0.5, 3.0), truth=1.5)
@@ -87,6 +90,62 @@ def test_points_scatter_as_their_covariances_say(monkeypatch):
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.3
     held = [(one.interval[:, 0] < [0.08, 1.5]) & ([0.08, 1.5] < one.interval[:, 1]) for one in fits]
     assert 0.77 < np.mean(held) < 1.0
+
+
+def test_covariances_are_those_of_the_whole_matrix(monkeypatch):
+    """Of two episodes with signals that lack samples, against the covariance of all that was measured, made in full."""
+    monkeypatch.setattr(least_squares, "CORRECTIONS", 0)
+    rng, several = np.random.default_rng(1), []
+    for count in (101, 60):
+        log = recorded(count=count)
+        signals = {"motor": log.signals["motor"]}
+        for name in ("angle", "velocity[0]"):
+            error = Discrepancy(0.01, 0.2).draws(rng, 1, log.times)[0] + 0.01 * rng.standard_normal(count)
+            signals[name] = np.where(rng.random(count) < 0.2, np.nan, log.signals[name] + error)
+        several.append(Log(log.times, signals))
+    own = mujoco_task(ARM, [DAMPING, GEAR], several, noises={"angle": 0.01, "velocity[0]": 0.02})
+    kept, estimate = {}, least_squares.forces.estimated
+    monkeypatch.setattr(
+        least_squares.forces, "estimated", lambda *given: kept.setdefault("size", (estimate(*given), given))[0]
+    )
+    found = fit(own, [0.1, 1.3])
+    (size, widened), (left, _, by_forces) = kept["size"]
+    residuals = Residuals(own)
+    there, times = residuals.simulator.there, residuals.simulator.times
+    episode, clock = np.repeat([0, 1], [len(one) for one in times]), np.concatenate(times)
+    signal = np.nonzero(there)[1]
+    row = np.nonzero(there)[0]
+    whole = np.eye(there.sum()) + (size * widened) ** 2 * by_forces @ by_forces.T
+    for c, process in enumerate(found.discrepancies):
+        same = (signal[:, None] == c) & (signal == c) & (episode[row][:, None] == episode[row])
+        whole += np.where(same, process.covariance(clock[row]), 0.0) / residuals.noise[c] ** 2
+    low, high = (np.asarray(bound, float) for bound in (own.inference.feasible.low, own.inference.feasible.high))
+    point = np.array([np.log(found.theta[0]), found.theta[1]])
+    bread = np.linalg.pinv(residuals.jacobian(point, low, high))
+    np.testing.assert_allclose(found.covariance, bread @ whole @ bread.T, rtol=1e-3)
+    assert len(left) == there.sum() and size > 0 and found.discrepancies[0].deviation > 3e-3 and found.informed.all()
+
+
+def test_memory_grows_with_the_recording_only(monkeypatch):
+    """Of a fit to 24,000 numbers, of which a matrix of each with each would take 4.6 GB."""
+    monkeypatch.setattr(least_squares, "CORRECTIONS", 0)
+    monkeypatch.setattr(simulator, "MEMORY", 2**22)
+    times = 0.01 * np.arange(12_000)
+    signals = {"angle": 0.3 * np.cos(times), "tip[2]": np.sin(3 * times)}
+    own = mujoco_task(
+        PENDULUM,
+        [Parameter("joint/hinge/damping", (0.005, 0.2))],
+        Log(times, signals),
+        noises=dict.fromkeys(signals, 1.0),
+    )
+    assert simulator_of(own)._chunk < 10
+    tracemalloc.start()
+    try:
+        found = fit(own, [0.05])
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert np.isfinite(found.misfit) and most < 1e8
 
 
 def test_an_error_that_persists_makes_intervals_wider(monkeypatch):

@@ -173,3 +173,61 @@ def test_sensors_that_the_model_does_not_have(name, expected):
     with pytest.raises(ValueError, match=expected):
         add_sensors(spec, [name])
         places(spec.compile(), [name])
+
+
+SERVOS = """
+<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" range="-1 1"/><geom size="0.1"/></body></worldbody><actuator>
+  <position name="position" joint="hinge" kp="20" kv="1"/>
+  <velocity name="velocity" joint="hinge" kv="3"/>
+  <intvelocity name="integrated" joint="hinge" kp="20" actrange="-1 1"/>
+  <position joint="hinge" kp="20" dampratio="1"/>
+  <general name="general" joint="hinge" gainprm="20" biastype="affine" biasprm="0 -10 -1"/>
+  <motor name="motor" joint="hinge"/>
+</actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "gain", "bias"),
+    [
+        ("actuator/position/kp", 40, (-40, -1)),
+        ("actuator/0/kp", 40, (-40, -1)),
+        ("actuator/position/kv", 20, (-20, -40)),
+        ("actuator/position/gear[0]", 20, (-20, -1)),
+        ("actuator/velocity/kv", 40, (0, -40)),
+        ("actuator/integrated/kp", 40, (-40, 0)),
+        ("actuator/general/gainprm[0]", 40, (-10, -1)),
+        ("actuator/motor/gainprm[0]", 40, (0, 0)),
+    ],
+)
+def test_gains_of_servos(name, gain, bias):
+    """Position servos go to where their control says, whatever their gain is."""
+    changed, _ = compiled(name, 40.0, SERVOS)
+    row = 0 if name.split("/")[1] == "0" else changed.actuator(name.split("/")[1]).id
+    assert changed.actuator_gainprm[row, 0] == gain and changed.actuator_biasprm[row, 1:3].tolist() == list(bias)
+
+
+def test_a_damping_ratio_stays_with_another_gain():
+    softer, stiffer = (compiled("actuator/3/kp", number, SERVOS)[0].actuator_biasprm[3] for number in (10.0, 40.0))
+    assert stiffer[2] == pytest.approx(2 * softer[2]) and stiffer[2] < 0
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("actuator/position/gainprm[0]", r"actuator/position/kp, which changes gainprm\[0\] and biasprm\[1\]"),
+        ("actuator/0/biasprm[1]", r"expected actuator/0/kp, which changes gainprm\[0\] and biasprm\[1\]"),
+        ("actuator/velocity/gainprm[0]", r"actuator/velocity/kv, which changes gainprm\[0\] and biasprm\[2\]"),
+        ("actuator/velocity/biasprm[2]", "expected actuator/velocity/kv, which"),
+        ("actuator/velocity/kp", "expected kp or kv of a position servo, or kv of a velocity servo"),
+        ("actuator/motor/kp", "expected kp or kv of a position servo"),
+        ("actuator/position/kp[0]", "without an index"),
+        ("actuator/position/group", "expected an attribute .*, got 'group'"),
+        ("actuator/7/gear[0]", "expected a actuator such as"),
+        ("actuator/position/kv", "kv: expected a gain of at least 0, got -40"),
+    ],
+)
+def test_a_part_of_a_gain_is_refused(name, expected):
+    with pytest.raises(ValueError, match=expected) as refusal:
+        compiled(name, -40.0, SERVOS)
+    assert "\n" not in str(refusal.value)
