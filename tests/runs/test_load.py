@@ -182,7 +182,7 @@ def replaced(name, **arrays):
         (config_with(format="other"), "config.json is not of jaxlfi"),
         (config_with(format="jaxlfi-grid"), "config.json is of format 'jaxlfi-grid'"),
         (config_with(version=1), r"expected version 2 of the format, got 1: .*run its command again"),
-        (config_with(status="running"), "expected a finished run; go on with it by 'jaxlfi resume'"),
+        (config_with(status="running"), "expected a finished run; go on with it by jaxlfi resume"),
         (lambda folder: (folder / "posterior.npz").unlink(), "expected a finished run"),
         (without("settings"), "config.json: expected a complete description of the run"),
         (without("parameters"), "config.json: expected a complete description of the run"),
