@@ -85,9 +85,9 @@ def watched(work: Callable[[], int]) -> int:
         try:
             watch.begin()
             status = work()
-            sys.stdout.flush()
         finally:
             watch.over = True
+            sys.stdout.flush()
     except BrokenPipeError as error:
         if is_unread(error):
             _end(UNREAD)

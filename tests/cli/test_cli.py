@@ -457,7 +457,7 @@ def test_several_objects_are_an_option_of_the_task(tmp_path, capsys):
     assert tasks.load(f"{reference},object=a b.npz;c;d").name == "('a b.npz', 'c', 'd') all"
     assert tasks.load(f"{reference},object=a").name == "('a',) all"
     message = error_line(capsys, "infer", TASK, "--object", "a,b", "c;d", *FLAGS, "--out", tmp_path / "out")
-    assert f"got '{TASK},object=\"a,b\";\"c;d\"'" in message
+    assert f'got \'{TASK},object="a,b";"c;d"\'' in message
     assert tasks.load(f'{reference},object="a,b";"c;d"').name == "('a,b', 'c;d') all"
 
 
