@@ -97,9 +97,10 @@ def watched(work: Callable[[], int]) -> int:
         if not (watch.received or isinstance(error, KeyboardInterrupt)):
             raise
         status = report()
-    if status == INTERRUPTED or watch.received:
-        report()
-        _end(INTERRUPTED)
+    if watch.received and status != INTERRUPTED:  # which whoever returned it has reported
+        status = report()
+    if status == INTERRUPTED:
+        _end(status)
     return status
 
 
