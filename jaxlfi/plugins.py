@@ -15,7 +15,7 @@ from typing import Any
 def points(group: str) -> dict[str, list[EntryPoint]]:
     """The entry points of a group by name, sorted: one each, or several that lead to different objects."""
     found: dict[str, dict[str, EntryPoint]] = {}
-    for point in sorted(entry_points(group=group), key=lambda point: (point.name, package_of(point))):
+    for point in sorted(entry_points(group=group), key=lambda point: (point.name, point.value)):
         found.setdefault(point.name, {}).setdefault(point.value, point)
     return {name: list(by_value.values()) for name, by_value in found.items()}
 
@@ -57,7 +57,7 @@ def find(group: str, word: str, reference: str, own: str = "module:factory") -> 
     if others:
         packages = [f"{package_of(each)} ({each.value})" for each in (point, *others)]
         refuse_clash(word, reference, packages, f": name the one that is meant as {own}")
-    return _loaded(word, f"{reference!r} ({point.value}) of {package_of(point)}", *place_of(point))
+    return _loaded(word, f"{reference!r} ({point.value})", *place_of(point))
 
 
 def refuse_clash(word: str, name: str, packages: list[str], advice: str = "") -> None:

@@ -87,19 +87,15 @@ def watched(work: Callable[[], int]) -> int:
             status = work()
         finally:
             watch.over = True
-            sys.stdout.flush()
-    except BrokenPipeError as error:
-        if is_unread(error):
-            _end(UNREAD)
-        raise
+            _flush(sys.stdout)
     except BaseException as error:
         # Native code may turn a KeyboardInterrupt into any other exception.
-        if not (watch.received or isinstance(error, KeyboardInterrupt)):
+        if not (watch.received or isinstance(error, KeyboardInterrupt) or is_unread(error)):
             raise
-        status = report()
+        status = UNREAD if is_unread(error) else report()
     if watch.received and status != INTERRUPTED:  # which whoever returned it has reported
         status = report()
-    if status == INTERRUPTED:
+    if status in (INTERRUPTED, UNREAD):
         _end(status)
     return status
 
@@ -177,6 +173,17 @@ def _line() -> str:
 def _end(status: int) -> NoReturn:
     """End the process without Python's own last acts, which wait for native code and threads."""
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(Exception):
-            stream.flush()
+        with contextlib.suppress(BrokenPipeError, RuntimeError):  # a signal may interrupt this very act
+            _flush(stream)
     os._exit(status)
+
+
+def _flush(stream: Any) -> None:
+    """Write what a stream holds back; what else fails than a pipe that nobody reads is left to Python's own end."""
+    try:
+        if stream is not None:
+            stream.flush()
+    except BrokenPipeError:
+        raise
+    except (OSError, ValueError):
+        return
