@@ -2,6 +2,6 @@
 
 import sys
 
-from jaxlfi.cli.parser import main
+from jaxlfi.cli.start import main
 
 sys.exit(main())

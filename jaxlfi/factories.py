@@ -1,29 +1,29 @@
-"""Objects made by name: by registered factories (entry points) or `module:factory`, with options given as text.
+"""Objects made by name: by factories that `jaxlfi.plugins` finds, with options given as text.
 
 A reference is a name, and options for its factory, as in "whip,object=dlo-0,detector=clean". Options are converted to
 the types that the factory's signature declares: int, float, bool, str, Path, Literal, unions of them, and tuples of any
-number of one of them, whose items ";" separates.
+number of one of them, whose items ";" separates. A value may be put in quotation marks, within which separators are
+part of it and "" is a quotation mark; a path with separators needs none where it exists, or where what follows a comma
+in it does not begin as an option does.
 """
 
-import importlib
 import inspect
+import itertools
 import os
-import sys
+import re
 import types
 import typing
-from importlib.metadata import entry_points
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 SEPARATOR = ";"
 """Between the items of an option of a tuple's type."""
 BOOLEANS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 """Words for an option of type bool."""
-
-
-def names(group: str) -> list[str]:
-    """All registered names of a group."""
-    return sorted({point.name for point in entry_points(group=group)})
+_QUOTED = r'(?<![^,=;])"(?:[^"]|"")*"(?![^,;])'
+"""A value in quotation marks, from one separator to the next."""
 
 
 def parse(reference: str, word: str = "task") -> tuple[str, dict[str, str]]:
@@ -42,41 +42,65 @@ def parse(reference: str, word: str = "task") -> tuple[str, dict[str, str]]:
     """
     if not isinstance(reference, str):
         raise ValueError(f"{word}: expected a name, got {reference!r}")
-    name, *parts = reference.split(",")
-    options = dict(part.partition("=")[::2] for part in parts)
-    if len(options) < len(parts) or not all(key.isidentifier() and value for key, value in options.items()):
-        raise ValueError(f"{word}: expected options as NAME,key=value,key=value, each key once, got {reference!r}")
+    name, *parts = _split(reference, ",")
+    options: dict[str, str] = {}
+    while parts:
+        # A value may be a path with commas: as many parts belong to it as name a file, or begin no option.
+        key, _, first = parts[0].partition("=")
+        values = [first, *parts[1:]]
+        whole = _length_of_path(values, ",")
+        while whole < len(values) and not _begins_option(values[whole]):
+            whole += 1
+        if not (key.isidentifier() and first) or key in options:
+            raise ValueError(f"{word}: expected options as NAME,key=value,key=value, each key once, got {reference!r}")
+        options[key], parts = ",".join(values[:whole]), parts[whole:]
     return name, options
 
 
-def find(group: str, word: str, reference: str) -> Any:
-    """The factory, or the ready-made object, that a registered name or "module:factory" refers to.
+def with_option(reference: str, name: str, *values: str) -> str:
+    """A reference with one more option, whose values are read as they are, whatever they contain.
 
-    Raises:
-        ValueError: for unknown names, and modules that cannot be imported.
+    Example:
+        >>> with_option("whip", "object", "monday,rope.npz", "dlo-0")
+        'whip,object="monday,rope.npz";dlo-0'
+        >>> convert(parse(with_option("whip", "object", "a;b", "c"))[1]["object"], tuple[str, ...], "object")
+        ('a;b', 'c')
     """
-    if ":" in reference:
-        module_name, _, attribute = reference.partition(":")
-        if module_name.endswith(".py"):
-            raise ValueError(
-                f"{word}: expected module:factory, got {reference!r}: leave out '.py' and run from the file's folder"
-            )
-        if os.getcwd() not in sys.path:
-            sys.path.insert(0, os.getcwd())
-        # A third party's module may raise anything while it is imported.
-        try:
-            return getattr(importlib.import_module(module_name), attribute)
-        except Exception as error:
-            raise ValueError(f"{word}: cannot load {reference!r}: {type(error).__name__}: {error}") from error
-    points = {point.name: point for point in entry_points(group=group)}
-    if reference not in points:
-        raise ValueError(f"{word}: expected one of {sorted(points)} or module:factory, got {reference!r}")
-    try:
-        return points[reference].load()
-    except Exception as error:
-        raise ValueError(
-            f"{word}: cannot load {reference!r} ({points[reference].value}): {type(error).__name__}: {error}"
-        ) from error
+    return f"{reference},{name}={SEPARATOR.join(map(_quoted, values))}"
+
+
+def _begins_option(part: str) -> bool:
+    return part.partition("=")[0].strip().isidentifier()
+
+
+def _length_of_path(parts: list[str], separator: str) -> int:
+    """How many of the first parts are together the name of a file that is there; 1 where it is none."""
+    return next((n for n in range(len(parts), 1, -1) if os.path.lexists(separator.join(parts[:n]))), 1)
+
+
+def _split(text: str, separator: str) -> list[str]:
+    """A text's parts between separators, but for separators in quotation marks."""
+    at = [match.start() for match in re.finditer(f"{_QUOTED}|{separator}", text) if match[0] == separator]
+    return [text[start + 1 : stop] for start, stop in itertools.pairwise([-1, *at, len(text)])]
+
+
+def _quoted(value: str) -> str:
+    plain = not re.search(f'[,{SEPARATOR}]|^"', value)
+    return value if plain else '"' + value.replace('"', '""') + '"'
+
+
+def _unquoted(text: str) -> str:
+    return text[1:-1].replace('""', '"') if re.fullmatch(_QUOTED, text) else text
+
+
+def _items(text: str) -> list[str]:
+    """The items of a value, some of which may be paths with separators."""
+    parts, items = _split(text, SEPARATOR), []
+    while parts:
+        whole = _length_of_path(parts, SEPARATOR)
+        items.append(_unquoted(SEPARATOR.join(parts[:whole])))
+        parts = parts[whole:]
+    return items
 
 
 def _signature(factory) -> inspect.Signature | None:
@@ -93,6 +117,26 @@ def parameters(factory: Any) -> tuple[str, ...]:
     return () if signature is None else tuple(signature.parameters)
 
 
+def wanted(name: str, factory: Any, options: Mapping[str, str] = MappingProxyType({})) -> str:
+    """The reference with the options besides those given that a factory cannot do without; empty where there are none.
+
+    Example:
+        >>> def arm(config: Path, mass: float, gain: float = 1.0): ...
+        >>> wanted("arm", arm)
+        'arm,config=FILE,mass=FLOAT'
+    """
+    signature = _signature(factory) if callable(factory) else None
+    if signature is None:
+        return ""
+    several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    missing = [
+        f"{each.name}={'FILE' if each.annotation is Path else getattr(each.annotation, '__name__', 'VALUE').upper()}"
+        for each in signature.parameters.values()
+        if each.default is each.empty and each.kind not in several and each.name not in options
+    ]
+    return ",".join([name, *missing]) if missing else ""
+
+
 def made(word: str, reference: str, factory: Any, options: dict[str, str], kind: type) -> Any:
     """The object that a factory makes with these options; or the object itself, if it was given ready-made.
 
@@ -106,10 +150,12 @@ def made(word: str, reference: str, factory: Any, options: dict[str, str], kind:
     signature = _signature(factory)
     if signature is not None:
         try:
-            signature.bind(**options)
+            signature.bind_partial(**options)
         except TypeError as error:
             known = ", ".join(signature.parameters) or "none"
             raise ValueError(f"{word}: expected options among {known}, got {reference!r}: {error}") from error
+        if whole := wanted(reference, factory, options):
+            raise ValueError(f"{word}: expected {whole}, got {reference!r}")
     try:
         return factory(**_converted(signature, options))
     except Exception as error:
@@ -119,7 +165,7 @@ def made(word: str, reference: str, factory: Any, options: dict[str, str], kind:
 def _converted(signature: inspect.Signature | None, options: dict[str, str]) -> dict[str, Any]:
     """Options in the types of the factory's parameters."""
     if signature is None:
-        return dict(options)
+        return {name: _unquoted(value) for name, value in options.items()}
     kinds = {name: parameter.annotation for name, parameter in signature.parameters.items()}
     return {name: convert(value, kinds.get(name, str), name) for name, value in options.items()}
 
@@ -145,7 +191,8 @@ def convert(text: str, kind: Any, name: str) -> Any:
                 refused = error
         raise refused
     if typing.get_origin(kind) is tuple and typing.get_args(kind)[1:] == (...,):
-        return tuple(convert(item, typing.get_args(kind)[0], name) for item in text.split(SEPARATOR))
+        return tuple(convert(item, typing.get_args(kind)[0], name) for item in _items(text))
+    text = _unquoted(text)
     if typing.get_origin(kind) is typing.Literal:
         known = {str(value): value for value in typing.get_args(kind)}
         if text not in known:

@@ -67,8 +67,11 @@ class _UnreadableError(Exception):
 
 def of_group(group: str) -> dict[str, Source]:
     """What all registered classes of an entry-point group declare, by the name they are registered by."""
-    reader = _Reader()
-    return {name: reader.source(point.module, point.attr) for name, point in plugins.points(group).items()}
+    reader, unknown = _Reader(), Source({}, complete=False)  # of a name that several packages register
+    return {
+        name: unknown if others else reader.source(*plugins.place_of(point))
+        for name, (point, *others) in plugins.points(group).items()
+    }
 
 
 def of_class(reference: str) -> Source:

@@ -329,12 +329,6 @@ def test_wrong_arguments_are_refused(swelling, words, message):
         registry.build(arguments.heuristic, arguments.hyperparameters, dim=2)
 
 
-def test_one_name_for_two_classes_is_refused(swelling):
-    package(swelling, "other", "[jaxlfi.heuristics]\nswell = other.rule:Swell\n")
-    with pytest.raises(ValueError, match=r"^jaxlfi\.heuristics: expected one 'swell', got "):
-        registry.names()
-
-
 BAD_REFERENCES = {
     "unknown": ("x", r"heuristic: expected one of \['centre', 'edge', .*\] or module:Class, got 'x'"),
     "no module": ("nowhere.at_all:X", "heuristic: cannot load 'nowhere.at_all:X': ModuleNotFoundError"),

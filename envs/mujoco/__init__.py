@@ -8,7 +8,7 @@ from typing import Literal
 
 
 def task(
-    config: Path | None = None,
+    config: Path,
     log: tuple[Path, ...] = (),
     summary: str | None = None,
     engine: Literal["native", "mjx"] = "native",
@@ -16,7 +16,7 @@ def task(
     """The task that a TOML file describes (`jaxlfi.envs.mujoco.config`).
 
     Args:
-        config: the file, which there has to be.
+        config: the file.
         log: recordings in place of those that the file names; several are episodes of the same parameters.
         summary: what the network sees of them, by its name, in place of what the file says.
         engine: "native" is MuJoCo on the processor's cores; "mjx" is MuJoCo in JAX, where it can simulate the model.
@@ -26,8 +26,6 @@ def task(
         ValueError: for whatever does not fit together, in one line.
     """
     require_mujoco()
-    if config is None:
-        raise ValueError("config: expected a TOML file that describes a task, as mujoco,config=arm.toml; got none")
     from jaxlfi.envs.mujoco.config import read
 
     return read(config, log, summary, engine)

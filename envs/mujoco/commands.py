@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import scipy.linalg
-from rich.console import Console
 from rich.table import Table
 
 import jaxlfi
 from jaxlfi import plot
+from jaxlfi.cli import tables
 from jaxlfi.envs.mujoco import config, informed, least_squares, sysid_point
 from jaxlfi.envs.mujoco.least_squares import Fit
 from jaxlfi.envs.mujoco.simulator import simulator_of
@@ -50,7 +50,7 @@ def fit(arguments: argparse.Namespace) -> None:
     task = config.read(source) if run is None else task_of(run)
     starts = _over_feasible(task, arguments.starts) if run is None else np.asarray(run.draws(arguments.starts))
     observation = None if run is None else np.asarray(run.observed)
-    console = Console()
+    console = tables.console()
 
     def counted(rows: Sequence[int]) -> Iterator[int]:
         with RoundProgress(console, len(rows), 0, task.name, "point") as progress:
@@ -60,10 +60,10 @@ def fit(arguments: argparse.Namespace) -> None:
 
     fits = least_squares.best_fits(task, starts, arguments.keep, observation=observation, counted=counted)
     for number, one in enumerate(fits):
-        console.print(_table(task, one, f"point {number + 1} of {len(fits)}"))
+        tables.show(_table(task, one, f"point {number + 1} of {len(fits)}"), console)
     other = sysid_point.sysid_point(task, observation) if arguments.sysid else None
     if other is not None:
-        console.print(_table(task, other, f"{SYSID}, from the middle of the first guess"))
+        tables.show(_table(task, other, f"{SYSID}, from the middle of the first guess"), console)
     for line in said(task, fits):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if out is not None:

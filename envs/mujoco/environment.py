@@ -183,7 +183,7 @@ class MujocoEnvironment:
         return {f"{name} off": jnp.abs(off) for name, off in self.reading.off(values).items()} | {"failed": failed}
 
 
-def environment(config: Path | None = None) -> MujocoEnvironment:
+def environment(config: Path) -> MujocoEnvironment:
     """The environment that a TOML file describes, in which the inference task is described, too.
 
     Args:
@@ -192,8 +192,6 @@ def environment(config: Path | None = None) -> MujocoEnvironment:
     Raises:
         ValueError: for whatever does not fit together, in one line.
     """
-    if config is None:
-        raise ValueError("config: expected a TOML file that describes a task, as mujoco,config=arm.toml; got none")
     table = tables.load(config)
     if "policy" not in table:
         raise ValueError(f"{config}: expected a table [policy] that says what policies are to do, got none")

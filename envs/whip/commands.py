@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import functools
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
+from jaxlfi.cli import tables
 from jaxlfi.envs.whip import control as controlling
 from jaxlfi.envs.whip import formats, planner
 from jaxlfi.envs.whip import recording as recordings
@@ -131,8 +132,8 @@ def deploy(arguments: argparse.Namespace) -> None:
     repetitions.write(out / "table.csv", lines)
     table = Table(*lines[0], title=f"{n} places: the first nominal, the others displaced as in training")
     for line in lines:
-        table.add_row(*(value if isinstance(value, str) else f"{value:.2f}" for value in line.values()))
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+        table.add_row(*(escape(value) if isinstance(value, str) else f"{value:.2f}" for value in line.values()))
+    tables.show(table)
     print(f"wrote {out / 'table.csv'} and {out / 'episodes.csv'}")
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi import factories
+from jaxlfi import factories, plugins
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.environment import ACTIONS, LIMITS, OBSERVATIONS
 from jaxlfi.envs.whip.frames import COLOURS
@@ -130,7 +130,7 @@ def robot_of(word: str, seed: int, remote: bool, sight: Any = None) -> tuple[Rob
         robot = SocketRobot(word, OBSERVATIONS.names, ACTIONS.names, remote)
     elif ":" in word:
         name, options = factories.parse(word, "robot")
-        robot = factories.made("robot", word, factories.find("", "robot", name), options, Robot)
+        robot = factories.made("robot", word, plugins.find("", "robot", name), options, Robot)
     else:
         from jaxlfi.envs.whip.reference_objects import objects
         from jaxlfi.envs.whip.reference_objects.robot import ReferenceRobot

@@ -108,7 +108,7 @@ def located(reference: str | Path) -> tuple[Path, int | None]:
         ValueError: for what is no number.
     """
     path, mark, number = str(reference).rpartition(EPISODE)
-    if not mark:
+    if not mark or Path(reference).exists():
         return Path(reference), None
     if not (number.isascii() and number.isdigit()):
         raise ValueError(f"recording: expected a number after {EPISODE}, got {number!r}")

@@ -23,10 +23,12 @@ from jaxlfi import flags
 from jaxlfi.cli import parser as command_line
 from jaxlfi.cli import train
 from jaxlfi.cli.exit_status import exit_status
+from jaxlfi.cli.interrupts import INTERRUPTED
 from jaxlfi.cli.parser import OneLineParser
 from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip import require_mujoco
 from jaxlfi.envs.whip.vision import options
+from jaxlfi.io.shell import quoted
 
 EXAMPLES = """\
 examples:
@@ -89,8 +91,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return exit_status("jaxlfi r2s2r", lambda: _loop(arguments), arguments.debug, go_on)
     except StageError as stage:  # which has said why
-        if stage.status == 130:
-            print(f"jaxlfi r2s2r: interrupted{go_on()}", file=sys.stderr)
         return stage.status
 
 
@@ -253,10 +253,10 @@ def _deploy(arguments: argparse.Namespace, policies: Sequence[Path]) -> None:
 
 
 def _command(run: Callable[[list[str]], int], words: list[str], what: str) -> None:
-    prefix = {train.main: "train ", whip.main: "whip "}.get(run, "")
-    _say(f"{what}: jaxlfi {prefix}{' '.join(words)}")
+    prefix = {train.main: ["train"], whip.main: ["whip"]}.get(run, [])
+    _say(f"{what}: {quoted('jaxlfi', *prefix, *words)}")
     if status := run(words):
-        raise StageError(status)
+        raise KeyboardInterrupt if status == INTERRUPTED else StageError(status)
 
 
 def _say(text: str) -> None:

@@ -127,8 +127,7 @@ def sped_up() -> Iterator[None]:
     """Read what is installed, and its sources, once for all cases."""
     found, read = functools.cache(importlib.metadata.entry_points), functools.cache(source_fields.of_group)
     with contextlib.ExitStack() as stack:
-        for module in (plugins, cli):
-            stack.enter_context(mock.patch.object(module, "entry_points", found))
+        stack.enter_context(mock.patch.object(plugins, "entry_points", found))
         stack.enter_context(mock.patch.object(source_fields, "of_group", read))
         yield
 

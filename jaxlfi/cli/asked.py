@@ -119,9 +119,9 @@ def support_of(arguments: argparse.Namespace, task: Task) -> tuple[str, Support]
     return "own", task.support(Support(low, high))
 
 
-def observation_of(arguments: argparse.Namespace, task: Task) -> np.ndarray | None:
+def observation_of(arguments: argparse.Namespace, task: Task, say: Callable[[str], None]) -> np.ndarray | None:
     """The observed trajectory of the files that were given; None for the task's own."""
-    return None if arguments.observation is None else read_for(task, *arguments.observation)
+    return None if arguments.observation is None else read_for(task, *arguments.observation, say=say)
 
 
 def seeds_of(arguments: argparse.Namespace) -> range:

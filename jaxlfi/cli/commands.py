@@ -16,7 +16,8 @@ from rich.table import Table
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.keys import key_of
 from jaxlfi.bayessim.presets import all_rounds
-from jaxlfi.cli import asked, summaries, train
+from jaxlfi.cli import asked, summaries, tables, train
+from jaxlfi.cli.exit_status import resuming
 from jaxlfi.distributions.truncation import TRIES
 from jaxlfi.heuristics import registry as heuristics
 from jaxlfi.io import files as atomic
@@ -24,6 +25,7 @@ from jaxlfi.io import host_devices
 from jaxlfi.io.locks import locked
 from jaxlfi.io.processes import Processes
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.io.shell import quoted
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import export
 from jaxlfi.runs import folder as run_store
@@ -56,13 +58,16 @@ def tasks(arguments: argparse.Namespace, console: Console) -> None:
     table = Table("task", "parameters", "supports", "observation")
     for name in task_lookup.names():
         try:
+            if wanted := task_lookup.wanted(name):
+                table.add_row(escape(name), "", "", escape(f"give it as {wanted}"))
+                continue
             task = task_lookup.load(name)
         except ValueError as error:  # one broken package must not hide the others
             table.add_row(escape(name), "", "", escape(str(error).splitlines()[0]))
             continue
         given = "given" if task.observation is not None else "simulated at the truth" if task.truth is not None else "-"
         table.add_row(*map(escape, (name, ", ".join(task.space.labels), ", ".join(task.supports), given)))
-    console.print(table)
+    tables.show(table, console)
     console.print("Details: jaxlfi tasks NAME. Your own: module:factory in place of a name.")
 
 
@@ -75,7 +80,7 @@ def _describe_task(task: Task, console: Console) -> None:
         boxes = [f"[{float(box.low[d]):g}, {float(box.high[d]):g}]" for box in (*task.supports.values(), task.feasible)]
         truth = [f"{float(task.truth[d]):.4g}"] if task.truth is not None else []
         table.add_row(*map(escape, (name, task.units[d], *boxes, *truth)))
-    console.print(table)
+    tables.show(table, console)
     logs = f" Inferred as logarithms: {', '.join(task.log)}." if task.log else ""
     console.print(escape(f"Supports, Phi and truth in natural units; the first support is the default.{logs}"))
 
@@ -125,7 +130,8 @@ def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, fir
     processes = arguments.joined
     if processes.writes:
         run_store.refuse_occupied(arguments.out)
-    observed = executing.prepare(plan, asked.observation_of(arguments, plan.task), first, processes)
+    observation = asked.observation_of(arguments, plan.task, lambda line: _say(console, line))
+    observed = executing.prepare(plan, observation, first, processes)
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
         if (mass := priors.require_mass(plan.task.inference.prior, box, name)) < priors.LOW_INSIDE:
             missed = (1 - mass) ** TRIES
@@ -165,7 +171,7 @@ def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
         preset=arguments.preset,
         support_name=name,
     )
-    observation = asked.observation_of(arguments, task)
+    observation = asked.observation_of(arguments, task, lambda line: _say(console, line))
     if arguments.joined.writes:
         run_store.refuse_occupied(arguments.out)
     _say(console, f"{task.name}: compiling for {plan.size} runs")
@@ -188,7 +194,7 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
         if arguments.joined.writes:
             executing.clean(folder)
-        _say(console, _COMPLETE.format(folder=folder))
+        _say(console, _complete(folder))
         return None
     plan, observed = executing.reopen(folder)
     if config.get("executor", False) and (arguments.workers, arguments.scheduler) == (None, None):
@@ -200,13 +206,14 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     return folder, (plan, observed)
 
 
-_COMPLETE = "{folder} is complete: nothing to resume. Its pictures: jaxlfi report {folder}"
+def _complete(folder: Path) -> str:
+    return f"{folder} is complete: nothing to resume. Its pictures: {quoted('jaxlfi', 'report', folder)}"
 
 
 def _resume_grid(folder: Path, processes: Processes, console: Console) -> Prepared | None:
     config = grid.read_config(folder)
     if config.get("status") == "finished":
-        _say(console, _COMPLETE.format(folder=folder))
+        _say(console, _complete(folder))
         return None
     if changed := executing.changed_machine(config, processes):
         _warn(console, f"begun with {', '.join(changed)}: results differ by rounding")
@@ -266,7 +273,7 @@ def diagnose(arguments: argparse.Namespace, console: Console) -> None:
         _say(console, f"{widths.heading}:")
         for name, one in widths.rows:
             _say(console, f"  {sentence(name, one)}")
-    console.print(summaries.checks_table(found.checks))
+    tables.show(summaries.checks_table(found.checks), console)
     _say(console, f"diagnostics: {out}")
     if arguments.no_figures:
         return
@@ -299,7 +306,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     if not processes.writes:
         return
     executing.finish(folder, plan, runs)
-    console.print(summaries.summary_table(plan, runs))
+    tables.show(summaries.summary_table(plan, runs), console)
     for warning in summaries.warnings(plan, runs):
         _warn(console, warning)
     for line in (*summaries.failure_lines(runs), *summaries.rounds_lines(plan, runs), *summaries.widths_lines(plan)):
@@ -313,7 +320,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
 def advice(error: Exception, prepared: Prepared) -> str:
     """What to do about an error of a run, for the end of its line."""
     from_outside = isinstance(error, ExecutorError | OSError)  # a lost cluster, a full disk
-    return f"; continue with: jaxlfi resume {prepared[0]}" if from_outside and prepared[0].exists() else ""
+    return resuming(prepared[0]) if from_outside and prepared[0].exists() else ""
 
 
 def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: Console) -> None:
@@ -328,7 +335,7 @@ def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: 
         raise
     if not arguments.joined.writes:
         return
-    console.print(summaries.marginal_table(work.grid, arrays))
+    tables.show(summaries.marginal_table(work.grid, arrays), console)
     _say(console, f"table: {folder / 'table.csv'}")
     if not arguments.no_figures:
         draw(folder, console)

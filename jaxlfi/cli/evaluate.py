@@ -6,14 +6,13 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 import argparse
 import csv
 import io
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from jaxlfi import flags
 from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import exit_status
-from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
+from jaxlfi.cli.parser import OneLineParser
 
 EXAMPLES = f"""\
 {DOMAINS}
@@ -58,9 +57,10 @@ def _run(arguments: argparse.Namespace) -> None:
     from jaxlfi.io import compile_cache, files
 
     compile_cache.enable()
-    from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
+    from jaxlfi.cli import tables
     from jaxlfi.rl import registry
     from jaxlfi.rl.evaluation import cross_evaluate
     from jaxlfi.rl.policy import load
@@ -75,8 +75,8 @@ def _run(arguments: argparse.Namespace) -> None:
     rows = cross_evaluate(environment, policies, draws, arguments.episodes, arguments.seed)
     table = Table(*rows[0], title=f"{arguments.episodes} episodes on each domain")
     for row in rows:
-        table.add_row(*(value if isinstance(value, str) else f"{value:.2f}" for value in row.values()))
-    (Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)).print(table)
+        table.add_row(*(escape(value) if isinstance(value, str) else f"{value:.2f}" for value in row.values()))
+    tables.show(table)
     if arguments.out is not None:
         text = io.StringIO()
         writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")

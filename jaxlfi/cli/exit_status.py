@@ -1,13 +1,18 @@
 """How a command ends: its exit status, and one line on stderr for bad input and interruptions."""
 
+import re
 import sys
 import traceback
 from collections.abc import Callable
+from pathlib import Path
+
+from jaxlfi.cli import interrupts
+from jaxlfi.io.shell import quoted
 
 
 def one_line(error: Exception) -> str:
     """What an error of bad input says, in one line; where a path caused it, what was expected instead."""
-    text = " ".join(str(error).split()) or type(error).__name__
+    text = re.sub(r"\s*[\r\n]+\s*", " ", str(error)).strip() or type(error).__name__  # names keep their spaces
     of_path = getattr(error, "filename", None) is not None or text == "embedded null byte"
     return f"expected a file or folder that can be used, got {text}" if of_path and "expected" not in text else text
 
@@ -23,16 +28,31 @@ def exit_status(program: str, work: Callable[[], None], debug: bool = False, adv
 
     Returns:
         0; 2 for bad input; 130 where it was interrupted.
+
+    Raises:
+        BrokenPipeError: where nobody reads the output.
     """
-    try:
-        work()
-    except (ValueError, OSError, ImportError) as error:
-        if debug:
-            traceback.print_exception(error)
-        go_on = advice() if isinstance(error, OSError) and not isinstance(error, BlockingIOError) else ""
-        print(f"{program}: error: {one_line(error)}{go_on}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"{program}: interrupted{advice()}", file=sys.stderr)
-        return 130
+    with interrupts.advising(program, advice):
+        try:
+            work()
+        except (ValueError, OSError, ImportError) as error:
+            if interrupts.is_unread(error):
+                raise
+            go_on = advice() if isinstance(error, OSError) and not isinstance(error, BlockingIOError) else ""
+            return refuse(program, error, debug, go_on)
+        except KeyboardInterrupt:
+            return interrupts.report()
     return 0
+
+
+def refuse(program: str, error: Exception, debug: bool = False, advice: str = "") -> int:
+    """Report an error in one line with what to do about it, and where it came from on request; returns 2."""
+    if debug:
+        traceback.print_exception(error)
+    print(f"{program}: error: {one_line(error)}{advice}", file=sys.stderr)
+    return 2
+
+
+def resuming(folder: Path) -> str:
+    """How to go on with a folder, for the end of a line."""
+    return f"; continue with: {quoted('jaxlfi', 'resume', folder)}"

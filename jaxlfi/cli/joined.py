@@ -5,6 +5,7 @@ process, which says in one line how the child ended. This module imports neither
 """
 
 import argparse
+import contextlib
 import os
 import signal
 import sys
@@ -12,6 +13,8 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NoReturn
+
+from jaxlfi.cli import interrupts
 
 if TYPE_CHECKING:
     from jaxlfi.io.processes import Processes
@@ -98,7 +101,9 @@ def work(command: Callable[[], int], advice: Callable[[], str], program: str, de
         _in_child(command, child_log, life)
     os.close(child_log)
     os.close(life)
-    interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # the child says that it was interrupted
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, lambda number, frame: _pass_on(child, number))  # the child says what came of it
     kept = b""
     while text := os.read(log, KEPT):
         kept = (kept + text)[-KEPT:]
@@ -106,7 +111,7 @@ def work(command: Callable[[], int], advice: Callable[[], str], program: str, de
             os.write(2, text)
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     os.close(parent_life)
-    signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGINT, before)
     if status >= 0:
         return status
     print(f"{program}: error: {_cause(-status, kept)}{advice()}", file=sys.stderr)
@@ -118,15 +123,23 @@ def _in_child(command: Callable[[], int], log: int, life: int) -> NoReturn:
     sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
     os.dup2(log, 2)
     threading.Thread(target=lambda: os.read(life, 1) or os._exit(1), daemon=True).start()
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     status = 1
     try:
-        status = command()
+        status = interrupts.watched(command)
     except BaseException:
         traceback.print_exc()
     finally:  # without jax's farewell, which waits for the others
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
+
+
+def _pass_on(child: int, number: int) -> None:
+    """Send a signal on, as one that a terminal has sent reaches parent and child, another the parent alone."""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(child, number)
 
 
 def _cause(number: int, log: bytes) -> str:

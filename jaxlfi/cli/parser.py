@@ -14,27 +14,26 @@ import itertools
 import json
 import math
 import sys
-import traceback
-from collections.abc import Mapping, Sequence
-from importlib.metadata import EntryPoint, entry_points
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import jaxlfi
-from jaxlfi import flags, source_fields
-from jaxlfi.cli import help_texts, joined
-from jaxlfi.cli.exit_status import one_line
+from jaxlfi import factories, flags, plugins, source_fields
+from jaxlfi.cli import help_texts, interrupts, joined
+from jaxlfi.cli.exit_status import refuse, resuming
 from jaxlfi.fields import Declared
 
-Commands = argparse._SubParsersAction  # argparse has no public name for it
+Subparsers = argparse._SubParsersAction  # argparse has no public name for it
 PRESETS = ("quick", "paper")
 METHODS = ("bayessim", "apt", "npe", "snle")
 HEURISTICS, ESTIMATORS = "jaxlfi.heuristics", "jaxlfi.estimators"
 """The entry-point groups of classes whose fields have flags."""
+COMMANDS = "jaxlfi.commands"
+"""The entry-point group of commands that packages add."""
+OWN_COMMANDS = ("tasks", "infer", "compare", "grid", "resume", "sample", "diagnose", "report")
 SETTINGS = "jaxlfi.bayessim.settings:Settings"
 """The class whose fields are the settings of a run."""
-FILE_WIDTH = 120
-"""Characters in a line of output that goes to a file or a pipe."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -123,12 +122,14 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
     _add_sample(commands)
     _add_diagnose(commands)
     _add_report(commands)
-    for name in foreign_commands():
-        commands.add_parser(name, add_help=False, help=f"commands of its own: jaxlfi {name} --help")
+    for name in plugins.names(COMMANDS):
+        if name not in OWN_COMMANDS:
+            shown = name.replace("%", "%%")
+            commands.add_parser(name, add_help=False, help=f"commands of its own: jaxlfi {shown} --help")
     return top
 
 
-def _add_tasks(commands: Commands) -> None:
+def _add_tasks(commands: Subparsers) -> None:
     command = commands.add_parser(
         "tasks", help="list tasks, or describe one", description="List tasks, or describe one."
     )
@@ -137,7 +138,7 @@ def _add_tasks(commands: Commands) -> None:
     )
 
 
-def _add_infer(commands: Commands, families: Families) -> None:
+def _add_infer(commands: Subparsers, families: Families) -> None:
     command = commands.add_parser(
         "infer",
         help="infer a task's parameters",
@@ -172,7 +173,7 @@ def _add_infer(commands: Commands, families: Families) -> None:
     _add_shared(command, families, seeds=1)
 
 
-def _add_compare(commands: Commands, families: Families) -> None:
+def _add_compare(commands: Subparsers, families: Families) -> None:
     command = commands.add_parser(
         "compare",
         help="run supports and heuristics side by side",
@@ -189,7 +190,7 @@ def _add_compare(commands: Commands, families: Families) -> None:
     _add_shared(command, families, seeds=4)
 
 
-def _add_grid(commands: Commands, families: Families) -> None:
+def _add_grid(commands: Subparsers, families: Families) -> None:
     command = commands.add_parser(
         "grid",
         help="run a heuristic over a grid of its hyperparameters",
@@ -223,7 +224,7 @@ def _add_grid(commands: Commands, families: Families) -> None:
     _add_shared(command, families, seeds=4, networks=False)
 
 
-def _add_resume(commands: Commands) -> None:
+def _add_resume(commands: Subparsers) -> None:
     command = commands.add_parser(
         "resume",
         help="go on with a run that was stopped",
@@ -235,7 +236,7 @@ def _add_resume(commands: Commands) -> None:
     _add_machine(command)
 
 
-def _add_sample(commands: Commands) -> None:
+def _add_sample(commands: Subparsers) -> None:
     command = commands.add_parser(
         "sample",
         help="draw from the posterior of a run",
@@ -252,7 +253,7 @@ def _add_sample(commands: Commands) -> None:
     )
 
 
-def _add_diagnose(commands: Commands) -> None:
+def _add_diagnose(commands: Subparsers) -> None:
     command = commands.add_parser(
         "diagnose",
         help="check whether the posterior of a run can be believed",
@@ -294,7 +295,7 @@ def _add_diagnose(commands: Commands) -> None:
     _add_machine(command)
 
 
-def _add_report(commands: Commands) -> None:
+def _add_report(commands: Subparsers) -> None:
     command = commands.add_parser(
         "report",
         help="draw the pictures of a run",
@@ -307,9 +308,16 @@ def _glossary(families: Families) -> str:
     return help_texts.GLOSSARY + flags.glossary(families.rules)
 
 
-def foreign_commands() -> dict[str, EntryPoint]:
-    """Commands that installed packages add, by name."""
-    return {point.name: point for point in entry_points(group="jaxlfi.commands")}
+def foreign_command(name: str) -> Callable[[list[str]], int] | None:
+    """The command of that name that an installed package adds.
+
+    Raises:
+        ValueError: where several packages add it, or it cannot be imported.
+    """
+    packages = [plugins.package_of(point) for point in plugins.points(COMMANDS).get(name, ())]
+    if packages and name in OWN_COMMANDS:
+        plugins.refuse_clash("command", name, ["jaxlfi", *packages])
+    return plugins.find(COMMANDS, "command", name) if packages else None
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
@@ -502,12 +510,21 @@ def _recorded(arguments: argparse.Namespace) -> dict:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
+    Args:
+        argv: the words; by default those of this process, which is then ended where it is interrupted.
+
     Returns:
         0; 2 for bad input; 130 where it was interrupted.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
-    if words and (foreign := foreign_commands().get(words[0])):
-        return foreign.load()(words[1:])
+    if argv is None:
+        return interrupts.watched(lambda: main(sys.argv[1:]))
+    words = list(argv)
+    try:
+        foreign = foreign_command(words[0]) if words else None
+    except ValueError as error:
+        return refuse("jaxlfi", error)
+    if foreign:
+        return foreign(words[1:])
     if joined.asked(words):
         return joined.work(lambda: _main(words), lambda: _advice(words), "jaxlfi", "--debug" in words)
     return _main(words)
@@ -515,58 +532,66 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(words: Sequence[str]) -> int:
     """Do what the words ask for; returns the exit status."""
+    begun: list[Path] = []
+    again = "; the same command goes on from here" if words[:1] == ["diagnose"] else ""
+    with interrupts.advising("jaxlfi", lambda: resuming(begun[0]) if begun else again):
+        try:
+            return _done(words, begun)
+        except KeyboardInterrupt:
+            return interrupts.report()
+
+
+def _done(words: Sequence[str], begun: list[Path]) -> int:
+    """The same, with the folder that can be resumed added to `begun`."""
     try:
         arguments = parse(words)
     except ValueError as error:
-        return _refuse(error)
-    if getattr(arguments, "object", None) is not None:
-        arguments.task = f"{arguments.task},object={';'.join(arguments.object)}"
-    if len(getattr(arguments, "observation", None) or ()) > 1 and ",trials=" not in arguments.task:
-        learnt = arguments.settings.get("embedding") == "trials" and ",pooling=" not in arguments.task
-        arguments.task = f"{arguments.task},trials={len(arguments.observation)}{',pooling=all' * learnt}"
+        return refuse("jaxlfi", error)
+    debug = getattr(arguments, "debug", False)
     try:
+        if arguments.command in ("infer", "compare", "grid"):
+            arguments.task = _reference(arguments)
         prepare_jax(arguments)
     except ValueError as error:
-        return _refuse(error, getattr(arguments, "debug", False))
-    prepared = None
-    try:
-        from rich.console import Console
+        return refuse("jaxlfi", error, debug)
+    from jaxlfi.cli import commands, tables
 
-        from jaxlfi.cli import commands
-
-        quiet = not arguments.joined.writes
-        console = Console(quiet=quiet) if sys.stdout.isatty() else Console(width=FILE_WIDTH, quiet=quiet)
-        with contextlib.ExitStack() as closing:
-            arguments.closing = closing
+    console = tables.console(quiet=not arguments.joined.writes)
+    with contextlib.ExitStack() as closing:
+        arguments.closing = closing
+        try:
+            prepared = commands.COMMANDS[arguments.command](arguments, console)
+        except (ValueError, OSError) as error:
+            if interrupts.is_unread(error):
+                raise
+            return refuse("jaxlfi", error, debug)
+        if prepared is not None:
+            begun.append(prepared[0])
             try:
-                prepared = commands.COMMANDS[arguments.command](arguments, console)
-            except (ValueError, OSError) as error:
-                return _refuse(error, getattr(arguments, "debug", False))
-            if prepared is not None:
-                try:
-                    commands.run(*prepared, arguments, console)
-                except commands.EXPECTED as error:
-                    return _refuse(error, getattr(arguments, "debug", False), commands.advice(error, prepared))
-            arguments.joined.leave()
-    except KeyboardInterrupt:
-        advice = f"; continue with: jaxlfi resume {prepared[0]}" if prepared else ""
-        if arguments.command == "diagnose":
-            advice = "; the same command goes on from here"
-        print(f"jaxlfi: interrupted{advice}", file=sys.stderr)
-        return 130
+                commands.run(*prepared, arguments, console)
+            except commands.EXPECTED as error:
+                if interrupts.is_unread(error):
+                    raise
+                return refuse("jaxlfi", error, debug, commands.advice(error, prepared))
+        arguments.joined.leave()
     return 0
+
+
+def _reference(arguments: argparse.Namespace) -> str:
+    """The task's reference, with the options that other arguments ask for."""
+    reference = arguments.task
+    if arguments.object is not None:
+        reference = factories.with_option(reference, "object", *arguments.object)
+    options = factories.parse(reference)[1]
+    if len(arguments.observation or ()) > 1 and "trials" not in options:
+        reference = factories.with_option(reference, "trials", str(len(arguments.observation)))
+        if arguments.settings.get("embedding") == "trials" and "pooling" not in options:
+            reference = factories.with_option(reference, "pooling", "all")
+    return reference
 
 
 def _advice(words: Sequence[str]) -> str:
     """What to do where a process of several was lost."""
     arguments, _ = parser(Families.of(words)).parse_known_args(words)
     folder = arguments.folder if arguments.command == "resume" else arguments.out
-    return f"; continue with: jaxlfi resume {folder}" if (folder / "config.json").exists() else ""
-
-
-def _refuse(error: Exception, debug: bool = False, advice: str = "") -> int:
-    """Report an error in one line with what to do about it, and where it came from on request."""
-    if debug:
-        traceback.print_exception(error)
-    print(f"jaxlfi: error: {one_line(error)}{advice}", file=sys.stderr)
-    return 2
+    return resuming(folder) if (folder / "config.json").exists() else ""

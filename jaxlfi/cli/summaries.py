@@ -25,8 +25,6 @@ def summary_table(plan: BatchPlan, runs: Sequence[Run]) -> Table:
     """What came out: one line a configuration, over its seeds."""
     lines = executing.results(plan, runs)
     table = Table("configuration", "seeds", "theta error [95 %]", "median", "traj. error", "success", "final support")
-    for column in table.columns[:-1]:
-        column.no_wrap = True
     natural = [run.final_support() for run in runs]
     for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
         own = [i for i, spec in enumerate(plan.specs) if spec.configuration == configuration]

@@ -7,7 +7,6 @@ import argparse
 import contextlib
 import json
 import shutil
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from jaxlfi import flags, source_fields
 from jaxlfi.cli import joined
 from jaxlfi.cli.domains import DOMAINS, domains_of
-from jaxlfi.cli.exit_status import exit_status
-from jaxlfi.cli.parser import FILE_WIDTH, OneLineParser
+from jaxlfi.cli.exit_status import exit_status, resuming
+from jaxlfi.cli.parser import OneLineParser
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -90,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0; 2 for bad input; 130 where it was interrupted.
     """
     arguments = parser().parse_args(argv)
-    begun = lambda: f"; continue with: jaxlfi resume {arguments.out}" if is_training(arguments.out) else ""
+    begun = lambda: resuming(arguments.out) if is_training(arguments.out) else ""
     command = lambda: exit_status("jaxlfi train", lambda: _train(arguments), arguments.debug, begun)
     if arguments.coordinator is None:
         return command()
@@ -98,8 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    from rich.console import Console
-
+    from jaxlfi.cli import tables
     from jaxlfi.io import compile_cache
     from jaxlfi.io.locks import locked
 
@@ -114,9 +112,8 @@ def _train(arguments: argparse.Namespace) -> None:
     plan = _plan(arguments)
     training.begin(plan, arguments.out, processes)
     try:
-        console = Console() if sys.stdout.isatty() else Console(width=FILE_WIDTH)
         with locked(arguments.out):
-            run(arguments.out, plan.environment, console, not arguments.no_figures, processes)
+            run(arguments.out, plan.environment, tables.console(), not arguments.no_figures, processes)
         processes.leave()
     except OSError:
         raise  # as of a full disk, or of another process that goes on with it: the folder is not to be lost
@@ -139,8 +136,10 @@ def run(
         processes: that share the trainings out among them; None for this one alone.
     """
     import numpy as np
+    from rich.markup import escape
     from rich.table import Table
 
+    from jaxlfi.cli import tables
     from jaxlfi.io.processes import ALONE
     from jaxlfi.io.progress import RoundProgress
     from jaxlfi.rl import tensorboard, training
@@ -171,9 +170,9 @@ def run(
     table = Table("domain", "seed", "return", *facts, title=f"on {training.HELD_OUT} other points of each domain")
     for place, (trained_on, seed) in enumerate(result.names):
         means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]
-        table.add_row(trained_on, str(seed), *(f"{mean:.2f}" for mean in means))
-    console.print(table)
-    console.print(f"policies: {out}/DOMAIN/seed_NNN/policy.npz", markup=False)
+        table.add_row(escape(trained_on), str(seed), *(f"{mean:.2f}" for mean in means))
+    tables.show(table, console)
+    console.print(f"policies: {out}/DOMAIN/seed_NNN/policy.npz", markup=False, soft_wrap=True)
     if figures:
         draw(out, console)
 
@@ -188,7 +187,7 @@ def draw(out: Path, console: "Console") -> None:
     names = tuple((one["domain"], one["seed"]) for one in config["trainings"])
     values = files.read_arrays(out / "curves.npz")["value"]
     learning.save_curves(out / "curves.png", names, values, training.settings_of(config).steps_per_update)
-    console.print(f"learning curves: {out / 'curves.png'}", markup=False)
+    console.print(f"learning curves: {out / 'curves.png'}", markup=False, soft_wrap=True)
 
 
 def is_training(out: Path) -> bool:
@@ -211,7 +210,7 @@ def resume(out: Path, console: "Console", figures: bool, processes: "Processes")
             training.clean(out)
             if figures and not (out / "curves.png").exists():  # it was stopped while it drew them
                 draw(out, console)
-        console.print(f"{out} is complete: nothing to resume", markup=False)
+        console.print(f"{out} is complete: nothing to resume", markup=False, soft_wrap=True)
         return
     if config["environment"] is None:
         raise ValueError(f"{out}: expected an environment that can be found by name; resume it in Python")

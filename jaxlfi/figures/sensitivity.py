@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from jaxlfi.figures import statistics
 from jaxlfi.figures.history import heuristic_name, read_arrays, read_config
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH, plain
+from jaxlfi.io.shell import quoted
 
 FORMAT = "jaxlfi-grid"
 SYMBOLS = {
@@ -91,9 +92,8 @@ def load(folder: Path) -> Grid:
     config = read_config(folder)
     measures = (TRAJECTORY.name, PARAMETER.name, SUCCESS.name)
     if not (folder / "grid.npz").is_file():
-        raise ValueError(
-            f"{folder}: expected a finished grid, found no grid.npz: continue with 'jaxlfi resume {folder}'"
-        )
+        resume = quoted("jaxlfi", "resume", folder)
+        raise ValueError(f"{folder}: expected a finished grid, found no grid.npz: continue with {resume}")
     arrays = read_arrays(folder / "grid.npz", ("axes", *measures), measures)
     try:
         names = tuple(str(name) for name in arrays["axes"])

@@ -12,9 +12,12 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 
 EVERY_BAR, EVERY_LINE = 0.5, 10.0
 """Seconds between two numbers of simulations, in a bar and in lines."""
+WIDE = 100
+"""Characters of a window in which there is room for a bar beside the numbers."""
 
 
 class RoundProgress:
@@ -38,14 +41,15 @@ class RoundProgress:
         self._console, self._rounds, self._first, self._done = console, rounds, done, done
         self._label, self._unit = label, unit
         self._began = self._shown = time.monotonic()
+        whole = Column(no_wrap=True)  # numbers are kept, the label may have several lines
         columns = (
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
+            TextColumn("{task.description}", markup=False, table_column=Column(overflow="fold")),
+            *([BarColumn()] if console.width >= WIDE else []),
+            MofNCompleteColumn(table_column=whole),
             TextColumn(f"{unit}s,"),
-            TimeElapsedColumn(),
+            TimeElapsedColumn(table_column=whole),
             TextColumn("elapsed,"),
-            TimeRemainingColumn(),
+            TimeRemainingColumn(table_column=whole),
             TextColumn("left"),
         )
         self._bar = Progress(*columns, console=console) if console.is_terminal else None

@@ -1,6 +1,6 @@
 """Finding environments by name: entry points of installed packages, or `module:factory`, with options."""
 
-from jaxlfi import factories
+from jaxlfi import factories, plugins
 from jaxlfi.rl.environment import Environment
 
 GROUP = "jaxlfi.environments"
@@ -9,7 +9,7 @@ GROUP = "jaxlfi.environments"
 
 def names() -> list[str]:
     """Names of all registered environments."""
-    return factories.names(GROUP)
+    return plugins.names(GROUP)
 
 
 def load(reference: str) -> Environment:
@@ -24,7 +24,7 @@ def load(reference: str) -> Environment:
             another type, and objects that are no environments.
     """
     name, options = factories.parse(reference, "environment")
-    factory = factories.find(GROUP, "environment", name)
+    factory = plugins.find(GROUP, "environment", name)
     environment = factories.made("environment", reference, factory, options, Environment)
     if not isinstance(environment, Environment):
         raise ValueError(

@@ -35,6 +35,7 @@ from jaxlfi.io import files as atomic
 from jaxlfi.io import trees
 from jaxlfi.io.formats import require_version
 from jaxlfi.io.serialise import json_safe
+from jaxlfi.io.shell import quoted
 from jaxlfi.runs import describe
 from jaxlfi.tasks import failures, priors, summaries
 from jaxlfi.tasks.task import Task
@@ -135,7 +136,7 @@ def refuse_occupied(folder: Path) -> None:
     if not folder.is_dir() or any(folder.iterdir()):
         raise StoreError(
             f"out: expected a new or empty folder, got {str(folder)!r} which holds something: "
-            f"take another name, or continue it with 'jaxlfi resume {folder}'"
+            f"take another name, or continue it with {quoted('jaxlfi', 'resume', folder)}"
         )
 
 

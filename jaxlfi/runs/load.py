@@ -20,6 +20,7 @@ from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.io import files as atomic
 from jaxlfi.io import trees
+from jaxlfi.io.shell import quoted
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.folder import StoreError
@@ -52,7 +53,7 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         one = next((run["folder"] for run in config.get("runs", ())), "seed_000")
         raise StoreError(f"{folder}: expected the folder of one run, such as {folder / one}")
     if config.get("status", "finished") != "finished" or not (folder / "posterior.npz").exists():
-        raise StoreError(f"{folder}: expected a finished run; go on with it by 'jaxlfi resume'")
+        raise StoreError(f"{folder}: expected a finished run; go on with it by {quoted('jaxlfi', 'resume', folder)}")
     try:
         space = Space(tuple(config["parameters"]), tuple(config["log"]))
         settings = describe.settings_from_json(config["settings"])

@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import functools
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,9 @@ from jaxlfi.tasks.trials import repeated, together
 
 TRIES = 16
 """Simulations at the truth that may fail before a task counts as unable to simulate its own truth."""
-TIME_COLUMNS = ("time", "t", "seconds", "s", "year", "step", "index", "")
-"""Headings, without a unit in brackets, of a first column that is not a channel. pandas' index has an empty one."""
+TIME_COLUMNS = ("time", "times", "timestamp", "seconds", "year", "step", "index", "")
+"""Headings, without a unit in brackets, of a first column that is no channel where it increases; case does not matter.
+pandas' index has an empty one. A small t is one, too, but no T, which may be a temperature."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -252,13 +253,41 @@ def _vectors_are_trials(task: Task, vectors: Sequence[Any]) -> bool:
     return as_trials
 
 
-def read(path: str | Path) -> np.ndarray:
+Say = Callable[[str], Any]
+"""What is told, in a line, how the columns of a file were read."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """What is known of the channels before a file is read.
+
+    Attributes:
+        names: of the channels, in their order; none where they have none.
+        count: of the channels; None where only a simulation shows it.
+    """
+
+    names: tuple[str, ...] = ()
+    count: int | None = None
+
+    @staticmethod
+    def of(task: Task) -> "Columns":
+        """Those of a task."""
+        if task.on_host:
+            return Columns(task.channels, len(task.channels) or None)
+        shape = simulator_shapes(task).trajectory
+        count = shape[-1] if len(shape) > 1 else 1
+        return Columns(task.channels if len(task.channels) == count else (), count)
+
+
+def read(path: str | Path, columns: Columns = Columns(), say: Say = lambda line: None) -> np.ndarray:
     """Read a trajectory from a file.
 
     Args:
         path: a .csv with one row a record and one column a channel (a row of headings is allowed, and a first
-            column of times or indices is left out: `TIME_COLUMNS`), or an .npz with an array "trajectory" or one
-            array only.
+            column of times or indices is left out where its heading is one of `TIME_COLUMNS`, its values increase, and
+            as many columns are not wanted), or an .npz with an array "trajectory" or one array only.
+        columns: what is known of the channels; headings that name them all say which column is which.
+        say: is told which columns were left out.
 
     Returns:
         The trajectory, shape [T, C]; of an .npz as it is.
@@ -267,22 +296,23 @@ def read(path: str | Path) -> np.ndarray:
         ValueError: for files that cannot be read.
     """
     path = Path(path)
-    readers = {".csv": _read_csv, ".npz": _read_npz}
-    if path.suffix.lower() not in readers:
+    if path.suffix.lower() not in (".csv", ".npz"):
         raise ValueError(f"observation: expected a .csv or .npz file, got {str(path)!r}")
     try:
-        return readers[path.suffix.lower()](path)
+        if path.suffix.lower() == ".npz":
+            return _read_npz(path)
+        return _channels(*_read_csv(path), columns, lambda line: say(f"observation: {path}: {line}"))
     except Exception as error:  # zipfile, numpy and the operating system each have their own
         text = files.first_line(error)
         raise ValueError(f"observation: expected a readable file, got {str(path)!r}: {text}") from error
 
 
-def read_for(task: Task, *paths: str | Path) -> np.ndarray:
+def read_for(task: Task, *paths: str | Path, say: Say = lambda line: None) -> np.ndarray:
     """A trajectory from a file, in the shape of the task's simulator where that is known before it has run.
 
-    Several files are the trials of a repeated task (`jaxlfi.repeated`), one after another.
+    Several files are the trials of a repeated task (`jaxlfi.repeated`), one after another. `say` is as of `read`.
     """
-    trajectory = together([read(path) for path in paths])
+    trajectory = together([read(path, Columns.of(task), say) for path in paths])
     if task.on_host:
         return trajectory
     shape = simulator_shapes(task).trajectory
@@ -290,7 +320,8 @@ def read_for(task: Task, *paths: str | Path) -> np.ndarray:
     return trajectory.reshape(shape) if long(trajectory.shape) == long(shape) else trajectory
 
 
-def _read_csv(path: Path) -> np.ndarray:
+def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
+    """The headings, where there are some, and the numbers."""
     with path.open(newline="", encoding="utf-8-sig") as file:  # a byte-order mark is no part of the first cell
         lines = [line for line in file if not line.startswith("#")]
         rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(cell.strip() for cell in row)]
@@ -306,8 +337,24 @@ def _read_csv(path: Path) -> np.ndarray:
             raise ValueError(f"expected {width} numbers in row {number}, got {','.join(row)!r}")
     if has_heading and len(rows) == 1:
         raise ValueError("expected at least one row of numbers, got headings only")
-    table = np.array([[float(cell) for cell in row] for row in rows[has_heading:]])
-    return table[:, 1:] if has_heading and _is_time(rows[0][0]) and width > 1 else table
+    return rows[0] if has_heading else [], np.array([[float(cell) for cell in row] for row in rows[has_heading:]])
+
+
+def _channels(headings: list[str], table: np.ndarray, columns: Columns, say: Say) -> np.ndarray:
+    """The columns of a table that are channels, in their order."""
+    if columns.names and set(columns.names) <= set(headings) and len(set(headings)) == len(headings):
+        places = [headings.index(name) for name in columns.names]
+        if left_out := [repr(name) for name in headings if name not in columns.names]:
+            say(f"{', '.join(left_out)} left out: no channel has that name")
+        if places != sorted(places):
+            say(f"columns taken by their names, in the order {', '.join(columns.names)}")
+        return table[:, places]
+    if table.shape[1] > 1 and headings and _is_time(headings[0]) and np.all(np.diff(table[:, 0]) > 0):
+        if table.shape[1] != columns.count:
+            say(f"the first column, {headings[0]!r}, is taken for the time and left out")
+            return table[:, 1:]
+        say(f"the first column, {headings[0]!r}, is taken for a channel, as {columns.count} columns are expected")
+    return table
 
 
 def _read_npz(path: Path) -> np.ndarray:
@@ -321,7 +368,8 @@ def _read_npz(path: Path) -> np.ndarray:
 
 
 def _is_time(heading: str) -> bool:
-    return heading.partition("(")[0].partition("[")[0].strip().lower() in TIME_COLUMNS
+    name = heading.partition("(")[0].partition("[")[0].strip()
+    return name == "t" or name.lower() in TIME_COLUMNS
 
 
 def _is_number(cell: str) -> bool:

@@ -1,6 +1,6 @@
 """Finding tasks by name: entry points of installed packages, or `module:factory`, with options for the factory."""
 
-from jaxlfi import factories
+from jaxlfi import factories, plugins
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.trials import repeated
 
@@ -10,7 +10,16 @@ GROUP = "jaxlfi.tasks"
 
 def names() -> list[str]:
     """Names of all registered tasks."""
-    return factories.names(GROUP)
+    return plugins.names(GROUP)
+
+
+def wanted(name: str) -> str:
+    """The reference of a registered task with the options that it cannot do without; empty where it needs none.
+
+    Raises:
+        ValueError: where the name cannot be loaded.
+    """
+    return factories.wanted(name, plugins.find(GROUP, "task", name))
 
 
 def load(reference: str) -> Task:
@@ -25,7 +34,7 @@ def load(reference: str) -> Task:
 
     Options are converted to the types that the factory's signature declares: int, float, bool, str, Path, Literal,
     unions of them, and tuples of any number of one of them, whose items ";" separates, as in
-    "whip,object=dlo-0;mine.npz". A comma separates options, a colon and a plus may be part of a path.
+    "whip,object=dlo-0;mine.npz". A value with separators can be put in quotation marks: whip,object="a;b.npz".
 
     Raises:
         ValueError: for unknown names, modules that cannot be imported, options that the factory does not have or of
@@ -36,7 +45,7 @@ def load(reference: str) -> Task:
         'gaussian_linear'
     """
     name, options = factories.parse(reference)
-    factory = factories.find(GROUP, "task", name)
+    factory = plugins.find(GROUP, "task", name)
     own = () if isinstance(factory, Task) else factories.parameters(factory)
     ours = ("trials", "pooling") if "trials" in options or "pooling" not in own else ()
     together = {option: options.pop(option) for option in ours if option in options}

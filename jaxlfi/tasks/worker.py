@@ -10,6 +10,7 @@ import dataclasses
 import json
 import os
 import queue
+import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -194,9 +195,11 @@ def _streams() -> tuple[BinaryIO, BinaryIO]:
 
 
 def _receive(requests: BinaryIO, inbox: queue.SimpleQueue) -> None:
-    """Pass requests on; at their end, end the process, whatever it is doing: nobody waits for it."""
+    """Pass requests on; at their end, end the process and what it has started: nobody waits for them."""
     for line in requests:
         inbox.put(line)
+    if hasattr(os, "killpg") and os.getpgrp() == os.getpid():  # as `jaxlfi.tasks.guard` starts it
+        os.killpg(os.getpgrp(), signal.SIGKILL)
     os._exit(0)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import factories, flags, plugins
+from jaxlfi import flags, plugins
 from jaxlfi.bayessim import memory
 from jaxlfi.bayessim.presets import METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
@@ -390,7 +390,7 @@ def registered(monkeypatch):
         EntryPoint("linear", "jaxlfi.envs.gaussian_linear:task", tasks.GROUP),
         EntryPoint("broken", "no.such.module:task", tasks.GROUP),
     ]
-    monkeypatch.setattr(factories, "entry_points", lambda group: points)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: points)
 
 
 def test_tasks_are_listed_also_beside_a_broken_package(registered, capsys):
@@ -406,7 +406,7 @@ def shouting(words):
 
 def test_packages_add_commands(monkeypatch, capsys):
     point = EntryPoint("shout", "tests.cli.test_cli:shouting", "jaxlfi.commands")
-    monkeypatch.setattr(cli, "entry_points", lambda group: [point])
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [point])
     assert cli.main(["shout", "whip", "--help"]) == 7
     assert capsys.readouterr().out == "WHIP --HELP\n"
     assert "shout" in cli.parser().format_help()
@@ -456,8 +456,9 @@ def test_several_objects_are_an_option_of_the_task(tmp_path, capsys):
     reference = "tests.cli.test_cli:several"
     assert tasks.load(f"{reference},object=a b.npz;c;d").name == "('a b.npz', 'c', 'd') all"
     assert tasks.load(f"{reference},object=a").name == "('a',) all"
-    message = error_line(capsys, "infer", reference, "--object", "a,b", *FLAGS, "--out", tmp_path / "out")
-    assert "expected options as NAME,key=value" in message
+    message = error_line(capsys, "infer", TASK, "--object", "a,b", "c;d", *FLAGS, "--out", tmp_path / "out")
+    assert f'got \'{TASK},object="a,b";"c;d"\'' in message
+    assert tasks.load(f'{reference},object="a,b";"c;d"').name == "('a,b', 'c;d') all"
 
 
 def test_a_pooling_is_the_tasks_own_unless_there_are_trials():

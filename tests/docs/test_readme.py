@@ -1,8 +1,8 @@
 """README's blocks run, in their order, from a fresh folder; what takes long is parsed by the real parsers."""
 
-import importlib
 import re
 import shlex
+import sys
 import tomllib
 from pathlib import Path
 
@@ -54,8 +54,8 @@ def fresh(tmp_path_factory):
 
 def parse(words: list[str]) -> None:
     """By the parser that the command itself uses."""
-    if point := cli.foreign_commands().get(words[0]):
-        importlib.import_module(point.module).parser().parse_args(words[1:])
+    if command := cli.foreign_command(words[0]):
+        sys.modules[command.__module__].parser().parse_args(words[1:])
     else:
         cli.parse(words)
 

@@ -2,6 +2,7 @@
 
 import io
 
+import pytest
 from rich.console import Console
 
 from jaxlfi.io import progress
@@ -27,3 +28,16 @@ def test_slow_simulations_are_told_now_and_then(monkeypatch):
         "round 1: simulation 30, 25 wanted, 30 s elapsed",
         "round 1 of 2, 30 s elapsed, about 30 s left",
     ]
+
+
+@pytest.mark.parametrize("width", [120, 80, 60])
+def test_a_narrow_window_shows_every_number(width):
+    file = io.StringIO()
+    console = Console(file=file, width=width, force_terminal=True, color_system=None)
+    with RoundProgress(console, 200, 3, "lotka_volterra: 12 runs in a batch") as bar:
+        bar.advance()
+        bar._shown = 0.0
+        bar.simulated(1234, 5000)
+    for word in ("4/200", "rounds,", "0:00:00", "elapsed,", "left", "12 runs", "1234,", "5000"):
+        assert word in file.getvalue().rpartition("lotka_volterra")[2], word
+    assert "\u2026" not in file.getvalue()

@@ -186,7 +186,7 @@ def test_a_run_in_a_folder_goes_on_where_a_callback_stopped_it(tmp_path):
         with pytest.raises(Stopped):
             infer(3, callback=stop_at(last), out=tmp_path / "stopped")
         assert left == [last]
-        with pytest.raises(StoreError, match=r"expected a finished run; go on with it by 'jaxlfi resume'"):
+        with pytest.raises(StoreError, match=r"expected a finished run; go on with it by jaxlfi resume"):
             load(tmp_path / "stopped")
     left = []
     resumed = infer(3, callback=stop_at(0), out=tmp_path / "stopped")

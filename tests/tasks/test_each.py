@@ -125,13 +125,36 @@ def test_what_hangs_is_killed_with_all_it_has_started():
         os.killpg(group, 0)  # it is there, with the program that it has started
         answer = future.result()
     assert answer.outcome == -3 and answer.message == "took longer than 1 s" and time.monotonic() - began < 8
-    for _ in range(50):  # until the system has collected what was started
+    assert ended(group)
+
+
+def ended(group: int, seconds: float = 5.0) -> bool:
+    """Whether the processes of a group end within seconds: the system has to collect what was started."""
+    until = time.monotonic() + seconds
+    while True:
         try:
             os.killpg(group, 0)
         except ProcessLookupError:
-            return
+            return True
+        if time.monotonic() > until:
+            return False
         time.sleep(0.1)
-    raise AssertionError("expected no process of the group to be left")
+
+
+def test_what_a_simulation_has_started_ends_with_the_process_that_waits_for_it():
+    script = (
+        "import cloudpickle, sys, threading, time; from jaxlfi.tasks.guard import Guard; "
+        "from jaxlfi.tasks.worker import Request; from tests.troubled import Troubled; "
+        "guard = Guard(cloudpickle.dumps(Troubled((0.0, 0.0, 1.0)))); "
+        "request = Request([0, 0], 0, [0.0, 0.0], [2]); "
+        "threading.Thread(target=guard.simulate, args=(request, None), daemon=True).start(); time.sleep(1.5); "
+        "print(guard._process.pid, flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
+        group = int(process.stdout.readline())
+        assert not ended(group, 0.0)
+        process.kill()
+    assert ended(group)
 
 
 def test_processes_end_with_their_executor_even_in_the_midst_of_simulations():

@@ -9,7 +9,7 @@ import pytest
 
 from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.host import HostSimulator, SimulatorError
-from jaxlfi.tasks.observation import checked, observe, read, read_for, simulate_observation, simulator_shapes
+from jaxlfi.tasks.observation import Columns, checked, observe, read, read_for, simulate_observation, simulator_shapes
 from jaxlfi.tasks.task import Task
 
 VALUES = np.float32([8.0, 5.3626, 3.5946, -2.4096])
@@ -74,6 +74,74 @@ def test_one_channel_is_read_with_every_record(tmp_path, text, encoding, suffix)
 def test_columns_are_channels(tmp_path, text, expected):
     (tmp_path / "x.csv").write_text(text)
     np.testing.assert_array_equal(read(tmp_path / "x.csv"), np.float32(expected))
+
+
+RISING = "{}\n0,8,-1\n1,5,2\n2,4,7\n"
+FLAT = "{}\n1,8,-1\n1,5,2\n2,4,7\n"
+
+
+@pytest.mark.parametrize(
+    ("heading", "time"),
+    [
+        ("t,a,b", True),
+        ("t [ms],a,b", True),
+        ("Time (s),a,b", True),
+        ("TIMESTAMP,a,b", True),
+        (",a,b", True),
+        ("Year,hare,lynx", True),
+        ("S,I,R", False),
+        ("T,p,v", False),
+        ("s,a,b", False),
+        ("temperature,a,b", False),
+        ("a,t,b", False),  # only a first column can be one
+        ("times seen,a,b", False),
+        ("timer,a,b", False),
+    ],
+)
+def test_a_column_is_time_where_its_heading_says_so_and_it_increases(tmp_path, heading, time):
+    (tmp_path / "rising.csv").write_text(RISING.format(heading))
+    (tmp_path / "flat.csv").write_text(FLAT.format(heading))
+    said = []
+    assert read(tmp_path / "rising.csv", say=said.append).shape == (3, 3 - time)
+    assert len(said) == time and all("left out" in line and repr(heading.split(",")[0]) in line for line in said)
+    assert read(tmp_path / "flat.csv", say=said.append).shape == (3, 3) and len(said) == time
+
+
+def test_times_that_single_precision_cannot_tell_apart_increase(tmp_path):
+    (tmp_path / "x.csv").write_text("timestamp,a\n1700000000.0,1\n1700000000.1,2\n1700000000.2,3\n")
+    np.testing.assert_array_equal(read(tmp_path / "x.csv"), [[1], [2], [3]])
+
+
+@pytest.mark.parametrize(("count", "shape"), [(3, (3, 3)), (2, (3, 2)), (4, (3, 2)), (None, (3, 2))])
+def test_nothing_is_left_out_of_as_many_columns_as_are_expected(tmp_path, count, shape):
+    (tmp_path / "x.csv").write_text(RISING.format("t,a,b"))
+    said = []
+    assert read(tmp_path / "x.csv", Columns(count=count), said.append).shape == shape
+    (line,) = said
+    assert ("taken for a channel" in line) == (count == 3)
+
+
+def test_headings_that_name_the_channels_say_which_column_is_which(tmp_path):
+    (tmp_path / "x.csv").write_text("index,b,note,a\n0,1,9,2\n1,3,9,4\n")
+    said = []
+    np.testing.assert_array_equal(read(tmp_path / "x.csv", Columns(("a", "b"), 2), said.append), [[2, 1], [4, 3]])
+    assert len(said) == 2 and "'index', 'note' left out" in said[0] and "in the order a, b" in said[1]
+    (tmp_path / "y.csv").write_text("t,b\n5,1\n6,3\n")  # a channel called t
+    np.testing.assert_array_equal(read(tmp_path / "y.csv", Columns(("t", "b"), 2), said.append), [[5, 1], [6, 3]])
+    assert len(said) == 2
+
+
+def test_what_a_task_knows_of_its_channels(tmp_path):
+    channels = task(lambda key, theta: jnp.zeros((3, 3)))
+    assert Columns.of(channels) == Columns((), 3)
+    assert Columns.of(dataclasses.replace(channels, channels=("S", "I", "R"))) == Columns(("S", "I", "R"), 3)
+    assert Columns.of(dataclasses.replace(channels, channels=("S", "I"))) == Columns((), 3)
+    assert Columns.of(task(lambda key, theta: jnp.zeros(3))) == Columns((), 1)
+    host = dataclasses.replace(channels, simulate=HostSimulator(lambda rng, theta: np.zeros((len(theta), 3, 2))))
+    assert Columns.of(host) == Columns() and Columns.of(dataclasses.replace(host, channels=("a", "b"))).count == 2
+    (tmp_path / "x.csv").write_text(RISING.format("t,a,b"))
+    assert read_for(channels, tmp_path / "x.csv").shape == (3, 3)
+    assert read_for(dataclasses.replace(host, channels=("a", "b")), tmp_path / "x.csv").shape == (3, 2)
 
 
 @pytest.mark.parametrize(

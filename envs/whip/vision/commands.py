@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from jaxlfi.cli import tables
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.physics.engines import pick as pick_engine
@@ -145,7 +146,7 @@ def train_vision(arguments: argparse.Namespace) -> None:
         table = Table("", name, title=f"on {HELD_OUT_PICTURES} pictures" if name == "segmenter" else "on new rollouts")
         for what, value in values.items():
             table.add_row(what, ", ".join(f"{number:.3f}" for number in np.atleast_1d(value)))
-        Console().print(table)
+        tables.show(table)
     print(f"wrote {', '.join(str(out / f'{name}.npz') for name in figures)}")
 
 

@@ -235,6 +235,8 @@ def _read_csv(path: Path, task: Task) -> np.ndarray:
     heading = [cell.strip() for cell in rows[0]] if rows else []
     if sorted(heading) != sorted(task.names):
         raise ValueError(f"expected the columns {', '.join(task.names)}, got {', '.join(heading) or 'none'}")
+    if ragged := next((number for number, row in enumerate(rows, start=1) if len(row) != len(heading)), None):
+        raise ValueError(f"expected {len(heading)} numbers in row {ragged}, got {len(rows[ragged - 1])}")
     table = np.array([[float(cell) for cell in row] for row in rows[1:]]).reshape(-1, len(heading))
     return table[:, [heading.index(name) for name in task.names]]
 

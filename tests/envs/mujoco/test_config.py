@@ -85,7 +85,7 @@ def test_a_summary_by_its_name(folder):
 
 def test_without_a_file_it_says_what_it_needs(capsys):
     assert cli.main(["tasks", "mujoco"]) == 2
-    assert "config: expected a TOML file that describes a task, as mujoco,config=arm.toml" in capsys.readouterr().err
+    assert "task: expected mujoco,config=FILE, got 'mujoco'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

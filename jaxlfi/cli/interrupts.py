@@ -1,0 +1,189 @@
+"""How the process of a command ends early: at once by Ctrl-C, whatever it is doing, and quietly by a closed pipe.
+
+Python raises KeyboardInterrupt in the main thread, and only when that thread executes Python again: native code that
+compiles or computes delays it for as long as it takes. Where native code has called Python (`__del__`, JAX's callback
+of the garbage collector), the exception is printed and lost. So a second thread watches for the signal: it raises a
+lost KeyboardInterrupt again, and ends the process where the exception does not end it in time. That is safe at any
+moment: files are written so that they outlive a process killed at any moment (`jaxlfi.io.files`), and workers end with
+the process that started them (`jaxlfi.tasks.worker`).
+
+This module imports neither jax nor numpy.
+"""
+
+import _thread
+import contextlib
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NoReturn
+
+INTERRUPTED = 130
+"""The exit status after SIGINT, as that of any program which it ends."""
+UNREAD = 141
+"""The exit status where nobody reads the output any more, as that of any program which SIGPIPE ends."""
+PATIENCE = 0.5
+"""Seconds from the signal within which KeyboardInterrupt has to end the process."""
+LOOK = 0.02
+"""Seconds between two looks at whether it was lost."""
+SHOW_CURSOR = "\x1b[?25h\n"
+"""For a terminal whose cursor a progress bar has hidden."""
+
+_advice: list[tuple[str, Callable[[], str]]] = []
+_speak_once = threading.Lock()
+
+
+@contextlib.contextmanager
+def advising(program: str, advice: Callable[[], str]) -> Iterator[None]:
+    """What to say of an interruption in this context; where contexts are nested, the outermost is meant.
+
+    Args:
+        program: the command's name.
+        advice: what comes after "interrupted"; asked then, perhaps in another thread.
+    """
+    global _speak_once
+    if not _advice:
+        _speak_once = threading.Lock()
+    _advice.append((program, advice))
+    try:
+        yield
+    finally:
+        _advice.pop()
+
+
+def report() -> int:
+    """Say once that the command was interrupted; returns its exit status."""
+    if _speak_once.acquire(blocking=False):
+        print(_line(), file=sys.stderr)
+    return INTERRUPTED
+
+
+def is_unread(error: BaseException) -> bool:
+    """Whether an error was raised because nobody reads standard output or standard error any more."""
+    if not isinstance(error, BrokenPipeError) or not hasattr(select, "poll"):
+        return isinstance(error, BrokenPipeError)
+    poll = select.poll()
+    for number in (1, 2):
+        poll.register(number, 0)
+    return any(events & select.POLLERR for _, events in poll.poll(0))
+
+
+def watched(work: Callable[[], int]) -> int:
+    """Do all the work of this process, and end the process where it is interrupted or its output is not read.
+
+    Args:
+        work: returns the exit status.
+
+    Returns:
+        The exit status of work that was not interrupted.
+    """
+    watch = _Watch()
+    try:
+        try:
+            watch.begin()
+            status = work()
+        finally:
+            watch.over = True
+            _flush(sys.stdout)
+    except BaseException as error:
+        # Native code may turn a KeyboardInterrupt into any other exception.
+        if not (watch.received or isinstance(error, KeyboardInterrupt) or is_unread(error)):
+            raise
+        status = UNREAD if is_unread(error) else report()
+    if watch.received and status != INTERRUPTED:  # which whoever returned it has reported
+        status = report()
+    if status in (INTERRUPTED, UNREAD):
+        _end(status)
+    return status
+
+
+class _Watch:
+    """The handler of SIGINT, and the thread that sees to it that the signal ends the process.
+
+    Attributes:
+        received: whether there was a signal.
+        over: whether the work is done: a signal then ends the process in the midst of Python's own last acts.
+    """
+
+    def __init__(self):
+        self.received = self.over = False
+        self._raises = True  # whether the next signal raises KeyboardInterrupt: one is enough, unless it is lost
+        self._unraisable = sys.unraisablehook
+
+    def begin(self) -> None:
+        """Handle SIGINT, where Python does by default: it may be ignored, as in a shell's background."""
+        default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if not default or threading.current_thread() is not threading.main_thread():
+            return
+        signal.signal(signal.SIGINT, self._handle)
+        sys.unraisablehook = self._lost
+        if os.name == "posix":  # elsewhere only sockets can be written to by a signal
+            heard, wake = os.pipe()
+            os.set_blocking(wake, False)
+            signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+            threading.Thread(target=self._wait, args=(heard,), name="interrupts", daemon=True).start()
+
+    def _handle(self, number: int, frame: Any) -> None:
+        self.received = True
+        if self.over:
+            _end(INTERRUPTED)
+        if self._raises:
+            self._raises = False
+            raise KeyboardInterrupt
+
+    def _lost(self, unraisable: Any) -> None:
+        if self.received and issubclass(unraisable.exc_type, KeyboardInterrupt):
+            self._raises = True
+        else:
+            self._unraisable(unraisable)
+
+    def _wait(self, heard: int) -> None:
+        """See to it that each signal ends the process, while nobody else handles it (`jaxlfi.robots.interrupts`)."""
+        ours = lambda: signal.getsignal(signal.SIGINT) == self._handle
+        while True:
+            if signal.SIGINT not in os.read(heard, 64) or not ours():
+                continue
+            until = time.monotonic() + PATIENCE
+            while (left := until - time.monotonic()) > 0:
+                time.sleep(min(LOOK, left))
+                if self.received and self._raises:
+                    _thread.interrupt_main()
+            if ours():
+                self._force()
+            _thread.interrupt_main()  # let those know who handle it now
+
+    def _force(self) -> NoReturn:
+        """End the process from this thread, whatever the main thread holds or waits for."""
+        with contextlib.suppress(Exception):
+            if sys.stdout.isatty():
+                os.write(1, SHOW_CURSOR.encode())
+            if _speak_once.acquire(blocking=False):
+                os.write(sys.stderr.fileno(), f"{_line()}\n".encode())
+        os._exit(INTERRUPTED)
+
+
+def _line() -> str:
+    program, advice = _advice[0] if _advice else ("jaxlfi", str)
+    return f"{program}: interrupted{advice()}"
+
+
+def _end(status: int) -> NoReturn:
+    """End the process without Python's own last acts, which wait for native code and threads."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(BrokenPipeError, RuntimeError):  # a signal may interrupt this very act
+            _flush(stream)
+    os._exit(status)
+
+
+def _flush(stream: Any) -> None:
+    """Write what a stream holds back; what else fails than a pipe that nobody reads is left to Python's own end."""
+    try:
+        if stream is not None:
+            stream.flush()
+    except BrokenPipeError:
+        raise
+    except (OSError, ValueError):
+        return

@@ -1,0 +1,60 @@
+"""What commands print on, and tables that lose no number in a narrow window."""
+
+import sys
+from typing import NoReturn
+
+from rich.console import Console, Group
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
+
+FILE_WIDTH = 120
+"""Characters in a line of output that goes to a file or a pipe."""
+
+
+class _Output(Console):
+    def on_broken_pipe(self) -> NoReturn:
+        """Raise what `jaxlfi.cli.interrupts` ends the process by, in place of rich's own end."""
+        raise
+
+
+def console(quiet: bool = False) -> Console:
+    """Standard output, as wide as its window."""
+    return _Output(width=None if sys.stdout.isatty() else FILE_WIDTH, quiet=quiet)
+
+
+def show(table: Table, on: Console | None = None) -> None:
+    """Print a table in whole words: where they do not fit side by side, one cell a line.
+
+    Args:
+        table: of texts, each with a heading.
+        on: where to; standard output by default.
+    """
+    on = on or console()
+    wide = on.options.update(width=10_000, max_width=10_000)
+    sizes = [[Measurement.get(on, wide, cell) for cell in (column.header, *column.cells)] for column in table.columns]
+    least = [max(size.minimum for size in column) for column in sizes]
+    widths = [max(size.maximum for size in column) for column in sizes]
+    room = on.width - sum(table.padding[1::2]) * len(widths) - len(widths) - 1
+    if sum(least) > room:
+        on.print(_stacked(table, max(size.maximum for column in sizes for size in column[:1]), on.width))
+        return
+    while sum(widths) > room:
+        widths[max(range(len(widths)), key=lambda place: (widths[place] > least[place], widths[place]))] -= 1
+    for column, width in zip(table.columns, widths, strict=True):
+        column.width, column.no_wrap = width, False
+    on.print(table)
+
+
+def _stacked(table: Table, heading: int, width: int) -> Group:
+    """The rows of a table one below the other, each a line for every cell."""
+    blocks = [Text.from_markup(str(table.title), style="italic")] if table.title else []
+    cells = zip(*(column.cells for column in table.columns), strict=True)
+    for row, values in zip(table.rows, cells, strict=True):
+        block = Table.grid(padding=(0, 2), pad_edge=False)
+        block.add_column(overflow="fold", width=min(heading, width // 2))
+        block.add_column(overflow="fold")
+        for column, value in zip(table.columns, values, strict=True):
+            block.add_row(column.header, value, style=row.style)
+        blocks += [block, Text()]
+    return Group(*blocks[:-1])
