@@ -194,8 +194,8 @@ def _series(records: np.ndarray, channels: Sequence[str]) -> tuple[np.ndarray, l
 
 def _constant(column: _Column, observed: float, low: float, high: float, count: int) -> Finding:
     text = (
-        f"{column.name} is {observed:.6g}, all {count:,} simulations have {low:.6g}: no parameters give that; is it the "
-        "same quantity?"
+        f"{column.name} is {observed:.6g}, all {count:,} simulations have {low:.6g}: no parameters give that; is it "
+        "the same quantity?"
     )
     return Finding(column.name, "constant", (observed, observed), low, high, 0.0, text)
 

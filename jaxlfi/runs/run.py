@@ -25,6 +25,7 @@ from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Heuristic
 from jaxlfi.runs import folder as folders
+from jaxlfi.runs.unlike import observation_findings
 from jaxlfi.tasks.task import Task
 
 DRAWS = 1000
@@ -33,6 +34,10 @@ DRAWS = 1000
 
 class SupportWarning(UserWarning):
     """A bound looks wrong that the heuristic cannot move: of a support that cannot grow, or of Phi."""
+
+
+class MisspecificationWarning(UserWarning):
+    """The observation is unlike everything that was simulated."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,13 +146,22 @@ class Run:
 
     @property
     def warnings(self) -> list[str]:
-        """In words, which bounds look wrong that the heuristic cannot move, and what to do.
+        """In words, which bounds look wrong that the heuristic cannot move, and in what the observation is unlike all.
 
-        They are those of a support that cannot grow, and those of Phi.
+        Bounds are those of a support that cannot grow, and those of Phi.
         """
         _require_one(self, "warnings")
         found = bound_warnings(self.space.labels, self.belief, self.feasible, grows=self.heuristic.grows)
-        return [warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in found]
+        return [
+            *(warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in found),
+            *self.misspecification,
+        ]
+
+    @property
+    def misspecification(self) -> list[str]:
+        """In words, in what the observation is unlike all simulations (`jaxlfi.diagnostics.unlike`); mostly nothing."""
+        _require_one(self, "misspecification")
+        return [f"observation: {finding}" for finding in observation_findings(self)]
 
     @property
     def spec(self) -> RunSpec:
