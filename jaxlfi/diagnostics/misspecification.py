@@ -15,7 +15,7 @@ import statistics
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 LEVEL = 0.001
 """p-value up to which something is reported, by each of the tests; 1 / (N + 1) where N simulations resolve no less."""
@@ -86,8 +86,8 @@ class _Column:
 
 
 def unlike(
-    x: Float[Array | np.ndarray, " obs"],
-    simulations: Float[Array | np.ndarray, "n obs"],
+    x: ArrayLike,
+    simulations: ArrayLike,
     names: Sequence[str] | None = None,
     channels: Sequence[str] = (),
 ) -> list[Finding]:
@@ -207,7 +207,10 @@ def _outside(both: np.ndarray, columns: Sequence[_Column]) -> list[Finding]:
         both: the observation, then the simulations, shape [1 + N, F].
         columns: F of them.
     """
-    p_values = _tail_p_values(both)
+    # Records and what a channel is like as a whole are two families: of many records none drowns the few features.
+    whole = np.array([column.log for column in columns])
+    sizes = np.where(whole, whole.sum(), (~whole).sum()) * len(set(whole))
+    p_values = _tail_p_values(both, sizes)
     if not (reported := np.flatnonzero(p_values <= LEVEL)).size:
         return []
     count = len(both) - 1
@@ -259,7 +262,7 @@ def _channel(both: np.ndarray, columns: Sequence[_Column], own: list[int], p_val
     return _beyond(columns[clearest], both[:, clearest], p_values[clearest], count, more)
 
 
-def _tail_p_values(both: np.ndarray) -> np.ndarray:
+def _tail_p_values(both: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """How probable so far a value beyond all simulations is, for each column, over all columns together; 1 inside.
 
     The logarithm of what exceeds the k-th largest of a power's tail is exponential, so that the distance of a new
@@ -269,11 +272,12 @@ def _tail_p_values(both: np.ndarray) -> np.ndarray:
 
     Args:
         both: the observation, then the simulations, shape [1 + N, F].
+        sizes: how many columns each one's p-value is to stand for, shape [F]; the sum of their inverses is 1.
 
     Returns:
         Shape [F].
     """
-    count, size = len(both) - 1, both.shape[1]
+    count = len(both) - 1
     centred = both - np.median(both[1:], axis=0)
     scale = 1.4826 * np.median(np.abs(centred[1:]), axis=0)
     largest = np.abs(centred[1:]).max(axis=0)
@@ -287,12 +291,12 @@ def _tail_p_values(both: np.ndarray) -> np.ndarray:
     observed = _extrapolated(z[0] - top[0], top[0] - top[extremes], extremes, count)
     simulated = _extrapolated(top[0] - top[1], top[1] - top[1 + extremes], extremes, count)
     rows = np.argmax(z[1:], axis=0)
-    p_values = np.where(z[0] > top[0], np.minimum(1.0, 2 * size * observed), 1.0)
+    p_values = np.where(z[0] > top[0], np.minimum(1.0, 2 * np.tile(sizes, 2) * observed), 1.0)
     for j in np.flatnonzero(p_values <= LEVEL):
         as_far = len(set(rows[simulated <= observed[j]]))
         if 1 + as_far > max(1.0, LEVEL * (count + 1)):
             p_values[j] = 1.0
-    return p_values.reshape(2, size).min(axis=0)
+    return p_values.reshape(2, -1).min(axis=0)
 
 
 def _extrapolated(gap: np.ndarray, spread: np.ndarray, extremes: int, count: int) -> np.ndarray:
@@ -301,11 +305,11 @@ def _extrapolated(gap: np.ndarray, spread: np.ndarray, extremes: int, count: int
     Args:
         gap: between the two, shape [F].
         spread: between the last largest and the one `extremes` places below, shape [F].
-        extremes: k. The spread is a sum of exponential variables with the rates 1 to k.
+        extremes: k. The gap is an exponential variable of rate 1, the spread a sum of those with the rates 2 to k + 1.
         count: number of values without the new one.
     """
     ratio = np.maximum(gap, 0.0) / np.maximum(spread, GRAIN)
-    return np.prod(1 / (1 + ratio[:, None] / np.arange(1, extremes + 1)), axis=1) / (count + 1)
+    return np.prod(1 / (1 + ratio[:, None] / np.arange(2, extremes + 2)), axis=1) / (count + 1)
 
 
 def _joint(both: np.ndarray, columns: Sequence[_Column]) -> list[Finding]:
