@@ -21,6 +21,7 @@ _HOMES = {
     "METHODS": "jaxlfi.bayessim.presets",
     "MaskedFlow": "jaxlfi.estimators.flow_estimators",
     "Matched": "jaxlfi.heuristics",
+    "MisspecificationWarning": "jaxlfi.runs.run",
     "MixtureLikelihood": "jaxlfi.estimators.likelihood_estimators",
     "MixtureNetwork": "jaxlfi.estimators.mixture_network",
     "Mode": "jaxlfi.heuristics",

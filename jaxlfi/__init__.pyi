@@ -44,6 +44,7 @@ from jaxlfi.heuristics import (
 )
 from jaxlfi.runs.infer import infer as infer
 from jaxlfi.runs.load import load as load
+from jaxlfi.runs.run import MisspecificationWarning as MisspecificationWarning
 from jaxlfi.runs.run import Run as Run
 from jaxlfi.runs.run import SupportWarning as SupportWarning
 from jaxlfi.tasks.errors import ExecutorError as ExecutorError

@@ -14,6 +14,7 @@ from jaxlfi.diagnostics.bounds import bound_summary
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs.execute import BatchPlan
 from jaxlfi.runs.run import Run
+from jaxlfi.runs.unlike import observation_summary
 from jaxlfi.studies import calibration, grid
 from jaxlfi.tasks import failures
 
@@ -97,8 +98,14 @@ def widths_lines(plan: BatchPlan) -> list[str]:
 
 
 def warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """In words, what went wrong in a batch: simulations that failed, training that failed, bounds that look wrong."""
-    return [*failure_warnings(plan, runs), *training_warnings(plan, runs), *support_warnings(plan, runs)]
+    """In words, what went wrong in a batch: failed simulations or training, wrong bounds, a foreign observation."""
+    return [
+        *failure_warnings(plan, runs),
+        *training_warnings(plan, runs),
+        *support_warnings(plan, runs),
+        *summary_warnings(runs),
+        *observation_warnings(plan, runs),
+    ]
 
 
 def failure_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
@@ -139,6 +146,20 @@ def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
         beliefs, grows = [run.belief for run in own], own[0].heuristic.grows
         found = bound_summary(plan.task.space.labels, beliefs, own[0].feasible, grows=grows)
         warnings += [f"{configuration}: {text}" for text in found]
+    return warnings
+
+
+def summary_warnings(runs: Sequence[Run]) -> list[str]:
+    """In words, which summaries do not vary, of the first run in which some do not."""
+    return next((found for run in runs if (found := run.unresolved)), [])
+
+
+def observation_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
+    """In words, where the observation of runs is unlike all of their simulations."""
+    warnings = []
+    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
+        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+        warnings += [f"{configuration}: {text}" for text in observation_summary(own)]
     return warnings
 
 

@@ -25,6 +25,7 @@ from jaxlfi.diagnostics.discrepancy import (
     trajectory_distance,
 )
 from jaxlfi.diagnostics.intervals import Estimate, Intervals, check_intervals, check_regions
+from jaxlfi.diagnostics.misspecification import Finding, unlike
 from jaxlfi.diagnostics.predictive import PredictiveCheck, predictive_check
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "SIGNIFICANCE",
     "Discrepancy",
     "Estimate",
+    "Finding",
     "Histogram",
     "Intervals",
     "PredictiveCheck",
@@ -57,4 +59,5 @@ __all__ = [
     "ranks_verdict",
     "trajectory_distance",
     "uniformity",
+    "unlike",
 ]

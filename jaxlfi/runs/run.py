@@ -31,6 +31,7 @@ from jaxlfi.runs import folder as folders
 from jaxlfi.tasks import failures, owned
 from jaxlfi.tasks.failures import Failure, Told
 from jaxlfi.tasks.reference import counted_from, summaries_in_double
+from jaxlfi.runs.unlike import observation_findings
 from jaxlfi.tasks.task import Task
 
 DRAWS = 1000
@@ -39,6 +40,10 @@ DRAWS = 1000
 
 class SupportWarning(UserWarning):
     """A bound looks wrong that the heuristic cannot move: of a support that cannot grow, or of Phi."""
+
+
+class MisspecificationWarning(UserWarning):
+    """The observation is unlike everything that was simulated."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,14 +161,23 @@ class Run:
 
     @property
     def warnings(self) -> list[str]:
-        """In words, which bounds look wrong that the heuristic cannot move, and what to do.
+        """In words, which bounds look wrong that the heuristic cannot move, and in what the observation is unlike all.
 
-        They are those of a support that cannot grow, and those of Phi.
+        Bounds are those of a support that cannot grow, and those of Phi.
         """
         _require_one(self, "warnings")
         found = bound_warnings(self.space.labels, self.belief, self.feasible, grows=self.heuristic.grows)
-        found = [warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in found]
-        return found + resolution_warnings(self.summary_names, np.asarray(self.dataset.x)[: int(self.dataset.size)])
+        return [
+            *(warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in found),
+            *self.unresolved,
+            *self.misspecification,
+        ]
+
+    @property
+    def unresolved(self) -> list[str]:
+        """In words, which summaries are the same in all simulations, or vary too little to be resolved."""
+        _require_one(self, "unresolved")
+        return resolution_warnings(self.summary_names, np.asarray(self.dataset.x)[: int(self.dataset.size)])
 
     @property
     def summary_names(self) -> tuple[str, ...]:
@@ -181,6 +195,12 @@ class Run:
         """
         _require_one(self, "failures")
         return failures.together([(self.told, self.history["failed"])])
+
+    @property
+    def misspecification(self) -> list[str]:
+        """In words, in what the observation is unlike all simulations (`jaxlfi.diagnostics.unlike`); mostly nothing."""
+        _require_one(self, "misspecification")
+        return [f"observation: {finding}" for finding in observation_findings(self)]
 
     @property
     def spec(self) -> RunSpec:

@@ -1,0 +1,53 @@
+"""In what the observation of a finished run is unlike its simulations."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxlfi.diagnostics.misspecification import Finding, unlike
+from jaxlfi.tasks import summaries
+from jaxlfi.tasks.task import Task
+
+if TYPE_CHECKING:  # runs know their findings
+    from jaxlfi.runs.run import Run
+
+
+def observation_findings(run: "Run") -> list[Finding]:
+    """The findings of `jaxlfi.diagnostics.unlike` on the observation and all simulations of one run.
+
+    Args:
+        run: one run, concrete.
+    """
+    rows = slice(int(run.dataset.size))
+    names, channels = None, ()
+    if run.task is not None:
+        names, channels = names_of(run.task, np.shape(run.observed), len(run.x))
+    return unlike(np.asarray(run.x), np.asarray(run.dataset.x)[rows], names, channels)
+
+
+def observation_summary(runs: Sequence["Run"]) -> list[str]:
+    """The warnings of several runs of a configuration: what the first of them finds, and how many find something."""
+    found = [texts for run in runs if (texts := run.misspecification)]
+    if not found or len(runs) == 1:
+        return [text for texts in found for text in texts]
+    return [f"{found[0][0]} (in {len(found)} of {len(runs)} runs, this is the first)"]
+
+
+def names_of(task: Task, trajectory: Sequence[int], size: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of a summary's numbers, and those of its channels where it is a series of records as they are.
+
+    Args:
+        task: whose summary it is.
+        trajectory: shape of what is summarised.
+        size: length S of the summary.
+
+    Returns:
+        S names; and C names, or none where it is no series.
+    """
+    names, channels = task.named_summaries(size), task.channels
+    series = task.summary is summaries.identity and not task.summary_names
+    if not series or len(trajectory) > 2 or (len(trajectory) == 1 and not channels and task.times is None):
+        return names, ()
+    count = 1 if len(trajectory) == 1 else trajectory[1]
+    return names, channels if len(channels) == count else tuple(f"channel {c + 1}" for c in range(count))
