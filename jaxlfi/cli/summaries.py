@@ -8,7 +8,7 @@ from rich.table import Table
 
 from jaxlfi import diagnostics
 from jaxlfi.bayessim.convergence import LAG
-from jaxlfi.bayessim.widths import expected_widths
+from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.diagnostics.bounds import bound_summary
 from jaxlfi.runs import execute as executing
@@ -74,10 +74,10 @@ def rounds_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 
 
 def widths_lines(plan: BatchPlan) -> list[str]:
-    """How far the widths of the runs' posteriors can be trusted, in one line; several where heuristics differ in it."""
+    """What is known of the widths of the runs' posteriors, in one line; several where heuristics differ in it."""
     by_line: dict[str, list[str]] = {}
     for spec in plan.specs:
-        names = by_line.setdefault(expected_widths(plan.settings, spec.heuristic), [])
+        names = by_line.setdefault(widths_note(plan.settings, spec.heuristic), [])
         names += [spec.configuration] * (spec.configuration not in names)
     several = len(by_line) > 1
     return [f"widths{' of ' + ', '.join(names) if several else ''}: {line}" for line, names in by_line.items()]

@@ -229,7 +229,7 @@ def _document(
 
 
 def _widths(collection: Collection) -> str:
-    """How far the widths can be trusted, and how that is known: measured in a run's folder, or as its settings say."""
+    """How far the widths can be trusted, as measured in a run's folder; or that nobody has measured them."""
     lines: dict[str, list[str]] = {}
     for name, histories in collection.runs.items():
         for history in histories:
