@@ -10,7 +10,7 @@ from jaxlfi import diagnostics
 from jaxlfi.bayessim.convergence import LAG
 from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
-from jaxlfi.diagnostics.bounds import bound_summary
+from jaxlfi.diagnostics.bounds import bound_warnings
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs.execute import BatchPlan
 from jaxlfi.runs.run import Run
@@ -123,8 +123,8 @@ def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
     warnings = []
     for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
         own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
-        beliefs, grows = [run.belief for run in own], own[0].heuristic.grows
-        found = bound_summary(plan.task.space.labels, beliefs, own[0].feasible, grows=grows)
+        evidence, grows = [run.bound_evidence for run in own], own[0].heuristic.grows
+        found = bound_warnings(plan.task.space, plan.task.units, evidence, own[0].feasible, grows)
         warnings += [f"{configuration}: {text}" for text in found]
     return warnings
 
