@@ -11,8 +11,8 @@ def widths_note(settings: Settings, heuristic: Heuristic) -> str:
     """That widths were not measured, and what corrects for the proposals, in one line.
 
     It follows from the settings alone, so it holds no figure. A network trained by the likelihood on proposals p~
-    learns L(theta) p~(theta) in place of L(theta) p(theta), unless something corrects for it (docs: calibration). By how
-    much widths are off depends on the simulator and on how well the network has learnt: only a measurement tells.
+    learns L(theta) p~(theta) in place of L(theta) p(theta), unless something corrects for it (docs: calibration). By
+    how much widths are off depends on the simulator and on how well the network has learnt: only a measurement tells.
 
     Args:
         settings: of the run.
