@@ -251,7 +251,7 @@ def _facts(collection: Collection) -> str:
         return next((config[name] for config in configs for name in names if config.get(name)), None)
 
     facts = {
-        "Parameters": ", ".join(_labels(first.names, first.units)),
+        "Parameters": ", ".join(_labels(first.config.get("parameters") or first.names, first.units)),
         "Rounds": first.rounds,
         "Seeds": max(len(histories) for histories in collection.runs.values()),
         **_provenance(get),
