@@ -31,6 +31,8 @@ MASS_BEYOND = 0.2
 On a wrong support the networks of an ensemble extrapolate, each to a place of its own and with little width, so that
 the mass beyond is near a multiple of 1 / ensemble size: this is enough for one of the usual four.
 """
+MOST = 0.5
+"""Mass beyond a bound that speaks against it where the simulations are undecided: then the median lies beyond it."""
 LESS = 0.5
 """Fraction of the greatest mass beyond a bound below which the mass beyond others does not count."""
 GAIN = 6.0
@@ -147,7 +149,7 @@ def judged(
     if helps.any() and (after <= _usual(degrees, 2.33) or before - after >= EXPLAINED * before):
         wrong = helps
     elif before <= _usual(degrees, 3.09):  # explained within the box
-        wrong = much & (gain >= WEAK_GAIN)
+        wrong = much & ((gain >= WEAK_GAIN) | (mass > MOST))
     elif helps.any() and much.any() and np.argmax(gain) == np.argmax(mass):  # both point to one bound
         wrong = gain == np.max(gain)
     else:

@@ -22,6 +22,8 @@ DIRECTIONS = 60
 """Most summaries, or principal components of them, that the model describes."""
 NEWEST = 20_000
 """Simulations that the model is fitted to, at most: the last ones."""
+EXPLODED = 30.0
+"""Distance from the median, in those of the observation or of most simulations, beyond which one is left out."""
 FLOOR = 1e-5
 """Least standard deviation of a summary's noise, as a fraction of its spread: float32 does not resolve less."""
 
@@ -69,6 +71,8 @@ def local_model(
     low, high = (np.asarray(bound, float) for bound in (box.low, box.high))
     unit = (2 * np.asarray(theta, float)[-NEWEST:] - low - high) / (high - low)
     x, observed = np.asarray(x, float)[-NEWEST:], np.asarray(observed, float)
+    comparable = _comparable(x, observed)
+    unit, x = unit[comparable], x[comparable]
     n, dim = unit.shape
     columns = 1 + dim + dim * (dim + 1) // 2
     quadratic = n >= 3 * columns
@@ -88,6 +92,14 @@ def local_model(
             step = model.nearest(-np.ones(dim), np.ones(dim)) - centre
             centre = np.clip(centre + np.clip(step, -STEP, STEP), -1, 1)
     return model
+
+
+def _comparable(x: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """Which simulations did not explode: none of their summaries is far further out than the observation's."""
+    middle = np.median(x, axis=0)
+    away = np.abs(x - middle)
+    usual = np.maximum(np.quantile(away, 0.75, axis=0), np.abs(observed - middle))
+    return np.all(away <= EXPLODED * np.where(usual > 0, usual, np.inf), axis=1)
 
 
 def _standardised(x: np.ndarray, observed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
