@@ -1,4 +1,4 @@
-"""Which rule tells a wrong bound from a right one: hits and false alarms on supports whose truth is known.
+"""Which posterior mass tells a wrong bound from a right one: hits and false alarms on supports whose truth is known.
 
     python -m experiments.bound_warnings --runs runs/bounds --out experiments/results/bound-warnings
 
@@ -21,7 +21,7 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
-from jaxlfi.diagnostics.bounds import MASS_BEYOND, bound_evidence, edge_mass
+from jaxlfi.diagnostics.bounds import MASS_BEYOND, edge_mass, mass_beyond
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
@@ -216,7 +216,7 @@ def centres_beyond(belief: Belief) -> tuple[Float[Array, " dim"], Float[Array, "
 
 RULES: dict[str, tuple[str, Rule]] = {
     "along": ("mass in or beyond the outer tenth of the width", edge_mass),
-    "beyond": ("mass beyond the bound", bound_evidence),
+    "beyond": ("mass beyond the bound", mass_beyond),
     "density": ("density at the bound / its maximum in the box", density_at),
     "centres": ("weight of the components centred beyond the bound", centres_beyond),
 }
@@ -225,7 +225,7 @@ RULES: dict[str, tuple[str, Rule]] = {
 FORMER = ("along", 0.2)
 """The rule before this study."""
 CHOSEN = ("beyond", MASS_BEYOND)
-"""The library's."""
+"""What the library takes of the posterior; it asks the simulations, too (experiments/wrong_bounds.py)."""
 
 
 @dataclasses.dataclass(frozen=True)

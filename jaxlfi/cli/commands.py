@@ -66,7 +66,7 @@ def tasks(arguments: argparse.Namespace, console: Console) -> None:
             table.add_row(escape(name), "", "", escape(str(error).splitlines()[0]))
             continue
         given = "given" if task.observation is not None else "simulated at the truth" if task.truth is not None else "-"
-        table.add_row(*map(escape, (name, ", ".join(task.space.labels), ", ".join(task.supports), given)))
+        table.add_row(*map(escape, (name, ", ".join(task.names), ", ".join(task.supports), given)))
     tables.show(table, console)
     console.print("Details: jaxlfi tasks NAME. Your own: module:factory in place of a name.")
 

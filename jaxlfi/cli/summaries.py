@@ -7,10 +7,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from jaxlfi import diagnostics
-from jaxlfi.bayessim.convergence import LAG
-from jaxlfi.bayessim.widths import expected_widths
+from jaxlfi.bayessim.convergence import LAG, SAME_CORRELATION, SAME_WIDTH, STILL
+from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
-from jaxlfi.diagnostics.bounds import bound_summary
+from jaxlfi.diagnostics.bounds import bound_warnings
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs.execute import BatchPlan
 from jaxlfi.runs.run import Run
@@ -75,23 +75,33 @@ def rounds_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
     for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
         own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
         made = [np.count_nonzero(~np.asarray(run.history["settled"][:-1])) + 1 for run in own]
-        moved = [float(run.history["moved"][-1]) for run in own if not run.history["settled"][-1]]
+        restless = [run.history for run in own if not run.history["settled"][-1]]
         extent = f"{made[0]}" if len(set(made)) == 1 else f"{min(made)} to {max(made)}"
         verdict = "the posterior has settled"
-        if moved:
-            verdict = (
-                f"{len(moved)} of {len(own)} posteriors still moved, by up to {max(moved):.1f} of their standard "
-                f"deviations over the last {LAG} rounds (--rounds allows for more)"
-            )
+        if restless:
+            verdict = f"{len(restless)} of {len(own)} posteriors {_changes(restless)}"
         lines.append(f"rounds of {configuration}: {extent}; {verdict}")
     return lines
 
 
+def _changes(histories: Sequence[Mapping[str, np.ndarray]]) -> str:
+    """How runs that had not settled still changed in their last round."""
+    moved, rescaled, turned = (
+        max(float(history[name][-1]) for history in histories) for name in ("moved", "rescaled", "turned")
+    )
+    if not np.isfinite(moved):
+        return f"made too few rounds to have settled: they are compared over {LAG}"
+    changes = [f"means by up to {moved:.1f} standard deviations"] * (moved >= STILL)
+    changes += [f"standard deviations by factors of up to {rescaled:.1f}"] * (rescaled >= SAME_WIDTH)
+    changes += [f"correlations by up to {turned:.1f}"] * (turned >= SAME_CORRELATION)
+    return f"still changed over the last {LAG} rounds: {', '.join(changes)} (--rounds allows for more)"
+
+
 def widths_lines(plan: BatchPlan) -> list[str]:
-    """How far the widths of the runs' posteriors can be trusted, in one line; several where heuristics differ in it."""
+    """What is known of the widths of the runs' posteriors, in one line; several where heuristics differ in it."""
     by_line: dict[str, list[str]] = {}
     for spec in plan.specs:
-        names = by_line.setdefault(expected_widths(plan.settings, spec.heuristic), [])
+        names = by_line.setdefault(widths_note(plan.settings, spec.heuristic), [])
         names += [spec.configuration] * (spec.configuration not in names)
     several = len(by_line) > 1
     return [f"widths{' of ' + ', '.join(names) if several else ''}: {line}" for line, names in by_line.items()]
@@ -143,8 +153,8 @@ def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
     warnings = []
     for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
         own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
-        beliefs, grows = [run.belief for run in own], own[0].heuristic.grows
-        found = bound_summary(plan.task.space.labels, beliefs, own[0].feasible, grows=grows)
+        evidence, grows = [run.bound_evidence for run in own], own[0].heuristic.grows
+        found = bound_warnings(plan.task.space, plan.task.units, evidence, own[0].feasible, grows)
         warnings += [f"{configuration}: {text}" for text in found]
     return warnings
 

@@ -1,6 +1,6 @@
 """Diagnostics: how far a posterior is from the truth, whether it is calibrated, and where it piles up on a bound."""
 
-from jaxlfi.diagnostics.bounds import bound_evidence, bound_summary, bound_warnings, edge_mass
+from jaxlfi.diagnostics.bounds import BoundEvidence, bound_evidence, bound_warnings, edge_mass, mass_beyond
 from jaxlfi.diagnostics.c2st import c2st
 from jaxlfi.diagnostics.calibration import (
     OK,
@@ -32,6 +32,7 @@ __all__ = [
     "OK",
     "POSTERIOR_SAMPLES",
     "SIGNIFICANCE",
+    "BoundEvidence",
     "Discrepancy",
     "Estimate",
     "Finding",
@@ -40,7 +41,6 @@ __all__ = [
     "PredictiveCheck",
     "Uniformity",
     "bound_evidence",
-    "bound_summary",
     "bound_warnings",
     "c2st",
     "check_intervals",
@@ -53,6 +53,7 @@ __all__ = [
     "distance_verdict",
     "edge_mass",
     "histogram",
+    "mass_beyond",
     "not_simulated",
     "predictive_check",
     "ranks",

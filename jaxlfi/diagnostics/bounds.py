@@ -1,10 +1,18 @@
-"""Bounds of a support that look wrong: the posterior lies beyond them.
+"""Bounds of a support that look wrong: the observation is explained better beyond them.
 
-A posterior mixture is learnt on a box but is not confined to it. Where the box holds the truth, the mixture's mass is
-inside, however close to a bound it lies; where a bound excludes the truth, the networks extrapolate and the mass moves
-beyond that bound. So the evidence against a bound is the marginal mass *beyond* it, not the mass along it.
+Two things speak against a bound. The posterior mixture is learnt on a box but is not confined to it: where a bound
+excludes the truth, the networks extrapolate, and marginal mass moves *beyond* that bound (mass along it says nothing).
+But they move other parameters too, which make up for the wrong one, and so the run's own simulations are asked as well:
+a local linear model of them (`jaxlfi.diagnostics.local_model`) says by how much the observation's misfit falls once a
+bound is taken away, bound by bound, the one that helps most first. One that no longer helps then is not to blame.
+
+Where the local model explains the observation, it decides. Where it does not (the simulator is far from linear between
+the box and the truth), the bound is named that it would take away first and that has most mass beyond it; if these are
+two, all bounds are that either of them speaks against. Hits and false alarms of this rule and of the mass alone:
+experiments/README.md.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -12,17 +20,32 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlfi.diagnostics.local_model import LocalModel, local_model
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.precision import single
+from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 
 MASS_BEYOND = 0.2
-"""Marginal posterior mass beyond a bound above which a warning names it.
+"""Marginal posterior mass beyond a bound that speaks against it.
 
 On a wrong support the networks of an ensemble extrapolate, each to a place of its own and with little width, so that
-the mass beyond is near a multiple of 1 / ensemble size: this is enough for one of the usual four. Hits and false alarms
-of this number and of others: experiments/README.md.
+the mass beyond is near a multiple of 1 / ensemble size: this is enough for one of the usual four.
 """
+MOST = 0.5
+"""Mass beyond a bound that speaks against it where the simulations are undecided: then the median lies beyond it."""
+LESS = 0.5
+"""Fraction of the greatest mass beyond a bound below which the mass beyond others does not count."""
+GAIN = 6.0
+"""Fall of the misfit that speaks against a bound by itself: a right one has it in less than 1 % of runs."""
+WEAK_GAIN = 1.0
+"""Fall of the misfit that speaks against a bound together with `MASS_BEYOND`."""
+NEXT = 0.3
+"""Least gain of a further bound, as a fraction of the greatest."""
+EXPLAINED = 0.5
+"""Fraction of the misfit that bounds must take away where what is left is not as small as noise."""
+REACH = 2.0
+"""How far beyond a bound the local model is trusted, in half widths of the box."""
 
 ROUNDING = 1e-6
 """Distance from Phi's bound, as a fraction of its width, up to which a bound is Phi's."""
@@ -30,6 +53,24 @@ ROUNDING = 1e-6
 SIDES = ("lower", "upper")
 ADVICE = "The true value may lie beyond it: widen the support there, or adapt it with --heuristic edge."
 PHI_ADVICE = "The bound is that of the feasible domain Phi: widen Phi if it can be."
+
+
+@dataclasses.dataclass(frozen=True)
+class BoundEvidence:
+    """What one run says of the bounds of its last support.
+
+    Attributes:
+        bounds: in inference space, shape [2, D]: the lower ones, the upper ones.
+        mass: marginal posterior mass beyond each, shape [2, D].
+        gain: fall of the observation's squared misfit, in standard deviations of the noise, when each is taken away
+            after those that help more; zero for those that no longer help, shape [2, D].
+        wrong: whether each looks wrong, shape [2, D].
+    """
+
+    bounds: Float[np.ndarray, "side dim"]
+    mass: Float[np.ndarray, "side dim"]
+    gain: Float[np.ndarray, "side dim"]
+    wrong: np.ndarray
 
 
 def edge_mass(belief: Belief, zone_fraction: float = 0.1) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
@@ -50,7 +91,7 @@ def edge_mass(belief: Belief, zone_fraction: float = 0.1) -> tuple[Float[Array, 
     )
 
 
-def bound_evidence(belief: Belief) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+def mass_beyond(belief: Belief) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
     """Marginal mass of the untruncated posterior beyond each lower and each upper bound, shape [D] each.
 
     Above 1/2, the marginal's median lies beyond the bound. In closed form; `jit`, `vmap` and `grad` apply.
@@ -62,86 +103,131 @@ def bound_evidence(belief: Belief) -> tuple[Float[Array, " dim"], Float[Array, "
         >>> from jaxlfi.distributions.mixture import GaussianMixture
         >>> mixture = GaussianMixture(jnp.zeros(1), jnp.array([[1.0, 0.5]]), jnp.array([jnp.eye(2) / 8]))
         >>> belief = Belief(mixture, Support([0.0, 0.0], [1.0, 1.0]), jnp.asarray(True))
-        >>> low, high = bound_evidence(belief)
+        >>> low, high = mass_beyond(belief)
         >>> high.round(2).tolist()
         [0.5, 0.0]
     """
     return edge_mass(belief, 0.0)
 
 
-_evidence = jax.jit(single(lambda belief: jnp.stack(bound_evidence(belief))))
+_mass = jax.jit(single(lambda belief: jnp.stack(mass_beyond(belief))))
+
+
+def bound_evidence(
+    belief: Belief,
+    theta: Float[Array | np.ndarray, "n dim"],
+    x: Float[Array | np.ndarray, "n obs"],
+    observed: Float[Array | np.ndarray, " obs"],
+) -> BoundEvidence:
+    """What a run's posterior and its simulations say of the bounds of its last support.
+
+    Args:
+        belief: the posterior on that support, concrete.
+        theta: parameters of all simulations of the run, in inference space, shape [N, D].
+        x: their summaries, shape [N, S].
+        observed: the observed summaries, shape [S].
+    """
+    box = jax.device_get(belief.support)
+    model = local_model(theta, x, observed, box)
+    return judged(np.stack([box.low, box.high]), np.asarray(_mass(belief), float), model)
+
+
+def judged(
+    bounds: Float[np.ndarray, "side dim"], mass: Float[np.ndarray, "side dim"], model: LocalModel | None
+) -> BoundEvidence:
+    """Which bounds look wrong, by the posterior mass beyond them and by the local model of the simulations.
+
+    Args:
+        bounds: in inference space, shape [2, D].
+        mass: beyond each, shape [2, D].
+        model: None where there are too few simulations for one: then the mass decides.
+    """
+    much = mass > MASS_BEYOND
+    if model is None:
+        return BoundEvidence(bounds, mass, np.zeros_like(mass), much)
+    gain, before, after = gains(model)
+    helps, degrees = gain >= GAIN, len(model.residual)
+    if helps.any() and (after <= _usual(degrees, 2.33) or before - after >= EXPLAINED * before):
+        wrong = helps
+    elif before <= _usual(degrees, 3.09):  # explained within the box
+        wrong = much & ((gain >= WEAK_GAIN) | (mass > MOST))
+    elif helps.any() and much.any() and np.argmax(gain) == np.argmax(mass):  # both point to one bound
+        wrong = gain == np.max(gain)
+    else:
+        wrong = helps | (much & (mass > LESS * np.max(mass)))
+    return BoundEvidence(bounds, mass, gain, wrong)
+
+
+def gains(model: LocalModel) -> tuple[Float[np.ndarray, "side dim"], float, float]:
+    """The fall of the misfit as bounds are taken away one after another, the one that helps most first.
+
+    Returns:
+        The gain of each, shape [2, D], and the misfit with all bounds and without those.
+    """
+    dim = len(model.centre)
+    limits, gain = np.stack([-np.ones(dim), np.ones(dim)]), np.zeros((2, dim))
+    before = after = model.misfit(*limits)
+    outwards = np.array([-REACH, REACH])
+    for _ in range(dim):
+        best, which = 0.0, None
+        for side, d in np.argwhere(gain == 0):
+            limits[side, d] += outwards[side]
+            own = after - model.misfit(*limits)
+            limits[side, d] -= outwards[side]
+            if own > best:
+                best, which = own, (side, d)
+        if which is None or best < NEXT * np.max(gain):
+            break
+        gain[which] = best
+        limits[which] += outwards[which[0]]
+        after -= best
+    return gain, before, after
+
+
+def _usual(degrees: int, z: float) -> float:
+    """The chi-squared quantile at z of the standard normal distribution, by Wilson and Hilferty."""
+    spread = 2 / (9 * degrees)
+    return degrees * (1 - spread + z * np.sqrt(spread)) ** 3
 
 
 def bound_warnings(
-    names: Sequence[str],
-    belief: Belief,
+    space: Space,
+    units: Sequence[str] | None,
+    evidence: Sequence[BoundEvidence],
     feasible: Support,
-    threshold: float = MASS_BEYOND,
     grows: bool = False,
 ) -> list[str]:
-    """Say in words which bounds of a support the posterior lies beyond, and what to do.
+    """Say in words which bounds of a support look wrong, and what to do.
 
     Args:
-        names: of the parameters in inference space ("ln young" for one inferred as its logarithm), D of them.
-        belief: one belief, concrete.
-        feasible: Phi.
-        threshold: marginal mass beyond a bound above which the bound is named.
+        space: of the parameters: values are given in natural units.
+        units: of the parameters; None where they are not known.
+        evidence: of runs that began on the same support, one or more.
+        feasible: Phi, in inference space.
         grows: whether the support can grow: then only bounds that are Phi's are named, which no heuristic moves.
 
     Example:
-        >>> from jaxlfi.distributions.mixture import GaussianMixture
-        >>> mixture = GaussianMixture(jnp.zeros(1), jnp.array([[4.0]]), jnp.array([[[0.5]]]))
-        >>> belief = Belief(mixture, Support([0.0], [3.0]), jnp.asarray(True))
-        >>> (warning,) = bound_warnings(["mass"], belief, feasible=Support([0.0], [9.0]))
+        >>> bounds, mass = np.array([[0.0], [3.0]]), np.array([[0.0], [0.98]])
+        >>> evidence = BoundEvidence(bounds, mass, np.zeros((2, 1)), mass > 0.2)
+        >>> (warning,) = bound_warnings(Space(("mass",), (False,)), ("kg",), [evidence], Support([0.0], [9.0]))
         >>> warning.partition(". ")[0]
-        'mass: 0.98 of the posterior mass lies beyond the upper bound 3'
+        'mass reaches its upper bound 3 kg (0.98 of the posterior mass lies beyond it)'
     """
-    mass = np.asarray(_evidence(belief))
-    bounds = np.stack([belief.support.low, belief.support.high])
-    final = _at_limit(bounds, feasible)
-    return [
-        f"{names[d]}: {mass[side, d]:.2f} of the posterior mass lies beyond the {SIDES[side]} bound "
-        f"{bounds[side, d]:.4g}. {PHI_ADVICE if final[side, d] else ADVICE}"
-        for d, side in np.argwhere(mass.T > threshold)
-        if final[side, d] or not grows
-    ]
-
-
-def bound_summary(
-    names: Sequence[str],
-    beliefs: Sequence[Belief],
-    feasible: Support,
-    threshold: float = MASS_BEYOND,
-    grows: bool = False,
-) -> list[str]:
-    """The warnings of several runs from one support: which bounds the posterior lies beyond, and in how many runs.
-
-    Args:
-        names: of the parameters in inference space, D of them.
-        beliefs: one a run; the warnings of a single one are those of `bound_warnings`.
-        feasible: Phi.
-        threshold: marginal mass beyond a bound above which the bound is named.
-        grows: whether the support can grow; see `bound_warnings`.
-
-    Returns:
-        At most two texts: one of the bounds that can be moved, and one of the bounds of Phi.
-    """
-    if len(beliefs) == 1:
-        return bound_warnings(names, beliefs[0], feasible, threshold, grows)
-    mass = np.stack([_evidence(belief) for belief in beliefs])  # [run, side, D]
-    bounds = np.stack([np.stack([belief.support.low, belief.support.high]) for belief in beliefs])
+    wrong = np.stack([one.wrong for one in evidence])  # [run, side, D]
+    mass = np.stack([one.mass for one in evidence])
+    bounds = np.stack([one.bounds for one in evidence])
     final = np.all(_at_limit(bounds, feasible), axis=0)
-    texts = []
-    for limited, advice in ((False, ADVICE), (True, PHI_ADVICE))[grows:]:
-        named = np.argwhere(np.any(mass > threshold, axis=0).T & (final.T == limited))
-        places = [
-            f"{names[d]} {SIDES[side]} {_value(bounds[:, side, d])} "
-            f"({np.sum(mass[:, side, d] > threshold)} of {len(beliefs)} runs, "
-            f"median mass {np.median(mass[:, side, d]):.2f})"
-            for d, side in named
-        ]
-        if places:
-            texts.append(f"posterior mass lies beyond a bound: {', '.join(places)}. {advice}")
+    runs, texts = len(evidence), []
+    for d, side in np.argwhere(np.any(wrong, axis=0).T):
+        if grows and not final[side, d]:
+            continue
+        unit = f" {units[d]}" if units is not None and units[d] else ""
+        value = _range(np.asarray(space.to_natural(bounds[:, side]), float)[:, d])
+        beyond = f"{np.median(mass[:, side, d]):.2f} of the posterior mass lies beyond it"
+        if runs > 1:
+            beyond = f"in {np.sum(wrong[:, side, d])} of {runs} runs; in the median {beyond}"
+        advice = PHI_ADVICE if final[side, d] else ADVICE
+        texts.append(f"{space.names[d]} reaches its {SIDES[side]} bound {value}{unit} ({beyond}). {advice}")
     return texts
 
 
@@ -153,7 +239,7 @@ def _at_limit(bounds: np.ndarray, feasible: Support) -> np.ndarray:
     return near | (outwards * (bounds - limits) > 0)
 
 
-def _value(bounds: np.ndarray) -> str:
+def _range(values: np.ndarray) -> str:
     """One number, or the range of those that differ from run to run (a support that was truncated)."""
-    low, high = (f"{bound:.4g}" for bound in (np.min(bounds), np.max(bounds)))
+    low, high = (f"{value:.4g}" for value in (np.min(values), np.max(values)))
     return low if low == high else f"{low} to {high}"

@@ -229,7 +229,7 @@ def _document(
 
 
 def _widths(collection: Collection) -> str:
-    """How far the widths can be trusted, and how that is known: measured in a run's folder, or as its settings say."""
+    """How far the widths can be trusted, as measured in a run's folder; or that nobody has measured them."""
     lines: dict[str, list[str]] = {}
     for name, histories in collection.runs.items():
         for history in histories:
@@ -251,7 +251,7 @@ def _facts(collection: Collection) -> str:
         return next((config[name] for config in configs for name in names if config.get(name)), None)
 
     facts = {
-        "Parameters": ", ".join(_labels(first.names, first.units)),
+        "Parameters": ", ".join(_labels(first.config.get("parameters") or first.names, first.units)),
         "Rounds": first.rounds,
         "Seeds": max(len(histories) for histories in collection.runs.values()),
         **_provenance(get),

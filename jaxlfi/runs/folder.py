@@ -30,7 +30,7 @@ import jaxlfi
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.record import FINAL, ledger_line
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.bayessim.widths import expected_widths
+from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.io import files as atomic
 from jaxlfi.io import trees
 from jaxlfi.io.formats import require_version
@@ -311,7 +311,7 @@ def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) 
         "simulation_timeout": task.simulate.timeout if task.one_by_one else None,
         "settings": describe.settings_to_json(settings),
         "seed": spec.seed,
-        "widths": expected_widths(settings, spec.heuristic),
+        "widths": widths_note(settings, spec.heuristic),
         **environment(),
     }
 

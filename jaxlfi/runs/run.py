@@ -15,7 +15,7 @@ from jaxlfi.bayessim.batch import RunSpec, posterior_after
 from jaxlfi.bayessim.correction import CORRECTIONS
 from jaxlfi.bayessim.keys import run_keys, seed_of
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.diagnostics.bounds import bound_warnings
+from jaxlfi.diagnostics.bounds import BoundEvidence, bound_evidence, bound_warnings
 from jaxlfi.diagnostics.resolution import resolution_warnings
 from jaxlfi.distributions.arguments import is_concrete
 from jaxlfi.distributions.belief import Belief, uninformed
@@ -166,7 +166,7 @@ class Run:
         Bounds are those of a support that cannot grow, and those of Phi.
         """
         _require_one(self, "warnings")
-        found = bound_warnings(self.space.labels, self.belief, self.feasible, grows=self.heuristic.grows)
+        found = bound_warnings(self.space, self.units, [self.bound_evidence], self.feasible, self.heuristic.grows)
         return [
             *(warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in found),
             *self.unresolved,
@@ -201,6 +201,14 @@ class Run:
         """In words, in what the observation is unlike all simulations (`jaxlfi.diagnostics.unlike`); mostly nothing."""
         _require_one(self, "misspecification")
         return [f"observation: {finding}" for finding in observation_findings(self)]
+
+    @property
+    def bound_evidence(self) -> BoundEvidence:
+        """What the posterior and the run's simulations say of the bounds of its last support."""
+        _require_one(self, "bound_evidence")
+        dataset = jax.device_get(self.dataset)
+        rows = slice(int(dataset.size))
+        return bound_evidence(self.belief, dataset.theta[rows], dataset.x[rows], self.x)
 
     @property
     def spec(self) -> RunSpec:

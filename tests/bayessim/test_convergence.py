@@ -9,7 +9,7 @@ import pytest
 
 import jaxlfi
 from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
-from jaxlfi.bayessim.convergence import LAG, STILL, advanced, not_begun
+from jaxlfi.bayessim.convergence import LAG, SAME_CORRELATION, SAME_WIDTH, STILL, advanced, not_begun
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import HostEngine
 from jaxlfi.diagnostics import POSTERIOR_SAMPLES
@@ -43,6 +43,67 @@ def test_movement_is_that_of_the_mean_in_standard_deviations_over_the_last_round
     expected = [np.max(np.abs(means[i] - means[i - LAG]) / sd) if i >= LAG else np.inf for i in range(len(means))]
     np.testing.assert_allclose(moved, expected, rtol=1e-5)
     assert int(progress.rounds) == 9
+
+
+def mixtures(rounds: int, dim: int, rng: np.random.Generator) -> list[GaussianMixture]:
+    """Random mixtures of two Gaussians."""
+    parts = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)
+    tril = lambda: jnp.tril(parts(2, dim, dim), -1) + jnp.eye(dim) * (0.2 + jnp.abs(parts(2, dim, dim)))
+    return [GaussianMixture(parts(2), parts(2, dim), tril()) for _ in range(rounds)]
+
+
+def test_widths_and_correlations_are_those_of_draws():
+    """NumPy's, of 200,000 draws of each posterior."""
+    posteriors = mixtures(5, 3, np.random.default_rng(1))
+    draws = [np.asarray(one.sample(jax.random.key(i), 200_000)) for i, one in enumerate(posteriors)]
+    progress, found = not_begun(3), []
+    for posterior in posteriors:
+        progress = advanced(progress, posterior, min_rounds=1)
+        found.append([float(progress.moved), float(progress.rescaled), float(progress.turned)])
+    assert np.all(np.isinf(found[:LAG]))
+    for i in (3, 4):
+        now, then = draws[i], draws[i - LAG]
+        ratio = now.std(axis=0) / then.std(axis=0)
+        expected = [
+            np.max(np.abs(now.mean(axis=0) - then.mean(axis=0)) / now.std(axis=0)),
+            np.max(np.maximum(ratio, 1 / ratio)),
+            np.max(np.abs(np.corrcoef(now.T) - np.corrcoef(then.T))),
+        ]
+        np.testing.assert_allclose(found[i], expected, atol=0.03)
+
+
+def correlated(sd, correlation: float) -> GaussianMixture:
+    covariance = np.outer(sd, sd) * [[1, correlation], [correlation, 1]]
+    return GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.linalg.cholesky(jnp.asarray(covariance))[None])
+
+
+@pytest.mark.parametrize(
+    ("last", "settled"),
+    [
+        (correlated([1.0, 1.0], 0.2), True),
+        (correlated([1.0, 1 / 6], 0.2), False),  # it has narrowed sixfold about the same mean
+        (correlated([6.0, 1.0], 0.2), False),
+        (correlated([1.0, 1.0 / SAME_WIDTH + 0.05], 0.2), True),
+        (correlated([1.0, 1.0], 0.25 + SAME_CORRELATION), False),
+        (correlated([1.0, 1.0], 0.15 + SAME_CORRELATION), True),
+        (correlated([1.0, 1.0], 0.15 - SAME_CORRELATION), False),
+    ],
+)
+def test_a_posterior_settles_once_its_widths_and_correlations_have(last, settled):
+    progress = not_begun(2)
+    for posterior in [correlated([1.0, 1.0], 0.2)] * LAG + [last]:
+        progress = advanced(progress, posterior, min_rounds=1)
+    assert float(progress.moved) == 0 and bool(progress.settled) is settled
+
+
+def test_the_unit_of_a_parameter_does_not_matter():
+    posteriors, unit = mixtures(4, 3, np.random.default_rng(2)), jnp.asarray([1e-6, 1.0, 1e5])
+    one = other = not_begun(3)
+    for posterior in posteriors:
+        one = advanced(one, posterior, min_rounds=1)
+        other = advanced(other, posterior.affine(unit, jnp.zeros(3)), min_rounds=1)
+    for name in ("moved", "rescaled", "turned"):
+        np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=1e-3)
 
 
 def test_a_run_does_not_settle_before_its_least_rounds():

@@ -272,7 +272,7 @@ def test_compare_warns_of_posteriors_beyond_the_bounds_of_fixed_supports(compari
     specs = tuple(run.spec for run in runs)
     plan = executing.BatchPlan(run_store.COMPARE, TASK, runs[0].task, None, runs[0].settings, specs)
     warnings = summaries.support_warnings(plan, runs)
-    assert any(text.startswith("misspecified:") and "first upper 0 (2 of 2 runs" in text for text in warnings)
+    assert any(text.startswith("misspecified: first reaches its upper bound 0 (in 2 of 2 runs") for text in warnings)
     assert not any(text.startswith("misspecified+edge") for text in warnings)
 
 

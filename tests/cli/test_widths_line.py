@@ -1,4 +1,4 @@
-"""The line on widths that a run ends with: one for all its configurations, or one for each kind of them."""
+"""The line on widths that a run ends with: one for all its configurations, or one for each kind of correction."""
 
 import types
 
@@ -13,12 +13,12 @@ def plan_of(**rules):
     return types.SimpleNamespace(settings=SETTINGS.replace(correction="none", inflation=1.0), specs=specs * 2)
 
 
-def test_configurations_of_the_same_widths_share_a_line():
+def test_configurations_corrected_in_the_same_way_share_a_line():
     (line,) = widths_lines(plan_of(ok=Fixed(), edge=Edge()))
-    assert line.startswith("widths: too narrow as a rule") and "\n" not in line
+    assert line.startswith("widths: not measured; nothing corrects for the proposals") and "\n" not in line
 
 
-def test_configurations_of_other_widths_are_named():
+def test_configurations_corrected_in_other_ways_are_named():
     lines = widths_lines(plan_of(ok=Fixed(), truncate=Truncate(), edge=Edge()))
     assert [line.partition(":")[0] for line in lines] == ["widths of ok, edge", "widths of truncate"]
-    assert "right in principle" in lines[1]
+    assert "every round drew from the prior" in lines[1]

@@ -395,7 +395,7 @@ def test_bound_warnings():
     """The chosen rule's hits and false alarms, from the posteriors that are kept."""
     from jax import vmap
 
-    from jaxlfi.diagnostics.bounds import MASS_BEYOND, bound_evidence
+    from jaxlfi.diagnostics.bounds import MASS_BEYOND, mass_beyond
     from jaxlfi.distributions.belief import Belief
     from jaxlfi.distributions.mixture import GaussianMixture
     from jaxlfi.distributions.support import Support
@@ -407,7 +407,7 @@ def test_bound_warnings():
         leaf = lambda part, name=name: kept[f"{name}/{part}"]
         box = Support(leaf("support_low"), leaf("support_high"))
         mixture = GaussianMixture(leaf("logits"), leaf("means"), leaf("scale_tril"))
-        evidence = vmap(bound_evidence)(Belief(mixture, box, np.ones(len(box.low), bool)))
+        evidence = vmap(mass_beyond)(Belief(mixture, box, np.ones(len(box.low), bool)))
         named = np.stack(evidence) > MASS_BEYOND
         beyond = np.stack([truth < box.low, truth > box.high])
         hits, wrong = hits + np.sum(named & beyond), wrong + np.sum(beyond)

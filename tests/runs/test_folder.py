@@ -91,6 +91,8 @@ def test_arrays_have_the_documented_shapes(folder):
             "not_positive_definite": (ROUNDS,),
             "mass_inside": (ROUNDS,),
             "moved": (ROUNDS,),
+            "rescaled": (ROUNDS,),
+            "turned": (ROUNDS,),
             "settled": (ROUNDS,),
             "predictive_simulations": (ROUNDS,),
             "names": (DIM,),

@@ -256,18 +256,18 @@ def test_the_picture_of_the_widths_shows_the_saved_arrays(repeated):
 
 @pytest.mark.slow
 def test_the_page_of_the_run_says_what_was_measured(repeated, folder, tmp_path):
-    """Of diagnostics in its own folder; before, what its settings let expect."""
+    """Of diagnostics in its own folder; before, that nothing was measured."""
     copy = tmp_path / "run"
     shutil.copytree(folder, copy)
     config = json.loads((copy / "config.json").read_text())
-    assert config["widths"].startswith("too narrow as a rule")
+    assert config["widths"].startswith("not measured; nothing corrects")
     line = lambda: page._widths(collection(copy, config))
-    assert "too narrow as a rule" in line() and "expected from the settings" in line()
+    assert "not measured" in line() and "jaxlfi diagnose" in line()
     shutil.copytree(repeated, copy / "diagnostics")
     found = json.loads((repeated / "diagnostics.json").read_text())
     assert html.escape(found["line"]) in line() and "(measured at this run's posterior with 20" in found["line"]
     (copy / "diagnostics" / "diagnostics.json").write_text("{")
-    assert "too narrow as a rule" in line()
+    assert "not measured" in line()
 
 
 def collection(folder, config):

@@ -66,7 +66,7 @@ def calibration(
     bars = [diagnostics.histogram(rank[:, d], plan.draws) for d in range(dim)]
     lines = [
         _support_check(theta, found),
-        *(_rank_check(name, rank[:, d], by_parameter[d], plan.draws) for d, name in enumerate(run.task.space.labels)),
+        *(_rank_check(name, rank[:, d], by_parameter[d], plan.draws) for d, name in enumerate(run.task.names)),
         _curve_check("coverage of densest regions", coverage, diagnostics.coverage_verdict(coverage)),
         _curve_check("coverage from random points (TARP)", tarp, diagnostics.distance_verdict(tarp)),
         _classifier_check(run, plan, truths, draws),

@@ -143,7 +143,7 @@ def diagnose(
         posterior = posteriors(
             out / plan.folder, run, plan, own_truths, found["chunk_length"], _fingerprint(found, plan), console
         )
-        widths.append(measured(plan, run.task.space.labels, own_truths, posterior))
+        widths.append(measured(plan, run.task.names, own_truths, posterior))
         own_arrays = {name: own_truths[name] for name in ("theta", "x")} | posterior
         if plan.at_posterior:
             arrays |= {f"{plan.reference}/{name}": array for name, array in own_arrays.items()}
