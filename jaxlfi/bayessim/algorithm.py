@@ -14,6 +14,7 @@ from jaxlfi.bayessim.correction import CORRECTIONS, CorrectionInfo, effective_si
 from jaxlfi.bayessim.keys import RoundKeys, init_key, round_keys
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.belief import RESTRICTIONS, Belief, uninformed
+from jaxlfi.distributions.region import Region
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import dataset as datasets
 from jaxlfi.estimators.base import Network, untrained
@@ -117,14 +118,15 @@ def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> F
 
     A belief that is not informed is the prior over its support: so it is in the first round, and always by `Truncate`.
     Where nothing else accounts for a prior that the task brings, it is a factor of the proposals: else a posterior
-    would forget it after the first round. A defensive fraction of the draws stays with the prior over the *current*
+    would forget it after the first round. Nothing is proposed where it is zero. A defensive fraction of the draws stays with the prior over the *current*
     support: it covers the ground that the support has gained, also where the posterior has locked itself onto a place
     where it learns nothing more.
     """
     key_prior, key_posterior, key_choice = jax.random.split(key, 3)
     attempts, prior = settings.simulation_budget, task.inference.prior
     factor = None if prior is None or settings.accounts_for_prior else prior.log_prob
-    informed = RESTRICTIONS[settings.restriction](key_posterior, belief, attempts, settings.inflation, factor)
+    inside = None if prior is None else Region(belief.support, prior)
+    informed = RESTRICTIONS[settings.restriction](key_posterior, belief, attempts, settings.inflation, factor, inside)
     from_prior = jax.random.bernoulli(key_choice, settings.defensive, (attempts, 1)) | ~belief.informed
     return jnp.where(from_prior, prior_draws(key_prior, prior, belief.support, attempts), informed)
 

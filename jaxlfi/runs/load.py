@@ -121,14 +121,13 @@ def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space
 
 
 def _prior(folder: Path, config: dict[str, Any], task: Task | None, settings: Settings) -> Any:
-    """The prior that a likelihood is multiplied by: it is a part of the task, and in no file."""
+    """The prior that a posterior needs: it is a part of the task, and in no file."""
     if task is not None:
         return task.inference.prior
-    if settings.estimator.of_summaries and config.get("prior") is not None:
-        raise StoreError(
-            f"{folder}: expected the task, whose prior ({config['prior']}) the posterior by a likelihood needs: "
-            "pass task=..."
-        )
+    needed = settings.estimator.of_summaries or config.get("prior_bounded", False)
+    if needed and config.get("prior") is not None:
+        why = "the posterior by a likelihood needs" if settings.estimator.of_summaries else "is zero in parts of the box"
+        raise StoreError(f"{folder}: expected the task, whose prior ({config['prior']}) {why}: pass task=...")
     return None
 
 

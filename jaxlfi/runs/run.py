@@ -97,7 +97,8 @@ class Run:
     def posterior(self) -> Posterior:
         """The posterior of the observation, truncated to the support the run ended with."""
         if self.network is None:
-            return _truncated(self.belief.mixture, self.belief.mixture, self.belief.support, self.space)
+            prior = None if self.task is None else self.task.inference.prior
+            return _truncated(self.belief.mixture, self.belief.mixture, self.belief.support, self.space, prior)
         return _posterior_after(self.belief, self.network, self.x)
 
     @property
@@ -208,7 +209,7 @@ def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
 
 
 _posterior_after = jax.jit(posterior_after)
-_truncated = jax.jit(truncated, static_argnums=3)
+_truncated = jax.jit(truncated, static_argnums=(3, 4))
 
 
 def _require_one(run: Run, what: str) -> None:
