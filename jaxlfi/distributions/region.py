@@ -47,8 +47,8 @@ class Region:
         """`n` draws of the prior inside the box, by rejection in bounded time.
 
         Where nearly all of the prior lies outside of the box, a draw is picked by the prior's density from points that
-        are uniform over the box. Should the prior be zero at all of them, the box has left the prior: the draws are then
-        the prior's own, wherever they are.
+        are uniform over the box. Should the prior be zero at all of them, the box has left the prior: the draws are
+        then the prior's own, wherever they are.
         """
         return rejection_sample(key, self._anywhere, self, n, self._picked)
 

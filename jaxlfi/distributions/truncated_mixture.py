@@ -26,7 +26,7 @@ TAIL = 4.0
 def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: Support, n: int) -> Array:
     """`n` draws of a mixture truncated to the support, by importance resampling; rejection has no part in it.
 
-    Each draw is one of `CANDIDATES` picked by weight, so that it is as good as exact where few dimensions are truncated.
+    Each draw is one of `CANDIDATES` picked by weight: as good as exact where few dimensions are truncated.
 
     Args:
         key: consumed.

@@ -33,7 +33,6 @@ class Place(Protocol):
         ...
 
 
-
 def rejection_sample(
     key: jax.Array, sample: Sampler, support: Place, n: int, fallback: Sampler | None = None
 ) -> Float[Array, "n dim"]:

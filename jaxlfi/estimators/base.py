@@ -233,6 +233,8 @@ class Network:
         space: the map between inference space and natural units.
         prior: the task's own prior over inference space, None for a uniform one. A likelihood is multiplied by it; a
             density that is the posterior has it in it, and is cut off where the prior is zero.
+        validity: the probability of success by the parameters (`jaxlfi.estimators.validity`), where what is learnt from
+            simulations that succeeded lacks it; else None.
     """
 
     estimator: Estimator
@@ -242,6 +244,7 @@ class Network:
     scale: Support
     space: Space = struct.field(pytree_node=False)
     prior: Any = struct.field(pytree_node=False, default=None)
+    validity: Any = None
 
     def condition(self, x: Float[Array, " obs"], support: Support, key: jax.Array | None = None) -> Posterior:
         """The posterior of a raw summary (Algorithm 1, line 11), truncated to a support.

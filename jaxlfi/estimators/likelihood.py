@@ -38,8 +38,8 @@ class Likelihood(Estimator):
     its networks'. The posterior on a support is the likelihood of the observation times the prior, drawn from by
     tempered sequential Monte Carlo (`jaxlfi.estimators.tempering`).
 
-    The likelihood is that of *valid* simulations, p(x | theta, valid). The probability of a valid simulation given
-    theta is not learnt: parameters whose simulations nearly always fail are not less probable for that.
+    The network's likelihood is that of *valid* simulations, p(x | theta, valid); the probability of a valid simulation
+    given theta is learnt beside it from all attempts (`jaxlfi.estimators.validity`), and multiplied by.
 
     Attributes:
         noise_floor: standard deviation of the normal noise that is added to normalised summaries before each round's
@@ -93,11 +93,12 @@ class Likelihood(Estimator):
     def log_likelihood(
         self, network: Network, x: Float[Array, " obs"], theta: Float[Array, "*n dim"]
     ) -> Float[Array, "*n"]:
-        """Log-density of the normalised summary of x given theta, numbers [..., D] in inference space."""
+        """Log-density of success with the normalised summary of x, given theta [..., D] in inference space."""
         module, given = self.module(x.shape[-1]), network.to_network(theta)
         value = jnp.broadcast_to(network.normaliser(x), (*theta.shape[:-1], x.shape[-1]))
         each = jax.vmap(lambda params: module.apply(params, given).log_prob(value))(network.params)
-        return jax.nn.logsumexp(each, axis=0) - jnp.log(self.ensemble_size)
+        of_valid = jax.nn.logsumexp(each, axis=0) - jnp.log(self.ensemble_size)
+        return of_valid if network.validity is None else of_valid + network.validity.log_prob(theta)
 
     def condition(
         self, network: Network, x: Float[Array, " obs"], support: Support, key: jax.Array | None

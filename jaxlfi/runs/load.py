@@ -15,6 +15,7 @@ from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
+from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.io import files as atomic
@@ -27,6 +28,8 @@ from jaxlfi.tasks import registry
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.task import Task
 
+VALIDITY = ".validity"
+"""Beginning of the names in network.npz of what is known of success; networks of earlier versions lack it."""
 LABELS = ("reasons", "names")
 """Arrays of history.npz that are texts, not records."""
 
@@ -126,7 +129,9 @@ def _prior(folder: Path, config: dict[str, Any], task: Task | None, settings: Se
         return task.inference.prior
     needed = settings.estimator.of_summaries or config.get("prior_bounded", False)
     if needed and config.get("prior") is not None:
-        why = "the posterior by a likelihood needs" if settings.estimator.of_summaries else "is zero in parts of the box"
+        why = (
+            "the posterior by a likelihood needs" if settings.estimator.of_summaries else "is zero in parts of the box"
+        )
         raise StoreError(f"{folder}: expected the task, whose prior ({config['prior']}) {why}: pass task=...")
     return None
 
@@ -175,6 +180,10 @@ def _network(
         return None
     estimator, obs = settings.estimator.reading(layout), math.prod(layout)
     make: Callable[[], Network] = lambda: untrained(jax.random.key(0), estimator, obs, feasible, space, prior)
+    arrays = _arrays(path, ())
+    if any(name.startswith(VALIDITY) for name in arrays):
+        plain, key = make, jax.random.key(0)
+        make = lambda: plain().replace(validity=validity.unknown(key, feasible, space))
     template = jax.eval_shape(make)
     expected = trees.named_leaves(template)
     arrays = _arrays(path, tuple(expected))

@@ -56,8 +56,8 @@ def check_density(prior: Any, space: Space, box: Support) -> None:
         box: Phi, or a support that is wider, in inference space.
 
     Raises:
-        ValueError: for a distribution of whole numbers, steps or single values, one whose log-density at its own draws is
-            no number, and one that has density where it is never drawn.
+        ValueError: for a distribution of whole numbers, steps or single values, one whose log-density at its own draws
+            is no number, and one that has density where it is never drawn.
     """
     own = jax.jit(lambda key: prior.distribution.sample(seed=key, sample_shape=DRAWS))(jax.random.key(0))
     if not is_concrete(own):  # a task that is made inside of a traced function
