@@ -1,6 +1,5 @@
 """What a density of any kind has inside a region: its mass there, and draws where that is next to nothing."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,7 +15,7 @@ from jaxlfi.distributions.truncation import MASS_DRAWS, Sampler, mass_inside
 
 POINTS = 1024
 """Weighted points by which a small mass is estimated: half of them draws of the mixture, half uniform over the box."""
-CANDIDATES = 32
+CANDIDATES = 16
 """Weighted candidates of each draw."""
 BLOCK = 256
 """Draws made at a time, which bounds the memory for their candidates."""
@@ -59,8 +58,8 @@ def rare_draws(density: Any, mixture: GaussianMixture, region: Support | Region)
     """A sampler of a density truncated to a region where next to none of its own draws lie inside.
 
     A mixture's in a box are those of `truncated_mixture_draws`. Of any other density each draw is one of `CANDIDATES`
-    draws of the truncated mixture, picked by weight; where all of these lie outside of the region, one of as many draws
-    that are uniform over it, or the prior's.
+    draws of the truncated mixture, picked by weight; where all of these lie where a prior is zero, one of as many draws
+    of the prior.
 
     Args:
         density: with `log_prob`, over inference space.
@@ -70,21 +69,24 @@ def rare_draws(density: Any, mixture: GaussianMixture, region: Support | Region)
     if isinstance(density, GaussianMixture) and isinstance(region, Support):
         return lambda key, n: truncated_mixture_draws(key, mixture, region, n)
     box = region if isinstance(region, Support) else region.box
-    log_anywhere: Callable = (lambda theta: jnp.zeros(theta.shape[:-1])) if region is box else region.log_prior
 
-    def block(key: jax.Array) -> Array:
+    def block(key: jax.Array, n: int) -> Array:
         key_mixture, key_anywhere, key_pick, key_other = jax.random.split(key, 4)
-        theta, log_weight = candidates(key_mixture, mixture, box, (BLOCK, CANDIDATES))
+        theta, log_weight = candidates(key_mixture, mixture, box, (n, CANDIDATES))
         log_weight = log_weight + density.log_prob(theta) - mixture.log_prob(theta)
         near, found = _picked(key_pick, theta, jnp.where(region.contains(theta), log_weight, -jnp.inf))
-        theta = region.sample(key_anywhere, BLOCK * CANDIDATES).reshape(theta.shape)
-        log_weight = density.log_prob(theta) - log_anywhere(theta)
+        if region is box:
+            return near
+        theta = region.sample(key_anywhere, n * CANDIDATES).reshape(theta.shape)
+        log_weight = density.log_prob(theta) - region.log_prior(theta)
         far, _ = _picked(key_other, theta, jnp.where(jnp.isfinite(log_weight), log_weight, -1e30))
         return jnp.where(found[:, None], near, far)
 
     def sample(key: jax.Array, n: int) -> Array:
+        if n <= BLOCK:
+            return block(key, n)
         keys = jax.random.split(key, -(-n // BLOCK))
-        return jax.lax.map(block, keys).reshape(-1, box.dim)[:n]
+        return jax.lax.map(lambda key: block(key, BLOCK), keys).reshape(-1, box.dim)[:n]
 
     return sample
 

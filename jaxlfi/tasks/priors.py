@@ -42,6 +42,9 @@ class InferencePrior:
     distribution: Any
     space: Space | None = None
 
+    def __post_init__(self):
+        object.__setattr__(self, "_values", _values_of(self.distribution))
+
     def sample(self, *, seed: jax.Array, sample_shape: int | tuple[int, ...]) -> Array:
         """Draws in inference space; NaN, and so in no support, where a log parameter was drawn that is not positive."""
         draws = self.distribution.sample(seed=seed, sample_shape=sample_shape)
@@ -58,21 +61,6 @@ class InferencePrior:
             possible &= ~jnp.any(jnp.isnan(self._values.inverse(value)), axis=-1)
         return jnp.where(possible, log_prob, -jnp.inf)
 
-    @functools.cached_property
-    def _values(self) -> Any:
-        """TensorFlow Probability's bijector from numbers to what the distribution can draw; None of others."""
-        found = self.distribution
-        if isinstance(found, distrax.Independent):
-            found = found.distribution
-        make = getattr(found, "experimental_default_event_space_bijector", None)
-        try:  # foreign code, which not every distribution has
-            bijector = None if make is None else make()
-            one = jax.ShapeDtypeStruct((1, *self.distribution.event_shape), jnp.float32)
-            fits = bijector is not None and jax.eval_shape(bijector.inverse, one).shape == one.shape
-        except Exception:
-            return None
-        return bijector if fits else None
-
     def __eq__(self, other: object) -> bool:
         """Whether both are made of the same."""
         if not isinstance(other, InferencePrior):
@@ -81,6 +69,21 @@ class InferencePrior:
 
     def __hash__(self) -> int:
         return hash((type(self.distribution), self.space))
+
+
+def _values_of(distribution: Any) -> Any:
+    """TensorFlow Probability's bijector from all numbers to those that a distribution can draw; None for others."""
+    own = distribution.distribution if isinstance(distribution, distrax.Independent) else distribution
+    make = getattr(own, "experimental_default_event_space_bijector", None)
+    if make is None:
+        return None
+    try:  # foreign code, which not every distribution has
+        with jax.ensure_compile_time_eval():  # it is kept, so it must not be made of tracers
+            bijector = make()
+        one = jax.ShapeDtypeStruct((1, *distribution.event_shape), jnp.float32)
+        return bijector if jax.eval_shape(bijector.inverse, one).shape == one.shape else None
+    except Exception:
+        return None
 
 
 def prior_draws(key: jax.Array, prior: Any, support: Support, n: int) -> Float[Array, "n dim"]:
