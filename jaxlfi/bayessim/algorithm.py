@@ -14,8 +14,10 @@ from jaxlfi.bayessim.correction import CORRECTIONS, CorrectionInfo, effective_si
 from jaxlfi.bayessim.keys import RoundKeys, init_key, round_keys
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.belief import RESTRICTIONS, Belief, uninformed
+from jaxlfi.distributions.region import Region
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import dataset as datasets
+from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.training import FitInfo, fit
@@ -35,6 +37,8 @@ class State:
         dataset: all simulations so far.
         network: the density estimator.
         progress: rounds made, and whether the posterior still moves.
+        attempts: parameters of all simulations so far, failed ones too, with 1 for success and 0 for failure as their
+            summary, where the estimator has to learn the probability of success; else None.
     """
 
     belief: Belief
@@ -42,6 +46,7 @@ class State:
     dataset: Dataset
     network: Network
     progress: Progress
+    attempts: Dataset | None = None
 
     @property
     def feasible(self) -> Support:
@@ -94,16 +99,23 @@ def init(
     chex.assert_shape([support.low, support.high], (task.dim,))
     belief = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
     obs = observed.shape[-1]
-    first = settings.simulations_per_round if first is None else first
-    capacity = first + (settings.rounds - 1) * settings.simulations_per_round
+    room = lambda each: (each if first is None else first) + (settings.rounds - 1) * each
+    capacity = room(settings.simulations_per_round)
+    network = untrained(
+        key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior
+    )
+    attempts = None
+    if settings.estimator.accounts_for_prior:  # whatever was proposed, and so whatever succeeded of it
+        key_validity = jax.random.fold_in(jax.random.clone(key), 1)
+        network = network.replace(validity=validity.unknown(key_validity, network.scale, task.space))
+        attempts = datasets.empty(room(settings.simulation_budget), task.dim, 1)
     return State(
         belief=belief,
         proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.rounds, *leaf.shape)), belief),
         dataset=datasets.empty(capacity, task.dim, obs),
-        network=untrained(
-            key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior
-        ),
+        network=network,
         progress=not_begun(task.dim),
+        attempts=attempts,
     )
 
 
@@ -117,14 +129,15 @@ def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> F
 
     A belief that is not informed is the prior over its support: so it is in the first round, and always by `Truncate`.
     Where nothing else accounts for a prior that the task brings, it is a factor of the proposals: else a posterior
-    would forget it after the first round. A defensive fraction of the draws stays with the prior over the *current*
-    support: it covers the ground that the support has gained, also where the posterior has locked itself onto a place
-    where it learns nothing more.
+    would forget it after the first round. Nothing is proposed where it is zero. A defensive fraction of the draws stays
+    with the prior over the *current* support: it covers the ground that the support has gained, also where the
+    posterior has locked itself onto a place where it learns nothing more.
     """
     key_prior, key_posterior, key_choice = jax.random.split(key, 3)
     attempts, prior = settings.simulation_budget, task.inference.prior
     factor = None if prior is None or settings.accounts_for_prior else prior.log_prob
-    informed = RESTRICTIONS[settings.restriction](key_posterior, belief, attempts, settings.inflation, factor)
+    inside = None if prior is None else Region(belief.support, prior)
+    informed = RESTRICTIONS[settings.restriction](key_posterior, belief, attempts, settings.inflation, factor, inside)
     from_prior = jax.random.bernoulli(key_choice, settings.defensive, (attempts, 1)) | ~belief.informed
     return jnp.where(from_prior, prior_draws(key_prior, prior, belief.support, attempts), informed)
 
@@ -150,7 +163,14 @@ def update(
     # The rows that the rounds still to come have room for are not there yet.
     expected = dataset.capacity - (settings.rounds - 1 - round) * settings.simulations_per_round
     key_fit, key_condition = state.network.estimator.keys(key)
-    network, fit_info = fit(key_fit, _started(state, dataset), dataset, weights, expected, log_prior)
+    network, attempts = _started(state, dataset), state.attempts
+    if attempts is not None:
+        attempts = datasets.augment(attempts, _outcomes(simulations), round)
+        learnt = network.validity.learnt(jax.random.fold_in(jax.random.clone(key_fit), 1), attempts)
+        network = network.replace(validity=learnt)
+        # Success is a part of the prior of the simulations that the atomic losses compare.
+        log_prior = (0.0 if log_prior is None else log_prior) + learnt.log_prob(dataset.theta)
+    network, fit_info = fit(key_fit, network, dataset, weights, expected, log_prior)
     posterior = network.condition(observed, state.belief.support, key_condition)
     mixture, not_positive_definite = correction.change(task, posterior.mixture, proposed)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
@@ -164,7 +184,7 @@ def update(
         fit=fit_info,
     )
     progress = advanced(state.progress, mixture, settings.min_rounds)
-    after = State(belief, proposals, dataset, network, progress)
+    after = State(belief, proposals, dataset, network, progress, attempts)
     return _unless_settled(state, after, info) if settings.min_rounds else (after, info)
 
 
@@ -184,6 +204,12 @@ def _unless_settled(before: State, after: State, info: Round) -> tuple[State, Ro
         ),
     )
     return state, jax.tree.map(lambda was, now: jnp.where(settled, was, now), nothing, info)
+
+
+def _outcomes(simulations: Simulations) -> Simulations:
+    """All attempted simulations, with what became of them as their summary: 1 for success, 0 for failure."""
+    success = (simulations.failure == 0).astype(jnp.float32)
+    return simulations.replace(x=success[:, None], kept=simulations.counted)
 
 
 def _started(state: State, dataset: Dataset) -> Network:

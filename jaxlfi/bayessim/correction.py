@@ -12,8 +12,10 @@ from jaxtyping import Array, Float, Int
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_algebra import product, quotient, reduce
+from jaxlfi.distributions.region import region
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.tasks.priors import InferencePrior
 from jaxlfi.tasks.task import Task
 
 MASS_DRAWS = 512
@@ -113,7 +115,7 @@ def importance_weights(
 
     def log_density(proposal: Belief) -> Array:
         draws = proposal.mixture.sample(jax.random.key(0), MASS_DRAWS)
-        inside = jnp.mean(proposal.support.contains(draws)) + 1.0 / MASS_DRAWS
+        inside = jnp.mean(region(proposal.support, task.inference.prior).contains(draws)) + 1.0 / MASS_DRAWS
         informed = proposal.mixture.log_prob(dataset.theta) - jnp.log(inside)
         prior = log_prior(task, proposal.support, dataset.theta)
         mixed = jnp.logaddexp(jnp.log1p(-defensive) + informed, jnp.log(defensive) + prior)
@@ -148,12 +150,13 @@ def gaussian_prior(prior) -> GaussianMixture:
     Raises:
         ValueError: for priors that are not Gaussian.
     """
-    if isinstance(prior, distrax.MultivariateNormalTri | distrax.MultivariateNormalDiag):
-        covariance = prior.covariance()
-        return GaussianMixture(jnp.zeros(1), prior.mean()[None], jnp.linalg.cholesky(covariance)[None])
+    own = prior.distribution if isinstance(prior, InferencePrior) and prior.space is None else prior
+    if isinstance(own, distrax.MultivariateNormalTri | distrax.MultivariateNormalDiag):
+        covariance = own.covariance()
+        return GaussianMixture(jnp.zeros(1), own.mean()[None], jnp.linalg.cholesky(covariance)[None])
     raise ValueError(
         f"correction='paper' divides by the prior and needs it uniform (none given) or a distrax multivariate normal, "
-        f"got {type(prior).__name__}; use correction='none' or 'importance'"
+        f"got {type(getattr(prior, 'distribution', prior)).__name__}; use correction='none' or 'importance'"
     )
 
 

@@ -136,7 +136,9 @@ def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, fir
         if (mass := priors.require_mass(plan.task.inference.prior, box, name)) < priors.LOW_INSIDE:
             missed = (1 - mass) ** TRIES
             _warn(
-                console, f"only {mass:.2g} of the prior lies in {name}: {missed:.0%} of its draws are uniform instead"
+                console,
+                f"only {mass:.2g} of the prior lies in {name}: {missed:.0%} of its draws are approximate, picked from "
+                "uniform ones by the prior's density",
             )
     if processes.writes:
         executing.begin(arguments.out, plan, observed, processes)

@@ -84,5 +84,4 @@ def domain(environment: "Environment", word: str) -> tuple[str, Callable]:
 
     run = load(folder)
     domains.check_belief(environment, run.space, run.space.box_to_natural(run.feasible), run.units)
-    limits = domains.limits_of(run)
-    return folder.resolve().name, lambda key, n: domains.of_belief(key, run.belief, run.space, limits, n)
+    return folder.resolve().name, domains.of_run(run)

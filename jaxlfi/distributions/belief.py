@@ -8,6 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.region import Region
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import TRIES, rejection_sample, weighted_sample
 
@@ -52,7 +53,12 @@ LogWeight = Callable[[Float[Array, "m dim"]], Float[Array, " m"]]
 
 
 def clipped(
-    key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0, log_weight: LogWeight | None = None
+    key: jax.Array,
+    belief: Belief,
+    n: int,
+    inflation: Factor = 1.0,
+    log_weight: LogWeight | None = None,
+    region: Region | None = None,
 ) -> Array:
     """`n` draws of the mixture, those outside the support moved to its nearest point (the paper's choice).
 
@@ -64,30 +70,41 @@ def clipped(
         n: how many.
         inflation: how many times as wide as the mixture, about its mean.
         log_weight: logarithm of a factor of the density, such as a prior, by which draws are chosen from many more.
+        region: the part of the support that draws are kept in; all of it by default. What is moved to where it is not
+            is drawn again, and, where that does not help, drawn from the prior in there.
     """
-    sample = belief.mixture.inflated(inflation).sample
-    if log_weight is None:
-        return belief.support.clip(sample(key, n))
-    key_candidates, key_choice = jax.random.split(key)
-    candidates = belief.support.clip(sample(key_candidates, max(CANDIDATES, TRIES * n)))
-    return weighted_sample(key_choice, candidates, log_weight(candidates), n)
+    sample = lambda key, n: belief.support.clip(belief.mixture.inflated(inflation).sample(key, n))
+    if log_weight is not None:
+        return _weighted(key, sample, log_weight, region or belief.support, n)
+    draws = sample(key, n)
+    if region is None:
+        return draws
+    again = rejection_sample(jax.random.fold_in(jax.random.clone(key), 1), sample, region, n)
+    return jnp.where(region.contains(draws)[:, None], draws, again)
 
 
 def rejected(
-    key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0, log_weight: LogWeight | None = None
+    key: jax.Array,
+    belief: Belief,
+    n: int,
+    inflation: Factor = 1.0,
+    log_weight: LogWeight | None = None,
+    region: Region | None = None,
 ) -> Array:
     """`n` draws of the mixture truncated to the support (`jaxlfi.distributions.truncation.rejection_sample`)."""
-    sample = belief.mixture.inflated(inflation).sample
+    sample, inside = belief.mixture.inflated(inflation).sample, region or belief.support
     if log_weight is None:
-        return rejection_sample(key, sample, belief.support, n)
-    key_candidates, key_choice = jax.random.split(key)
-    candidates = sample(key_candidates, max(CANDIDATES, TRIES * n))
-    weight = jnp.where(belief.support.contains(candidates), log_weight(candidates), -jnp.inf)
-    return belief.support.clip(weighted_sample(key_choice, candidates, weight, n))
+        return rejection_sample(key, sample, inside, n)
+    return _weighted(key, sample, log_weight, inside, n)
 
 
 def mixed(
-    key: jax.Array, belief: Belief, n: int, inflation: Factor = 1.0, log_weight: LogWeight | None = None
+    key: jax.Array,
+    belief: Belief,
+    n: int,
+    inflation: Factor = 1.0,
+    log_weight: LogWeight | None = None,
+    region: Region | None = None,
 ) -> Array:
     """`n` draws: as by `clipped` for the mass that the mixture has outside the support, as by `rejected` for the rest.
 
@@ -97,8 +114,24 @@ def mixed(
     """
     key_posterior, key_wide = jax.random.split(key)
     draws = belief.mixture.sample(key_posterior, n)
-    inside = belief.support.contains(draws)[:, None]
-    return jnp.where(inside, rejected(key_wide, belief, n, inflation, log_weight), belief.support.clip(draws))
+    moved = belief.support.clip(draws)
+    inside = belief.support.contains(draws)
+    wide = inside if region is None else inside | ~region.contains(moved)
+    return jnp.where(wide[:, None], rejected(key_wide, belief, n, inflation, log_weight, region), moved)
+
+
+def _weighted(
+    key: jax.Array,
+    sample: Callable[[jax.Array, int], Array],
+    log_weight: LogWeight,
+    inside: Support | Region,
+    n: int,
+) -> Array:
+    """`n` of many more draws, chosen by weight among those inside."""
+    key_candidates, key_choice = jax.random.split(key)
+    candidates = sample(key_candidates, max(CANDIDATES, TRIES * n))
+    weight = jnp.where(inside.contains(candidates), log_weight(candidates), -jnp.inf)
+    return weighted_sample(key_choice, candidates, weight, n, inside.sample)
 
 
 RESTRICTIONS = {"clip": clipped, "reject": rejected, "mixed": mixed}

@@ -1,12 +1,11 @@
 """Truncation: draws, mass and density of a distribution restricted to a box."""
 
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
-
-from jaxlfi.distributions.support import Support
 
 Sampler = Callable[[jax.Array, int], Float[Array, "n dim"]]
 """A function that draws from a distribution before truncation: (key, n) -> [n, D]."""
@@ -16,13 +15,26 @@ TRIES = 32
 BLOCK = 8192
 """Number of draws made at a time, which bounds the memory for their candidates."""
 MASS_DRAWS = 10_000
-"""Monte Carlo draws for the truncation constant (1 % error at mass 0.5)."""
-MIN_MASS = 1e-6
-"""Minimum truncation constant, which keeps log-densities finite where no Monte Carlo draw was inside."""
+"""Monte Carlo draws for a mass that has no closed form (1 % error at mass 0.5)."""
+
+
+@runtime_checkable
+class Place(Protocol):
+    """Where draws are kept: a box, or the part of one where a prior is not zero (`jaxlfi.distributions.region`)."""
+
+    dim: int
+
+    def contains(self, theta: Float[Array, "*n dim"]) -> Bool[Array, "*n"]:
+        """Whether each parameter vector lies inside."""
+        ...
+
+    def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
+        """`n` draws inside: uniform ones, or those of the prior."""
+        ...
 
 
 def rejection_sample(
-    key: jax.Array, sample: Sampler, support: Support, n: int, fallback: Sampler | None = None
+    key: jax.Array, sample: Sampler, support: Place, n: int, fallback: Sampler | None = None
 ) -> Float[Array, "n dim"]:
     """`n` draws of a distribution truncated to the support, by rejection in bounded time.
 
@@ -32,9 +44,9 @@ def rejection_sample(
     Args:
         key: consumed.
         sample: of the distribution before truncation.
-        support: the box.
+        support: where.
         n: number of draws.
-        fallback: draws inside the box; uniform ones by default.
+        fallback: draws inside; by default `support.sample`: uniform ones, or those of the prior.
     """
     if n > BLOCK:
         keys = jax.random.split(key, -(-n // BLOCK))
@@ -43,11 +55,17 @@ def rejection_sample(
     key_candidates, key_fallback = jax.random.split(key)
     candidates = sample(key_candidates, n * TRIES).reshape(n, TRIES, -1)
     theta, found = first_inside(candidates, support)
-    return jnp.where(found[:, None], theta, (fallback or support.sample)(key_fallback, n))
+    fill = lambda: jnp.where(found[:, None], theta, (fallback or support.sample)(key_fallback, n))
+    # A branch, as most of the time nothing is missing, and the fallback would take longer than all the rest.
+    return jax.lax.cond(jnp.all(found), lambda: theta, fill)
 
 
 def weighted_sample(
-    key: jax.Array, candidates: Float[Array, "m dim"], log_weight: Float[Array, " m"], n: int
+    key: jax.Array,
+    candidates: Float[Array, "m dim"],
+    log_weight: Float[Array, " m"],
+    n: int,
+    fallback: Sampler | None = None,
 ) -> Float[Array, "n dim"]:
     """`n` of the candidates, each at most once, with odds in proportion to their weights.
 
@@ -59,13 +77,19 @@ def weighted_sample(
         candidates: shape [M, D].
         log_weight: of each; NaN counts as no weight at all.
         n: number of draws, at most M.
+        fallback: draws that take the place of those missing where fewer than n candidates have any weight; without one,
+            candidates of no weight do.
     """
-    odds = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight) + jax.random.gumbel(key, log_weight.shape)
-    return candidates[jax.lax.top_k(odds, n)[1]]
+    key_noise, key_fallback = (key, None) if fallback is None else jax.random.split(key)
+    odds = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight) + jax.random.gumbel(key_noise, log_weight.shape)
+    best, rows = jax.lax.top_k(odds, n)
+    if fallback is None:
+        return candidates[rows]
+    return jnp.where((best > -jnp.inf)[:, None], candidates[rows], fallback(key_fallback, n))
 
 
 def first_inside(
-    candidates: Float[Array, "n tries dim"], support: Support
+    candidates: Float[Array, "n tries dim"], support: Place
 ) -> tuple[Float[Array, "n dim"], Bool[Array, " n"]]:
     """The first candidate inside the support for each draw, and whether there is one."""
     inside = support.contains(candidates)
@@ -73,20 +97,20 @@ def first_inside(
     return theta, jnp.any(inside, axis=1)
 
 
-def mass_inside(sample: Sampler, support: Support) -> Float[Array, ""]:
+def mass_inside(sample: Sampler, support: Place) -> Float[Array, ""]:
     """The distribution's mass in the support, from `MASS_DRAWS` draws that are the same each time."""
     return jnp.mean(support.contains(sample(jax.random.key(0), MASS_DRAWS)))
 
 
 def truncated_log_prob(
-    log_prob: Float[Array, "*n"], theta: Float[Array, "*n dim"], support: Support, mass: Float[Array, ""]
+    log_prob: Float[Array, "*n"], theta: Float[Array, "*n dim"], support: Place, log_mass: Float[Array, ""]
 ) -> Float[Array, "*n"]:
     """Log-density of the truncated distribution at theta: log q - log mass inside the support, -inf outside.
 
     Args:
         log_prob: log q(theta) before truncation, shape [...].
         theta: shape [..., D].
-        support: the box.
-        mass: q's mass in it.
+        support: where.
+        log_mass: logarithm of q's mass in it.
     """
-    return jnp.where(support.contains(theta), log_prob - jnp.log(jnp.maximum(mass, MIN_MASS)), -jnp.inf)
+    return jnp.where(support.contains(theta), log_prob - log_mass, -jnp.inf)

@@ -12,8 +12,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_fit import fit_mixture
+from jaxlfi.distributions.region import region
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.truncation import Place
 from jaxlfi.estimators.dataset import Dataset, empty
 from jaxlfi.estimators.density import Density, EnsembleDensity
 from jaxlfi.estimators.embeddings import EMBEDDINGS, Embedded
@@ -189,14 +191,14 @@ class Estimator(Checked, abc.ABC):
         self, network: "Network", x: Float[Array, " obs"], support: Support, key: jax.Array | None
     ) -> Posterior:
         """See `Network.condition`."""
-        density = self.density(network, x)
-        return truncated(density, self.mixture(key, density, support), support, network.space)
+        density, inside = self.density(network, x), region(support, network.prior)
+        return truncated(density, self.mixture(key, density, inside), support, network.space, network.prior)
 
     def posterior(
         self, network: "Network", x: Float[Array, " obs"], mixture: GaussianMixture, support: Support
     ) -> Posterior:
         """The same posterior on another support, where the mixture that goes with it is known already."""
-        return truncated(self.density(network, x), mixture, support, network.space)
+        return truncated(self.density(network, x), mixture, support, network.space, network.prior)
 
     def density(self, network: "Network", x: Float[Array, " obs"]) -> Density:
         """q_phi(theta | x) in inference space, not truncated: the whole ensemble."""
@@ -205,7 +207,7 @@ class Estimator(Checked, abc.ABC):
         shift, scale = network.from_network()
         return EnsembleDensity(each, shift, scale, self.ensemble_size)
 
-    def mixture(self, key: jax.Array | None, density: Density, support: Support) -> GaussianMixture:
+    def mixture(self, key: jax.Array | None, density: Density, support: Place) -> GaussianMixture:
         """The density as E K Gaussians: fitted to its draws inside the support.
 
         Inside, as a density that was trained by the atomic loss may leak any amount of mass to where no simulation was.
@@ -229,8 +231,10 @@ class Network:
             standard normal; none for a mixture density network (reading D).
         scale: the box in inference space that [-1, 1]^D stands for, Phi.
         space: the map between inference space and natural units.
-        prior: the task's own prior over inference space, where a likelihood is to be multiplied by it; None for a
-            uniform one, and where the density is the posterior, which has the prior in it.
+        prior: the task's own prior over inference space, None for a uniform one. A likelihood is multiplied by it; a
+            density that is the posterior has it in it, and is cut off where the prior is zero.
+        validity: the probability of success by the parameters (`jaxlfi.estimators.validity`), where what is learnt from
+            simulations that succeeded lacks it; else None.
     """
 
     estimator: Estimator
@@ -240,6 +244,7 @@ class Network:
     scale: Support
     space: Space = struct.field(pytree_node=False)
     prior: Any = struct.field(pytree_node=False, default=None)
+    validity: Any = None
 
     def condition(self, x: Float[Array, " obs"], support: Support, key: jax.Array | None = None) -> Posterior:
         """The posterior of a raw summary (Algorithm 1, line 11), truncated to a support.
@@ -285,7 +290,6 @@ def untrained(
     estimator = jax.tree.map(jnp.asarray, estimator).reading((obs, 1))  # its leaves are carried through loops
     nothing = empty(1, scale.dim, obs)
     params = estimator.initialise(key, scale.dim, obs)
-    prior = prior if estimator.of_summaries else None
     return Network(estimator, params, *_normalisers(estimator, nothing, scale), scale, space, prior)
 
 

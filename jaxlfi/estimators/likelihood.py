@@ -14,13 +14,13 @@ from jaxtyping import Array, Float
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_fit import fit_mixture
 from jaxlfi.distributions.precision import single
+from jaxlfi.distributions.region import region
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Estimator, Network
 from jaxlfi.estimators.losses import Rows
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.estimators.tempering import LEAST, require_blackjax, tempered
 from jaxlfi.fields import hyperparameter, option
-from jaxlfi.tasks.priors import prior_draws
 
 EVERYWHERE = 8
 """Candidates of each draw that are uniform over the support: where the mixture misses something, they do not."""
@@ -39,8 +39,8 @@ class Likelihood(Estimator):
     its networks'. The posterior on a support is the likelihood of the observation times the prior, drawn from by
     tempered sequential Monte Carlo (`jaxlfi.estimators.tempering`).
 
-    The likelihood is that of *valid* simulations, p(x | theta, valid). The probability of a valid simulation given
-    theta is not learnt: parameters whose simulations nearly always fail are not less probable for that.
+    The network's likelihood is that of *valid* simulations, p(x | theta, valid); the probability of a valid simulation
+    given theta is learnt beside it from all attempts (`jaxlfi.estimators.validity`), and multiplied by.
 
     Attributes:
         noise_floor: standard deviation of the normal noise that is added to normalised summaries before each round's
@@ -94,22 +94,24 @@ class Likelihood(Estimator):
     def log_likelihood(
         self, network: Network, x: Float[Array, " obs"], theta: Float[Array, "*n dim"]
     ) -> Float[Array, "*n"]:
-        """Log-density of the normalised summary of x given theta, numbers [..., D] in inference space."""
+        """Log-density of success with the normalised summary of x, given theta [..., D] in inference space."""
         module, given = self.module(x.shape[-1]), network.to_network(theta)
         value = jnp.broadcast_to(network.normaliser(x), (*theta.shape[:-1], x.shape[-1]))
         each = jax.vmap(lambda params: module.apply(params, given).log_prob(value))(network.params)
-        return jax.nn.logsumexp(each, axis=0) - jnp.log(self.ensemble_size)
+        of_valid = jax.nn.logsumexp(each, axis=0) - jnp.log(self.ensemble_size)
+        return of_valid if network.validity is None else of_valid + network.validity.log_prob(theta)
 
     def condition(
         self, network: Network, x: Float[Array, " obs"], support: Support, key: jax.Array | None
     ) -> "LikelihoodPosterior":
         """The posterior on a support, by sequential Monte Carlo from the prior there; see `Network.condition`."""
         key_start, key_draw, key_fit = jax.random.split(jax.random.key(0) if key is None else key, 3)
-        start = prior_draws(key_start, network.prior, support, self.particles)
+        inside = region(support, network.prior)
+        start = inside.sample(key_start, self.particles)
         draws = tempered(
             key_draw,
             start,
-            lambda theta: jnp.where(support.contains(theta), _log_prior(network, theta), -jnp.inf),
+            lambda theta: jnp.where(inside.contains(theta), _log_prior(network, theta), -jnp.inf),
             lambda theta: self.log_likelihood(network, x, theta),
         ).theta
         mixture, _ = fit_mixture(key_fit, draws, jnp.ones(self.particles), self.ensemble_size * self.components)
@@ -122,7 +124,7 @@ class Likelihood(Estimator):
         density = LikelihoodDensity(network, x, mixture, support, jnp.zeros(()))
         _, log_weight = density.candidates(jax.random.key(0), EVIDENCE)
         density = density.replace(log_evidence=jax.nn.logsumexp(log_weight) - jnp.log(log_weight.size))
-        return LikelihoodPosterior(density, mixture, support, jnp.ones(()), network.space)
+        return LikelihoodPosterior(density, mixture, support, jnp.zeros(()), network.space, network.prior)
 
 
 def _log_prior(network: Network, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
@@ -153,7 +155,8 @@ class LikelihoodDensity:
         """Log-density at theta; -inf outside of the box."""
         log_likelihood = self.network.estimator.log_likelihood(self.network, self.x, theta)
         joint = jnp.maximum(jnp.nan_to_num(log_likelihood, nan=LEAST), LEAST) + _log_prior(self.network, theta)
-        return jnp.where(self.support.contains(theta), joint - self.log_evidence, -jnp.inf)
+        inside = region(self.support, self.network.prior).contains(theta)
+        return jnp.where(inside, joint - self.log_evidence, -jnp.inf)
 
     def candidates(self, key: jax.Array, n: int) -> tuple[Float[Array, "n m dim"], Float[Array, "n m"]]:
         """`n` sets of `CANDIDATES` draws of mixture and box, and the logarithms of their importance weights.
@@ -179,7 +182,12 @@ class LikelihoodDensity:
         key_candidates, key_pick = jax.random.split(key)
         theta, log_weight = self.candidates(key_candidates, n)
         picked = jax.random.categorical(key_pick, log_weight)
-        return jnp.take_along_axis(theta, picked[:, None, None], axis=1)[:, 0]
+        theta = jnp.take_along_axis(theta, picked[:, None, None], axis=1)[:, 0]
+        if self.network.prior is None:
+            return theta
+        # All candidates of a draw may lie where the prior is zero.
+        instead = region(self.support, self.network.prior).sample(jax.random.fold_in(jax.random.clone(key_pick), 1), n)
+        return jnp.where(jnp.any(log_weight > -jnp.inf, axis=1, keepdims=True), theta, instead)
 
 
 @struct.dataclass

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_algebra import pool
 from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.truncation import Place
 from jaxlfi.estimators.base import Estimator, Network
 from jaxlfi.estimators.mdn import ACTIVATIONS, MDN
 from jaxlfi.estimators.posterior import Posterior, truncated
@@ -61,8 +62,8 @@ class MixtureNetwork(Estimator):
         self, network: Network, x: Float[Array, " obs"], mixture: GaussianMixture, support: Support
     ) -> Posterior:
         """The mixture, which is the density itself, truncated."""
-        return truncated(mixture, mixture, support, network.space)
+        return truncated(mixture, mixture, support, network.space, network.prior)
 
-    def mixture(self, key: jax.Array | None, density: GaussianMixture, support: Support) -> GaussianMixture:
+    def mixture(self, key: jax.Array | None, density: GaussianMixture, support: Place) -> GaussianMixture:
         """The density itself."""
         return density

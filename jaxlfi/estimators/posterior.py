@@ -1,7 +1,8 @@
 """Posterior: q_phi(theta | x^r) truncated to a support, for mixture density networks and flows alike."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +11,13 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlfi.distributions.arguments import require_count, require_key
+from jaxlfi.distributions.mass import log_mass_inside, rare_draws
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.precision import single
+from jaxlfi.distributions.region import Region, region
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support
-from jaxlfi.distributions.truncated_mixture import truncated_mixture_draws
-from jaxlfi.distributions.truncation import mass_inside, rejection_sample, truncated_log_prob
+from jaxlfi.distributions.truncation import rejection_sample, truncated_log_prob
 from jaxlfi.estimators.density import Density
 
 MAX_DRAWS = 10_000_000
@@ -38,8 +40,9 @@ ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
 class Posterior:
     """What an observation says of the parameters: a density on a box. A pytree.
 
-    It is always the density truncated to the support. Draws are rejected until they lie inside, never moved there;
-    where next to no mass is inside, they are those of the mixture, truncated (`truncated_mixture_draws`).
+    It is always the density truncated to the support, and zero where a prior that the task brings is zero. Draws are
+    rejected until they lie inside, never moved there; where next to no mass is inside, they are picked by weight from
+    draws of the mixture that do (`jaxlfi.distributions.mass`).
     Arguments and results are in natural units, or in inference space (logarithms of log parameters) where
     `space="inference"` is passed.
 
@@ -47,15 +50,27 @@ class Posterior:
         density: q before truncation, over inference space: a `GaussianMixture`, or a flow's density.
         mixture: the same as a mixture of Gaussians, which heuristics and proposals see: itself, or fitted to draws.
         support: the box, in inference space.
-        mass_inside: of q in the support; the rest has leaked. Shape [].
+        log_mass_inside: logarithm of `mass_inside`, which may be too small for a number. Shape [].
         space: the map between natural units and inference space.
+        prior: the task's own prior over inference space, or None; where it is zero, so is the posterior.
     """
 
     density: Density
     mixture: GaussianMixture
     support: Support
-    mass_inside: Float[Array, "*batch"]
+    log_mass_inside: Float[Array, "*batch"]
     space: Space = struct.field(pytree_node=False)
+    prior: Any = struct.field(pytree_node=False, default=None)
+
+    @property
+    def mass_inside(self) -> Float[Array, "*batch"]:
+        """Mass of q inside the support, where the prior is not zero; the rest has leaked. Shape []."""
+        return jnp.exp(self.log_mass_inside)
+
+    @property
+    def region(self) -> Support | Region:
+        """Where the posterior is not zero: the support, without the places where the prior is zero."""
+        return region(self.support, self.prior)
 
     def sample(self, key: jax.Array, n: int, space: SpaceName = "natural") -> Float[Array, "n dim"]:
         """`n` independent draws, shape [n, D].
@@ -98,18 +113,20 @@ class Posterior:
 
     def inner_draws(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` draws in inference space, by rejection; pure, where `sample` is checked and compiled."""
-        box = self.support
-        fallback = lambda key, n: truncated_mixture_draws(key, self.mixture, box, n)
-        return rejection_sample(key, self.density.sample, box, n, fallback)
+        fallback = rare_draws(self.density, self.mixture, self.region)
+        return rejection_sample(key, self.density.sample, self.region, n, fallback)
 
     def on(self, support: Support) -> "Posterior":
         """The same density truncated to another support, in inference space."""
-        return truncated(self.density, self.mixture, support, self.space)
+        return truncated(self.density, self.mixture, support, self.space, self.prior)
 
 
-def truncated(density: Density, mixture: GaussianMixture, support: Support, space: Space) -> Posterior:
-    """A density truncated to a support, with the mass it has in there."""
-    return Posterior(density, mixture, support, mass_inside(density.sample, support), space)
+def truncated(
+    density: Density, mixture: GaussianMixture, support: Support, space: Space, prior: Any = None
+) -> Posterior:
+    """A density truncated to a support, and to where a prior is not zero, with the mass it has in there."""
+    log_mass = log_mass_inside(density, mixture, region(support, prior))
+    return Posterior(density, mixture, support, log_mass, space, prior)
 
 
 # Compiled as wholes: operation by operation, a flow's density alone would be hundreds of small programs.
@@ -134,7 +151,8 @@ def _log_prob(posterior: Posterior, theta: Array, natural: bool) -> Array:
         inner = jnp.where(inside, box.clip(inner), inner)
     finite = jnp.all(jnp.isfinite(inner), axis=-1)
     inner = jnp.where(finite[..., None], inner, posterior.support.centre)
-    log_prob = truncated_log_prob(posterior.density.log_prob(inner), inner, posterior.support, posterior.mass_inside)
+    log_prob = posterior.density.log_prob(inner)
+    log_prob = truncated_log_prob(log_prob, inner, posterior.region, posterior.log_mass_inside)
     log_jacobian = posterior.space.log_jacobian(inner) if natural else 0.0
     return jnp.where(finite, log_prob - log_jacobian, -jnp.inf)
 
@@ -146,22 +164,40 @@ def _maximum(posterior: Posterior, draws: Array, natural: bool) -> Array:
     box = posterior.support
 
     def objective(unit: Array) -> Array:
-        theta = box.centre + 0.5 * box.width * unit
+        theta = _of_unit(box, unit)
         return posterior.density.log_prob(theta) - (posterior.space.log_jacobian(theta) if natural else 0.0)
 
     draws = box.to_unit(draws)
     _, best = jax.lax.top_k(jax.vmap(objective)(draws), MAP_STARTS)
     adam = optax.adam(optax.cosine_decay_schedule(MAP_RATE, MAP_STEPS))
+    moved = lambda unit, step: jnp.clip(unit + step, -1.0, 1.0)
+    if posterior.prior is not None:
+        moved = functools.partial(_moved_inside, lambda unit: posterior.region.contains(_of_unit(box, unit)))
 
     def ascend(start: Array) -> tuple[Array, Array]:
         def step(carry, _):
             unit, moments = carry
             updates, moments = adam.update(-jax.grad(objective)(unit), moments)
-            return (jnp.clip(unit + updates, -1.0, 1.0), moments), None
+            return (moved(unit, updates), moments), None
 
         (unit, _), _ = jax.lax.scan(step, (start, adam.init(start)), length=MAP_STEPS)
         return unit, objective(unit)
 
     units, heights = jax.vmap(ascend)(draws[best])
-    point = box.clip(box.centre + 0.5 * box.width * units[jnp.argmax(heights)])
+    point = box.clip(_of_unit(box, units[jnp.argmax(heights)]))
     return posterior.space.to_natural(point) if natural else point
+
+
+def _of_unit(box: Support, unit: Array) -> Array:
+    """From [-1, 1]^D to the box."""
+    return box.centre + 0.5 * box.width * unit
+
+
+def _moved_inside(inside: Callable[[Array], Array], unit: Array, step: Array) -> Array:
+    """As much of a step as leads to no place of zero density, one dimension after another."""
+
+    def along(d: Array, unit: Array) -> Array:
+        tried = unit.at[d].set(jnp.clip(unit[d] + jnp.nan_to_num(step[d]), -1.0, 1.0))
+        return jnp.where(inside(tried), tried, unit)
+
+    return jax.lax.fori_loop(0, unit.shape[-1], along, unit)

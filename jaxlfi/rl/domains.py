@@ -1,6 +1,7 @@
 """Domains: the parameters of the environments that a policy is trained on (section VI-H)."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,10 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.region import region
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support, check_within
+from jaxlfi.distributions.truncation import rejection_sample
 from jaxlfi.rl.environment import Environment
 from jaxlfi.runs.run import Run
 
@@ -35,8 +38,10 @@ Draw = Callable[[jax.Array, int], Domain]
 """Draws a domain of so many points with a key."""
 
 
-def of_belief(key: jax.Array, belief: Belief, space: Space, limits: Support, n: int) -> Domain:
+def of_belief(key: jax.Array, belief: Belief, space: Space, limits: Support, n: int, prior: Any = None) -> Domain:
     """Low-variance draws of a posterior's mixture, clipped to a box (section VI-H).
+
+    With a prior, the draws that are moved to where it is zero are drawn again, and drawn from it where that is in vain.
 
     Args:
         key: consumed.
@@ -44,9 +49,21 @@ def of_belief(key: jax.Array, belief: Belief, space: Space, limits: Support, n: 
         space: from there to natural units.
         limits: Phi; or Theta_0, for a posterior on a fixed support. In natural units.
         n: how many.
+        prior: the task's own over inference space (`Task.inference.prior`), or None.
     """
     draws = belief.mixture.low_variance_sample(key, n)
+    if prior is not None:
+        box = space.box_to_inference(limits)
+        sample = lambda key, n: box.clip(belief.mixture.sample(key, n))
+        again = rejection_sample(jax.random.fold_in(jax.random.clone(key), 1), sample, region(box, prior), n)
+        draws = jnp.where(region(box, prior).contains(box.clip(draws))[:, None], box.clip(draws), again)
     return Domain(limits.clip(space.to_natural(draws)))
+
+
+def of_run(run: Run) -> Draw:
+    """How to draw a domain from the posterior of a run."""
+    prior = None if run.task is None else run.task.inference.prior
+    return lambda key, n: of_belief(key, run.belief, run.space, limits_of(run), n, prior)
 
 
 def limits_of(run: Run) -> Support:

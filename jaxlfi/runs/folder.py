@@ -300,6 +300,7 @@ def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) 
         "units": list(task.units),
         "prior": None if task.prior is None else type(task.prior).__name__,
         "prior_log_density": priors.fingerprint(task.inference.prior, feasible),
+        "prior_bounded": priors.is_bounded(task.inference.prior, feasible),
         "feasible_low": np.asarray(feasible.low).tolist(),
         "feasible_high": np.asarray(feasible.high).tolist(),
         "configuration": spec.configuration,

@@ -16,6 +16,7 @@ from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
+from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.io import files as atomic
@@ -29,6 +30,8 @@ from jaxlfi.tasks import failures, registry
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.task import Task
 
+VALIDITY = ".validity"
+"""Beginning of the names in network.npz of what is known of success; networks of earlier versions lack it."""
 
 def load(folder: str | Path, task: Task | None = None) -> Run:
     """Read a finished run back: what `infer`, `run.save` and the command line wrote, of one seed.
@@ -133,14 +136,15 @@ def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space
 
 
 def _prior(folder: Path, config: dict[str, Any], task: Task | None, settings: Settings) -> Any:
-    """The prior that a likelihood is multiplied by: it is a part of the task, and in no file."""
+    """The prior that a posterior needs: it is a part of the task, and in no file."""
     if task is not None:
         return task.inference.prior
-    if settings.estimator.of_summaries and config.get("prior") is not None:
-        raise StoreError(
-            f"{folder}: expected the task, whose prior ({config['prior']}) the posterior by a likelihood needs: "
-            "pass task=..."
+    needed = settings.estimator.of_summaries or config.get("prior_bounded", False)
+    if needed and config.get("prior") is not None:
+        why = (
+            "the posterior by a likelihood needs" if settings.estimator.of_summaries else "is zero in parts of the box"
         )
+        raise StoreError(f"{folder}: expected the task, whose prior ({config['prior']}) {why}: pass task=...")
     return None
 
 
@@ -196,6 +200,10 @@ def _network(
         return None
     estimator, obs = settings.estimator.reading(layout), math.prod(layout)
     make: Callable[[], Network] = lambda: untrained(jax.random.key(0), estimator, obs, feasible, space, prior)
+    arrays = _arrays(path, ())
+    if any(name.startswith(VALIDITY) for name in arrays):
+        plain, key = make, jax.random.key(0)
+        make = lambda: plain().replace(validity=validity.unknown(key, feasible, space))
     template = jax.eval_shape(make)
     expected = trees.named_leaves(template)
     counted = {} if version > 2 else _counted_from_zero(expected)

@@ -28,10 +28,10 @@ from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Heuristic
 from jaxlfi.runs import folder as folders
+from jaxlfi.runs.unlike import observation_findings
 from jaxlfi.tasks import failures, owned
 from jaxlfi.tasks.failures import Failure, Told
 from jaxlfi.tasks.reference import counted_from, summaries_in_double
-from jaxlfi.runs.unlike import observation_findings
 from jaxlfi.tasks.task import Task
 
 DRAWS = 1000
@@ -113,7 +113,8 @@ class Run:
     def posterior(self) -> Posterior:
         """The posterior of the observation, truncated to the support the run ended with."""
         if self.network is None:
-            return _truncated(self.belief.mixture, self.belief.mixture, self.belief.support, self.space)
+            prior = None if self.task is None else self.task.inference.prior
+            return _truncated(self.belief.mixture, self.belief.mixture, self.belief.support, self.space, prior)
         return _posterior_after(self.belief, self.network, self.counted(self.x))
 
     @property
@@ -275,7 +276,7 @@ def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
 
 
 _posterior_after = jax.jit(single(posterior_after))
-_truncated = jax.jit(single(truncated), static_argnums=3)
+_truncated = jax.jit(single(truncated), static_argnums=(3, 4))
 
 
 def _require_one(run: Run, what: str) -> None:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlfi.distributions.region import region
 from jaxlfi.distributions.support import Support
 from jaxlfi.io import files
 from jaxlfi.tasks import owned
@@ -45,7 +46,8 @@ def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None 
         arrays: `theta` [N, D] in natural units; `trajectory` [N, ...] or their summaries `x` [N, S]; where they were
             not drawn uniformly, `log_density` [N], the log-density over natural units that they were drawn from; and
             `low` and `high` [D], in natural units, of the box they fill: by default that of the parameters.
-        support: Theta_0 in inference space, where the run begins on another box; what lies outside of it is left out.
+        support: Theta_0 in inference space, where the run begins on another box; what lies outside of it is left out,
+            as is what lies where the task's prior is zero.
 
     Returns:
         The simulations, and Theta_0 in inference space.
@@ -69,7 +71,7 @@ def presimulated(task: Task, arrays: Mapping[str, Any], support: Support | None 
         high = _array(arrays, "high", (task.dim,)) if "high" in arrays else theta.max(axis=0)
         support = task.support(Support(low.tolist(), high.tolist()))
     x, failure = _summaries(task, arrays, rows)
-    inside = np.asarray(support.contains(inner))
+    inside = np.asarray(region(support, task.inference.prior).contains(inner))
     kept = inside & (failure == 0)
     if not kept.any():
         raise ValueError(f"simulations: expected some inside the support, got {inside.sum()} of {rows}, none finite")
@@ -107,7 +109,7 @@ def _weights(task: Task, arrays: Mapping[str, Any], inner: jax.Array, kept: np.n
     if "log_density" in arrays:
         density = _array(arrays, "log_density", (rows,))
         log_weight = log_weight - (density + np.asarray(task.space.log_jacobian(inner)))
-    if not np.isfinite(log_weight[kept]).all():
+    if not np.isfinite(log_weight[kept]).all():  # of `log_density`: the prior is finite at all that is kept
         raise ValueError("simulations: expected finite log-densities")
     weight = np.where(kept, np.exp(log_weight - np.max(log_weight[kept])), 0.0)
     limit = np.sqrt(kept.sum()) * weight[kept].mean()

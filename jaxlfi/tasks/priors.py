@@ -11,62 +11,84 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlfi.distributions.precision import single
+from jaxlfi.distributions.region import region
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
-from jaxlfi.distributions.truncation import MASS_DRAWS, mass_inside, rejection_sample
+from jaxlfi.distributions.truncation import MASS_DRAWS, mass_inside
+from jaxlfi.tasks.equality import same
 
 MIN_INSIDE = 0.01
-"""Mass of a prior inside the support below which a run is refused: its draws would be those of a uniform prior."""
+"""Mass of a prior inside the support below which a run is refused: most of its draws could not be rejected for it."""
 FINGERPRINT_POINTS = 8
 """Points at which priors are compared."""
+ZERO_POINTS = 4096
+"""Points among which a place is looked for where a prior is zero."""
 LOW_INSIDE = 0.1
-"""Mass below which a run warns: 3 % of the draws, or more, are uniform over the support instead."""
+"""Mass below which a run warns: 3 % of the draws, or more, are picked from uniform ones by the prior's density."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class InferencePrior:
-    """A prior over natural units as a distribution over inference space.
+    """A task's own prior as a distribution over inference space, zero wherever its density is no finite number.
+
+    Distributions say NaN where they have no mass, or go on as if they had some: those of TensorFlow Probability name
+    the values they can take by a bijector, which is asked as well.
 
     Attributes:
-        natural: a distribution over parameters in natural units.
-        space: the map between the two.
+        distribution: the task's own.
+        space: the map from natural units to inference space, where the distribution is over the former and the two
+            differ; else None.
     """
 
-    natural: Any
-    space: Space
+    distribution: Any
+    space: Space | None = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "_values", _values_of(self.distribution))
 
     def sample(self, *, seed: jax.Array, sample_shape: int | tuple[int, ...]) -> Array:
         """Draws in inference space; NaN, and so in no support, where a log parameter was drawn that is not positive."""
-        return self.space.to_inference(self.natural.sample(seed=seed, sample_shape=sample_shape))
+        draws = self.distribution.sample(seed=seed, sample_shape=sample_shape)
+        return draws if self.space is None else self.space.to_inference(draws)
 
     def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
-        """Log-density over inference space."""
-        return self.natural.log_prob(self.space.to_natural(theta)) + self.space.log_jacobian(theta)
+        """Log-density over inference space, -inf where there is none."""
+        value = theta if self.space is None else self.space.to_natural(theta)
+        log_prob = self.distribution.log_prob(value)
+        if self.space is not None:
+            log_prob = log_prob + self.space.log_jacobian(theta)
+        possible = jnp.isfinite(log_prob)
+        if self._values is not None:
+            possible &= ~jnp.any(jnp.isnan(self._values.inverse(value)), axis=-1)
+        return jnp.where(possible, log_prob, -jnp.inf)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both are made of the same."""
+        if not isinstance(other, InferencePrior):
+            return NotImplemented
+        return self.space == other.space and same(self.distribution, other.distribution)
+
+    def __hash__(self) -> int:
+        return hash((type(self.distribution), self.space))
 
 
-def check_prior(prior: Any, dim: int) -> None:
-    """Refuse what is no distribution over D parameters.
-
-    Raises:
-        ValueError: naming what came.
-    """
-    expected = f"prior: expected a distrax distribution over vectors of {dim} parameters"
-    if not callable(getattr(prior, "sample", None)) or not callable(getattr(prior, "log_prob", None)):
-        raise ValueError(f"{expected}, got {type(prior).__name__}")
-    try:  # a distribution is foreign code: what it raises is reported in one line
-        draws = jax.eval_shape(lambda key: prior.sample(seed=key, sample_shape=2), jax.random.key(0))
-        density = jax.eval_shape(prior.log_prob, jax.ShapeDtypeStruct((2, dim), jnp.float32))
-    except Exception as error:
-        raise ValueError(f"{expected}, got {type(prior).__name__}: {str(error).splitlines()[0]}") from error
-    if draws.shape != (2, dim) or density.shape != (2,):
-        raise ValueError(
-            f"{expected}, got draws of shape {list(draws.shape[1:])} with log-densities of shape "
-            f"{list(density.shape[1:])} (distrax.Independent makes one distribution of several)"
-        )
+def _values_of(distribution: Any) -> Any:
+    """TensorFlow Probability's bijector from all numbers to those that a distribution can draw; None for others."""
+    own = distribution.distribution if isinstance(distribution, distrax.Independent) else distribution
+    make = getattr(own, "experimental_default_event_space_bijector", None)
+    if make is None:
+        return None
+    try:  # foreign code, which not every distribution has
+        with jax.ensure_compile_time_eval():  # it is kept, so it must not be made of tracers
+            bijector = make()
+        one = jax.ShapeDtypeStruct((1, *distribution.event_shape), jnp.float32)
+        return bijector if jax.eval_shape(bijector.inverse, one).shape == one.shape else None
+    except Exception:
+        return None
 
 
 def prior_draws(key: jax.Array, prior: Any, support: Support, n: int) -> Float[Array, "n dim"]:
-    """`n` draws of the prior inside the support: uniform for None, else by rejection.
+    """`n` draws of the prior inside the support: uniform for None, else by rejection (`jaxlfi.distributions.region`).
 
     Args:
         key: consumed.
@@ -74,12 +96,14 @@ def prior_draws(key: jax.Array, prior: Any, support: Support, n: int) -> Float[A
         support: in inference space.
         n: number of draws.
     """
-    return support.sample(key, n) if prior is None else rejection_sample(key, _sampler(prior), support, n)
+    return region(support, prior).sample(key, n)
 
 
 def prior_mass(prior: Any, support: Support) -> Float[Array, ""]:
     """The prior's mass in the support; 1 for None."""
-    return jnp.ones(()) if prior is None else mass_inside(_sampler(prior), support)
+    if prior is None:
+        return jnp.ones(())
+    return mass_inside(lambda key, n: prior.sample(seed=key, sample_shape=n), region(support, prior))
 
 
 def fingerprint(prior: Any, feasible: Support) -> list[float] | None:
@@ -88,7 +112,15 @@ def fingerprint(prior: Any, feasible: Support) -> list[float] | None:
         return None
     unit = np.random.default_rng(0).uniform(size=(FINGERPRINT_POINTS, feasible.dim)).astype(np.float32)
     low, high = np.asarray(feasible.low), np.asarray(feasible.high)
-    return np.asarray(prior.log_prob(jnp.asarray(low + unit * (high - low))), float).tolist()
+    log_prob = np.asarray(prior.log_prob(jnp.asarray(low + unit * (high - low))), float)
+    return np.where(np.isfinite(log_prob), log_prob, np.nan).tolist()
+
+
+def is_bounded(prior: Any, feasible: Support) -> bool:
+    """Whether a prior is zero at some of `ZERO_POINTS` places of a box."""
+    if prior is None:
+        return False
+    return not bool(jnp.all(region(feasible, prior).contains(feasible.sample(jax.random.key(0), ZERO_POINTS))))
 
 
 def require_mass(prior: Any, support: Support, label: str) -> float:
@@ -108,10 +140,6 @@ def require_mass(prior: Any, support: Support, label: str) -> float:
 
 def _prior_mass(prior: Any, support: Support) -> Array:
     return jax.jit(single(functools.partial(prior_mass, prior)))(support)
-
-
-def _sampler(prior: Any):
-    return lambda key, n: prior.sample(seed=key, sample_shape=n)
 
 
 class TailedUniform(distrax.Distribution):

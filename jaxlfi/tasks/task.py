@@ -3,11 +3,9 @@
 import dataclasses
 import functools
 import re
-import types
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import distrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +13,9 @@ import numpy as np
 from jaxlfi.distributions.arguments import require_texts
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support, check_within
-from jaxlfi.tasks import owned, priors, summaries
+from jaxlfi.tasks import owned, prior_checks, priors, summaries
 from jaxlfi.tasks.command import Command
+from jaxlfi.tasks.equality import same
 from jaxlfi.tasks.host import HostSimulator
 
 Simulate = Callable[..., Any]
@@ -33,7 +32,8 @@ class InferenceView:
         feasible: Phi.
         supports: boxes Theta_0 by name.
         truth: theta_gt, shape [D], or None.
-        prior: `sample(seed=key, sample_shape=n)` and `log_prob` over inference space, or None for a uniform prior.
+        prior: `sample(seed=key, sample_shape=n)` and `log_prob` over inference space (`jaxlfi.tasks.priors`), or None
+            for a uniform prior.
     """
 
     feasible: Support
@@ -66,8 +66,8 @@ class Task:
         truth: the parameters of the observation, where they are known, shape [D].
         observation: a fixed observed trajectory, where the task has one (real data).
         log: names of the parameters inferred as logarithms.
-        prior: a distrax distribution to draw the first round from, truncated to the support, instead of the uniform
-            one over it.
+        prior: a continuous distrax distribution to draw the first round from, truncated to the support, instead of the
+            uniform one over it. Where its density is zero or no number, nothing is proposed and the posterior is zero.
         prior_space: whether the prior's variables are parameters in "natural" units or those of "inference" space: a
             normal prior over the latter is log-normal in a log parameter.
         failures: names of the reasons for which a simulation can fail.
@@ -83,7 +83,8 @@ class Task:
 
     Raises:
         ValueError: for numbers of names, units and bounds that do not agree, reversed bounds, unknown names in `log`,
-            bounds or a truth of a log parameter that are not positive, or a prior that is not one over D parameters.
+            bounds or a truth of a log parameter that are not positive, or a prior that is not a continuous one over D
+            parameters.
 
     Example:
         >>> spring = Task(lambda key, theta: theta[:1] / theta[1:], names=("force", "stiffness"), units=("N", "N/m"),
@@ -149,11 +150,14 @@ class Task:
             store("truth", truth)
         if isinstance(self.summary, str):
             store("summary", summaries.named(self.summary))
-        if self.prior is not None:
-            priors.check_prior(self.prior, len(names))
         is_natural(self.prior_space)
         for field in ("observation", "times"):  # who made them may go on to change them
             store(field, owned.copied(getattr(self, field)))
+        if self.prior is not None:
+            prior_checks.check_prior(self.prior, len(names))
+            view = self.inference
+            widest = functools.reduce(Support.hull, view.supports.values(), view.feasible)
+            prior_checks.check_density(view.prior, self.space, widest)
 
     @classmethod
     def from_command(
@@ -212,8 +216,9 @@ class Task:
             truth = None if self.truth is None else self.space.to_inference(jnp.asarray(self.truth))
             feasible = self.space.box_to_inference(self.feasible)
         prior = self.prior
-        if prior is not None and is_natural(self.prior_space) and any(self.space.log):
-            prior = priors.InferencePrior(prior, self.space)
+        if prior is not None:
+            over_natural = is_natural(self.prior_space) and any(self.space.log)
+            prior = priors.InferencePrior(prior, self.space if over_natural else None)
         return InferenceView(feasible, boxes, truth, prior)
 
     @property
@@ -283,35 +288,10 @@ class Task:
             return True
         if not isinstance(other, Task):
             return NotImplemented
-        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self))
+        return all(same(getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self))
 
     def __hash__(self) -> int:
         return hash((self.name, self.names, self.log, self.failures))
-
-
-def _same(a: Any, b: Any) -> bool:
-    """Whether two values of a field are the same."""
-    if a is b:
-        return True
-    if type(a) is not type(b):
-        return False
-    if isinstance(a, Mapping):
-        return list(a) == list(b) and all(_same(a[name], b[name]) for name in a)
-    if isinstance(a, distrax.Distribution | distrax.Bijector):  # as pytrees they hold bound methods, which differ
-        return _same(vars(a), vars(b))
-    if isinstance(a, types.MethodType):
-        return a.__func__ is b.__func__ and _same(a.__self__, b.__self__)
-    if isinstance(a, functools.partial):
-        return a.func == b.func and _same(a.args, b.args) and _same(a.keywords, b.keywords)
-    if isinstance(a, tuple | list):
-        return len(a) == len(b) and all(map(_same, a, b))
-    if isinstance(a, np.ndarray | jax.Array):
-        return a.shape == b.shape and a.dtype == b.dtype and np.array_equal(np.asarray(a), np.asarray(b))
-    leaves, structure = jax.tree.flatten(a)
-    others, other_structure = jax.tree.flatten(b)
-    if len(leaves) == 1 and leaves[0] is a:
-        return bool(a == b)
-    return structure == other_structure and all(map(_same, leaves, others))
 
 
 def _vector(value: Any, length: int, name: str) -> np.ndarray:

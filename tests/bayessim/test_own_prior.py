@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxlfi import METHODS, QUICK
+from jaxlfi import METHODS, QUICK, infer
 from jaxlfi.bayessim import algorithm
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
@@ -116,3 +116,51 @@ def test_a_sequential_run_keeps_the_prior():
     off = (np.median(jax.vmap(lambda mixture: mixture.mean)(mixtures), axis=0) - EXACT.mean) / deviation
     without = (np.asarray(gaussian_linear.posterior(X).mean) - EXACT.mean) / deviation
     assert np.abs(off).max() < 0.5 and np.abs(without).max() > 2.0
+
+
+class Disc:
+    """Uniform over a disc about the origin, zero beyond."""
+
+    def sample(self, *, seed, sample_shape):
+        key_radius, key_angle = jax.random.split(seed)
+        radius = jnp.sqrt(jax.random.uniform(key_radius, (sample_shape,)))
+        angle = 2 * jnp.pi * jax.random.uniform(key_angle, (sample_shape,))
+        return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle)], axis=-1)
+
+    def log_prob(self, value):
+        return jnp.where(jnp.sum(value**2, axis=-1) <= 1, -jnp.log(jnp.pi), jnp.nan)
+
+
+BOUNDED = dataclasses.replace(PLAIN, prior=Disc())
+
+
+@pytest.mark.parametrize("correction", ["none", "importance"])
+@pytest.mark.parametrize("restriction", ["clip", "reject", "mixed"])
+def test_nothing_is_proposed_where_the_prior_is_zero(restriction, correction, key):
+    """Of a mixture half of which is beyond, and of one that is all beyond, whatever accounts for the prior."""
+    drawn = settings(inflation=2.0, restriction=restriction, correction=correction, simulation_budget=500)
+    for shift in (0.0, 8.0):
+        belief = BELIEF.replace(mixture=BELIEF.mixture.affine(jnp.ones(2), jnp.full(2, shift)))
+        theta = np.asarray(_propose(jax.random.clone(key), BOUNDED, drawn, belief))
+        assert theta.shape == (500, 2) and (np.sum(theta**2, axis=1) <= 1).all()
+        assert len(np.unique(theta, axis=0)) > 400
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["bayessim", "snle"])
+def test_a_run_stays_where_its_prior_is_not_zero(method):
+    """Proposals, draws, the mean and the mode; and the density of what is left is one in all."""
+    small = METHODS[method](QUICK)
+    estimator = small.estimator.replace(hidden=(16,), epochs=0, steps=100, ensemble_size=2)
+    quick = small.replace(estimator=estimator, rounds=3, min_rounds=0, predictive=False)
+    observed = gaussian_linear.MIXING @ np.array([1.5, 0.5], np.float32)  # beyond the disc
+    run = infer(jax.random.key(0), BOUNDED, observed, support="ok", heuristic=Fixed(), settings=quick)
+    proposed = run.history["theta"][np.asarray(run.history["counted"], bool)]
+    draws = np.asarray(run.posterior.sample(jax.random.key(1), 2000))
+    for theta in (proposed, draws, run.posterior.map()[None]):
+        assert (np.sum(np.asarray(theta) ** 2, axis=1) <= 1 + 1e-6).all()
+    axis = np.linspace(-1.05, 1.05, 301, dtype=np.float32)
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+    density = np.exp(np.asarray(run.posterior.log_prob(grid), float))
+    assert density.sum() * (axis[1] - axis[0]) ** 2 == pytest.approx(1, abs=0.1)
+    assert (density[np.sum(grid**2, axis=-1) > 1] == 0).all()

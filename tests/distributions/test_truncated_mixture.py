@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
-from jaxlfi.distributions.truncated_mixture import truncated_mixture_draws
+from jaxlfi.distributions.truncated_mixture import log_mass, truncated_mixture_draws
 
 N = 4000
 DRAWS = jax.jit(truncated_mixture_draws, static_argnums=3)
@@ -135,3 +135,79 @@ def test_it_agrees_with_rejection_where_much_is_inside(key):
     for d in (0, 4, 9):
         assert stats.ks_2samp(draws[:, d], kept[:, d]).pvalue > 1e-3
     assert stats.ks_2samp(draws.sum(1), kept.sum(1)).pvalue > 1e-3
+
+
+# --------------------------------------------------------------------------------------------------------- masses
+
+
+LOG_MASS = jax.jit(log_mass)
+
+
+def log_interval(low: float, high: float) -> float:
+    """Logarithm of a standard normal's mass in an interval above zero, by SciPy."""
+    above, beyond = special.log_ndtr(-low), special.log_ndtr(-high)
+    return above + np.log1p(-np.exp(beyond - above))
+
+
+@pytest.mark.parametrize("low", [0.0, 2.0, 3.5, 5.0, 8.0, 37.0])
+def test_a_mass_in_one_dimension_is_the_closed_form(low):
+    """Down to 1e-300, on either side, and of components on both sides of the box."""
+    expected = log_interval(low, low + 2.0)
+    for support in (box(low, low + 2.0), box(-low - 2.0, -low)):
+        assert float(LOG_MASS(gaussian(0.0, 1.0), support)) == pytest.approx(expected, abs=1e-4, rel=1e-6)
+    weights, means = np.array([0.9, 0.1]), np.array([0.0, 2 * low + 2.5])
+    two = GaussianMixture(jnp.log(jnp.asarray(weights)), jnp.asarray(means)[:, None], jnp.ones((2, 1, 1)))
+    parts = np.log(weights) + np.array([expected, log_interval(low + 0.5, low + 2.5)])
+    assert float(LOG_MASS(two, box(low, low + 2.0))) == pytest.approx(special.logsumexp(parts), abs=1e-4, rel=1e-6)
+
+
+def by_quadrature(correlation: float, low, high) -> float:
+    """Logarithm of the mass of a standard normal pair in a box: a sum over the first of closed forms."""
+    first, width = np.linspace(low[0], high[0], 200_001, retstep=True)
+    deviation = np.sqrt(1 - correlation**2)
+    ends = (np.array([low[1], high[1]])[:, None] - correlation * first) / deviation
+    near, far = np.where(ends.sum(0) < 0, -ends[::-1], ends)
+    above = special.log_ndtr(-near)
+    inside = above + np.log1p(-np.exp(np.minimum(special.log_ndtr(-far) - above, -1e-12)))
+    return special.logsumexp(stats.norm.logpdf(first) + inside) + np.log(width)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6, 0.95, -0.9])
+def test_a_mass_of_correlated_pairs_is_that_of_a_quadrature(correlation):
+    """Also where only the second dimension is truncated, which decides where the first one is."""
+    factor = np.linalg.cholesky([[1.0, correlation], [correlation, 1.0]])
+    pair = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.asarray(factor[None], jnp.float32))
+    for low, high in (
+        ([-1.0, -1.0], [1.0, 2.0]), ([-10.0, 5.0], [10.0, 7.0]), ([5.0, -10.0], [7.0, 10.0]), ([5.0, 5.0], [7.0, 7.0]),
+        ([5.0, -7.0], [7.0, -5.0]), ([1.0, -1.0], [1.2, 3.0]),
+    ):  # fmt: skip
+        expected = by_quadrature(correlation, low, high)
+        assert float(LOG_MASS(pair, Support(low, high))) == pytest.approx(expected, abs=5e-3, rel=1e-4)
+
+
+def test_a_mass_in_ten_dimensions_is_scipys():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(10, 10))
+    covariance, mean = root @ root.T / 10 + 0.3 * np.eye(10), 0.3 * rng.normal(size=10)
+    law = stats.multivariate_normal(mean, covariance, abseps=1e-14, releps=1e-4, maxpts=200_000)
+    one = GaussianMixture(
+        jnp.zeros(1),
+        jnp.asarray(mean, jnp.float32)[None],
+        jnp.asarray(np.linalg.cholesky(covariance)[None], jnp.float32),
+    )
+    for shift in (0.0, 1.0):
+        low = mean + (0.8 * shift - 0.5) * np.sqrt(np.diag(covariance))
+        high = low + 2.5 * np.sqrt(np.diag(covariance))
+        expected = np.log(law.cdf(high, lower_limit=low))
+        got = float(LOG_MASS(one, Support(jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32))))
+        assert got == pytest.approx(expected, abs=0.05)
+
+
+def test_draws_follow_the_dimension_that_is_truncated(key):
+    """Only the second is, far out, and the first goes with it: by the order of the dimensions it would stay behind."""
+    factor = np.linalg.cholesky([[1.0, 0.95], [0.95, 1.0]])
+    pair = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.asarray(factor[None], jnp.float32))
+    draws = np.asarray(DRAWS(key, pair, Support([-10.0, 5.0], [10.0, 7.0]), N), np.float64)
+    assert stats.kstest(draws[:, 1], stats.truncnorm(5, 7).cdf).statistic < CRITICAL
+    left = (draws[:, 0] - 0.95 * draws[:, 1]) / np.sqrt(1 - 0.95**2)
+    assert stats.kstest(left, stats.norm.cdf).statistic < CRITICAL

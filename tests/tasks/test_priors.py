@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import integrate, stats
+from tensorflow_probability.substrates.jax import distributions as tfd
 
 import jaxlfi
 from jaxlfi.distributions.support import Support
@@ -130,7 +131,7 @@ NATURAL = distrax.Transformed(INNER, _Exp())
 def test_a_log_normal_prior_is_the_same_from_either_space(key):
     """The same density over inference space, and the same draws by the same key."""
     natural, inner = decade(NATURAL).inference.prior, decade(INNER, "inference").inference.prior
-    assert inner is INNER
+    assert inner.distribution is INNER and inner.space is None
     theta = jnp.array([[0.7, -0.5], [0.0, 1.0], [2.0, -2.5]])
     np.testing.assert_allclose(natural.log_prob(theta), inner.log_prob(theta), rtol=1e-5, atol=1e-5)
     support = decade().support()
@@ -152,7 +153,7 @@ def test_a_prior_over_natural_units_is_transformed_with_its_jacobian():
     np.testing.assert_allclose(inner.log_prob(theta), expected, rtol=1e-4)
     # Without any logarithm there is nothing to transform.
     plain = dataclasses.replace(decade(normal), log=())
-    assert plain.inference.prior is normal
+    assert plain.inference.prior.distribution is normal and plain.inference.prior.space is None
 
 
 def test_draws_that_have_no_logarithm_are_in_no_support(key):
@@ -202,6 +203,162 @@ def test_a_run_does_not_start_on_a_prior_outside_its_box():
     with pytest.raises(ValueError, match=r"^prior: expected some of its mass inside the support") as caught:
         jaxlfi.infer(jax.random.key(0), decade(elsewhere), jnp.array([1.0, 0.0]), settings=small.SETTINGS)
     assert "\n" not in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------- where a prior has no mass
+
+
+class Disc:
+    """Uniform over the unit disc; NaN beyond it, as by a user's own arithmetic."""
+
+    def sample(self, *, seed, sample_shape):
+        key_radius, key_angle = jax.random.split(seed)
+        radius = jnp.sqrt(jax.random.uniform(key_radius, (sample_shape,)))
+        angle = 2 * jnp.pi * jax.random.uniform(key_angle, (sample_shape,))
+        return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle)], axis=-1)
+
+    def log_prob(self, value):
+        return jnp.where(jnp.sum(value**2, axis=-1) <= 1, -jnp.log(jnp.pi), jnp.nan)
+
+
+class Triangle:
+    """Uniform over positive numbers of a sum below 1; plus infinity elsewhere, which is no density either."""
+
+    def sample(self, *, seed, sample_shape):
+        ordered = jnp.sort(jax.random.uniform(seed, (sample_shape, 2)), axis=-1)
+        return jnp.stack([ordered[:, 0], ordered[:, 1] - ordered[:, 0]], axis=-1)
+
+    def log_prob(self, value):
+        return jnp.where(jnp.all(value >= 0, axis=-1) & (jnp.sum(value, axis=-1) <= 1), jnp.log(2.0), jnp.inf)
+
+
+def each(distribution) -> distrax.Distribution:
+    """Independent ones as one over vectors."""
+    return distrax.Independent(distribution, 1)
+
+
+ONE = jnp.ones(1)
+WIDE = Support([-1.0], [2.0])
+PLANE = Support([-2.0, -2.0], [2.0, 2.0])
+BOUNDED = {
+    "gamma": (each(distrax.Gamma(2 * ONE, 4 * ONE)), WIDE, stats.gamma(2, scale=0.25)),
+    "beta": (each(distrax.Beta(2 * ONE, 3 * ONE)), WIDE, stats.beta(2, 3)),
+    "flat beta": (each(tfd.Beta(ONE, ONE)), WIDE, stats.uniform()),  # its log-density is 0 everywhere
+    "exponential": (each(tfd.Exponential(4 * ONE)), WIDE, stats.expon(scale=0.25)),  # its density is largest below 0
+    "log-normal": (each(tfd.LogNormal(0 * ONE, 0.5 * ONE)), WIDE, stats.lognorm(0.5)),
+    "half-normal": (tfd.Independent(tfd.HalfNormal(ONE), 1), WIDE, stats.halfnorm()),
+    "truncated normal": (
+        each(tfd.TruncatedNormal(0.2 * ONE, ONE, 0 * ONE, ONE)),
+        WIDE,
+        stats.truncnorm(-0.2, 0.8, 0.2),
+    ),
+    "disc": (Disc(), PLANE, None),
+    "triangle": (Triangle(), PLANE, None),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDED)
+def test_no_draw_lies_where_a_prior_is_zero(name, key):
+    prior, box, law = BOUNDED[name]
+    task = Task(simulate, ("a", "b")[: box.dim], {"box": box}, box, prior=prior)
+    grid = np.asarray(box.sample(jax.random.clone(key), 500))
+    density = np.asarray(task.inference.prior.log_prob(grid))
+    assert not np.isnan(density).any() and not np.isposinf(density).any() and np.isneginf(density).any()
+    draws = np.asarray(prior_draws(key, task.inference.prior, box, 2000))
+    assert np.isfinite(task.inference.prior.log_prob(draws)).all()
+    if law is not None:
+        inside = law.cdf(2.0)
+        np.testing.assert_allclose(density, law.logpdf(grid[:, 0]), rtol=1e-4, atol=1e-4)
+        assert stats.kstest(draws[:, 0], lambda x: law.cdf(x) / inside).pvalue > 1e-3
+
+
+def test_a_tenth_of_a_percent_of_a_prior_is_drawn_from_by_its_density(key):
+    """Where rejection finds nothing: neither uniform, nor where the prior is zero."""
+    gamma = each(distrax.Gamma(2 * ONE, 4 * ONE))
+    law = stats.gamma(2, scale=0.25)
+    box = Support([2.5], [3.5])
+    draws = np.asarray(jax.jit(lambda key: prior_draws(key, gamma, box, 4000))(key))[:, 0]
+    inside = law.cdf(3.5) - law.cdf(2.5)
+    assert inside < 1e-3
+    assert stats.kstest(draws, lambda x: (law.cdf(x) - law.cdf(2.5)) / inside).statistic < 0.05
+    below = jax.jit(lambda key: prior_draws(key, gamma, Support([-1000.0], [0.02]), 100))(jax.random.clone(key))
+    assert (np.asarray(below) > 0).all()
+
+
+class Drawn:
+    """A prior by a function of a key and a number of draws, of any density."""
+
+    def __init__(self, draw, dim=1):
+        self.draw, self.dim = draw, dim
+
+    def sample(self, *, seed, sample_shape):
+        return self.draw(seed, (sample_shape, self.dim))
+
+    def log_prob(self, value):
+        return jnp.sum(-0.5 * value**2, axis=-1)
+
+
+def spiked(key, shape):
+    """Standard normal, but for one draw in twenty."""
+    key_choice, key_value = jax.random.split(key)
+    return jnp.where(jax.random.uniform(key_choice, shape) < 0.05, 0.25, jax.random.normal(key_value, shape))
+
+
+def half_whole(key, shape):
+    """A continuous number beside a whole one."""
+    key_whole, key_value = jax.random.split(key)
+    whole = jax.random.randint(key_whole, shape[:1], 0, 4).astype(jnp.float32)
+    return jnp.stack([jax.random.normal(key_value, shape[:1]), whole], axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("prior", "why"),
+    [
+        (Drawn(lambda key, shape: jax.random.randint(key, shape, 1, 21) / 1.0), r"whole numbers for a:.*\[0.5, 20.5\]"),
+        (Drawn(lambda key, shape: jax.random.randint(key, shape, 1, 21)), r"whole numbers for a"),
+        (Drawn(lambda key, shape: 0.1 * jax.random.randint(key, shape, 0, 11)), r"again and again for a"),
+        (Drawn(spiked), r"draws 0.25 again and again for a"),
+        (Drawn(lambda key, shape: jnp.full(shape, 0.5)), r"always draws 0.5 for a"),
+        (Drawn(half_whole, 2), r"whole numbers for b"),
+        (each(distrax.VonMises(0 * ONE, ONE)), r"expected a log-density of -inf where it never draws.* at a = "),
+        (each(tfd.Poisson(3 * ONE)), r"whole numbers for a"),
+    ],
+    ids=["whole", "integers", "steps", "spike", "constant", "mixed", "periodic", "poisson"],
+)  # fmt: skip
+def test_what_has_no_density_over_the_parameters_is_refused(prior, why):
+    dim = getattr(prior, "dim", 1)
+    box = Support([-6.0] * dim, [20.0] * dim)
+    with pytest.raises(ValueError, match=f"^prior: .*{why}") as caught:
+        Task(simulate, ("a", "b")[:dim], {"box": box}, box, prior=prior)
+    assert "\n" not in str(caught.value)
+
+
+def test_draws_without_a_density_of_their_own_are_refused():
+    elsewhere = Drawn(lambda key, shape: jax.random.uniform(key, shape))
+    elsewhere.log_prob = lambda value: jnp.where((value > 1) & (value < 2), 0.0, -jnp.inf)[..., 0]
+    with pytest.raises(ValueError, match=r"^prior: expected a finite log-density at its own draws"):
+        Task(simulate, ("a",), {"box": WIDE}, WIDE, prior=elsewhere)
+
+
+@pytest.mark.parametrize(
+    ("prior", "box"),
+    [
+        (each(distrax.Normal(0 * ONE, 1e-4 * ONE)), WIDE),
+        (each(distrax.Normal(1000 * ONE, 1e-3 * ONE)), Support([900.0], [1100.0])),  # rounding makes many draws equal
+        (each(distrax.Uniform(1e9 * ONE, 2e9 * ONE)), Support([1e8], [1e10])),  # every float32 there is whole
+        (each(tfd.StudentT(1.5, 0 * ONE, ONE)), Support([-1e3], [1e3])),
+    ],
+    ids=["narrow", "offset", "large", "heavy"],
+)
+def test_unusual_continuous_priors_are_taken(prior, box):
+    assert Task(simulate, ("a",), {"box": box}, box, prior=prior).prior is prior
+
+
+def test_an_equal_prior_of_another_task_is_the_same():
+    """Or programs would be compiled anew for every task that is made again."""
+    one, other = (decade(each(distrax.Gamma(2 * jnp.ones(2), jnp.ones(2)))).inference.prior for _ in range(2))
+    different = decade(each(distrax.Gamma(3 * jnp.ones(2), jnp.ones(2)))).inference.prior
+    assert one is not other and one == other and hash(one) == hash(other) and one != different
 
 
 # ------------------------------------------------------------------------------------------------ tailed priors

@@ -1,0 +1,98 @@
+"""What a density of any kind has inside a region: its mass there, and draws where that is next to nothing."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.region import Region
+from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.truncated_mixture import candidates, log_mass, truncated_mixture_draws
+from jaxlfi.distributions.truncation import MASS_DRAWS, Sampler, mass_inside
+
+POINTS = 1024
+"""Weighted points by which a small mass is estimated: half of them draws of the mixture, half uniform over the box."""
+CANDIDATES = 16
+"""Weighted candidates of each draw."""
+BLOCK = 256
+"""Draws made at a time, which bounds the memory for their candidates."""
+
+
+def log_mass_inside(density: Any, mixture: GaussianMixture, region: Support | Region) -> Float[Array, ""]:
+    """Logarithm of the mass of a density in a region, also where it is next to nothing; the same each time.
+
+    A mixture's in a box is known without a draw of it (`truncated_mixture.log_mass`). Any other is the share of the
+    density's draws that lie inside, or an importance estimate from points inside the box, whichever has the smaller
+    variance: nearly always the second is where the first has no draw to count.
+
+    Args:
+        density: with `log_prob` and `sample`, over inference space.
+        mixture: like the density inside the box.
+        region: a box, or the part of one where a prior is not zero.
+    """
+    if isinstance(density, GaussianMixture) and isinstance(region, Support):
+        return log_mass(density, region)
+    box = region if isinstance(region, Support) else region.box
+    share = mass_inside(density.sample, region)
+    key_box, key_mixture = jax.random.split(jax.random.key(1))
+    half = POINTS // 2
+    theta = jnp.concatenate(
+        [box.sample(key_box, half), truncated_mixture_draws(key_mixture, mixture, box, POINTS - half)]
+    )
+    uniform = jnp.full(POINTS, -jnp.sum(jnp.log(box.width)))
+    log_drawn = jnp.logaddexp(uniform, mixture.log_prob(theta) - log_mass(mixture, box)) - np.log(2.0)
+    log_weight = jnp.where(region.contains(theta), density.log_prob(theta) - log_drawn, -jnp.inf)
+    log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
+    estimate = jax.nn.logsumexp(log_weight) - np.log(POINTS)
+    # Squared relative errors of the two: of a share, and of a mean of weights.
+    of_share = jnp.where(share > 0, (1 - share) / jnp.maximum(share * MASS_DRAWS, 1e-30), jnp.inf)
+    effective = jnp.exp(2 * jax.nn.logsumexp(log_weight) - jax.nn.logsumexp(2 * log_weight))
+    of_estimate = jnp.where(effective > 0, 1 / effective - 1 / POINTS, jnp.inf)
+    return jnp.where(of_estimate < of_share, estimate, jnp.log(share))
+
+
+def rare_draws(density: Any, mixture: GaussianMixture, region: Support | Region) -> Sampler:
+    """A sampler of a density truncated to a region where next to none of its own draws lie inside.
+
+    A mixture's in a box are those of `truncated_mixture_draws`. Of any other density each draw is one of `CANDIDATES`
+    draws of the truncated mixture, picked by weight; where all of these lie where a prior is zero, one of as many draws
+    of the prior.
+
+    Args:
+        density: with `log_prob`, over inference space.
+        mixture: like the density inside the box.
+        region: a box, or the part of one where a prior is not zero.
+    """
+    if isinstance(density, GaussianMixture) and isinstance(region, Support):
+        return lambda key, n: truncated_mixture_draws(key, mixture, region, n)
+    box = region if isinstance(region, Support) else region.box
+
+    def block(key: jax.Array, n: int) -> Array:
+        key_mixture, key_anywhere, key_pick, key_other = jax.random.split(key, 4)
+        theta, log_weight = candidates(key_mixture, mixture, box, (n, CANDIDATES))
+        log_weight = log_weight + density.log_prob(theta) - mixture.log_prob(theta)
+        near, found = _picked(key_pick, theta, jnp.where(region.contains(theta), log_weight, -jnp.inf))
+        if region is box:
+            return near
+        theta = region.sample(key_anywhere, n * CANDIDATES).reshape(theta.shape)
+        log_weight = density.log_prob(theta) - region.log_prior(theta)
+        far, _ = _picked(key_other, theta, jnp.where(jnp.isfinite(log_weight), log_weight, -1e30))
+        return jnp.where(found[:, None], near, far)
+
+    def sample(key: jax.Array, n: int) -> Array:
+        if n <= BLOCK:
+            return block(key, n)
+        keys = jax.random.split(key, -(-n // BLOCK))
+        return jax.lax.map(lambda key: block(key, BLOCK), keys).reshape(-1, box.dim)[:n]
+
+    return sample
+
+
+def _picked(key: jax.Array, theta: Array, log_weight: Array) -> tuple[Array, Array]:
+    """One of the candidates [N, M, D] for each draw, and whether any of them has weight."""
+    log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
+    picked = jax.random.categorical(key, log_weight)
+    return jnp.take_along_axis(theta, picked[:, None, None], axis=1)[:, 0], jnp.any(log_weight > -jnp.inf, axis=1)

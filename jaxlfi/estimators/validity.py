@@ -1,0 +1,108 @@
+"""Validity: the probability that a simulation succeeds, learnt from all that were attempted.
+
+Networks learn from simulations that succeeded. Where success depends on the parameters, those have been selected by it,
+as they have by what was proposed; and whatever takes no account of proposals (a likelihood, the atomic losses) takes
+none of the selection either. The posterior given that the observation is a valid one, p(theta | x, valid), is then what
+they have learnt times P(valid | theta).
+"""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.base import Network, untrained
+from jaxlfi.estimators.dataset import Dataset
+from jaxlfi.estimators.likelihood import Likelihood
+from jaxlfi.estimators.mdn import ACTIVATIONS, Dense
+from jaxlfi.estimators.training import fit
+from jaxlfi.fields import option
+
+
+@struct.dataclass
+class Success:
+    """Whether a simulation succeeds: 1 with the probability of a logit, else 0."""
+
+    logit: Float[Array, "*batch"]
+
+    def log_prob(self, x: Float[Array, "*batch one"]) -> Float[Array, "*batch"]:
+        """Log-probability of an outcome, 1 for success."""
+        return jax.nn.log_sigmoid(jnp.where(x[..., 0] > 0.5, self.logit, -self.logit))
+
+
+class SuccessNetwork(nn.Module):
+    """A multilayer perceptron from parameters to the probability of success."""
+
+    hidden: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, theta: Float[Array, "*batch dim"]) -> Success:
+        """The probability for each parameter vector."""
+        h = theta
+        for units in self.hidden:
+            h = ACTIVATIONS["tanh"](Dense(units)(h))
+        return Success(Dense(1)(h)[..., 0])
+
+
+class SuccessLikelihood(Likelihood):
+    """The likelihood of an outcome, as if it were a summary."""
+
+    hidden: tuple[int, ...] = option((32, 32), low=1, help="units of each hidden layer")
+
+    def module(self, dim: int) -> nn.Module:
+        """The Flax network of one ensemble member."""
+        return SuccessNetwork(self.hidden)
+
+
+ESTIMATOR = SuccessLikelihood(
+    ensemble_size=4,
+    epochs=0,
+    steps=1000,
+    batch_size=100,
+    learning_rate=5e-3,
+    schedule="cosine",
+    validation=0.2,
+    warm_start=False,
+    normaliser="none",
+    noise_floor=0.0,
+)
+"""Four small networks, each with the weights of the epoch that was best on its held-out fifth of the attempts."""
+
+
+@struct.dataclass
+class Validity:
+    """The probability of success of a simulation, by its parameters.
+
+    Attributes:
+        network: of the outcome.
+        failures: among the attempts it has learnt from; without any, everything succeeds.
+    """
+
+    network: Network
+    failures: Int[Array, "*batch"]
+
+    def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
+        """Logarithm of the probability, at parameters in inference space."""
+        learnt = self.network.estimator.log_likelihood(self.network, jnp.ones(1), theta)
+        return jnp.where(self.failures > 0, learnt, 0.0)
+
+    def learnt(self, key: jax.Array, attempts: Dataset) -> "Validity":
+        """The same from all attempts so far; nothing is trained where all have succeeded.
+
+        Args:
+            key: consumed.
+            attempts: parameters of all attempted simulations, with 1 for success and 0 for failure as their summary.
+        """
+        failures = jnp.sum(attempts.valid & (attempts.x[:, 0] < 0.5))
+        weights = attempts.valid.astype(jnp.float32)
+        train = lambda: fit(key, self.network, attempts, weights, attempts.capacity)[0]
+        network = jax.lax.cond(failures > 0, train, lambda: self.network)
+        return Validity(network, failures)
+
+
+def unknown(key: jax.Array, scale: Support, space: Space) -> Validity:
+    """Everything succeeds, until something is learnt."""
+    return Validity(untrained(key, ESTIMATOR, 1, scale, space), jnp.zeros((), jnp.int32))

@@ -1,0 +1,77 @@
+"""Masses and draws of densities that have no closed form, against those of a mixture that has one."""
+
+import distrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from scipy import stats
+
+from jaxlfi.distributions.mass import log_mass_inside, rare_draws
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.region import Region
+from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.truncated_mixture import log_mass
+
+
+@struct.dataclass
+class Flow:
+    """A Gaussian that does not say that it is one."""
+
+    own: GaussianMixture
+
+    def log_prob(self, theta):
+        return self.own.log_prob(theta)
+
+    def sample(self, key, n):
+        return self.own.sample(key, n)
+
+
+TRUE = GaussianMixture(jnp.zeros(1), jnp.array([[0.0, 0.3]]), jnp.array([[[1.0, 0.0], [0.5, 0.6]]]))
+FITTED = GaussianMixture(jnp.zeros(1), jnp.array([[0.1, 0.2]]), jnp.array([[[1.1, 0.0], [0.3, 0.7]]]))
+"""Like the density, as a mixture fitted to its draws is."""
+UNIT = distrax.Independent(distrax.Uniform(jnp.zeros(2), jnp.ones(2)), 1)
+
+_log_mass = jax.jit(log_mass_inside)
+
+
+@pytest.mark.parametrize("low", [-1.0, 2.0, 5.0])
+def test_a_flows_mass_is_the_mixtures_it_equals(low):
+    """From two thirds to a ten-millionth."""
+    support = Support([low, -1.0], [low + 2.5, 1.5])
+    expected = float(log_mass(TRUE, support))
+    assert float(_log_mass(Flow(TRUE), FITTED, support)) == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize("shift", [0.0, 4.0])
+def test_a_mass_where_a_prior_is_not_zero_is_that_of_its_box(shift):
+    """The prior is zero but for a small part of a wide box; shifted, rejection finds nothing of the density there."""
+    box, unit = Support([-6.0, -6.0], [6.0, 6.0]), Support([0.0, 0.0], [1.0, 1.0])
+    moved, fitted = (mixture.affine(jnp.ones(2), jnp.full(2, shift)) for mixture in (TRUE, FITTED))
+    expected = float(log_mass(moved, unit))
+    region = Region(box, UNIT)
+    for density, mixture in ((Flow(moved), fitted), (moved, moved)):
+        got = float(jax.jit(lambda density, mixture: log_mass_inside(density, mixture, region))(density, mixture))
+        assert got == pytest.approx(expected, abs=0.4)
+
+
+def test_rare_draws_are_the_densitys_own(key):
+    """And not those of the mixture that was fitted to it."""
+    support = Support([4.0, -1.0], [6.0, 4.0])
+    sampler = jax.jit(lambda key: rare_draws(Flow(TRUE), FITTED, support)(key, 3000))
+    draws = np.asarray(sampler(key), float)
+    assert np.asarray(support.contains(draws)).all() and len(np.unique(draws, axis=0)) > 2900
+    assert stats.kstest(draws[:, 0], stats.truncnorm(4, 6).cdf).statistic < 0.05
+    left = (draws[:, 1] - 0.3 - 0.5 * draws[:, 0]) / 0.6
+    assert np.mean(left) == pytest.approx(0, abs=0.15)  # by the mixture it would be at -0.9
+
+
+def test_rare_draws_keep_out_of_where_a_prior_is_zero(key):
+    region = Region(Support([-6.0, -6.0], [6.0, 6.0]), UNIT)
+    far = TRUE.affine(jnp.full(2, 0.2), jnp.full(2, -4.0))
+    for density in (Flow(far), far):
+        draws = np.asarray(jax.jit(lambda key, density=density: rare_draws(density, far, region)(key, 300))(key))
+        key = jax.random.clone(key)
+        assert ((draws >= 0) & (draws <= 1)).all()
+        assert draws.max(axis=1).mean() < 0.5  # at the corner nearest to the density
