@@ -33,6 +33,7 @@ from jaxlfi.tasks.task import Task
 VALIDITY = ".validity"
 """Beginning of the names in network.npz of what is known of success; networks of earlier versions lack it."""
 
+
 def load(folder: str | Path, task: Task | None = None) -> Run:
     """Read a finished run back: what `infer`, `run.save` and the command line wrote, of one seed.
 
