@@ -7,6 +7,7 @@ it is compiled in single precision as always, and such a simulator in double pre
 import contextlib
 import contextvars
 import functools
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -35,7 +36,9 @@ def single(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(*arguments, **named)
         token = _DOUBLE.set(True)
         try:
-            with jax.enable_x64(False):
+            with jax.enable_x64(False), warnings.catch_warnings():
+                # Constants in double precision, as of a prior, are rounded: that is what is wanted here.
+                warnings.filterwarnings("ignore", message="Explicitly requested dtype")
                 arguments, named = jax.tree.map(_narrowed, (arguments, named))
                 return function(*arguments, **named)
         finally:
