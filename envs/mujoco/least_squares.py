@@ -84,7 +84,8 @@ class Residuals:
         """
         simulator = simulator_of(task)
         self._log, self.simulator, self.simulations = np.asarray(task.space.log), simulator, 0
-        self.observed = np.asarray(simulator.observation if observation is None else observation, float)
+        self.observed = simulator.observation if observation is None else simulator.aligned(np.asarray(observation))
+        self.observed = np.asarray(self.observed, float)
         there = simulator.there
         deviation = np.array([self.observed[own, c].std() for c, own in enumerate(there.T)])
         self.noise = np.maximum(simulator.noise, _NOISELESS * deviation)

@@ -10,11 +10,12 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxlfi.envs.mujoco import measured
+from jaxlfi.envs.mujoco import measured, orientations
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import STATE, Effects
 from jaxlfi.envs.mujoco.forces import UnmodelledForces, typical
 from jaxlfi.envs.mujoco.logs import Log
+from jaxlfi.envs.mujoco.plausible import check
 from jaxlfi.envs.mujoco.quiet import quietly
 from jaxlfi.io.host_devices import processors
 from jaxlfi.tasks.task import Task
@@ -41,6 +42,7 @@ class Simulator:
         noise: standard deviation of each signal's noise, shape [C]; 0 where it is inferred.
         actuators: names of the controls.
         places: of the signals among the model's sensor data, C of them.
+        orientations: among the signals, whose quaternions are compared as rotations (`aligned`).
         discrepancies: what the model gets wrong, by the signal's number.
         forces: that the model lacks, if any are drawn (`lacking`).
         model, build, does, logs, starts: as they are given, below.
@@ -77,7 +79,7 @@ class Simulator:
         self.model, self.build, self.does = model, build, does
         self.logs, self.signals, self.starts = tuple(logs), tuple(signals), tuple(starts)
         self.places = measured.places(model, signals)
-        self.units = tuple(measured.unit(model, name) for name in signals)
+        self.units = tuple(measured.unit(model, name).removeprefix("1") for name in signals)
         self.noise = np.array([noise[name] for name in signals])
         self.discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
         self.forces: UnmodelledForces | None = None
@@ -90,6 +92,7 @@ class Simulator:
                 for log, own in zip(logs, rows, strict=True)
             ]
         )
+        self.orientations = tuple(orientations.groups(model, self.places).values())
         self.there = np.isfinite(recorded)
         self.observation = np.where(self.there, recorded, 0.0).astype(np.float32)
         self._threads = threads or processors()
@@ -158,9 +161,7 @@ class Simulator:
             )
         if missing := [name for name in self.signals if name not in log.signals]:
             raise ValueError(f"{log.name}: expected signals {', '.join(missing)}, got {known}")
-        for name, unit in zip(self.signals, self.units, strict=True):
-            if unit and log.units.get(name, unit) != unit:
-                raise ValueError(f"{log.name}: {name}: expected {unit} as the sensor, got {log.units[name]}")
+        check(self.model, log, self.signals)
         if log.times[-1] < self.model.opt.timestep:
             raise ValueError(
                 f"{log.name}: expected more than a step of the model, {self.model.opt.timestep:g} s, "
@@ -179,7 +180,11 @@ class Simulator:
         noisy = clean + deviation[:, None] * rng.standard_normal(clean.shape)
         for signal, process in self.discrepancies.items():
             noisy[:, :, signal] += np.concatenate([process.draws(rng, len(theta), own) for own in self.times], axis=1)
-        return np.where(self.there, noisy, 0.0), outcome
+        return np.where(self.there, self.aligned(noisy), 0.0), outcome
+
+    def aligned(self, rows: Float[np.ndarray | Array, "*n rows signals"]) -> Float[np.ndarray | Array, "*n rows signals"]:
+        """Measurements with orientations of norm 1 and of the sign that is nearer to the recorded ones."""
+        return orientations.aligned(rows, self.observation, self.orientations)
 
     def clean(
         self, theta: Float[np.ndarray, "n dim"], lacking: Float[np.ndarray, "n numbers"] | None = None
@@ -199,6 +204,7 @@ class Simulator:
                 rows[part], outcome[part] = self._rolled(theta[part], lacking[part])
         for signal, d in self.does.biases:
             rows[:, :, signal] += theta[:, d, None]
+        rows = self.aligned(rows)
         rows[outcome != 0] = 0.0
         return rows, outcome
 

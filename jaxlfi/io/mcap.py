@@ -2,7 +2,7 @@
 
 Each signal is a topic, "observation.state" is /observation/state, with messages encoded as JSON of the schema
 `jaxlfi.Signal`: {"time": 0.16, "values": [0.4, 0.36]}. What the numbers are is in the channel's metadata: `dtype`,
-`names` (a JSON list), `unit`, `duration`. The rollout's metadata are in the record `jaxlfi.rollout`. A file may have
+`names` (a JSON list), `unit` (or a JSON list of units), `duration`. The rollout's metadata are in the record `jaxlfi.rollout`. A file may have
 topics of other schemas; they are not read.
 
 Times of the log are ns from the first message on. Those of the rollout, which may begin before zero, are in the
@@ -54,7 +54,7 @@ def write(path: str | Path, rollout: Rollout) -> None:
     messages = []
     for name, signal in rollout.signals.items():
         schema = writer.register_schema(SCHEMA, "jsonschema", json.dumps(_schema(signal)).encode())
-        metadata = {"dtype": signal.values.dtype.name, "names": json.dumps(signal.names), "unit": signal.unit}
+        metadata = {"dtype": signal.values.dtype.name, "names": json.dumps(signal.names), "unit": _unit_text(signal)}
         if signal.duration is not None:
             metadata["duration"] = repr(float(signal.duration))
         channel = writer.register_channel(_topic(name), "json", schema, metadata)
@@ -177,7 +177,20 @@ def _signal(metadata: Mapping[str, str], times: list[float], rows: list[list]) -
         raise ValueError(f"expected names as a JSON list and a duration in s, got {dict(metadata)}") from error
     # In the order of time: messages of the same instant may stand in any.
     order = np.argsort(times, kind="stable")
-    return Signal(np.asarray(times)[order], values[order], names, metadata.get("unit", ""), duration)
+    return Signal(np.asarray(times)[order], values[order], names, _unit(metadata.get("unit", "")), duration)
+
+
+def _unit_text(signal: Signal) -> str:
+    return signal.unit if isinstance(signal.unit, str) else json.dumps(signal.unit)
+
+
+def _unit(text: str) -> str | tuple[str, ...]:
+    """One unit, or a JSON list with that of each number."""
+    try:
+        several = json.loads(text) if text.startswith("[") else None
+    except ValueError:
+        return text
+    return text if several is None else tuple(map(str, several))
 
 
 def _some(names: set[str]) -> str:
