@@ -15,12 +15,12 @@ _OF_BODIES = {"pos": mujoco.mjtSensor.mjSENS_FRAMEPOS, "quat": mujoco.mjtSensor.
 
 _UNITS = {
     "s": ("CLOCK",),
-    "m": ("FRAMEPOS", "GEOMDIST", "GEOMFROMTO", "RANGEFINDER", "SUBTREECOM", "TENDONPOS"),
-    "m/s": ("FRAMELINVEL", "VELOCIMETER", "SUBTREELINVEL", "TENDONVEL"),
+    "m": ("FRAMEPOS", "GEOMDIST", "GEOMFROMTO", "RANGEFINDER", "SUBTREECOM"),
+    "m/s": ("FRAMELINVEL", "VELOCIMETER", "SUBTREELINVEL"),
     "rad/s": ("FRAMEANGVEL", "GYRO", "BALLANGVEL"),
     "m/s^2": ("ACCELEROMETER", "FRAMELINACC"),
     "rad/s^2": ("FRAMEANGACC",),
-    "N": ("FORCE", "TOUCH", "TENDONACTFRC"),
+    "N": ("FORCE", "TOUCH"),
     "N m": ("TORQUE",),
     "1": ("FRAMEQUAT", "BALLQUAT", "FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS", "GEOMNORMAL"),
 }

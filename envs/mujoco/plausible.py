@@ -17,8 +17,8 @@ FASTEST = 5
 """Rows within a step of the model from which on times look wrong."""
 FAR = 6.0
 """Standard deviations of the noise from which on a recording begins elsewhere than the model."""
-NOISELESS = 1e-3
-"""Standard deviation, as a fraction of the signal's own, that stands for the noise of a signal that has none."""
+LEAST = 1e-3
+"""Of a signal's standard deviation: what begins nearer than this does not begin elsewhere, however small the noise."""
 
 
 def check(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> None:
@@ -81,15 +81,14 @@ def check_start(
         if number in turned or first is None or not measured.kinematic(model, name):
             continue
         low, high = values[:, where[number]].min(), values[:, where[number]].max()
-        deviation = _deviation(log, name, noises)
+        off, spread = max(low - first, first - high), float(np.std(log.samples(name)[1]))
         # What depends on parameters may begin somewhat further than at the few that were tried.
-        if max(low - first, first - high) > FAR * deviation + (high - low):
+        if off > max(FAR * noises[name], LEAST * spread) + (high - low):
             own = f" {unit}" if (unit := measured.unit(model, name)) else ""
             there = f"{low:.4g}" if high - low <= 1e-6 * abs(high) else f"{low:.4g} to {high:.4g}"
-            off = max(low - first, first - high) / deviation if deviation else np.inf
             say(
-                f"{log.name}: {name}: the recording begins at {first:.4g}{own}, the model at {there}{own}: "
-                f"{off:.3g} standard deviations of the noise apart"
+                f"{log.name}: {name}: the recording begins at {first:.4g}{own}, the model at {there}{own}"
+                f"{_in_noises(off, noises[name])}"
             )
     for sensor, columns in oriented.items():
         names = [signals[column] for column in columns]
@@ -97,12 +96,11 @@ def check_start(
         if None in first:
             continue
         off = [orientations.angle(np.array(first), own[[where[c] for c in columns]]) for own in values]
-        deviation = 2 * float(np.mean([_deviation(log, name, noises) for name in names]))
-        if min(off) > FAR * deviation + np.ptp(off):
-            apart = min(off) / deviation if deviation else np.inf
+        noise = 2 * float(np.mean([noises[name] for name in names]))  # an angle is twice that of its quaternions
+        if min(off) > max(FAR * noise, LEAST) + np.ptp(off):
             say(
-                f"{log.name}: {sensor}: the recording begins {min(off):.3g} rad from the orientation that the model "
-                f"begins in: {apart:.3g} standard deviations of the noise"
+                f"{log.name}: {sensor}: the recording begins {min(off):.3g} rad from the orientation of the model"
+                f"{_in_noises(min(off), noise)}"
             )
 
 
@@ -120,18 +118,17 @@ def say(text: str) -> None:
 
 
 def _check_times(log: Log, step: float) -> None:
-    between = float(np.median(np.diff(log.times)))
-    looks = looks_like(between, min(max(between, 5 * step), 0.1))
-    other = f"in {looks} they would be {parse(looks).factor * between:.3g} s apart"
+    between = float(log.times[-1]) / (len(log.times) - 1)
     if between > max(SLOWEST * step, LONGEST):
         text = f"{log.name}: expected times in s, got rows {between:.6g} apart, {between / step:.3g} steps of the model"
+        looks = looks_like(between, min(5 * step, LONGEST))
+        other = f"in {looks} they would be {parse(looks).factor * between:.3g} s apart"
         if TIME not in log.units:
             raise ValueError(f"{text}: {other}; name their unit, as 'time [{looks}]' or 'time [s]'")
-        if looks != "s":
-            say(f"{text}: {other}")
+        say(f"{text}: {other}")
     elif FASTEST * between < step:
-        looks = looks_like(between, step)
-        other = f": in {looks} they would be {parse(looks).factor * between:.3g} s apart" if looks != "s" else ""
+        looks = looks_like(between, 5 * step)
+        other = f": in {looks} they would be {parse(looks).factor * between:.3g} s apart" * (looks != "s")
         say(f"{log.name}: rows are {between:.3g} s apart, {step / between:.3g} of them in a step of the model{other}")
 
 
@@ -141,5 +138,5 @@ def _beginning(log: Log, name: str, step: float) -> float | None:
     return float(values[0]) if len(times) and times[0] <= step else None
 
 
-def _deviation(log: Log, name: str, noises: Mapping[str, float]) -> float:
-    return max(noises[name], NOISELESS * float(np.std(log.samples(name)[1])))
+def _in_noises(off: float, noise: float) -> str:
+    return f": {off / noise:.3g} standard deviations of the noise apart" if noise else ""

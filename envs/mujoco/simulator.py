@@ -22,7 +22,11 @@ from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.worker import OneOfBatch
 
 CHUNK = 128
-"""Models that are rolled out in one call, which bounds the memory of their states."""
+"""Models that are rolled out in one call, at most."""
+MEMORY = 2**30
+"""Bytes that the states, sensors and controls of one call may take: of long episodes fewer models are rolled out."""
+LARGEST = 2**33
+"""Bytes that those of a single simulation may take."""
 UNSTABLE, REFUSED = 1, 2
 """Why a simulation fails, as `FAILURES` numbers it."""
 FAILURES = ("unstable", "refused by MuJoCo")
@@ -95,6 +99,7 @@ class Simulator:
         self.orientations = tuple(orientations.groups(model, self.places).values())
         self.there = np.isfinite(recorded)
         self.observation = np.where(self.there, recorded, 0.0).astype(np.float32)
+        self._chunk = int(np.clip(MEMORY // self._bytes(), 1, CHUNK))
         self._threads = threads or processors()
         self._pool: mujoco.rollout.Rollout | None = None
 
@@ -151,6 +156,18 @@ class Simulator:
         other.forces = forces
         return other
 
+    def _bytes(self) -> int:
+        """Bytes of the states, sensors and controls of a simulation of the longest episode."""
+        step, size = self.model.opt.timestep, mujoco.mj_stateSize(self.model, STATE)
+        longest = int(np.argmax([times[-1] for times in self.times]))
+        steps = self.times[longest][-1] / step + 1
+        if (taken := 8 * steps * (size + self.model.nsensordata + self.model.nu)) > LARGEST:
+            raise ValueError(
+                f"{self.logs[longest].name}: expected an episode whose simulation fits into memory, got one of "
+                f"{self.times[longest][-1]:.6g} s, {steps:.3g} steps of {step:g} s"
+            )
+        return int(taken)
+
     def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
         """Rows of a log with a sample of anything that is measured."""
         known = ", ".join(log.signals)
@@ -161,12 +178,12 @@ class Simulator:
             )
         if missing := [name for name in self.signals if name not in log.signals]:
             raise ValueError(f"{log.name}: expected signals {', '.join(missing)}, got {known}")
-        check(self.model, log, self.signals)
         if log.times[-1] < self.model.opt.timestep:
             raise ValueError(
                 f"{log.name}: expected more than a step of the model, {self.model.opt.timestep:g} s, "
                 f"got {log.times[-1]:g} s"
             )
+        check(self.model, log, self.signals)
         return np.flatnonzero(np.isfinite([log.signals[name] for name in self.signals]).any(axis=0))
 
     def __call__(
@@ -199,8 +216,8 @@ class Simulator:
         lacking = np.zeros((len(theta), 0)) if lacking is None else lacking
         rows, outcome = np.zeros((len(theta), *self.observation.shape)), np.zeros(len(theta), int)
         with _LOCK, quietly():
-            for first in range(0, len(theta), CHUNK):
-                part = slice(first, first + CHUNK)
+            for first in range(0, len(theta), self._chunk):
+                part = slice(first, first + self._chunk)
                 rows[part], outcome[part] = self._rolled(theta[part], lacking[part])
         for signal, d in self.does.biases:
             rows[:, :, signal] += theta[:, d, None]

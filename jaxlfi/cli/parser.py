@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 
 import jaxlfi
 from jaxlfi import flags, source_fields
-from jaxlfi.cli import help_texts, joined
+from jaxlfi.cli import help_texts, joined, warned
 from jaxlfi.cli.exit_status import one_line
 from jaxlfi.fields import Declared
 
@@ -505,7 +505,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0; 2 for bad input; 130 where it was interrupted.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    with warned.in_lines():
+        return _run(list(sys.argv[1:] if argv is None else argv))
+
+
+def _run(words: Sequence[str]) -> int:
     if words and (foreign := foreign_commands().get(words[0])):
         return foreign.load()(words[1:])
     if joined.asked(words):

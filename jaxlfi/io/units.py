@@ -15,7 +15,7 @@ class Unit(NamedTuple):
 
     Attributes:
         factor: by which a number is multiplied.
-        name: of the SI unit, such as "rad/s" and "N m"; "" where the text names none, and "1" for a ratio such as %.
+        name: of the SI unit, such as "rad/s" and "N m"; "1" for a pure number, and "" where the text names none.
         offset: added after the multiplication, as for temperatures.
     """
 
@@ -56,7 +56,7 @@ _WORDS = {
 _WORD_PREFIXES = {"": "", "nano": "n", "micro": "u", "milli": "m", "centi": "c", "kilo": "k", "mega": "M"}
 _NAMES = {"N m/A s": "V", "N m/s": "W", "N/m^2": "Pa", "N/m A": "T", "kg m/s^2": "N", "kg m^2/s^2": "N m", "1/s": "Hz"}
 _WHOLE = {
-    **dict.fromkeys(("", "1", "-", "none", "unitless", "dimensionless", "bool", "boolean"), Unit(1.0, "")),
+    **dict.fromkeys(("", "-", "none", "unitless", "dimensionless", "bool", "boolean"), Unit(1.0, "")),
     **{"g": Unit(_G, "m/s^2"), "mg": Unit(1e-3 * _G, "m/s^2"), "ug": Unit(1e-6 * _G, "m/s^2")},
     **dict.fromkeys(("degC", "celsius", "Celsius"), Unit(1.0, "K", 273.15)),
     "degF": Unit(5 / 9, "K", 459.67 * 5 / 9),
