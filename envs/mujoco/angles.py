@@ -50,13 +50,13 @@ def unwrapped(
 ) -> Unwrapped:
     """An angle without the jumps of an encoder that begins anew after one or several half turns.
 
-    It jumps by its period, readings lie within one period, and the angle without the jump goes on as before it and after
-    it. An angle that is within the joint's limits is left as it is.
+    Its readings lie within one period and jump by that period, and without the jump the angle goes on as before and
+    afterwards. An angle that is within the joint's limits is left as it is.
 
     Args:
         times: of the samples, in s.
         values: in rad.
-        start: where the model begins, in rad, which says what whole periods are to be added; None where it is not known.
+        start: where the model begins, in rad, which says how many periods are to be added; None where it is not known.
         limits: of the joint, in rad; None where it has none.
     """
     period, jumps = _period(times, values)

@@ -159,9 +159,8 @@ def _check_increasing(times: np.ndarray, where: str) -> None:
         return  # which is refused for that
     if times.dtype.kind == "f":
         if len(rows := np.flatnonzero(~np.isfinite(times))):
-            raise ValueError(
-                f"{where}: expected at least two increasing times, got {times[rows[0]]} in row {rows[0] + 1}{_more(rows)}"
-            )
+            got = f"{times[rows[0]]} in row {rows[0] + 1}{_more(rows)}"
+            raise ValueError(f"{where}: expected at least two increasing times, got {got}")
         resolution = float(np.spacing(np.abs(times).max()))
         if resolution > 0.1 * float(np.ptp(times)) / (len(times) - 1):
             raise ValueError(

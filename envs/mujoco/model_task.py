@@ -77,6 +77,8 @@ def mujoco_task(
     if not several or not parameters:
         raise ValueError("expected at least one recording and one parameter, got none")
     episodes = [one if isinstance(one, Log) else logs.read(Path(one)) for one in several]
+    known = [one.name for one in (*spec.sensors, *spec.actuators)]
+    episodes = [recordings.renamed(log, [*known, *(measured or ())]) for log in episodes]
     if measured is None:
         controls = {one.name for one in spec.actuators}
         measured = [name for name in episodes[0].signals if name not in controls]

@@ -1,6 +1,6 @@
 """Orientations as quaternions, which are compared as rotations: whatever their sign and their norm."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -18,12 +18,21 @@ def groups(model: mujoco.MjModel, places: Sequence[int]) -> dict[str, Columns]:
         model: with a sensor for each signal.
         places: of the signals among the model's sensor data.
     """
-    found = {}
+    whole = {sensor: first for sensor, first, count in _measured(model, places) if count == 4}
+    return {sensor: tuple(list(places).index(first + k) for k in range(4)) for sensor, first in whole.items()}
+
+
+def parts(model: mujoco.MjModel, places: Sequence[int]) -> dict[str, int]:
+    """How many numbers are measured of those orientations that are measured in part, by their sensors."""
+    return {sensor: count for sensor, _, count in _measured(model, places) if 0 < count < 4}
+
+
+def _measured(model: mujoco.MjModel, places: Sequence[int]) -> Iterator[tuple[str, int, int]]:
+    """Each orientation's sensor, where it begins in the sensor data, and how many of its numbers are measured."""
     for sensor in range(model.nsensor):
-        first = int(model.sensor_adr[sensor])
-        if mujoco.mjtSensor(model.sensor_type[sensor]) in SENSORS and set(range(first, first + 4)) <= set(places):
-            found[model.sensor(sensor).name] = tuple(list(places).index(first + k) for k in range(4))
-    return found
+        if mujoco.mjtSensor(model.sensor_type[sensor]) in SENSORS:
+            first = int(model.sensor_adr[sensor])
+            yield model.sensor(sensor).name, first, len(set(places) & set(range(first, first + 4)))
 
 
 def aligned(

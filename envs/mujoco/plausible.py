@@ -11,8 +11,8 @@ from jaxlfi.envs.mujoco.effects import STATE
 from jaxlfi.envs.mujoco.logs import TIME, Log, RecordingWarning
 from jaxlfi.io.units import looks_like, parse
 
-SLOWEST, LONGEST = 100, 0.5
-"""Steps of the model, and seconds, between two rows beyond which times without a unit are not taken for seconds."""
+SLOWEST, LONGEST = 40, 0.4
+"""Steps of the model, and seconds, between two rows from which on times without a unit are not taken for seconds."""
 FASTEST = 5
 """Rows within a step of the model from which on times look wrong."""
 FAR = 6.0
@@ -32,7 +32,7 @@ def check(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> None:
         if (own := measured.unit(model, name)) and log.units.get(name, own) != own:
             raise ValueError(f"{log.name}: {name}: expected {own} as the sensor, got {log.units[name]}")
     for i in range(model.nu):
-        name = model.actuator(i).name
+        name = model.actuator(i).name or f"actuator[{i}]"
         expected, given = measured.control_units(model, i), log.units.get(name, "")
         if name not in signals and given and expected and given not in expected:
             raise ValueError(f"{log.name}: {name}: expected {' or '.join(expected)} as the actuator, got {given}")
@@ -119,12 +119,12 @@ def say(text: str) -> None:
 
 def _check_times(log: Log, step: float) -> None:
     between = float(log.times[-1]) / (len(log.times) - 1)
-    if between > max(SLOWEST * step, LONGEST):
+    if between >= max(SLOWEST * step, LONGEST):
         text = f"{log.name}: expected times in s, got rows {between:.6g} apart, {between / step:.3g} steps of the model"
         looks = looks_like(between, min(5 * step, LONGEST))
         other = f"in {looks} they would be {parse(looks).factor * between:.3g} s apart"
         if TIME not in log.units:
-            raise ValueError(f"{text}: {other}; name their unit, as 'time [{looks}]' or 'time [s]'")
+            raise ValueError(f"{text}: {other}; give them in s, or with their unit, as 'time [{looks}]' or 'time [s]'")
         say(f"{text}: {other}")
     elif FASTEST * between < step:
         looks = looks_like(between, 5 * step)

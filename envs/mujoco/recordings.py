@@ -43,15 +43,37 @@ def prepared(model: mujoco.MjModel, log: Log, signals: Sequence[str], start: np.
     for name, place in zip(signals, where, strict=True):
         if measured.unit(model, name) == "rad" and not beyond_radians(model, log, name):
             changed[name] = _continuous(log, name, float(first[place]), measured.joint_limits(model, name))
+    for sensor, count in orientations.parts(model, where).items():
+        say(f"{log.name}: {sensor}: {count} of 4 numbers are measured: they are not compared as a rotation")
     for sensor, columns in orientations.groups(model, where).items():
         names = [signals[column] for column in columns]
         rows = np.stack([log.signals[name] for name in names], axis=1)
         found = _rotations(f"{log.name}: {sensor}", rows, first[[where[column] for column in columns]])
         changed |= dict(zip(names, found.T, strict=True))
     for i in range(model.nu):
-        if (name := model.actuator(i).name) in log.signals and measured.control_units(model, i) == ("rad",):
+        name = model.actuator(i).name or f"actuator[{i}]"
+        if name in log.signals and name not in signals and measured.control_units(model, i) == ("rad",):
             beyond_radians(model, log, name)
     return dataclasses.replace(log, signals=changed)
+
+
+def renamed(log: Log, known: Sequence[str]) -> Log:
+    """A recording whose signals are called as a model's, where its names say a unit besides: arm_deg of a sensor arm.
+
+    Args:
+        log: a recording.
+        known: names of the model's sensors and actuators.
+    """
+    called, units = {}, dict(log.units)
+    for name in log.signals:
+        base, _, suffix = name.rpartition("_")
+        new = base in known or measured.JOINT.fullmatch(base)
+        if new and name not in {*known, *log.units} and base not in log.signals and is_unit(suffix):
+            called[name], units[base] = base, suffix
+            say(f"{log.name}: {name}: read as {base} in {suffix}")
+    if not called:
+        return log
+    return Log(log.times, {called.get(name, name): own for name, own in log.signals.items()}, log.name, units)
 
 
 def _named_units(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> Log:
@@ -59,9 +81,9 @@ def _named_units(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> Log
     found = {}
     for name in signals:
         _, _, suffix = name.rpartition("_")
-        if name in log.units or suffix == name or not is_unit(suffix) or not (own := measured.unit(model, name)):
+        if name in log.units or not is_unit(suffix) or parse(suffix).name != measured.unit(model, name):
             continue
-        if parse(suffix).name == own and parse(suffix).factor != 1:
+        if suffix and parse(suffix).factor != 1:
             found[name] = suffix
             say(f"{log.name}: {name}: read in {suffix}, as its name says")
     return Log(log.times, log.signals, log.name, {**log.units, **found}) if found else log
@@ -89,7 +111,7 @@ def _fresh(log: Log, signals: Sequence[str]) -> Log:
 def repeats(values: np.ndarray) -> tuple[np.ndarray, int]:
     """Samples that only repeat the one before although the signal moves, and in how many rows there is a new one.
 
-    A signal that rests repeats itself, too. So values are looked at that differ from the one before and the one after by
+    A signal that rests repeats itself, too. So only values count that differ from the one before and the one after by
     much more than the signal resolves. Where nearly all of them last equally long, the sensor is slower than the
     recording: a value that lasts longer is then new again after as many rows.
 
@@ -132,9 +154,9 @@ def _continuous(log: Log, name: str, start: float, limits: Sequence[float] | Non
         return log.signals[name]
     period = found.period or angles.TURN
     what = [f"begins anew after {period:.4g} rad, {_times(found.count)}: made continuous"] if found.count else []
-    what += [f"{period:.4g} rad {'added' if turns > 0 else 'taken off'} {_times(abs(turns))}, where the model begins"] * (
-        turns != 0
-    )
+    if turns:
+        done = "added" if turns > 0 else "taken off"
+        what.append(f"{period:.4g} rad {done} {_times(abs(turns))}, as the model begins there")
     if found.ambiguous:
         what.append(f"up to {found.fastest:.2g} of that between two samples, which may have been the other way round")
     say(f"{log.name}: {name}: {'; '.join(what)}")

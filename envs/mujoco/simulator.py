@@ -199,7 +199,9 @@ class Simulator:
             noisy[:, :, signal] += np.concatenate([process.draws(rng, len(theta), own) for own in self.times], axis=1)
         return np.where(self.there, self.aligned(noisy), 0.0), outcome
 
-    def aligned(self, rows: Float[np.ndarray | Array, "*n rows signals"]) -> Float[np.ndarray | Array, "*n rows signals"]:
+    def aligned(
+        self, rows: Float[np.ndarray | Array, "*n rows signals"]
+    ) -> Float[np.ndarray | Array, "*n rows signals"]:
         """Measurements with orientations of norm 1 and of the sign that is nearer to the recorded ones."""
         return orientations.aligned(rows, self.observation, self.orientations)
 

@@ -404,7 +404,7 @@ def _seconds(name: str, times: np.ndarray, feature: Mapping[str, Any], fps: Any)
         looks = units.looks_like(step, 1 / fps)
         raise ValueError(
             f"{name}: expected seconds, {1 / fps:.3g} apart at {fps:g} frames a second, got {step:.6g} apart: they "
-            f"look like {looks}; say so in meta/info.json, as \"info\": {{\"unit\": \"{looks}\"}} of this feature"
+            f'look like {looks}; say so in meta/info.json, as "info": {{"unit": "{looks}"}} of this feature'
         )
     return seconds
 

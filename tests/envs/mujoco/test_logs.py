@@ -79,7 +79,7 @@ def test_signals_of_arrays_and_logs_are_in_units_of_their_own(tmp_path):
     log = Log([0.0, 1.0], {"heat": [0.0, 100.0], "speed": [60.0, 30.0]}, units={"heat": "°C", "speed": "rpm"})
     np.testing.assert_allclose(log.signals["heat"], [273.15, 373.15])
     np.testing.assert_allclose(log.signals["speed"], [2 * np.pi, np.pi])
-    with pytest.raises(ValueError, match="log: speed: expected a unit such as .* got 'furlong'"):
+    with pytest.raises(ValueError, match=r"log: speed: expected a unit such as .* got 'furlong'"):
         Log([0.0, 1.0], {"speed": [60.0, 30.0]}, units={"speed": "furlong"})
 
 
@@ -97,12 +97,12 @@ def test_signals_of_robotics_formats_are_in_the_units_that_they_say(tmp_path):
         assert log.units.items() >= {"shoulder": "rad", "lift": "m", "pull": "N", "twist": "N m"}.items()
     with pytest.raises(ValueError, match="one of its 2 episodes, got none: name it as set#episode=0"):
         read(tmp_path / "set")
-    with pytest.raises(ValueError, match="state: expected one sample at a time, got samples 2 and 3 at 0.02 s"):
+    with pytest.raises(ValueError, match=r"state: expected one sample at a time, got samples 2 and 3 at 0.02 s"):
         twice = Signal(np.array([0.0, 0.02, 0.02]), np.ones((3, 1)), ("a",))
         mcap.write(tmp_path / "twice.mcap", Rollout({"state": twice}))
         read(tmp_path / "twice.mcap")
     mcap.write(tmp_path / "b.mcap", Rollout({"state": Signal(times, np.ones((6, 1)), ("a",), "furlong")}))
-    with pytest.raises(ValueError, match="b.mcap: a: expected a unit such as .* got 'furlong'"):
+    with pytest.raises(ValueError, match=r"b\.mcap: a: expected a unit such as .* got 'furlong'"):
         read(tmp_path / "b.mcap")
 
 
@@ -110,7 +110,7 @@ def test_times_of_a_data_set_agree_with_its_frame_rate(tmp_path):
     """They are in the unit that the data set says, and refused where they cannot be seconds."""
     frames = Signal(20_000_000.0 * np.arange(6), np.ones((6, 1)), ("a",))
     lerobot.write(tmp_path / "set", [Rollout({"state": frames})], "state", 50)
-    with pytest.raises(ValueError, match="time: expected seconds, 0.02 apart at 50 frames .* they look like ns"):
+    with pytest.raises(ValueError, match=r"time: expected seconds, 0\.02 apart at 50 frames .* they look like ns"):
         read(tmp_path / "set")
     info = tmp_path / "set/meta/info.json"
     info.write_text(info.read_text().replace('"time": {', '"time": {"info": {"unit": "ns"}, ', 1))

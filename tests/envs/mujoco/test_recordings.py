@@ -116,10 +116,10 @@ def test_times_that_are_no_seconds_are_refused_with_the_unit_that_they_look_like
 
 
 def test_times_that_are_said_to_be_seconds_are_believed_as_far_as_memory_goes():
-    with pytest.warns(RecordingWarning, match="expected times in s, got rows 10 apart, 5e.03 steps of the model: in ms"):
+    with pytest.warns(RecordingWarning, match=r"got rows 10 apart, 5e\+03 steps of the model: in ms they would be"):
         task(log(UNITS, 1e3 * TIMES))
     with (
-        pytest.raises(ValueError, match="a.csv: expected an episode whose simulation fits into memory, got one of"),
+        pytest.raises(ValueError, match=r"a\.csv: expected an episode whose simulation fits into memory, got one of"),
         pytest.warns(RecordingWarning),
     ):
         task(log(UNITS, 1e9 * TIMES))
@@ -148,9 +148,18 @@ def test_angles_that_look_like_degrees_are_said():
 
 
 def test_units_that_only_a_name_says():
-    with pytest.warns(RecordingWarning, match="a.csv: rate_rpm: read in rpm, as its name says"):
+    with pytest.warns(RecordingWarning, match=r"a\.csv: rate_rpm: read in rpm, as its name says"):
         found = observed(log(without("rate_rpm"), rate_rpm=RECORDED["rate_rpm"] * 30 / np.pi))
     np.testing.assert_allclose(found[:, 1], RECORDED["rate_rpm"], rtol=1e-5, atol=1e-6)
+
+
+def test_a_name_that_says_a_unit_besides():
+    signals = {("angle_deg" if name == "angle" else name): own for name, own in RECORDED.items()}
+    signals["angle_deg"] = np.degrees(signals["angle_deg"])
+    with pytest.warns(RecordingWarning, match=r"a\.csv: angle_deg: read as angle in deg"):
+        own = simulator_of(task(Log(TIMES, signals, "a.csv", without("angle"))))
+    assert own.signals == ("angle", "rate_rpm", "place")
+    np.testing.assert_allclose(own.observation[:, 0], RECORDED["angle"], rtol=1e-5, atol=1e-6)
 
 
 def test_an_encoder_is_made_continuous_and_begins_in_the_turn_of_the_model():
@@ -159,7 +168,7 @@ def test_an_encoder_is_made_continuous_and_begins_in_the_turn_of_the_model():
         with pytest.warns(RecordingWarning, match="angle: begins anew after 6.283 rad, .*: made continuous"):
             found = observed(log(angle=wrapped))
         np.testing.assert_allclose(found[:, 0], RECORDED["angle"], atol=1e-5)
-    with pytest.warns(RecordingWarning, match="angle: 6.283 rad taken off twice, where the model begins"):
+    with pytest.warns(RecordingWarning, match="angle: 6.283 rad taken off twice, as the model begins there"):
         found = observed(log(angle=RECORDED["angle"] + 4 * np.pi))
     np.testing.assert_allclose(found[:, 0], RECORDED["angle"], atol=1e-5)
 
