@@ -64,7 +64,8 @@ class Log:
 
     def __post_init__(self):
         given = {name: self._unit(name, text) for name, text in self.units.items()}
-        times, clock = _seconds(np.asarray(self.times), given.pop(TIME, parse("")), self.name)
+        of_times = parse("") if TIME in self.signals else given.pop(TIME, parse(""))
+        times, clock = _seconds(np.asarray(self.times), of_times, self.name)
         signals = {}
         for name, recorded in self.signals.items():
             values = np.asarray(recorded, float)
@@ -76,7 +77,7 @@ class Log:
                 raise ValueError(f"{self.name}: {name}: expected finite samples, got infinite ones or none at all")
             unit = given.get(name, parse(""))
             signals[name] = unit.factor * values + unit.offset
-        known = {TIME: clock} | {name: unit.name for name, unit in given.items()}
+        known = ({} if TIME in signals else {TIME: clock}) | {name: unit.name for name, unit in given.items()}
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "signals", signals)
         object.__setattr__(self, "units", {name: unit for name, unit in known.items() if unit})

@@ -97,9 +97,7 @@ def unit(model: mujoco.MjModel, name: str) -> str:
 
 
 def joint_limits(model: mujoco.MjModel, name: str) -> tuple[float, float] | None:
-    """The limits of the joint whose position a signal, or an actuator of that name, is; None where there are none."""
-    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name) < 0:
-        return None
+    """The limits of the joint whose position a signal is; None where there are none."""
     sensor = _sensor(model, name)
     joint = int(sensor.objid[0])
     if mujoco.mjtSensor(sensor.type[0]) != _OF_JOINTS["qpos"] or not model.jnt_limited[joint]:

@@ -39,9 +39,9 @@ def check(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> None:
     _check_times(log, model.opt.timestep)
 
 
-def beyond_radians(model: mujoco.MjModel, log: Log, name: str) -> bool:
+def beyond_radians(log: Log, name: str, limits: Sequence[float] | None = None) -> bool:
     """Whether an angle without a unit is beyond a turn, or far beyond the joint's limits; that is said."""
-    values, limits = log.samples(name)[1], measured.joint_limits(model, name)
+    values = log.samples(name)[1]
     beyond = np.abs(values).max() > angles.TURN
     if limits is not None and (reach := limits[1] - limits[0]) < angles.TURN:
         beyond |= np.abs(values - np.mean(limits)).max() > max(reach, angles.TURN / 2)

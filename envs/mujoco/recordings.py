@@ -41,7 +41,7 @@ def prepared(model: mujoco.MjModel, log: Log, signals: Sequence[str], start: np.
     log = _fresh(_named_units(model, log, signals), signals)
     where, first, changed = measured.places(model, signals), sensed(model, start), dict(log.signals)
     for name, place in zip(signals, where, strict=True):
-        if measured.unit(model, name) == "rad" and not beyond_radians(model, log, name):
+        if measured.unit(model, name) == "rad":
             changed[name] = _continuous(log, name, float(first[place]), measured.joint_limits(model, name))
     for sensor, count in orientations.parts(model, where).items():
         say(f"{log.name}: {sensor}: {count} of 4 numbers are measured: they are not compared as a rotation")
@@ -53,7 +53,7 @@ def prepared(model: mujoco.MjModel, log: Log, signals: Sequence[str], start: np.
     for i in range(model.nu):
         name = model.actuator(i).name or f"actuator[{i}]"
         if name in log.signals and name not in signals and measured.control_units(model, i) == ("rad",):
-            beyond_radians(model, log, name)
+            beyond_radians(log, name)
     return dataclasses.replace(log, signals=changed)
 
 
@@ -67,8 +67,10 @@ def renamed(log: Log, known: Sequence[str]) -> Log:
     called, units = {}, dict(log.units)
     for name in log.signals:
         base, _, suffix = name.rpartition("_")
-        new = base in known or measured.JOINT.fullmatch(base)
-        if new and name not in {*known, *log.units} and base not in log.signals and is_unit(suffix):
+        new = base and (base in known or measured.JOINT.fullmatch(base))
+        if not new or name in {*known, *log.units} or base in log.signals:
+            continue
+        if len(suffix) > 1 and is_unit(suffix):  # a single letter may as well number motors
             called[name], units[base] = base, suffix
             say(f"{log.name}: {name}: read as {base} in {suffix}")
     if not called:
@@ -145,7 +147,10 @@ def repeats(values: np.ndarray) -> tuple[np.ndarray, int]:
 def _continuous(log: Log, name: str, start: float, limits: Sequence[float] | None) -> np.ndarray:
     """An angle without the jumps of its encoder, and begun in the turn in which the model begins."""
     times, recorded = log.samples(name)
-    found = angles.unwrapped(times, recorded, start, limits)
+    in_degrees = name not in log.units and np.abs(recorded).max() > 1.1 * angles.TURN
+    found = angles.Unwrapped(recorded) if in_degrees else angles.unwrapped(times, recorded, start, limits)
+    if not found.count and beyond_radians(log, name, limits):
+        return log.signals[name]
     values, turns = found.values, found.turns
     if not found.count and limits is None:
         turns = angles.whole_turns(start - values[0], WHOLE)

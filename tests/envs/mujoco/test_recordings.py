@@ -173,6 +173,20 @@ def test_an_encoder_is_made_continuous_and_begins_in_the_turn_of_the_model():
     np.testing.assert_allclose(found[:, 0], RECORDED["angle"], atol=1e-5)
 
 
+def test_an_encoder_without_a_unit_of_a_joint_with_limits():
+    """Its readings are beyond the limits, but are no degrees."""
+    limited = WHEEL.replace('name="axle"', 'name="axle" range="-100 100" limited="true" stiffness="0.3"')
+    times, recorded = simulated(xml=limited)
+    wrapped = recorded | {"angle": (recorded["angle"] - 0.3) % (2 * np.pi) + 0.3}
+    with pytest.warns(RecordingWarning) as caught:
+        own = mujoco_task(limited, [DAMPING], Log(times, wrapped, "a.csv", without("angle")), noises=NOISE)
+    assert ["begins anew after 6.283 rad" in str(one.message) for one in caught] == [True]
+    np.testing.assert_allclose(simulator_of(own).observation[:, 0], recorded["angle"], atol=1e-5)
+    degrees = recorded | {"angle": 5 / np.abs(recorded["angle"]).max() * recorded["angle"]}
+    with pytest.warns(RecordingWarning, match="angle: no unit, read in rad from .* if these are degrees"):
+        mujoco_task(limited, [DAMPING], Log(times, degrees, "a.csv", without("angle")), noises=NOISE)
+
+
 def test_a_beginning_elsewhere_is_said_once_for_each_signal():
     with pytest.warns(RecordingWarning) as caught:
         task([log(), log(angle=RECORDED["angle"] + 0.5, place=RECORDED["place"] - 0.1)])
