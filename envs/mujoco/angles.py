@@ -11,6 +11,10 @@ _NEIGHBOURS = 3
 """Steps on either side that say how fast an angle changes."""
 _AGREES, _SLACK = 0.25, 0.15
 """By how much a step may differ from its neighbours where the encoder begins anew: of the period, and in rad."""
+_MOST = 0.75
+"""Of the jumps: as many have to be such, as some readings may be lost."""
+_JUMP, _STEADY = 0.8, 0.2
+"""Of the readings' range: what is longer is a jump, where nearly all other steps are shorter than the second."""
 _BEYOND = 0.06
 """Of the period: by how much noise may carry readings beyond it."""
 _POSES = 8
@@ -73,6 +77,13 @@ def unwrapped(
     return Unwrapped(continuous + turns * period, period, jumps, turns, fastest)
 
 
+def jumps(values: Float[np.ndarray, " time"]) -> int:
+    """How often readings jump from one end of their range to the other, while they change little otherwise."""
+    steps = np.abs(np.diff(values)) / max(float(np.ptp(values)), 1e-300)
+    count = int(np.sum(steps > _JUMP))
+    return count if count > 1 and np.mean(steps < _STEADY) > _JUMP else 0
+
+
 def whole_turns(difference: float, tolerance: float) -> int:
     """How many turns a difference of angles is, where it is whole ones; otherwise 0."""
     turns = round(difference / TURN)
@@ -94,7 +105,7 @@ def _period(times: np.ndarray, values: np.ndarray) -> tuple[float, int]:
         visited = period >= TURN or np.histogram(values, _POSES)[0].all()
         if len(jumps) and visited and np.ptp(values) <= (1 + _BEYOND) * period:
             speeds = np.diff(np.unwrap(values, period=period)) / gaps
-            if all(_goes_on(speeds, gaps, jump, period, steps[jump]) for jump in jumps):
+            if np.mean([_goes_on(speeds, gaps, jump, period, steps[jump]) for jump in jumps]) >= _MOST:
                 return period, len(jumps)
     return 0.0, 0
 

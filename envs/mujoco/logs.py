@@ -53,7 +53,7 @@ class Log:
 
     Example:
         >>> log = Log([0, 10, 20], {"angle": [0.0, 90.0, 180.0]}, units={"time": "ms", "angle": "deg"})
-        >>> log.times[-1], log.signals["angle"].round(3).tolist(), log.units["angle"]
+        >>> float(log.times[-1]), log.signals["angle"].round(3).tolist(), log.units["angle"]
         (0.02, [0.0, 1.571, 3.142], 'rad')
     """
 

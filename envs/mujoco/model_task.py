@@ -44,7 +44,8 @@ def mujoco_task(
 
     A trajectory has a row for each time of the recordings at which something was measured, episodes one after another,
     and a column for each measured signal; what was not sampled is 0, in simulations too. Every episode begins in the
-    same state and has the same parameters.
+    same state and has the same parameters. Angles that wrap and orientations are put right first (`recordings`); that,
+    and what looks wrong (`plausible`), is said in a `logs.RecordingWarning`.
 
     Args:
         model: an MJCF file, its text, or a specification.

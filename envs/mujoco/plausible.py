@@ -121,7 +121,7 @@ def _check_times(log: Log, step: float) -> None:
     between = float(log.times[-1]) / (len(log.times) - 1)
     if between >= max(SLOWEST * step, LONGEST):
         text = f"{log.name}: expected times in s, got rows {between:.6g} apart, {between / step:.3g} steps of the model"
-        looks = looks_like(between, min(5 * step, LONGEST))
+        looks = looks_like(between, min(5 * step, LONGEST), ("ms", "us", "ns"))
         other = f"in {looks} they would be {parse(looks).factor * between:.3g} s apart"
         if TIME not in log.units:
             raise ValueError(f"{text}: {other}; give them in s, or with their unit, as 'time [{looks}]' or 'time [s]'")

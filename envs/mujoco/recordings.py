@@ -151,6 +151,11 @@ def _continuous(log: Log, name: str, start: float, limits: Sequence[float] | Non
     found = angles.Unwrapped(recorded) if in_degrees else angles.unwrapped(times, recorded, start, limits)
     if not found.count and beyond_radians(log, name, limits):
         return log.signals[name]
+    if not found.count and (count := angles.jumps(recorded)):
+        say(
+            f"{log.name}: {name}: jumps {_times(count)} by about {np.ptp(recorded):.3g} rad between two samples: left as "
+            "it is; if its encoder begins anew there, make it continuous"
+        )
     values, turns = found.values, found.turns
     if not found.count and limits is None:
         turns = angles.whole_turns(start - values[0], WHOLE)

@@ -401,7 +401,7 @@ def _seconds(name: str, times: np.ndarray, feature: Mapping[str, Any], fps: Any)
     seconds = unit.factor * times.astype(float)
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
     if isinstance(fps, int | float) and fps > 0 and step * fps > FARTHEST:
-        looks = units.looks_like(step, 1 / fps)
+        looks = units.looks_like(step, 1 / fps, ("ms", "us", "ns"))
         raise ValueError(
             f"{name}: expected seconds, {1 / fps:.3g} apart at {fps:g} frames a second, got {step:.6g} apart: they "
             f'look like {looks}; say so in meta/info.json, as "info": {{"unit": "{looks}"}} of this feature'

@@ -6,7 +6,7 @@ itself "g" is the acceleration of gravity, as accelerometers have it; in a produ
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 
@@ -110,14 +110,19 @@ def is_unit(text: str) -> bool:
     return True
 
 
-def looks_like(number: float, expected: float) -> str:
+def looks_like(number: float, expected: float, among: Sequence[str] = TIMES) -> str:
     """The unit of time in which a number is nearest to an expected number of seconds, in orders of magnitude.
+
+    Args:
+        number: of a time without a unit.
+        expected: in s.
+        among: the units that it may be in.
 
     Example:
         >>> looks_like(10.0, 0.01), looks_like(1e7, 0.02)
         ('ms', 'ns')
     """
-    return min(TIMES, key=lambda unit: abs(math.log(number * parse(unit).factor / expected)))
+    return min(among, key=lambda unit: abs(math.log(number * parse(unit).factor / expected)))
 
 
 def _factors(symbol: str) -> list[tuple[float, Mapping[str, int]]]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxlfi.envs.mujoco.angles import TURN, unwrapped
+from jaxlfi.envs.mujoco.angles import TURN, jumps, unwrapped
 
 TIMES = 0.01 * np.arange(400)
 ANGLE = 3 * np.sin(2 * TIMES) + 2 * TIMES
@@ -65,6 +65,21 @@ def test_other_jumps_are_no_encoders(angles):
     found = unwrapped(TIMES, angles, 0.0)
     assert not found.count
     np.testing.assert_array_equal(found.values, angles)
+
+
+def test_an_encoder_of_which_some_readings_are_lost():
+    readings = encoder(4 * ANGLE, -np.pi)
+    readings[250] = 0.0
+    found = unwrapped(TIMES, readings, 0.0)
+    kept = np.arange(400) != 250
+    np.testing.assert_allclose(found.values[kept], 4 * ANGLE[kept], atol=1e-9)
+
+
+def test_jumps_that_are_left_as_they_are_can_be_told():
+    """Of an encoder behind a gear, as its period is not known."""
+    assert jumps(encoder(ANGLE, 0.0, TURN / 7)) == np.sum(np.abs(np.diff(encoder(ANGLE, 0.0, TURN / 7))) > 0.5)
+    for angles in (ANGLE, SWING, 3.1 * np.sin(1.3 * np.arange(400)), np.zeros(400), np.arange(400) < 100):
+        assert jumps(np.asarray(angles, float)) == 0
 
 
 def test_of_fast_turns_it_is_said_that_they_are_hardly_told():
