@@ -152,10 +152,8 @@ def _continuous(log: Log, name: str, start: float, limits: Sequence[float] | Non
     if not found.count and beyond_radians(log, name, limits):
         return log.signals[name]
     if not found.count and (count := angles.jumps(recorded)):
-        say(
-            f"{log.name}: {name}: jumps {_times(count)} by about {np.ptp(recorded):.3g} rad between two samples: left as "
-            "it is; if its encoder begins anew there, make it continuous"
-        )
+        jumps = f"jumps {_times(count)} by about {np.ptp(recorded):.3g} rad between two samples"
+        say(f"{log.name}: {name}: {jumps}: left as it is; if its encoder begins anew there, make it continuous")
     values, turns = found.values, found.turns
     if not found.count and limits is None:
         turns = angles.whole_turns(start - values[0], WHOLE)
