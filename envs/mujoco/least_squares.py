@@ -101,7 +101,8 @@ class Residuals:
         """
         simulator = simulator_of(task)
         self._log, self.simulator, self.simulations = np.asarray(task.space.log), simulator, 0
-        self.observed = np.asarray(simulator.observation if observation is None else observation, float)
+        self.observed = simulator.observation if observation is None else simulator.aligned(np.asarray(observation))
+        self.observed = np.asarray(self.observed, float)
         columns = [self.observed[own, c] for c, own in enumerate(simulator.there.T)]
         self.noise = np.maximum(simulator.noise, [_NOISELESS * values.std() for values in columns])
         for c, _ in simulator.does.deviations:  # whose noise inference finds

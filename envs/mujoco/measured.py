@@ -14,14 +14,27 @@ _OF_JOINTS = {"qpos": mujoco.mjtSensor.mjSENS_JOINTPOS, "qvel": mujoco.mjtSensor
 _OF_BODIES = {"pos": mujoco.mjtSensor.mjSENS_FRAMEPOS, "quat": mujoco.mjtSensor.mjSENS_FRAMEQUAT}
 
 _UNITS = {
-    "m": ("FRAMEPOS", "GEOMDIST", "RANGEFINDER"),
-    "m/s": ("FRAMELINVEL", "VELOCIMETER"),
+    "s": ("CLOCK",),
+    "m": ("FRAMEPOS", "GEOMDIST", "GEOMFROMTO", "RANGEFINDER", "SUBTREECOM"),
+    "m/s": ("FRAMELINVEL", "VELOCIMETER", "SUBTREELINVEL"),
     "rad/s": ("FRAMEANGVEL", "GYRO", "BALLANGVEL"),
     "m/s^2": ("ACCELEROMETER", "FRAMELINACC"),
     "rad/s^2": ("FRAMEANGACC",),
     "N": ("FORCE", "TOUCH"),
     "N m": ("TORQUE",),
+    "1": ("FRAMEQUAT", "BALLQUAT", "FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS", "GEOMNORMAL"),
 }
+_PER_JOINT = {
+    mujoco.mjtSensor.mjSENS_JOINTPOS: ("rad", "m"),
+    mujoco.mjtSensor.mjSENS_JOINTLIMITPOS: ("rad", "m"),
+    mujoco.mjtSensor.mjSENS_JOINTVEL: ("rad/s", "m/s"),
+    mujoco.mjtSensor.mjSENS_JOINTLIMITVEL: ("rad/s", "m/s"),
+    mujoco.mjtSensor.mjSENS_JOINTACTFRC: ("N m", "N"),
+    mujoco.mjtSensor.mjSENS_JOINTLIMITFRC: ("N m", "N"),
+}
+"""Units of sensors of hinges and of slides."""
+_PER_ACTUATOR = {mujoco.mjtSensor.mjSENS_ACTUATORPOS: "", mujoco.mjtSensor.mjSENS_ACTUATORVEL: "/s"}
+"""Units of sensors of actuators, after that of their length."""
 _UNIT = {getattr(mujoco.mjtSensor, f"mjSENS_{kind}"): unit for unit, kinds in _UNITS.items() for kind in kinds}
 
 
@@ -70,14 +83,64 @@ def places(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
 
 
 def unit(model: mujoco.MjModel, name: str) -> str:
-    """The unit that a signal is measured in; "" where its sensor does not say."""
-    match, sensors = INDEXED.fullmatch(name), _sensors(model)
-    sensor = model.sensor(sensors.index(name if match is None or name in sensors else match["sensor"]))
-    kind = mujoco.mjtSensor(int(sensor.type[0]))
-    if kind in _OF_JOINTS.values():
-        hinge = model.jnt_type[int(sensor.objid[0])] == mujoco.mjtJoint.mjJNT_HINGE
-        return ("rad" if hinge else "m") + ("/s" if kind == _OF_JOINTS["qvel"] else "")
+    """The unit that a signal is measured in; "1" of orientations, and "" where its sensor does not say."""
+    sensor = _sensor(model, name)
+    kind, thing = mujoco.mjtSensor(int(sensor.type[0])), int(sensor.objid[0])
+    if kind in _PER_JOINT:
+        of_hinge, of_slide = _PER_JOINT[kind]
+        return of_hinge if model.jnt_type[thing] == mujoco.mjtJoint.mjJNT_HINGE else of_slide
+    if kind in _PER_ACTUATOR:
+        return length + _PER_ACTUATOR[kind] if (length := _length(model, thing)) else ""
     return _UNIT.get(kind, "")
+
+
+def joint_limits(model: mujoco.MjModel, name: str) -> tuple[float, float] | None:
+    """The limits of the joint whose position a signal is; None where there are none."""
+    sensor = _sensor(model, name)
+    joint = int(sensor.objid[0])
+    if mujoco.mjtSensor(sensor.type[0]) != _OF_JOINTS["qpos"] or not model.jnt_limited[joint]:
+        return None
+    return tuple(model.jnt_range[joint].tolist())
+
+
+def kinematic(model: mujoco.MjModel, name: str) -> bool:
+    """Whether a signal depends on positions and velocities only, and not on forces."""
+    stage = mujoco.mjtStage(_sensor(model, name).needstage[0])
+    return stage in (mujoco.mjtStage.mjSTAGE_POS, mujoco.mjtStage.mjSTAGE_VEL)
+
+
+def control_units(model: mujoco.MjModel, actuator: int) -> tuple[str, ...]:
+    """The units that an actuator's control may have; none where the model does not say.
+
+    Those of a servo are of what it controls. What applies a force may be driven by one, or by a voltage or current.
+    """
+    gain, bias = model.actuator_gainprm[actuator], model.actuator_biasprm[actuator]
+    kinds = model.actuator_gaintype[actuator], model.actuator_biastype[actuator], model.actuator_dyntype[actuator]
+    of_gain, of_bias, dynamics = mujoco.mjtGain(kinds[0]), mujoco.mjtBias(kinds[1]), mujoco.mjtDyn(kinds[2])
+    if of_gain != mujoco.mjtGain.mjGAIN_FIXED:
+        return ()
+    if of_bias == mujoco.mjtBias.mjBIAS_NONE:
+        return ("N m", "N", "V", "A", "1", "count") if dynamics == mujoco.mjtDyn.mjDYN_NONE else ()
+    length = _length(model, actuator)
+    if of_bias != mujoco.mjtBias.mjBIAS_AFFINE or not length or not gain[0]:
+        return ()
+    if bias[1] == -gain[0]:
+        return (f"{length}/s",) if dynamics == mujoco.mjtDyn.mjDYN_INTEGRATOR else (length,)
+    return (f"{length}/s",) if not bias[1] and bias[2] == -gain[0] else ()
+
+
+def _length(model: mujoco.MjModel, actuator: int) -> str:
+    """The unit of an actuator's length, "rad" or "m"; "" where it acts on no joint."""
+    of_joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    if mujoco.mjtTrn(model.actuator_trntype[actuator]) not in of_joints:
+        return ""
+    kind = mujoco.mjtJoint(model.jnt_type[model.actuator_trnid[actuator, 0]])
+    return {mujoco.mjtJoint.mjJNT_HINGE: "rad", mujoco.mjtJoint.mjJNT_SLIDE: "m"}.get(kind, "")
+
+
+def _sensor(model: mujoco.MjModel, name: str):
+    match, sensors = INDEXED.fullmatch(name), _sensors(model)
+    return model.sensor(sensors.index(name if match is None or name in sensors else match["sensor"]))
 
 
 def _sensors(model: mujoco.MjModel) -> list[str]:

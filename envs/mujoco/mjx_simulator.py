@@ -98,7 +98,7 @@ class MjxSimulator:
         for own, (signal, process) in zip(keys, native.discrepancies.items(), strict=True):
             each = zip(jax.random.split(own, len(native.times)), native.times, strict=True)
             rows = rows.at[:, signal].add(jnp.concatenate([process.draw(one, times) for one, times in each]))
-        return jnp.where(native.there, rows, 0.0), outcome
+        return jnp.where(native.there, native.aligned(rows), 0.0), outcome
 
     def clean(
         self, theta: Float[Array | np.ndarray, " dim"], lacking: Float[Array, " numbers"] | None = None
@@ -120,7 +120,7 @@ class MjxSimulator:
         rows = [between(self._grid, own, times) for own, times in zip(values, native.times, strict=True)]
         unstable = jnp.any(self._needed & ~stable)
         outcome = jnp.where(refused, REFUSED, jnp.where(unstable, UNSTABLE, 0))
-        return jnp.where(outcome == 0, biased(native.does, theta, jnp.concatenate(rows)), 0.0), outcome
+        return jnp.where(outcome == 0, native.aligned(biased(native.does, theta, jnp.concatenate(rows))), 0.0), outcome
 
     def _drawn(self, key: jax.Array) -> Float[Array, " numbers"] | None:
         """The coefficients of the forces that the model lacks, of one simulation."""

@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import columns, logs, noise, summaries
+from jaxlfi.envs.mujoco import columns, logs, noise, plausible, recordings, summaries
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
-from jaxlfi.envs.mujoco.effects import built, effects, initial_state
+from jaxlfi.envs.mujoco.effects import Effects, built, effects, initial_state
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -44,7 +44,8 @@ def mujoco_task(
 
     A trajectory has a row for each time of the recordings at which something was measured, episodes one after another,
     and a column for each measured signal; what was not sampled is 0, in simulations too. Every episode begins in the
-    same state and has the same parameters.
+    same state and has the same parameters. Angles that wrap and orientations are put right first (`recordings`); that,
+    and what looks wrong (`plausible`), is said in a `logs.RecordingWarning`.
 
     Args:
         model: an MJCF file, its text, or a specification.
@@ -78,6 +79,7 @@ def mujoco_task(
         raise ValueError("expected at least one recording and one parameter, got none")
     episodes = [one if isinstance(one, Log) else logs.read(Path(one)) for one in several]
     actuators, sensors = ([one.name for one in several] for several in (spec.actuators, spec.sensors))
+    episodes = [recordings.renamed(one, [*sensors, *actuators, *(measured or ())]) for one in episodes]
     episodes = [columns.arranged(one, actuators, sensors) for one in episodes]
     noises = columns.by_signal(noises, sensors, "noises")
     discrepancies = columns.by_signal(discrepancies, sensors, "discrepancy")
@@ -90,16 +92,21 @@ def mujoco_task(
     names = [one.name for one in parameters]
     columns.require_measured(episodes[0], measured, actuators)
     inferred = {signal for signal in measured if f"sensor/{signal.removeprefix('sensor/')}/noise" in names}
-    deviations = _deviations(episodes[0], measured, noises, inferred)
+    _check_noises(episodes[0], measured, noises, inferred)
     add_sensors(spec, measured)
     compiled = compile_spec(spec)
     does = effects(spec, compiled, names, [one.support for one in parameters], measured)
+    start = initial_state(compiled, initial or {})
+    begins = _started(does, start, np.array([_centre(one) for one in parameters]))
+    episodes = [recordings.prepared(compiled, log, measured, begins) for log in episodes]
+    deviations = _deviations(episodes[0], measured, noises, inferred)
 
     build = functools.partial(built, spec, does)
-    starts = [initial_state(compiled, initial or {})] * len(episodes)
+    starts = [start] * len(episodes)
     if unknown := [name for name in discrepancies if name not in measured]:
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
     simulator = Simulator(compiled, build, episodes, measured, deviations, starts, does, discrepancies, threads)
+    _check_starts(simulator, parameters, deviations)
     others = {"name": spec.modelname or "mujoco"} | others
     task = task_of(simulator, parameters, measured, summary, supports, unmodelled_force, **others)
     if engine == "native":
@@ -196,26 +203,54 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
         raise ValueError(f"model: MuJoCo refuses it: {' '.join(str(error).split())}") from error
 
 
-def _deviations(log: Log, measured: Sequence[str], given: Mapping[str, float], inferred: set[str]) -> dict[str, float]:
-    """Standard deviations of the noise of signals: given, inferred (here 0), or estimated."""
+def _check_noises(log: Log, measured: Sequence[str], given: Mapping[str, float], inferred: set[str]) -> None:
     if unknown := [name for name in given if name not in measured]:
         raise ValueError(f"noises: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
+    for name in measured:
+        if name in given and not float(given[name]) >= 0:
+            raise ValueError(f"noises: {name}: expected a standard deviation of at least 0, got {given[name]}")
+        if name not in log.signals and name not in {*given, *inferred}:
+            raise ValueError(f"measured: expected signals of {log.name}: {', '.join(log.signals)}; got {name!r}")
+
+
+def _deviations(log: Log, measured: Sequence[str], given: Mapping[str, float], inferred: set[str]) -> dict[str, float]:
+    """Standard deviations of the noise of signals: given, inferred (here 0), or estimated."""
     found = {}
     for name in measured:
         if name in given:
             found[name] = float(given[name])
-            if not found[name] >= 0:
-                raise ValueError(f"noises: {name}: expected a standard deviation of at least 0, got {given[name]}")
         elif name in inferred:
             found[name] = 0.0
-        elif name not in log.signals:
-            raise ValueError(f"measured: expected signals of {log.name}: {', '.join(log.signals)}; got {name!r}")
         else:
             try:
                 found[name] = noise.standard_deviation(log.signals[name])
             except ValueError as error:
                 raise ValueError(f"noises: {name}: {error}") from error
     return found
+
+
+def _started(does: Effects, start: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """The state that the model of a parameter vector begins in."""
+    state = start.copy()
+    for place, d in does.starts:
+        state[place] = theta[d]
+    return state
+
+
+def _check_starts(simulator: Simulator, parameters: Sequence[Parameter], noises: Mapping[str, float]) -> None:
+    """Say where recordings begin elsewhere than the model does for all parameters that are possible."""
+    does, begins = simulator.does, []
+    bounds = np.array([one.feasible or one.support for one in parameters])
+    for theta in (np.array([_centre(one) for one in parameters]), *bounds.T):
+        try:
+            model = simulator.build(theta) if does.edits else simulator.model
+        except ValueError:
+            continue  # such simulations fail, and are counted
+        begins.append(plausible.sensed(model, _started(does, simulator.starts[0], theta)))
+    biased = {signal for signal, _ in does.biases}
+    compared = [name for number, name in enumerate(simulator.signals) if number not in biased]
+    for log in simulator.logs if begins else ():
+        plausible.check_start(simulator.model, log, compared, noises, begins)
 
 
 def _box(bounds: Sequence[tuple[float, float]]) -> Support:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxlfi.envs.mujoco.measured import places
+from jaxlfi.envs.mujoco.orientations import continuous
 
 _SIZES = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}
 """Numbers of the positions of joints that have more than one; the last four are a quaternion."""
@@ -64,8 +65,10 @@ def recorded_positions(
     for i in range(model.njnt):
         if len(own := _positions(model.joint(i))) > 1:
             # A quaternion and its negative are the same turn, and between the two there is none.
-            flips = np.sum(samples[1:, own[-4:]] * samples[:-1, own[-4:]], axis=1) < 0
-            samples[1:, own[-4:]] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+            turns = continuous(rows[:, [numbers[place] for place in own[-4:]]])
+            there = np.isfinite(turns).all(axis=1)
+            for place, values in zip(own[-4:], turns[there].T, strict=True):
+                samples[:, place] = np.interp(times, times[there], values)
     positions = np.stack([np.interp(when, times, column) for column in samples.T], axis=1)
     for qpos in positions:
         mujoco.mj_normalizeQuat(model, qpos)

@@ -10,12 +10,13 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxlfi.envs.mujoco import measured
+from jaxlfi.envs.mujoco import measured, orientations
 from jaxlfi.envs.mujoco.columns import controls_of
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import STATE, Effects
 from jaxlfi.envs.mujoco.forces import UnmodelledForces, typical
 from jaxlfi.envs.mujoco.logs import Log
+from jaxlfi.envs.mujoco.plausible import check
 from jaxlfi.envs.mujoco.quiet import quietly
 from jaxlfi.io.host_devices import processors
 from jaxlfi.tasks.task import Task
@@ -25,6 +26,8 @@ CHUNK = 128
 """Models that are rolled out in one call, at most."""
 MEMORY = 2**27
 """Bytes that the states, sensors and controls of one call may take: of long episodes fewer models are rolled out."""
+LARGEST = 2**33
+"""Bytes that those of a single simulation may take."""
 UNSTABLE, REFUSED = 1, 2
 """Why a simulation fails, as `FAILURES` numbers it."""
 FAILURES = ("unstable", "refused by MuJoCo")
@@ -44,6 +47,7 @@ class Simulator:
         noise: standard deviation of each signal's noise, shape [C]; 0 where it is inferred.
         actuators: names of the controls (`columns`).
         places: of the signals among the model's sensor data, C of them.
+        orientations: among the signals, whose quaternions are compared as rotations (`aligned`).
         discrepancies: what the model gets wrong, by the signal's number.
         forces: that the model lacks, if any are drawn (`lacking`).
         model, build, does, logs, starts: as they are given, below.
@@ -80,7 +84,7 @@ class Simulator:
         self.model, self.build, self.does = model, build, does
         self.logs, self.signals, self.starts = tuple(logs), tuple(signals), tuple(starts)
         self.places = measured.places(model, signals)
-        self.units = tuple(measured.unit(model, name) for name in signals)
+        self.units = tuple(measured.unit(model, name).removeprefix("1") for name in signals)
         self.noise = np.array([noise[name] for name in signals])
         self.discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
         self.forces: UnmodelledForces | None = None
@@ -93,6 +97,7 @@ class Simulator:
                 for log, own in zip(logs, rows, strict=True)
             ]
         )
+        self.orientations = tuple(orientations.groups(model, self.places).values())
         self.there = np.isfinite(recorded)
         self.observation = np.where(self.there, recorded, 0.0).astype(np.float32)
         self._chunk = int(np.clip(MEMORY // self._bytes(), 1, CHUNK))
@@ -155,8 +160,15 @@ class Simulator:
 
     def _bytes(self) -> int:
         """Bytes of the states, sensors and controls of a simulation of the longest episode."""
-        numbers = mujoco.mj_stateSize(self.model, STATE) + self.model.nsensordata + self.model.nu
-        return int(8 * numbers * (max(times[-1] for times in self.times) / self.model.opt.timestep + 2))
+        step, size = self.model.opt.timestep, mujoco.mj_stateSize(self.model, STATE)
+        longest = int(np.argmax([times[-1] for times in self.times]))
+        steps = self.times[longest][-1] / step + 2
+        if (taken := 8 * steps * (size + self.model.nsensordata + self.model.nu)) > LARGEST:
+            raise ValueError(
+                f"{self.logs[longest].name}: expected an episode whose simulation fits into memory, got one of "
+                f"{self.times[longest][-1]:.6g} s, {steps:.3g} steps of {step:g} s"
+            )
+        return int(taken)
 
     def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
         """Rows of a log with a sample of anything that is measured."""
@@ -168,14 +180,12 @@ class Simulator:
             )
         if missing := [name for name in self.signals if name not in log.signals]:
             raise ValueError(f"{log.name}: expected signals {', '.join(missing)}, got {known}")
-        for name, unit in zip(self.signals, self.units, strict=True):
-            if unit and log.units.get(name, unit) != unit:
-                raise ValueError(f"{log.name}: {name}: expected {unit} as the sensor, got {log.units[name]}")
         if log.times[-1] < self.model.opt.timestep:
             raise ValueError(
                 f"{log.name}: expected more than a step of the model, {self.model.opt.timestep:g} s, "
                 f"got {log.times[-1]:g} s"
             )
+        check(self.model, log, self.signals)
         return np.flatnonzero(np.isfinite([log.signals[name] for name in self.signals]).any(axis=0))
 
     def __call__(
@@ -189,7 +199,13 @@ class Simulator:
         noisy = clean + deviation[:, None] * rng.standard_normal(clean.shape)
         for signal, process in self.discrepancies.items():
             noisy[:, :, signal] += np.concatenate([process.draws(rng, len(theta), own) for own in self.times], axis=1)
-        return np.where(self.there, noisy, 0.0), outcome
+        return np.where(self.there, self.aligned(noisy), 0.0), outcome
+
+    def aligned(
+        self, rows: Float[np.ndarray | Array, "*n rows signals"]
+    ) -> Float[np.ndarray | Array, "*n rows signals"]:
+        """Measurements with orientations of norm 1 and of the sign that is nearer to the recorded ones."""
+        return orientations.aligned(rows, self.observation, self.orientations)
 
     def clean(
         self, theta: Float[np.ndarray, "n dim"], lacking: Float[np.ndarray, "n numbers"] | None = None
@@ -209,6 +225,7 @@ class Simulator:
                 rows[part], outcome[part] = self._rolled(theta[part], lacking[part])
         for signal, d in self.does.biases:
             rows[:, :, signal] += theta[:, d, None]
+        rows = self.aligned(rows)
         rows[outcome != 0] = 0.0
         return rows, outcome
 

@@ -2,7 +2,7 @@
 
 | name | what, of each episode and signal |
 |---|---|
-| `samples` | up to 30 rows at equal intervals, as they are |
+| `samples` | up to 30 rows at about equal intervals, as they are |
 | `cross-correlation` | correlations with the controls and with itself, at some lags; means and standard deviations |
 | `spectrum` | the mean, and the logarithm of the power in bands of frequency |
 | `learnt` | all rows, through convolutions that are trained with the density in every round |
@@ -170,7 +170,8 @@ def regular(times: Sequence[np.ndarray], there: np.ndarray) -> tuple[Regular, ..
 
 
 def _samples(simulator: Simulator) -> dict[str, Any]:
-    return {"summary": functools.partial(samples, rows=_rows([len(times) for times in simulator.times]))}
+    lengths = [len(times) for times in simulator.times]
+    return {"summary": functools.partial(samples, rows=_rows(np.split(simulator.there, np.cumsum(lengths)[:-1])))}
 
 
 def _cross_correlation(simulator: Simulator) -> dict[str, Any]:
@@ -224,12 +225,23 @@ def fields(summary: str | Summary, simulator: Simulator) -> dict[str, Any]:
     return OWN[summary](simulator) if summary in OWN else {"summary": summary}
 
 
-def _rows(lengths: Sequence[int]) -> tuple[int, ...]:
-    """Rows at equal intervals of episodes that lie one after another, the first and the last among them."""
+def _rows(there: Sequence[np.ndarray]) -> tuple[int, ...]:
+    """Rows at about equal intervals of episodes that lie one after another, the first and the last among them.
+
+    Where signals have clocks of their own, those rows are taken that have samples of all, if there are enough of them.
+
+    Args:
+        there: whether there is a sample, shape [T, C] for each episode.
+    """
     rows, begin = [], 0
-    for length in lengths:
-        rows += [begin + int(row) for row in np.unique(np.linspace(0, length - 1, min(SAMPLES, length)).round())]
-        begin += length
+    for own in there:
+        known = np.flatnonzero(own.all(axis=1))
+        if len(known) < min(SAMPLES, len(own)):
+            known = np.arange(len(own))
+        wanted = np.linspace(known[0], known[-1], min(SAMPLES, len(own)))
+        nearest = known[np.argmin(np.abs(known[:, None] - wanted.round()), axis=0)]
+        rows += [begin + int(row) for row in np.unique(nearest)]
+        begin += len(own)
     return tuple(rows)
 
 

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from jaxlfi.envs.mujoco import noise as noises
+from jaxlfi.envs.mujoco import plausible, recordings
 from jaxlfi.envs.mujoco.columns import controls_of
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import signals_of
@@ -65,7 +66,12 @@ def from_sysid(
         _log(f"{sequences.name}/{name}", control, sensed, model, signals)
         for name, control, sensed in zip(sequences.sequence_name, sequences.control, sequences.sensordata, strict=True)
     ]
+    starts = sequences.initial_state
+    several = zip(episodes, starts, strict=True)
+    episodes = [recordings.prepared(model, log, signals, np.asarray(start)) for log, start in several]
     deviations = {name: _deviation(name, noise or {}, episodes[0]) for name in signals}
+    for log, start in zip(episodes, starts, strict=True):
+        plausible.check_start(model, log, signals, deviations, [plausible.sensed(model, np.asarray(start))])
 
     def build(theta: np.ndarray) -> mujoco.MjModel:
         own = parameters.copy()  # modifiers read their values
@@ -85,7 +91,7 @@ def from_sysid(
     ]
     summary, threads = others.pop("summary", "samples"), others.pop("threads", None)
     unmodelled_force = others.pop("unmodelled_force", 0.0)
-    simulator = Simulator(model, build, episodes, signals, deviations, sequences.initial_state, threads=threads)
+    simulator = Simulator(model, build, episodes, signals, deviations, starts, threads=threads)
     others = {"name": sequences.name} | others
     return task_of(simulator, doubted, signals, summary, unmodelled_force=unmodelled_force, **others)
 

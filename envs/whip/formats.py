@@ -22,6 +22,7 @@ from jaxlfi.envs.whip.frames import COLOURS
 from jaxlfi.envs.whip.recording import ORDER, UNITS, Recording
 from jaxlfi.envs.whip.rules import STEPS
 from jaxlfi.io import lerobot, mcap
+from jaxlfi.io.lerobot import EPISODE, located
 from jaxlfi.io.rollout import Rollout, Signal
 from jaxlfi.io.serialise import json_safe
 
@@ -36,7 +37,6 @@ OBSERVED = {
 """Signals of the frames: the array of a recording, and the names of its numbers."""
 ACTIONS = ("dx", "dz")
 FORMATS = "NAME.npz, NAME.mcap or a folder (a LeRobot data set)"
-EPISODE = "#episode="
 
 
 def read(reference: str | Path) -> Recording:
@@ -99,20 +99,6 @@ def write(path: str | Path, several: Sequence[Recording]) -> None:
             shown = ", ".join(f"{rate:g}" for rate in sorted(rates))
             raise ValueError(f"frame_rate: expected the same of all episodes of a data set, got {shown} Hz")
         lerobot.write(path, [as_rollout(one) for one in several], STATE, several[0].frame_rate)
-
-
-def located(reference: str | Path) -> tuple[Path, int | None]:
-    """The path and, after "#episode=", the number that a reference names.
-
-    Raises:
-        ValueError: for what is no number.
-    """
-    path, mark, number = str(reference).rpartition(EPISODE)
-    if not mark or Path(reference).exists():
-        return Path(reference), None
-    if not (number.isascii() and number.isdigit()):
-        raise ValueError(f"recording: expected a number after {EPISODE}, got {number!r}")
-    return Path(path), int(number)
 
 
 def as_rollout(recording: Recording) -> Rollout:

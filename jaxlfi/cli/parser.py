@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 
 import jaxlfi
 from jaxlfi import factories, flags, plugins, source_fields
-from jaxlfi.cli import help_texts, interrupts, joined
+from jaxlfi.cli import help_texts, interrupts, joined, warned
 from jaxlfi.cli.exit_status import refuse, resuming
 from jaxlfi.fields import Declared
 
@@ -518,7 +518,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     if argv is None:
         return interrupts.watched(lambda: main(sys.argv[1:]))
-    words = list(argv)
+    with warned.in_lines():
+        return _run(list(argv))
+
+
+def _run(words: list[str]) -> int:
     try:
         foreign = foreign_command(words[0]) if words else None
     except ValueError as error:

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxlfi.io import files
+from jaxlfi.io import files, units
 from jaxlfi.io.formats import require_version
 from jaxlfi.io.rollout import Rollout, Signal, array, numbers
 
@@ -36,6 +36,10 @@ COUNTED = ("frame_index", "episode_index", "index", "task_index")
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 INSTALL = "LeRobot data sets need the package pyarrow: pip install 'jaxlfi[robotics]'"
+EPISODE = "#episode="
+"""What stands between the folder of a data set and the number of an episode in a reference to that episode."""
+FARTHEST = 100.0
+"""Intervals at the frame rate that successive time stamps may be apart, in the median."""
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 
@@ -109,6 +113,20 @@ def episodes(path: str | Path) -> list[int]:
         raise ValueError(f"{path}: {error}") from error
 
 
+def located(reference: str | Path) -> tuple[Path, int | None]:
+    """The path and, after "#episode=", the number that a reference names.
+
+    Raises:
+        ValueError: for what is no number.
+    """
+    path, mark, number = str(reference).rpartition(EPISODE)
+    if not mark or Path(reference).exists():
+        return Path(reference), None
+    if not (number.isascii() and number.isdigit()):
+        raise ValueError(f"recording: expected a number after {EPISODE}, got {number!r}")
+    return Path(path), int(number)
+
+
 def read(path: str | Path, episode: int | None = None) -> Rollout:
     """Read an episode of a data set.
 
@@ -127,7 +145,10 @@ def read(path: str | Path, episode: int | None = None) -> Rollout:
     try:
         listed = _episodes(path)
         if episode is None and len(listed) != 1:
-            raise ValueError(f"expected the number of one of its {len(listed)} episodes, got none")
+            raise ValueError(
+                f"expected the number of one of its {len(listed)} episodes, got none: name it as "
+                f"{path.name}{EPISODE}{min(listed)}"
+            )
         number = next(iter(listed)) if episode is None else episode
         if number not in listed:
             raise ValueError(f"expected an episode from {min(listed)} to {max(listed)}, got {number}")
@@ -341,13 +362,13 @@ def _rollout(path: Path, info: Mapping[str, Any], number: int, row: Mapping[str,
     clock = CLOCK if CLOCK in columns and columns[CLOCK].shape[1] == 1 else "timestamp"
     if clock not in columns:
         raise ValueError("expected a feature timestamp, got none")
-    times = columns[clock][:, 0].astype(float)
+    times = _seconds(clock, columns[clock][:, 0], features[clock], info.get("fps"))
     signals = {}
     for name, values in columns.items():
         if name in (CLOCK, "timestamp"):
             continue
         words = _words(name, features[name].get("names"), values.shape[1])
-        unit = (features[name].get("info") or {}).get("unit") or ""
+        unit = _unit(name, features[name])
         signal = Signal(times, values, words, unit)
         if name in own["signals"]:
             apart = own["signals"][name]
@@ -360,6 +381,33 @@ def _rollout(path: Path, info: Mapping[str, Any], number: int, row: Mapping[str,
                 )
         signals[name] = signal
     return Rollout(signals, own["metadata"], (row.get("tasks") or [""])[0])
+
+
+def _unit(name: str, feature: Mapping[str, Any]) -> str | tuple[str, ...]:
+    """The unit of a feature's numbers, or the units of each, where its description says so."""
+    info = feature.get("info") or {}
+    unit = (info.get("unit") or info.get("units") or "") if isinstance(info, Mapping) else ""
+    if isinstance(unit, list) and all(isinstance(one, str) for one in unit):
+        return tuple(unit)
+    if not isinstance(unit, str):
+        raise ValueError(f"{name}: expected a unit as text, or a list of them, got {unit!r}")
+    return unit
+
+
+def _seconds(name: str, times: np.ndarray, feature: Mapping[str, Any], fps: Any) -> np.ndarray:
+    """Time stamps in s: by the unit that the data set says they have, and as far apart as its frames are."""
+    unit = units.parse(str(_unit(name, feature)))
+    if unit.name not in ("", "s"):
+        raise ValueError(f"{name}: expected a unit of time, got {_unit(name, feature)!r}")
+    seconds = unit.factor * times.astype(float)
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    if isinstance(fps, int | float) and fps > 0 and step * fps > FARTHEST:
+        looks = units.looks_like(step, 1 / fps, ("ms", "us", "ns"))
+        raise ValueError(
+            f"{name}: expected seconds, {1 / fps:.3g} apart at {fps:g} frames a second, got {step:.6g} apart: they "
+            f'look like {looks}; say so in meta/info.json, as "info": {{"unit": "{looks}"}} of this feature'
+        )
+    return seconds
 
 
 def _own(text: str | None) -> dict[str, Any]:

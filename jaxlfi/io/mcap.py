@@ -2,8 +2,9 @@
 
 Each signal is a topic, "observation.state" is /observation/state, with messages encoded as JSON of the schema
 `jaxlfi.Signal`: {"time": 0.16, "values": [0.4, 0.36]}. What the numbers are is in the channel's metadata: `dtype`,
-`names` (a JSON list), `unit`, `duration`. The rollout's metadata are in the record `jaxlfi.rollout`. A file may have
-topics of other schemas; they are not read.
+`names` (a JSON list), `unit` (or a JSON list of them), `duration`. Units may also stand in the JSON schema, as the
+`unit` of its property `values`, or of its property `time` where times are not in s. The rollout's metadata are in the
+record `jaxlfi.rollout`. A file may have topics of other schemas; they are not read.
 
 Times of the log are ns from the first message on. Those of the rollout, which may begin before zero, are in the
 messages, in full precision.
@@ -19,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxlfi.io import files
+from jaxlfi.io import files, units
 from jaxlfi.io.formats import require_version
 from jaxlfi.io.rollout import Rollout, Signal, array, numbers
 
@@ -55,7 +56,7 @@ def write(path: str | Path, rollout: Rollout) -> None:
     messages = []
     for name, signal in rollout.signals.items():
         schema = writer.register_schema(SCHEMA, "jsonschema", json.dumps(_schema(signal)).encode())
-        metadata = {"dtype": signal.values.dtype.name, "names": json.dumps(signal.names), "unit": signal.unit}
+        metadata = {"dtype": signal.values.dtype.name, "names": json.dumps(signal.names), "unit": _unit_text(signal)}
         if signal.duration is not None:
             metadata["duration"] = repr(float(signal.duration))
         channel = writer.register_channel(_topic(name), "json", schema, metadata)
@@ -124,14 +125,15 @@ def _schema(signal: Signal) -> dict[str, Any]:
 
 
 def _rollout(messages: list[tuple[Any, Any, bytes]], records: Mapping[str, Mapping[str, str]]) -> Rollout:
-    channels, times, values = {}, {}, {}
+    channels, times, values, said = {}, {}, {}, {}
     others = set()
     for schema, channel, data in messages:
         if schema is None or schema.name != SCHEMA or channel.message_encoding != "json":
             others.add(f"{channel.topic} ({schema.name if schema else 'no schema'}, {channel.message_encoding})")
             continue
         name = _name(channel.topic)
-        channels[name] = channel
+        if name not in channels:
+            channels[name], said[name] = channel, _said(schema.data)
         time, row = _message(channel.topic, data)
         times.setdefault(name, []).append(time)
         values.setdefault(name, []).append(row)
@@ -140,7 +142,11 @@ def _rollout(messages: list[tuple[Any, Any, bytes]], records: Mapping[str, Mappi
     signals = {}
     for name, channel in channels.items():
         try:
-            signals[name] = _signal(channel.metadata, times[name], values[name])
+            unit = units.parse(said[name].get("time", "s"))
+            if unit.name != "s":
+                raise ValueError(f"expected times in a unit of time, got {said[name]['time']!r}")
+            when = [unit.factor * time for time in times[name]]
+            signals[name] = _signal({"unit": said[name].get("values", ""), **channel.metadata}, when, values[name])
         except ValueError as error:
             raise ValueError(f"{channel.topic}: {error}") from error
     record = records.get(RECORD, {"version": str(VERSION)})
@@ -151,6 +157,15 @@ def _rollout(messages: list[tuple[Any, Any, bytes]], records: Mapping[str, Mappi
         return Rollout(signals, dict(metadata), record.get("task", ""))
     except (ValueError, TypeError) as error:
         raise ValueError(f"expected a JSON object as metadata in the record {RECORD}, got another text") from error
+
+
+def _said(schema: bytes) -> dict[str, str]:
+    """The units that a JSON schema says of its properties."""
+    try:
+        properties = json.loads(schema)["properties"]
+        return {name: one["unit"] for name, one in properties.items() if isinstance(one.get("unit"), str)}
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return {}
 
 
 def _message(topic: str, data: bytes) -> tuple[float, list]:
@@ -178,7 +193,20 @@ def _signal(metadata: Mapping[str, str], times: list[float], rows: list[list]) -
         raise ValueError(f"expected names as a JSON list and a duration in s, got {dict(metadata)}") from error
     # In the order of time: messages of the same instant may stand in any.
     order = np.argsort(times, kind="stable")
-    return Signal(np.asarray(times)[order], values[order], names, metadata.get("unit", ""), duration)
+    return Signal(np.asarray(times)[order], values[order], names, _unit(metadata.get("unit", "")), duration)
+
+
+def _unit_text(signal: Signal) -> str:
+    return signal.unit if isinstance(signal.unit, str) else json.dumps(signal.unit)
+
+
+def _unit(text: str) -> str | tuple[str, ...]:
+    """One unit, or a JSON list with that of each number."""
+    try:
+        several = json.loads(text) if text.startswith("[") else None
+    except ValueError:
+        return text
+    return text if several is None else tuple(map(str, several))
 
 
 def _some(names: set[str]) -> str:

@@ -22,7 +22,7 @@ class Signal:
         times: in s, shape [N], at least one, not decreasing.
         values: booleans, integers or floats, shape [N, n].
         names: of the n numbers.
-        unit: of the numbers.
+        unit: of the numbers, or those of each.
         duration: of a value in s, after which the signal is zero; by default a value lasts until the next.
 
     Raises:
@@ -37,7 +37,7 @@ class Signal:
     times: np.ndarray
     values: np.ndarray
     names: tuple[str, ...]
-    unit: str = ""
+    unit: str | tuple[str, ...] = ""
     duration: float | None = None
 
     def __post_init__(self):
@@ -52,8 +52,15 @@ class Signal:
         names = tuple(self.names)
         if len(names) != values.shape[1]:
             raise ValueError(f"names: expected {values.shape[1]}, one for each number, got {len(names)}")
+        if not isinstance(self.unit, str) and len(self.unit) != values.shape[1]:
+            raise ValueError(f"unit: expected one, or {values.shape[1]} for the numbers, got {len(self.unit)}")
         for name, value in (("times", times), ("values", values), ("names", names)):
             object.__setattr__(self, name, value)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each number."""
+        return (self.unit,) * len(self.names) if isinstance(self.unit, str) else tuple(self.unit)
 
     def held(self, times: Sequence[float]) -> np.ndarray:
         """The values that are in force at other times [F]; zero before the first one. Returns [F, n]."""

@@ -66,13 +66,13 @@ def test_the_file_is_what_the_documentation_says(tmp_path):
     assert action.log_time == pytest.approx(-first * 1e9, abs=1)
 
 
-def by_hand(path, *topics, record=None):
+def by_hand(path, *topics, record=None, described=b"{}"):
     """A file of another program: (topic, schema, encoding, channel's metadata, bodies)."""
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()
     for topic, name, encoding, metadata, bodies in topics:
-        schema = writer.register_schema(name, "jsonschema", b"{}") if name else 0
+        schema = writer.register_schema(name, "jsonschema", described) if name else 0
         channel = writer.register_channel(topic, encoding, schema, metadata)
         for i, body in enumerate(bodies):
             writer.add_message(channel, 10**18 + i, body, 10**18 + i)
@@ -95,6 +95,20 @@ def test_what_others_wrote_is_read_beside_their_own_topics(tmp_path):
     state = read.signals["observation.state"]
     assert state.times.tolist() == [0.5, 1.0] and state.names == ("0", "1") and state.unit == ""
     np.testing.assert_array_equal(state.values, [[1.5, np.nan], [2.0, 3.0]])
+
+
+def test_units_stand_in_the_metadata_or_in_the_schema(tmp_path):
+    said = {"properties": {"time": {"unit": "ms"}, "values": {"unit": "deg"}}}
+    path = by_hand(tmp_path / "one.mcap", STATE, described=json.dumps(said).encode())
+    state = mcap.read(path).signals["observation.state"]
+    assert state.times.tolist() == [0.0005, 0.001] and state.units == ("deg", "deg")
+    path = by_hand(tmp_path / "two.mcap", with_state({"unit": '["mm", "N"]'}), described=json.dumps(said).encode())
+    assert mcap.read(path).signals["observation.state"].units == ("mm", "N")
+    path = by_hand(tmp_path / "three.mcap", STATE, described=b'{"properties": {"time": {"unit": "mm"}}}')
+    with pytest.raises(ValueError, match="/observation/state: expected times in a unit of time, got 'mm'"):
+        mcap.read(path)
+    with pytest.raises(ValueError, match="unit: expected one, or 2 for the numbers, got 1"):
+        mcap.read(by_hand(tmp_path / "four.mcap", with_state({"unit": '["mm"]'})))
 
 
 def with_state(metadata, *bodies):
