@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxlfi.estimators.normaliser import RESOLVED
+from jaxlfi.tasks.reference import RESOLVED
 
 SHOWN = 3
 """Names in a warning; of others their number."""

@@ -12,14 +12,14 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
+from jaxlfi.tasks.reference import RESOLVED
+
 UNITS = np.logspace(-3, 2, 11).astype(np.float32)
 """Units of asinh that are tried, relative to the median distance from the origin that is tried."""
 ORIGINS = (0.0, 0.5, 1.0)
 """Origins of asinh that are tried: quantiles of a summary. From the least, asinh is a logarithm of an upper tail."""
 ROWS = 256
 """Simulations that origin and unit are chosen by, at most; the moments are those of all."""
-RESOLVED = 8.0
-"""Spread of a summary, in units of the last place of its largest value, below which it does not vary."""
 
 
 @struct.dataclass

@@ -13,6 +13,9 @@ import numpy as np
 
 from jaxlfi.tasks.task import Task
 
+RESOLVED = 8.0
+"""Range of a number, in units of the last place of its largest value, up to which it counts as not varying."""
+
 
 def summaries_in_double(task: Task, trajectories: np.ndarray) -> np.ndarray:
     """Summaries of trajectories [N, ...] as float64, shape [N, S]; as precise as `task.summary` calculates."""
