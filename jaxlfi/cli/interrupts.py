@@ -26,7 +26,7 @@ INTERRUPTED = 130
 """The exit status after SIGINT, as that of any program which it ends."""
 UNREAD = 141
 """The exit status where nobody reads the output any more, as that of any program which SIGPIPE ends."""
-PATIENCE = 0.5
+PATIENCE = 0.4
 """Seconds from the signal within which KeyboardInterrupt has to end the process."""
 LOOK = 0.02
 """Seconds between two looks at whether it was lost."""
