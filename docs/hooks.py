@@ -66,10 +66,10 @@ def fields_table(reference: str) -> str:
 def help_text(command: str) -> str:
     """What a command prints about itself."""
     os.environ["COLUMNS"] = "100"
-    from jaxlfi.cli.parser import Families, foreign_commands, parser
+    from jaxlfi.cli.parser import Families, foreign_command, parser
 
-    if point := foreign_commands().get(command):
-        return f"```text\n{importlib.import_module(point.module).parser().format_help().strip()}\n```"
+    if main := foreign_command(command):
+        return f"```text\n{sys.modules[main.__module__].parser().format_help().strip()}\n```"
     words = [command] if command != "jaxlfi" else []
     top = parser(Families.of(words))
     (commands,) = [action for action in top._actions if getattr(action, "choices", None) and action.dest == "command"]

@@ -97,7 +97,7 @@ def named(word: str, reference: str) -> Any:
     module, _, attribute = reference.partition(":")
     if module.endswith(".py"):
         raise ValueError(
-            f"{word}: expected module:name, got {reference!r}: leave out '.py' and run in the file's folder"
+            f"{word}: expected module:name, got {reference!r}: leave out '.py' and run from the file's folder"
         )
     return _loaded(word, repr(reference), module, attribute)
 

@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
-from jaxlfi.cli import tables
+from jaxlfi.cli import interrupts, tables
 from jaxlfi.envs.whip import control as controlling
 from jaxlfi.envs.whip import formats, planner
 from jaxlfi.envs.whip import recording as recordings
@@ -149,7 +149,8 @@ def control(arguments: argparse.Namespace) -> None:
         raise ValueError(f"out: expected a new .npz file beside which there is no .json, got {out}")
     act = repetitions.acting(arguments.policy)()
     loop = controlling.loop_of(act, arguments)
-    with sights(arguments.detector, arguments.renderer, arguments.weights) as seeing:
+    seen_by = sights(arguments.detector, arguments.renderer, arguments.weights)
+    with interrupts.orderly(), seen_by as seeing:  # a robot that has been found is stopped
         sight = seeing(jax.random.fold_in(jax.random.key(arguments.seed), 2**31 - 1))
         robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote, sight)
         loop = dataclasses.replace(loop, clock=getattr(robot, "simulated_clock", loop.clock))

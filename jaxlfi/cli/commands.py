@@ -16,7 +16,7 @@ from rich.table import Table
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.keys import key_of
 from jaxlfi.bayessim.presets import all_rounds
-from jaxlfi.cli import asked, summaries, tables, train
+from jaxlfi.cli import asked, interrupts, summaries, tables, train
 from jaxlfi.cli.exit_status import resuming
 from jaxlfi.distributions.truncation import TRIES
 from jaxlfi.heuristics import registry as heuristics
@@ -270,7 +270,8 @@ def diagnose(arguments: argparse.Namespace, console: Console) -> None:
     if arguments.against is not None:
         reference = arguments.against.name, calibration.read_reference(arguments.against, run.task)
     out = arguments.out or arguments.folder / DIAGNOSTICS
-    found = calibration.diagnose(out, run, plans, console, reference)
+    with interrupts.orderly(run.task.on_host):
+        found = calibration.diagnose(out, run, plans, console, reference)
     for widths in found.widths:
         _say(console, f"{widths.heading}:")
         for name, one in widths.rows:
@@ -296,7 +297,8 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     label = f"{plan.task.name}: {count} {'run' if count == 1 else 'runs in a batch'}"
     done = executing.rounds_done(folder) if processes.writes else 0
     try:
-        with RoundProgress(console, plan.settings.rounds, done, label) as progress:
+        orderly = interrupts.orderly(plan.task.on_host)
+        with orderly, RoundProgress(console, plan.settings.rounds, done, label) as progress:
             on_round = lambda index, row: progress.advance()
             runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated, processes)
     except (ExecutorError, OSError):

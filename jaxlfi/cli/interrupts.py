@@ -2,10 +2,11 @@
 
 Python raises KeyboardInterrupt in the main thread, and only when that thread executes Python again: native code that
 compiles or computes delays it for as long as it takes. Where native code has called Python (`__del__`, JAX's callback
-of the garbage collector), the exception is printed and lost. So a second thread watches for the signal: it raises a
-lost KeyboardInterrupt again, and ends the process where the exception does not end it in time. That is safe at any
-moment: files are written so that they outlive a process killed at any moment (`jaxlfi.io.files`), and workers end with
-the process that started them (`jaxlfi.tasks.worker`).
+of the garbage collector), the exception is printed and lost, and native modules may crash where it meets them while
+they are imported. So none is raised: the process ends where the signal arrives, or in a second thread that waits for
+it. That is safe at any moment, as files are written for a process that may be killed (`jaxlfi.io.files`), and workers
+end with the process that started them (`jaxlfi.tasks.worker`). Only foreign code that may have something to clean up
+is given the exception (`orderly`), and the process ends where that does not end it in time.
 
 This module imports neither jax nor numpy.
 """
@@ -25,7 +26,7 @@ INTERRUPTED = 130
 """The exit status after SIGINT, as that of any program which it ends."""
 UNREAD = 141
 """The exit status where nobody reads the output any more, as that of any program which SIGPIPE ends."""
-PATIENCE = 0.5
+PATIENCE = 0.4
 """Seconds from the signal within which KeyboardInterrupt has to end the process."""
 LOOK = 0.02
 """Seconds between two looks at whether it was lost."""
@@ -34,6 +35,7 @@ SHOW_CURSOR = "\x1b[?25h\n"
 
 _advice: list[tuple[str, Callable[[], str]]] = []
 _speak_once = threading.Lock()
+_orderly = False
 
 
 @contextlib.contextmanager
@@ -52,6 +54,17 @@ def advising(program: str, advice: Callable[[], str]) -> Iterator[None]:
         yield
     finally:
         _advice.pop()
+
+
+@contextlib.contextmanager
+def orderly(wanted: bool = True) -> Iterator[None]:
+    """Where an interruption is a KeyboardInterrupt, as foreign code expects it to be."""
+    global _orderly
+    before, _orderly = _orderly, wanted
+    try:
+        yield
+    finally:
+        _orderly = before
 
 
 def report() -> int:
@@ -128,8 +141,8 @@ class _Watch:
 
     def _handle(self, number: int, frame: Any) -> None:
         self.received = True
-        if self.over:
-            _end(INTERRUPTED)
+        if self.over or not _orderly:
+            self._end_now(flush=True)
         if self._raises:
             self._raises = False
             raise KeyboardInterrupt
@@ -146,17 +159,20 @@ class _Watch:
         while True:
             if signal.SIGINT not in os.read(heard, 64) or not ours():
                 continue
-            until = time.monotonic() + PATIENCE
+            until = time.monotonic() + (PATIENCE if _orderly else LOOK)
             while (left := until - time.monotonic()) > 0:
                 time.sleep(min(LOOK, left))
                 if self.received and self._raises:
                     _thread.interrupt_main()
             if ours():
-                self._force()
+                self._end_now()
             _thread.interrupt_main()  # let those know who handle it now
 
-    def _force(self) -> NoReturn:
-        """End the process from this thread, whatever the main thread holds or waits for."""
+    def _end_now(self, flush: bool = False) -> NoReturn:
+        """End the process whatever its threads hold or wait for; `flush` may wait for the reader of its output."""
+        with contextlib.suppress(Exception):
+            if flush:
+                sys.stdout.flush()
         with contextlib.suppress(Exception):
             if sys.stdout.isatty():
                 os.write(1, SHOW_CURSOR.encode())

@@ -528,7 +528,8 @@ def _run(words: list[str]) -> int:
     except ValueError as error:
         return refuse("jaxlfi", error)
     if foreign:
-        return foreign(words[1:])
+        with interrupts.orderly(not foreign.__module__.startswith("jaxlfi.")):
+            return foreign(words[1:])
     if joined.asked(words):
         return joined.work(lambda: _main(words), lambda: _advice(words), "jaxlfi", "--debug" in words)
     return _main(words)

@@ -122,16 +122,18 @@ def interrupted(process: subprocess.Popen) -> tuple[int, str, float]:
     return process.returncode, errors, time.monotonic() - begun
 
 
-def program(body: str) -> subprocess.Popen:
+def program(body: str, orderly: bool = True) -> subprocess.Popen:
     """A process whose work is watched, when it is ready."""
-    process = started(sys.executable, "-c", f"{START}{textwrap.dedent(body)}\nsys.exit(interrupts.watched(work))")
+    end = f"with interrupts.orderly({orderly}):\n    sys.exit(interrupts.watched(work))"
+    process = started(sys.executable, "-c", f"{START}{textwrap.dedent(body)}\n{end}")
     assert process.stdout.readline() == "ready\n", process.stderr.read()
     return process
 
 
+@pytest.mark.parametrize("orderly", [True, False])
 @pytest.mark.parametrize("body", LOST.values(), ids=LOST)
-def test_no_code_can_lose_an_interrupt(body):
-    status, errors, seconds = interrupted(program(body))
+def test_no_code_can_lose_an_interrupt(body, orderly):
+    status, errors, seconds = interrupted(program(body, orderly))
     assert status == 130 and seconds < PATIENCE
     assert "jaxlfi: interrupted\n" in errors or not errors  # which has said what it had to, in its last acts
     assert "Traceback" not in errors and "ignored" not in errors

@@ -32,9 +32,7 @@ RUN = {
     "jaxlfi infer gaussian_linear --support": f"{SMALL} --steps 20",
     "jaxlfi infer mujoco,config=examples/mujoco/furuta.toml": SMALL,
     "jaxlfi compare lotka_volterra": f"{SMALL} --seeds 1 --configurations ok misspecified+edge",
-    "jaxlfi grid lotka_volterra --support": (
-        f"{SMALL} --seeds 1 --vary zone_fraction=0.1 mass_threshold=0.005 expansion=0.2"
-    ),
+    "jaxlfi grid lotka_volterra --support": f"{SMALL} --seeds 1",
     "jaxlfi sample": "",
     "jaxlfi diagnose": "--truths 20 --draws 20 --no-figures",
     "jaxlfi report": "",
