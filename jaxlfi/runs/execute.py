@@ -188,10 +188,11 @@ def execute(
         if not processes.writes:
             return
         seconds.append(elapsed / len(plan.specs))
+        kept, final = apart(row)
         if checkpoint is not None:
+            checkpoint.require_records(rows[0] if rows else kept, kept)
             checkpoint.write_round(index, whole, row, seconds[-1])
             journal.clear()
-        kept, final = apart(row)
         rows.append(kept)
         if folder is not None:
             for run, name in enumerate(plan.folders()):
