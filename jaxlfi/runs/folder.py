@@ -256,8 +256,7 @@ def save(run: "Run", folder: Path) -> Path:
     """Write one run into a new folder, complete or not at all.
 
     Raises:
-        StoreError: for a run without its task, or one that was loaded from an earlier version's folder and lacks what is
-            recorded now.
+        StoreError: for a run without its task, or one of an earlier version that lacks what is recorded now.
     """
 
     def fill(staging: Path) -> None:
