@@ -9,6 +9,7 @@ round that is not done.
 """
 
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 from jaxlfi.bayessim.record import FINAL, apart
 from jaxlfi.io import files as atomic
 from jaxlfi.io import trees
+from jaxlfi.io.formats import written_by
 from jaxlfi.tasks.simulation import Simulations
 
 FOLDER = "checkpoint"
@@ -93,7 +95,27 @@ class Checkpoint:
         try:
             return trees.from_arrays(arrays, template)
         except ValueError as error:
-            raise CheckpointError(f"{self.folder / 'state.npz'}: {error}") from error
+            raise CheckpointError(f"{self.folder / 'state.npz'}: {error}{self._begun_by()}") from error
+
+    def require_records(self, before: Iterable[str], now: Iterable[str]) -> None:
+        """Refuse to add a round's record to those of earlier rounds that hold other arrays.
+
+        Raises:
+            CheckpointError: naming one of them.
+        """
+        if other := sorted({*before} ^ {*now}):
+            raise CheckpointError(
+                f"{self.folder / _round_name(0)}: expected a record of the same arrays as later rounds have, got one "
+                f"that differs in {other[0]}{self._begun_by()}"
+            )
+
+    def _begun_by(self) -> str:
+        """The jaxlfi that can go on with the run, for the end of an error."""
+        try:
+            author = written_by(atomic.read_json(self.folder.parent / "config.json"))
+        except (ValueError, AttributeError):
+            return ""
+        return f"; {author} began the run and goes on with it" if author else ""
 
     def remove(self) -> None:
         """Clean up after a run that is complete."""

@@ -193,15 +193,16 @@ def execute(
         if not processes.writes:
             return
         seconds.append(elapsed / len(plan.specs))
+        kept, final = apart(row)
         for run, found in journal.failures().items():
             messages = [Message(index, *failure) for failure in found]
             told[run] += messages
             if folder is not None:  # before the checkpoint: they are taken back where the round is made again
                 failures.append(folder / plan.folders()[run], messages)
         if checkpoint is not None:
+            checkpoint.require_records(rows[0] if rows else kept, kept)
             checkpoint.write_round(index, whole, row, seconds[-1])
             journal.clear()
-        kept, final = apart(row)
         rows.append(kept)
         if folder is not None:
             for run, name in enumerate(plan.folders()):

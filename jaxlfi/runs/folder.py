@@ -261,12 +261,22 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
 
 
 def save(run: "Run", folder: Path) -> Path:
-    """Write one run into a new folder, complete or not at all."""
+    """Write one run into a new folder, complete or not at all.
+
+    Raises:
+        StoreError: for a run without its task, or one of an earlier version that lacks what is recorded now.
+    """
 
     def fill(staging: Path) -> None:
         for index, seconds in enumerate(np.asarray(run.history["seconds"])):
             row = {name: value[index] for name, value in run.history.items() if not name.startswith(FINAL)}
-            append_ledger(staging, index, jax.device_get(row), run.task.reasons, seconds)
+            try:
+                append_ledger(staging, index, jax.device_get(row), run.task.reasons, seconds)
+            except KeyError as missing:  # of a folder from before there was such a record
+                raise StoreError(
+                    f"save: expected a run whose history has {missing}, got one without, as earlier versions made it: "
+                    "copy its folder"
+                ) from missing
         failures.append(staging, run.told.messages)
         write_run(staging, run)
 

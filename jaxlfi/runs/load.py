@@ -21,6 +21,7 @@ from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.io import files as atomic
 from jaxlfi.io import trees
+from jaxlfi.io.formats import written_by
 from jaxlfi.io.shell import quoted
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
@@ -58,6 +59,15 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         raise StoreError(f"{folder}: expected the folder of one run, such as {folder / one}")
     if config.get("status", "finished") != "finished" or not (folder / "posterior.npz").exists():
         raise StoreError(f"{folder}: expected a finished run; go on with it by {quoted('jaxlfi', 'resume', folder)}")
+    try:
+        return _read(folder, config, task)
+    except StoreError as error:
+        if author := written_by(config):
+            raise StoreError(f"{error}; {author} wrote the folder") from error
+        raise
+
+
+def _read(folder: Path, config: dict[str, Any], task: Task | None) -> Run:
     try:
         space = Space(tuple(config["parameters"]), tuple(config["log"]))
         settings = describe.settings_from_json(config["settings"])
