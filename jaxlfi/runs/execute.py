@@ -396,6 +396,8 @@ def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
     for run, name in zip(runs, plan.folders(), strict=True):
         folders.write_run(folder / name, run, plan.keep_network)
         atomic.flush(folder / name / "ledger.jsonl")  # the checkpoint, which could complete it, is going to be removed
+        if (said := folder / name / failures.FILE).exists():
+            atomic.flush(said)
     if plan.kind == COMPARE:
         lines = results(plan, runs)
         order = list(dict.fromkeys(line["configuration"] for line in lines))
