@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 LEVEL = 0.001
-"""p-value up to which something is reported, by each of the tests; 1 / (N + 1) where N simulations resolve no less."""
+"""p-value up to which something is reported: by the test of summaries by themselves, and by that of all together."""
 MIN_SIMULATIONS = 20
 """Number of simulations below which nothing is reported but a constant that differs."""
 EXTREMES = 5
@@ -45,12 +45,12 @@ class Finding:
 
     Attributes:
         name: of the summary or channel.
-        kind: "constant" (it never varies in simulations), "range" (it lies outside of all simulations) or "joint" (it
-            lies outside of the simulations that are most similar otherwise).
-        observed: the value, and the largest where it is a channel's range.
+        kind: "constant" (it never varies in simulations), "range" (it lies far outside of all simulations) or "joint"
+            (all numbers together do; this one differs most from those of the most similar simulations).
+        observed: its value, twice; least and greatest value of a channel.
         low: least value of these simulations.
         high: greatest value.
-        p_value: of the test.
+        p_value: of the test; 0 for a constant.
         text: in words.
     """
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxlfi.diagnostics.misspecification import Finding, unlike
+from jaxlfi.diagnostics.misspecification import RECORDS, Finding, unlike
 from jaxlfi.tasks import summaries
 from jaxlfi.tasks.task import Task
 
@@ -46,8 +46,10 @@ def names_of(task: Task, trajectory: Sequence[int], size: int) -> tuple[tuple[st
         S names; and C names, or none where it is no series.
     """
     names, channels = task.named_summaries(size), task.channels
-    series = task.summary is summaries.identity and not task.summary_names
-    if not series or len(trajectory) > 2 or (len(trajectory) == 1 and not channels and task.times is None):
+    if task.summary is not summaries.identity or task.summary_names or len(trajectory) > 2:
+        return names, ()
+    # A vector may be a series or single numbers, each in a unit of its own.
+    if len(trajectory) == 1 and (size < RECORDS or (not channels and task.times is None)):
         return names, ()
     count = 1 if len(trajectory) == 1 else trajectory[1]
     return names, channels if len(channels) == count else tuple(f"channel {c + 1}" for c in range(count))

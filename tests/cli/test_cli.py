@@ -276,6 +276,19 @@ def test_compare_warns_of_posteriors_beyond_the_bounds_of_fixed_supports(compari
     assert not any(text.startswith("misspecified+edge") for text in warnings)
 
 
+def test_compare_warns_in_one_line_of_observations_unlike_all_simulations(comparison):
+    names = [run["folder"] for run in run_store.read_config(comparison)["runs"]]
+    runs = [jaxlfi.load(comparison / name) for name in names]
+    plan = executing.BatchPlan(
+        run_store.COMPARE, TASK, runs[0].task, None, runs[0].settings, tuple(run.spec for run in runs)
+    )
+    assert summaries.observation_warnings(plan, runs) == []
+    foreign = [run.replace(x=run.x + 1e6) if run.origin.configuration == "ok" else run for run in runs]
+    (text,) = summaries.observation_warnings(plan, foreign)
+    assert text.startswith("ok: observation: x_1 is 1e+06") and text.endswith("(in 2 of 2 runs, this is the first)")
+    assert text in summaries.warnings(plan, foreign)
+
+
 def test_resuming_what_is_complete_says_so(comparison, capsys):
     for folder in (comparison, comparison / "ok" / "seed_000"):
         assert command("resume", folder) == 0

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import embedding, mujoco_sysid, widths
+from experiments import embedding, misspecification, mujoco_sysid, widths
 from experiments.policies import report
 from experiments.policies import results as policies
 from experiments.sota import rows as sota
@@ -669,3 +669,14 @@ def test_what_survives():
         how = [row["how"] for row in kills if row["command"] == name]
         line = rf"\| {re.escape(words)} \| \d+ \| {how.count('in a window')} \| {how.count('at a moment')} \| all \|"
         assert re.search(line, README), line
+
+
+def test_the_table_of_observations_unlike_simulations():
+    """The page's rows are those of the arrays, which hold few false alarms of each simulator."""
+    folder = RESULTS / "misspecification"
+    table = misspecification.table(folder)
+    assert table == (folder / "table.md").read_text()
+    assert table in (ROOT.parent / "docs" / "calibration.md").read_text()
+    own = {name: kinds["own"] for name, kinds in misspecification.rates(folder).items()}
+    assert sum(of for _, of in own.values()) >= 200
+    assert all(hits < 0.02 * of for hits, of in own.values())

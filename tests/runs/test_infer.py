@@ -317,6 +317,23 @@ def test_a_fixed_support_that_is_wrong_warns():
     assert all("--heuristic" not in text and "heuristic=jaxlfi.Edge()" in text for text in run.warnings)
 
 
+def test_an_observation_unlike_all_simulations_warns(tmp_path):
+    with pytest.warns(
+        jaxlfi.MisspecificationWarning, match=r"^observation: x_1 is 1e\+06, all 40 simulations lie between"
+    ):
+        run = infer(observation=np.array([1e6, 0.0], np.float32))
+    (text,) = run.misspecification
+    assert text.endswith("is it in the simulator's units?") and text in run.warnings
+    again = load(run.save(tmp_path / "run"), gaussian())
+    assert again.misspecification == run.replace(task=None).misspecification == [text]
+    assert run.replace(x=run.dataset.x[39]).misspecification == []
+
+
+def test_an_observation_of_the_model_does_not(recwarn):
+    assert infer().misspecification == []
+    assert not [found for found in recwarn if found.category is jaxlfi.MisspecificationWarning]
+
+
 @pytest.mark.slow
 def test_a_support_that_grows_warns_of_the_bounds_of_phi_alone():
     """Edge cannot move them, and moves all others."""
