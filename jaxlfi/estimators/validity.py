@@ -98,8 +98,14 @@ class Validity:
         """
         failures = jnp.sum(attempts.valid & (attempts.x[:, 0] < 0.5))
         weights = attempts.valid.astype(jnp.float32)
-        train = lambda: fit(key, self.network, attempts, weights, attempts.capacity)[0]
-        network = jax.lax.cond(failures > 0, train, lambda: self.network)
+        # As plain numbers: the checker of keys that are used twice takes a branch under vmap for such.
+        numbers, kind = jax.random.key_data(key), jax.random.key_impl(key)
+
+        def trained() -> Network:
+            own = jax.random.wrap_key_data(numbers, impl=kind)
+            return fit(own, self.network, attempts, weights, attempts.capacity)[0]
+
+        network = jax.lax.cond(failures > 0, trained, lambda: self.network)
         return Validity(network, failures)
 
 
