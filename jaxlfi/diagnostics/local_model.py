@@ -71,9 +71,12 @@ def local_model(
     low, high = (np.asarray(bound, float) for bound in (box.low, box.high))
     unit = (2 * np.asarray(theta, float)[-NEWEST:] - low - high) / (high - low)
     x, observed = np.asarray(x, float)[-NEWEST:], np.asarray(observed, float)
+    dim = unit.shape[1]
+    if len(unit) < 3 * (1 + dim):
+        return None
     comparable = _comparable(x, observed)
     unit, x = unit[comparable], x[comparable]
-    n, dim = unit.shape
+    n = len(unit)
     columns = 1 + dim + dim * (dim + 1) // 2
     quadratic = n >= 3 * columns
     columns = columns if quadratic else 1 + dim

@@ -78,6 +78,10 @@ _COLUMNS = {
 }
 
 
+UNMEASURED = "not measured"
+"""Beginning of what a run says of its widths. Earlier versions gave a figure instead, which nobody had measured."""
+
+
 def render(collection: Collection, pictures: Sequence[Picture]) -> str:
     """The page as text.
 
@@ -234,7 +238,8 @@ def _widths(collection: Collection) -> str:
     for name, histories in collection.runs.items():
         for history in histories:
             measured = history.measured_widths
-            text = measured or history.config.get("widths")
+            said = str(history.config.get("widths") or "")
+            text = measured or (said if said.startswith(UNMEASURED) or not said else UNMEASURED)
             own = f"{name}, seed {history.seed}" if measured and len(histories) > 1 else name
             if text and own not in lines.setdefault(str(text), []):
                 lines[str(text)].append(own)

@@ -63,7 +63,20 @@ def test_units_and_offsets_of_summaries_do_not_matter():
     np.testing.assert_allclose(again, expected, rtol=1e-4)
 
 
+def test_simulations_that_exploded_are_left_out():
+    """One in twenty is 1e12 times too large, or not finite; and a count that is nearly always zero is no reason to."""
+    rng = np.random.default_rng(5)
+    theta = rng.uniform(BOX.low, BOX.high, (500, 2))
+    x, observed = simulated(rng, theta), np.array([3.0, 3.5, 1.0, 0.0])
+    x = np.concatenate([x, rng.poisson(0.05, (500, 1))], axis=1)
+    expected = local_model(theta, x, observed, BOX).misfit(-ONES, ONES)
+    broken = np.concatenate([x, x[:25] * 1e12, np.full((2, 4), np.inf)])
+    again = local_model(np.concatenate([theta, theta[:25], theta[:2]]), broken, observed, BOX).misfit(-ONES, ONES)
+    np.testing.assert_allclose(again, expected, rtol=1e-6)
+
+
 def test_there_is_none_of_too_few_simulations_or_of_constants():
     theta = np.random.default_rng(4).uniform(BOX.low, BOX.high, (50, 2))
-    assert local_model(theta[:8], theta[:8], theta[0], BOX) is None
+    for few in (0, 8):
+        assert local_model(theta[:few], theta[:few], theta[0], BOX) is None
     assert local_model(theta, np.full((50, 3), 4.0), np.full(3, 4.0), BOX) is None

@@ -414,9 +414,24 @@ def test_bound_warnings():
         if not beyond.any():
             alarms, right = alarms + np.sum(named), right + named.size
             warned, runs = warned + np.sum(named.any(axis=(0, 2))), runs + named.shape[1]
-    (row,) = re.findall(r"\| \*\*now: more than [^|]+\|[^|]+\|[^|]+\|[^|]+\|", README)
+    (row,) = re.findall(r"\| \*\*more than 0.2 of the mass [^|]+\|[^|]+\|[^|]+\|[^|]+\|", README)
     for count, of in ((hits, wrong), (alarms, right), (warned, runs)):
         assert f"({count} of {of})" in row
+
+
+def test_wrong_bounds():
+    """Sums over the problems that the rule was chosen on, and over those that were held out."""
+    from experiments.wrong_bounds import PROBLEMS, counts
+    from jaxlfi.diagnostics.bounds import MASS_BEYOND
+
+    rules = {"mass": lambda found: found["mass"] > MASS_BEYOND, "simulations": lambda found: found["wrong"]}
+    for held_out, title in ((False, "seen"), (True, "held out")):
+        for rule, named in rules.items():
+            own = [arrays(f"wrong-bounds/{name}") for name, one in PROBLEMS.items() if one.held_out == held_out]
+            total = np.sum([list(counts(found, named(found)).values()) for found in own], axis=0)
+            (row,) = re.findall(rf"\| {title}[^|]* \| [^|]*{rule}[^|]* \|[^|]+\|[^|]+\|[^|]+\|", README)
+            for hits, of in total:
+                assert f" {hits} of {of} ({100 * hits / of:.0f} %) |" in row
 
 
 # ------------------------------------------------------------------------------------------------------------ policies

@@ -263,6 +263,7 @@ def test_the_page_of_the_run_says_what_was_measured(repeated, folder, tmp_path):
     assert config["widths"].startswith("not measured; nothing corrects")
     line = lambda: page._widths(collection(copy, config))
     assert "not measured" in line() and "jaxlfi diagnose" in line()
+    assert "87" not in page._widths(collection(copy, config | {"widths": "about 87 % of the right ones"}))
     shutil.copytree(repeated, copy / "diagnostics")
     found = json.loads((repeated / "diagnostics.json").read_text())
     assert html.escape(found["line"]) in line() and "(measured at this run's posterior with 20" in found["line"]
