@@ -58,7 +58,7 @@ def _with_interval(values: np.ndarray) -> str:
 
 def failure_lines(runs: Sequence[Run]) -> list[str]:
     """How many simulations failed, and the commonest reasons; nothing where none did."""
-    found = failures.together([(run.told, run.history["failed"]) for run in runs])
+    found = failures.together([(run.failure_log, run.history["failed"]) for run in runs])
     attempted = sum(int(np.sum(run.history["attempted"])) for run in runs)
     if not found:
         return []

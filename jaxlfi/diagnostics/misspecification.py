@@ -126,6 +126,7 @@ def unlike(
         >>> unlike([0.3, 0.0012], simulated)
         []
     """
+    precision = np.finfo(np.promote_types(np.asarray(simulations).dtype, np.float32)).eps
     x, simulations = np.asarray(x, np.float64), np.asarray(simulations, np.float64)
     if simulations.ndim != 2 or x.shape != simulations.shape[1:] or not np.isfinite(x).all():
         raise ValueError(
@@ -141,8 +142,8 @@ def unlike(
         return []
     columns = _columns(x.size, names, channels)
     low, high = simulations.min(axis=0), simulations.max(axis=0)
-    reach = ROUNDING * np.maximum(np.abs(low), np.abs(high))
-    constant = high - low <= reach
+    largest = np.maximum(np.abs(low), np.abs(high))
+    constant, reach = high - low <= 4 * precision * largest, ROUNDING * largest
     found = [
         _constant(columns[j], x[j], low[j], high[j], len(simulations))
         for j in np.flatnonzero(constant & ((x < low - reach) | (x > high + reach)))

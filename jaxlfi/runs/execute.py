@@ -30,7 +30,7 @@ from jaxlfi.runs.folder import COMPARE, RUN, RUNS, StoreError
 from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks import failures, priors, registry
 from jaxlfi.tasks.executors import one_by_one
-from jaxlfi.tasks.failures import Message, Told
+from jaxlfi.tasks.failures import Message, FailureLog
 from jaxlfi.tasks.journal import Journal, OnSimulation
 from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.reference import raw
@@ -182,10 +182,10 @@ def execute(
     engine = engine_for(plan.task, plan.settings, inputs, observed.first, journal, processes)
     done = 0 if checkpoint is None else checkpoint.rounds_done()
     rows, seconds, final = ([], [], {}) if checkpoint is None else checkpoint.read_rounds(done)
-    told: list[list[Message]] = [[] for _ in plan.specs]
+    messages: list[list[Message]] = [[] for _ in plan.specs]
     if checkpoint is not None:
         _complete_ledgers(folder, plan, rows, seconds, places)
-        told = [failures.cut(folder / name, done) for name in plan.folders()]
+        messages = [failures.cut(folder / name, done) for name in plan.folders()]
 
     def keep(index: int, state: State, row: dict[str, np.ndarray], elapsed: float) -> None:
         nonlocal final
@@ -195,10 +195,10 @@ def execute(
         seconds.append(elapsed / len(plan.specs))
         kept, final = apart(row)
         for run, found in journal.failures().items():
-            messages = [Message(index, *failure) for failure in found]
-            told[run] += messages
+            of_round = [Message(index, *failure) for failure in found]
+            messages[run] += of_round
             if folder is not None:  # before the checkpoint: they are taken back where the round is made again
-                failures.append(folder / plan.folders()[run], messages)
+                failures.append(folder / plan.folders()[run], of_round)
         if checkpoint is not None:
             checkpoint.require_records(rows[0] if rows else kept, kept)
             checkpoint.write_round(index, whole, row, seconds[-1])
@@ -222,7 +222,7 @@ def execute(
         _run(
             *(plan, spec, jax.tree.map(lambda leaf, i=i: leaf[i], state), observed, i),
             *(rows, seconds, final, places[i], references[i]),
-        ).replace(told=Told(plan.task.reasons, told[i]))
+        ).replace(failure_log=FailureLog(plan.task.reasons, messages[i]))
         for i, spec in enumerate(plan.specs)
     ]
 

@@ -277,7 +277,7 @@ def save(run: "Run", folder: Path) -> Path:
                     f"save: expected a run whose history has {missing}, got one without, as earlier versions made it: "
                     "copy its folder"
                 ) from missing
-        failures.append(staging, run.told.messages)
+        failures.append(staging, run.failure_log.messages)
         write_run(staging, run)
 
     if run.task is None:

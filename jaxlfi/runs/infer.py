@@ -32,7 +32,7 @@ from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import MisspecificationWarning, Origin, Run, SupportWarning
 from jaxlfi.tasks.executors import one_by_one
-from jaxlfi.tasks.failures import Told
+from jaxlfi.tasks.failures import FailureLog
 from jaxlfi.tasks.observation import observe, trials_of
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.priors import require_mass
@@ -273,7 +273,7 @@ def _traced(key, task: Task, observation, support: Support, heuristic, settings:
         task=task,
         origin=Origin(),
         units=tuple(task.units),
-        told=Told(task.reasons),
+        failure_log=FailureLog(task.reasons),
     )
 
 

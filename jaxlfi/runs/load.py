@@ -111,14 +111,14 @@ def _read(folder: Path, config: dict[str, Any], task: Task | None) -> Run:
         task=task,
         origin=origin,
         units=units,
-        told=_told(folder, history),
+        failure_log=_failure_log(folder, history),
         reference=observation.get("reference"),
     )
 
 
-def _told(folder: Path, history: dict[str, np.ndarray]) -> failures.Told:
+def _failure_log(folder: Path, history: dict[str, np.ndarray]) -> failures.FailureLog:
     try:
-        return failures.Told(map(str, history.get("reasons", ())), failures.read(folder))
+        return failures.FailureLog(map(str, history.get("reasons", ())), failures.read(folder))
     except ValueError as error:
         raise StoreError(str(error)) from error
 

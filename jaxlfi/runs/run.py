@@ -30,7 +30,7 @@ from jaxlfi.heuristics import Heuristic
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.unlike import observation_findings
 from jaxlfi.tasks import failures, owned
-from jaxlfi.tasks.failures import Failure, Told
+from jaxlfi.tasks.failures import Failure, FailureLog
 from jaxlfi.tasks.reference import counted_from, summaries_in_double
 from jaxlfi.tasks.task import Task
 
@@ -86,7 +86,7 @@ class Run:
         task: what was inferred; None for a loaded run whose task cannot be found.
         origin: how the run is described in its config.json: task, configuration, support's name, preset.
         units: of the parameters; None where its folder does not say.
-        told: what its simulations say of their failures (`failures`).
+        failure_log: what its simulations say of their failures (`failures`).
         reference: what the network's summaries are counted from, shape [S], in double precision; None for zero
             (`jaxlfi.tasks.reference`). `x` and those of the dataset are counted from zero.
     """
@@ -106,7 +106,7 @@ class Run:
     task: Task | None = struct.field(pytree_node=False)
     origin: Origin = struct.field(pytree_node=False)
     units: tuple[str, ...] | None = struct.field(pytree_node=False, default=None)
-    told: Told = struct.field(pytree_node=False, default=Told())
+    failure_log: FailureLog = struct.field(pytree_node=False, default=FailureLog())
     reference: np.ndarray | None = None
 
     @property
@@ -195,7 +195,7 @@ class Run:
             [Failure(reason='error', message='sim: exit status 3: mesh inverted at a=2.31', count=41)]
         """
         _require_one(self, "failures")
-        return failures.together([(self.told, self.history["failed"])])
+        return failures.together([(self.failure_log, self.history["failed"])])
 
     @property
     def misspecification(self) -> list[str]:

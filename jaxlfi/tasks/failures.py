@@ -43,7 +43,7 @@ class Message(NamedTuple):
     count: int
 
 
-class Told:
+class FailureLog:
     """What the simulations of a run say of their failures.
 
     Part of the structure of `Run`, a pytree: any two are equal, as other messages make no other structure.
@@ -58,10 +58,10 @@ class Told:
         self.reasons, self.messages = tuple(reasons), tuple(messages)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Told)
+        return isinstance(other, FailureLog)
 
     def __hash__(self) -> int:
-        return hash(Told)
+        return hash(FailureLog)
 
 
 class Tally:
@@ -87,22 +87,22 @@ class Tally:
         return [Failure(reason, message, -count) for count, _, reason, message in sorted(found)]
 
 
-def together(parts: Iterable[tuple[Told, np.ndarray]]) -> list[Failure]:
+def together(parts: Iterable[tuple[FailureLog, np.ndarray]]) -> list[Failure]:
     """Failures of some runs, the commonest first.
 
     Args:
-        parts: of each run, what is told, and failures by round and reason, shape [rounds, R].
+        parts: of each run, its log, and its failures by round and reason, shape [rounds, R].
 
     Example:
-        >>> told = Told(("error", "non_finite"), [Message(0, "error", "at 1.5", 2), Message(1, "error", "at 2.5", 1)])
-        >>> together([(told, np.array([[2, 0], [2, 5]]))])
+        >>> log = FailureLog(("error", "non_finite"), [Message(0, "error", "at 1.5", 2), Message(1, "error", "at 2.5", 1)])
+        >>> together([(log, np.array([[2, 0], [2, 5]]))])
         [Failure(reason='non_finite', message='', count=5), Failure(reason='error', message='at 1.5', count=3), \
 Failure(reason='error', message='', count=1)]
     """
     tally = Tally()
-    for told, failed in parts:
-        left = dict(zip(told.reasons, np.sum(failed, axis=0).tolist(), strict=True))
-        for one in told.messages:
+    for log, failed in parts:
+        left = dict(zip(log.reasons, np.sum(failed, axis=0).tolist(), strict=True))
+        for one in log.messages:
             tally.add(one.reason, one.message, one.round, one.count)
             left[one.reason] = left.get(one.reason, 0) - one.count
         for reason, count in left.items():

@@ -67,7 +67,7 @@ class Journal:
         self._count(request, answer)
 
     def failures(self) -> dict[int, list[Failure]]:
-        """The commonest failures that are told of since this was asked last, by the run."""
+        """The commonest failures since this was last called, by the run."""
         found = {run: tally.commonest()[:KEPT] for run, tally in self._failures.items()}
         self._failures = {}
         return found

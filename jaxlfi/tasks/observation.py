@@ -199,13 +199,13 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
 
 def _numbers(observation: Any) -> np.ndarray:
     """A copy of what was given, of real numbers and none of them missing."""
-    told = lambda: textwrap.shorten(repr(observation), 200)
+    shown = lambda: textwrap.shorten(repr(observation), 200)
     try:
         array, missing = owned.array(observation), owned.missing(observation)
     except ValueError as error:
-        raise ValueError(f"observation: expected an array, got rows of several shapes in {told()}") from error
+        raise ValueError(f"observation: expected an array, got rows of several shapes in {shown()}") from error
     if array.dtype.kind not in "biuf":
-        raise ValueError(f"observation: expected an array of numbers, got {told()}")
+        raise ValueError(f"observation: expected an array of numbers, got {shown()}")
     if missing:
         raise ValueError(
             f"observation: expected a number in every place, got {missing} of {array.size} that are missing (masked): "
@@ -254,7 +254,7 @@ def _vectors_are_trials(task: Task, vectors: Sequence[Any]) -> bool:
 
 
 Say = Callable[[str], Any]
-"""What is told, in a line, how the columns of a file were read."""
+"""Called with a line on how the columns of a file were read."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -287,7 +287,7 @@ def read(path: str | Path, columns: Columns = Columns(), say: Say = lambda line:
             column of times or indices is left out where its heading is one of `TIME_COLUMNS`, its values increase, and
             as many columns are not wanted), or an .npz with an array "trajectory" or one array only.
         columns: what is known of the channels; headings that name them all say which column is which.
-        say: is told which columns were left out.
+        say: called with a line that names the columns left out.
 
     Returns:
         The trajectory, shape [T, C]; of an .npz as it is.

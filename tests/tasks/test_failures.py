@@ -8,7 +8,7 @@ import pytest
 
 import jaxlfi
 from jaxlfi.tasks import failures
-from jaxlfi.tasks.failures import Failure, Message, Tally, Told
+from jaxlfi.tasks.failures import Failure, Message, Tally, FailureLog
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.worker import LONGEST_MESSAGE, failed
 from tests.small import FLAGS, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
@@ -45,8 +45,8 @@ def test_what_is_counted_is_bounded():
 
 
 def test_what_no_message_is_known_of_is_counted_by_its_reason():
-    told = Told(("slow", "error"), [Message(0, "error", "at 1", 2), Message(1, "error", "at 2", 1)])
-    found = failures.together([(told, np.array([[4, 2], [1, 2]])), (Told(("slow", "error")), np.array([[0, 1]]))])
+    log = FailureLog(("slow", "error"), [Message(0, "error", "at 1", 2), Message(1, "error", "at 2", 1)])
+    found = failures.together([(log, np.array([[4, 2], [1, 2]])), (FailureLog(("slow", "error")), np.array([[0, 1]]))])
     assert found == [Failure("slow", "", 5), Failure("error", "at 1", 3), Failure("error", "", 2)]
     assert failures.together([]) == []
 
@@ -91,7 +91,7 @@ def test_a_run_tells_why_its_simulations_failed(tmp_path):
     saved = jaxlfi.load(run.save(tmp_path / "saved"), moody_task())
     again = jaxlfi.load(tmp_path / "run")
     assert run.failures == kept.failures == saved.failures == again.failures
-    assert jax.tree.structure(run) == jax.tree.structure(run.replace(told=Told()))
+    assert jax.tree.structure(run) == jax.tree.structure(run.replace(failure_log=FailureLog()))
     (tmp_path / "run" / failures.FILE).unlink()  # as earlier versions leave it
     assert sum(one.count for one in jaxlfi.load(tmp_path / "run", moody_task()).failures) == sum(counts.values())
 
