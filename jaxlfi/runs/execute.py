@@ -30,7 +30,7 @@ from jaxlfi.runs.folder import COMPARE, RUN, RUNS, StoreError
 from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks import failures, priors, registry
 from jaxlfi.tasks.executors import one_by_one
-from jaxlfi.tasks.failures import Message, FailureLog
+from jaxlfi.tasks.failures import FailureLog, Message
 from jaxlfi.tasks.journal import Journal, OnSimulation
 from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.reference import raw

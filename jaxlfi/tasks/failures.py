@@ -94,7 +94,8 @@ def together(parts: Iterable[tuple[FailureLog, np.ndarray]]) -> list[Failure]:
         parts: of each run, its log, and its failures by round and reason, shape [rounds, R].
 
     Example:
-        >>> log = FailureLog(("error", "non_finite"), [Message(0, "error", "at 1.5", 2), Message(1, "error", "at 2.5", 1)])
+        >>> messages = [Message(0, "error", "at 1.5", 2), Message(1, "error", "at 2.5", 1)]
+        >>> log = FailureLog(("error", "non_finite"), messages)
         >>> together([(log, np.array([[2, 0], [2, 5]]))])
         [Failure(reason='non_finite', message='', count=5), Failure(reason='error', message='at 1.5', count=3), \
 Failure(reason='error', message='', count=1)]

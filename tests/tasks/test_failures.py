@@ -8,7 +8,7 @@ import pytest
 
 import jaxlfi
 from jaxlfi.tasks import failures
-from jaxlfi.tasks.failures import Failure, Message, Tally, FailureLog
+from jaxlfi.tasks.failures import Failure, FailureLog, Message, Tally
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.worker import LONGEST_MESSAGE, failed
 from tests.small import FLAGS, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
