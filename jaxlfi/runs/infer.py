@@ -30,7 +30,7 @@ from jaxlfi.runs import execute as executing
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
-from jaxlfi.runs.run import MisspecificationWarning, Origin, Run, SupportWarning
+from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.failures import FailureLog
 from jaxlfi.tasks.observation import observe, trials_of
@@ -133,10 +133,8 @@ def infer(
     spec = RunSpec("own", name, box, heuristic, seed_of(key))
     plan = BatchPlan(folders.RUN, None, task, None, settings, (spec,))
     run = _run(plan, observation, first, progress, callback, None if out is None else Path(out))
-    unlike = run.misspecification
-    for warning in run.warnings:
-        category = MisspecificationWarning if warning in unlike else SupportWarning
-        python_warnings.warn(warning, category, stacklevel=2)
+    for category, text in run.findings():
+        python_warnings.warn(text, category, stacklevel=2)
     return run
 
 

@@ -30,6 +30,7 @@ from jaxlfi.heuristics import Heuristic
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.unlike import observation_findings
 from jaxlfi.tasks import failures, owned
+from jaxlfi.tasks.errors import SimulatorWarning
 from jaxlfi.tasks.failures import Failure, FailureLog
 from jaxlfi.tasks.reference import counted_from, summaries_in_double
 from jaxlfi.tasks.task import Task
@@ -162,17 +163,23 @@ class Run:
 
     @property
     def warnings(self) -> list[str]:
-        """In words, which bounds look wrong that the heuristic cannot move, and in what the observation is unlike all.
+        """In words, what looks wrong: bounds that the heuristic cannot move, summaries, and the observation.
 
         Bounds are those of a support that cannot grow, and those of Phi.
         """
+        return [text for _, text in self.findings()]
+
+    def findings(self) -> list[tuple[type[Warning], str]]:
+        """What looks wrong, as the warnings that `jaxlfi.infer` issues: their classes and texts."""
         _require_one(self, "warnings")
-        found = bound_warnings(self.space, self.units, [self.bound_evidence], self.feasible, self.heuristic.grows)
-        return [
-            *(warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in found),
-            *self.unresolved,
-            *self.misspecification,
-        ]
+        bounds = bound_warnings(self.space, self.units, [self.bound_evidence], self.feasible, self.heuristic.grows)
+        bounds = [warning.replace("--heuristic edge", "heuristic=jaxlfi.Edge()") for warning in bounds]
+        found = {
+            SupportWarning: bounds,
+            SimulatorWarning: self.unresolved,
+            MisspecificationWarning: self.misspecification,
+        }
+        return [(category, text) for category, texts in found.items() for text in texts]
 
     @property
     def unresolved(self) -> list[str]:
