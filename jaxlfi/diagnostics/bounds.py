@@ -222,9 +222,12 @@ def bound_warnings(
             continue
         unit = f" {units[d]}" if units is not None and units[d] not in ("", "1") else ""
         value = _range(np.asarray(space.to_natural(bounds[:, side]), float)[:, d])
-        beyond = f"{np.median(mass[:, side, d]):.2f} of the posterior mass lies beyond it"
+        share = np.median(mass[:, side, d])
+        beyond = f"{'in the median ' if runs > 1 else ''}{share:.2f} of the posterior mass lies beyond it"
+        if share <= MASS_BEYOND:
+            beyond = "the run's simulations say so, not its posterior" if runs == 1 else ""
         if runs > 1:
-            beyond = f"in {np.sum(wrong[:, side, d])} of {runs} runs; in the median {beyond}"
+            beyond = f"in {np.sum(wrong[:, side, d])} of {runs} runs{'; ' if beyond else ''}{beyond}"
         advice = PHI_ADVICE if final[side, d] else ADVICE
         texts.append(f"{space.names[d]} reaches its {SIDES[side]} bound {value}{unit} ({beyond}). {advice}")
     return texts
