@@ -201,7 +201,7 @@ def bound_warnings(
 
     Args:
         space: of the parameters: values are given in natural units.
-        units: of the parameters; None where they are not known.
+        units: of the parameters, "" or "1" for none; None where they are not known.
         evidence: of runs that began on the same support, one or more.
         feasible: Phi, in inference space.
         grows: whether the support can grow: then only bounds that are Phi's are named, which no heuristic moves.
@@ -221,11 +221,14 @@ def bound_warnings(
     for d, side in np.argwhere(np.any(wrong, axis=0).T):
         if grows and not final[side, d]:
             continue
-        unit = f" {units[d]}" if units is not None and units[d] else ""
+        unit = f" {units[d]}" if units is not None and units[d] not in ("", "1") else ""
         value = _range(np.asarray(space.to_natural(bounds[:, side]), float)[:, d])
-        beyond = f"{np.median(mass[:, side, d]):.2f} of the posterior mass lies beyond it"
+        share = np.median(mass[:, side, d])
+        beyond = f"{'in the median ' if runs > 1 else ''}{share:.2f} of the posterior mass lies beyond it"
+        if share <= MASS_BEYOND:
+            beyond = "the run's simulations say so, not its posterior" if runs == 1 else ""
         if runs > 1:
-            beyond = f"in {np.sum(wrong[:, side, d])} of {runs} runs; in the median {beyond}"
+            beyond = f"in {np.sum(wrong[:, side, d])} of {runs} runs{'; ' if beyond else ''}{beyond}"
         advice = PHI_ADVICE if final[side, d] else ADVICE
         texts.append(f"{space.names[d]} reaches its {SIDES[side]} bound {value}{unit} ({beyond}). {advice}")
     return texts

@@ -236,6 +236,15 @@ def test_a_posterior_centred_beyond_a_bound_warns_of_that_bound(d, at, begin):
     assert warning == f"{begin} (0.84 of the posterior mass lies beyond it). {ADAPT}"
 
 
+def test_a_bound_that_only_the_simulations_speak_against_is_said_to_be_so():
+    bounds, wrong = np.array([[0.0, -2.0], [4.0, 6.0]]), np.array([[False, False], [True, False]])
+    one = BoundEvidence(bounds, np.full((2, 2), 0.05), 20.0 * wrong, wrong)
+    (text,) = bound_warnings(SPACE, UNITS, [one], PHI)
+    assert text == f"mass reaches its upper bound 4 kg (the run's simulations say so, not its posterior). {ADAPT}"
+    (text,) = bound_warnings(SPACE, UNITS, [one, one], PHI)
+    assert text == f"mass reaches its upper bound 4 kg (in 2 of 2 runs). {ADAPT}"
+
+
 def test_bounds_are_in_natural_units():
     """Of a parameter that is inferred as its logarithm, too."""
     box = Support(np.log([0.5, 0.1]), np.log([4.0, 10.0]))

@@ -309,10 +309,9 @@ def test_a_network_of_several_rounds_does_not():
 
 
 def test_a_fixed_support_that_is_wrong_warns():
-    # Hardly trained, the posterior is nearly as wide as Phi: far wider than this support.
-    narrow = Support([0.9, -0.2], [1.1, 0.2])
-    with pytest.warns(jaxlfi.SupportWarning, match="second reaches its upper bound 0.2"):
-        run = infer(task=OWN, support=narrow, heuristic=FIXED, settings=ONE)
+    far = Support([0.5, 2.0], [2.4, 3.0])  # the observation says -0.6
+    with pytest.warns(jaxlfi.SupportWarning, match="second reaches its lower bound 2 "):
+        run = infer(task=OWN, support=far, heuristic=FIXED, settings=ONE)
     assert any("widen the support" in text for text in run.warnings)
     assert all("--heuristic" not in text and "heuristic=jaxlfi.Edge()" in text for text in run.warnings)
 
