@@ -133,7 +133,7 @@ def _curve_check(name: str, result: diagnostics.Uniformity, verdict: str) -> Che
 
 def _classifier_check(run: Run, plan: CalibrationPlan, truths: Mapping[str, np.ndarray], draws: np.ndarray) -> Check:
     """Whether a classifier that sees the simulations tells truths from posterior draws."""
-    x = jnp.asarray(truths["x"])
+    x = jnp.asarray(run.counted(truths["x"]))
     x = np.asarray(fit_normaliser(run.settings.estimator.normaliser, x, jnp.ones(len(x), bool))(x))
     rows = [np.concatenate([theta, x], axis=1) for theta in (truths["theta"], draws[:, 0])]
     accuracy = _accuracy(plan.key(CLASSIFIER), *rows)
