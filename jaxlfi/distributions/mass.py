@@ -13,10 +13,12 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncated_mixture import candidates, log_mass, truncated_mixture_draws
 from jaxlfi.distributions.truncation import MASS_DRAWS, Sampler, mass_inside
 
-POINTS = 1024
-"""Weighted points by which a small mass is estimated: half of them draws of the mixture, half uniform over the box."""
-CANDIDATES = 16
+POINTS = 512
+"""Weighted points of each source by which a small mass is estimated: the mixture, the prior, and the box."""
+CANDIDATES = 32
 """Weighted candidates of each draw."""
+WIDER = 1.25
+"""How many times as wide as the mixture they are drawn: the density's tails may be heavier."""
 BLOCK = 256
 """Draws made at a time, which bounds the memory for their candidates."""
 
@@ -37,21 +39,31 @@ def log_mass_inside(density: Any, mixture: GaussianMixture, region: Support | Re
         return log_mass(density, region)
     box = region if isinstance(region, Support) else region.box
     share = mass_inside(density.sample, region)
-    key_box, key_mixture = jax.random.split(jax.random.key(1))
-    half = POINTS // 2
-    theta = jnp.concatenate(
-        [box.sample(key_box, half), truncated_mixture_draws(key_mixture, mixture, box, POINTS - half)]
-    )
-    uniform = jnp.full(POINTS, -jnp.sum(jnp.log(box.width)))
-    log_drawn = jnp.logaddexp(uniform, mixture.log_prob(theta) - log_mass(mixture, box)) - np.log(2.0)
+    key_box, key_draws, key_prior = jax.random.split(jax.random.key(1), 3)
+    sources = [mixture] if region is box else [mixture, _like(region.sample(key_prior, POINTS))]
+    keys = jax.random.split(key_draws, len(sources))
+    draws = [truncated_mixture_draws(key, one, box, POINTS) for key, one in zip(keys, sources, strict=True)]
+    theta = jnp.concatenate([box.sample(key_box, POINTS), *draws])
+    uniform = jnp.full(len(theta), -jnp.sum(jnp.log(box.width)))
+    log_each = jnp.stack([uniform, *(one.log_prob(theta) - log_mass(one, box) for one in sources)])
+    log_drawn = jax.nn.logsumexp(log_each, axis=0) - np.log(len(log_each))
     log_weight = jnp.where(region.contains(theta), density.log_prob(theta) - log_drawn, -jnp.inf)
     log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
-    estimate = jax.nn.logsumexp(log_weight) - np.log(POINTS)
+    estimate = jax.nn.logsumexp(log_weight) - np.log(len(theta))
     # Squared relative errors of the two: of a share, and of a mean of weights.
     of_share = jnp.where(share > 0, (1 - share) / jnp.maximum(share * MASS_DRAWS, 1e-30), jnp.inf)
     effective = jnp.exp(2 * jax.nn.logsumexp(log_weight) - jax.nn.logsumexp(2 * log_weight))
-    of_estimate = jnp.where(effective > 0, 1 / effective - 1 / POINTS, jnp.inf)
+    of_estimate = jnp.where(effective > 0, 1 / effective - 1 / len(theta), jnp.inf)
     return jnp.where(of_estimate < of_share, estimate, jnp.log(share))
+
+
+def _like(draws: Float[Array, "n dim"]) -> GaussianMixture:
+    """A Gaussian of the mean and covariance of some draws."""
+    mean = jnp.mean(draws, axis=0)
+    scale = jnp.maximum(jnp.std(draws, axis=0), 1e-6 * (1 + jnp.abs(mean)))
+    z = (draws - mean) / scale
+    covariance = z.T @ z / len(draws) + 1e-3 * jnp.eye(draws.shape[-1])
+    return GaussianMixture(jnp.zeros(1), mean[None], (scale[:, None] * jnp.linalg.cholesky(covariance))[None])
 
 
 def rare_draws(density: Any, mixture: GaussianMixture, region: Support | Region) -> Sampler:
@@ -69,6 +81,7 @@ def rare_draws(density: Any, mixture: GaussianMixture, region: Support | Region)
     if isinstance(density, GaussianMixture) and isinstance(region, Support):
         return lambda key, n: truncated_mixture_draws(key, mixture, region, n)
     box = region if isinstance(region, Support) else region.box
+    mixture = mixture.inflated(WIDER)
 
     def block(key: jax.Array, n: int) -> Array:
         key_mixture, key_anywhere, key_pick, key_other = jax.random.split(key, 4)

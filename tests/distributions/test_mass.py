@@ -64,7 +64,7 @@ def test_rare_draws_are_the_densitys_own(key):
     assert np.asarray(support.contains(draws)).all() and len(np.unique(draws, axis=0)) > 2900
     assert stats.kstest(draws[:, 0], stats.truncnorm(4, 6).cdf).statistic < 0.05
     left = (draws[:, 1] - 0.3 - 0.5 * draws[:, 0]) / 0.6
-    assert np.mean(left) == pytest.approx(0, abs=0.15)  # by the mixture it would be at -0.9
+    assert np.mean(left) == pytest.approx(0, abs=0.3)  # by the mixture it would be beyond -1.2
 
 
 def test_rare_draws_keep_out_of_where_a_prior_is_zero(key):
