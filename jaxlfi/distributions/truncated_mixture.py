@@ -70,6 +70,7 @@ def candidates(
     return one(component, uniform)
 
 
+@jax.jit  # a round asks for it more than once: it is traced once
 def log_mass(mixture: GaussianMixture, support: Support) -> Float[Array, ""]:
     """Logarithm of the mass of a mixture in a box, however little it is; in one dimension in closed form.
 
@@ -106,8 +107,9 @@ def _lattice(n: int, dim: int) -> np.ndarray:
 def _marginal_log_masses(mixture: GaussianMixture, support: Support) -> Float[Array, "comp dim"]:
     """Logarithm of each component's mass inside, dimension by dimension."""
     scales = mixture.marginal_scales
-    one = lambda low, high: _truncated_normal(jnp.float32(0.5), low, high)[2]
-    return jax.vmap(jax.vmap(one))((support.low - mixture.means) / scales, (support.high - mixture.means) / scales)
+    low, high = (support.low - mixture.means) / scales, (support.high - mixture.means) / scales
+    flip = low + high < 0
+    return _log_interval(jnp.where(flip, -high, low), jnp.where(flip, -low, high))
 
 
 def _ordered(mixture: GaussianMixture, support: Support) -> tuple[Array, Array, Array]:
@@ -141,6 +143,14 @@ def _by_conditionals(
     return support.clip(theta), log_weight, log_mass
 
 
+@jax.jit
+def _log_interval(near: Float[Array, "*n"], far: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Logarithm of the standard normal's mass in an interval, by its ends on the side of the upper tail."""
+    log_near, log_far = log_ndtr(-jnp.stack([near, far]))
+    return log_near + jnp.log1p(-jnp.exp(jnp.minimum(log_far - log_near, -1e-7)))
+
+
+@jax.jit
 def _truncated_normal(
     uniform: Float[Array, ""], low: Float[Array, ""], high: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
@@ -151,10 +161,9 @@ def _truncated_normal(
     """
     flip = low + high < 0  # to the side of the upper tail, where small masses keep their precision
     near, far = jnp.where(flip, -high, low), jnp.where(flip, -low, high)
-    log_beyond_near, log_beyond_far = log_ndtr(-jnp.stack([near, far]))
-    log_mass = log_beyond_near + jnp.log1p(-jnp.exp(jnp.minimum(log_beyond_far - log_beyond_near, -1e-7)))
-    beyond_near, beyond_far = jnp.exp(log_beyond_near), jnp.exp(log_beyond_far)
-    middle = -ndtri(jnp.clip(beyond_near - uniform * (beyond_near - beyond_far), 1e-37, 1.0 - 1e-7))
+    log_mass = _log_interval(near, far)
+    beyond = jnp.exp(log_ndtr(-near)) - uniform * jnp.exp(log_mass)
+    middle = -ndtri(jnp.clip(beyond, 1e-37, 1.0 - 1e-7))
     # Beyond a of a few standard deviations the density falls about as exp(-a (z - a)).
     rate = jnp.maximum(near, TAIL)
     all_beyond = -jnp.expm1(-rate * (far - near))
