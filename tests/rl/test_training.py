@@ -274,7 +274,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(words, expected, tmp_path, cap
 
 def test_domains_that_print_alike_are_told_apart(tmp_path, monkeypatch):
     run = SimpleNamespace(space=LINE.space, feasible=LINE.space.box_to_inference(LINE.feasible), units=None)
-    run.heuristic, run.belief = SimpleNamespace(grows=True), None
+    run.heuristic, run.belief, run.task = SimpleNamespace(grows=True), None, None
     monkeypatch.setattr("jaxlfi.runs.load.load", lambda folder: run)
     folders = [tmp_path / name for name in ("a/one/posterior", "b/one/posterior", "b/two/posterior", "other")]
     for folder in folders:
