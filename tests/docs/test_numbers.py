@@ -56,7 +56,11 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize(
     "line",
-    [line for folder in sorted((RESULTS / "widths").glob("*/*")) for line in widths.table(folder).splitlines()[2:]],
+    [
+        line
+        for folder in sorted([*(RESULTS / "widths").glob("*/*"), *(RESULTS / "normaliser").glob("*/*")])
+        for line in widths.table(folder).splitlines()[2:]
+    ],
 )
 def test_widths(line):
     assert " ".join(line.split()) in README
