@@ -65,7 +65,7 @@ def fit_mixture(
     deviation = jnp.sqrt(weights @ (theta - shift) ** 2)
     # Equal samples have a deviation of 0 or of rounding errors: the resolution of float32 is the least that means much.
     largest = jnp.max(jnp.where((weights > 0)[:, None], jnp.abs(theta), 0.0), axis=0)
-    scale = jnp.maximum(deviation, jnp.maximum(1e-6 * largest, jnp.finfo(theta.dtype).tiny))
+    scale = jnp.maximum(deviation, jnp.maximum(1e-6 * largest, 1e-16))  # whose square is still a number
     z = jnp.where((weights > 0)[:, None], (theta - shift) / scale, 0.0)
 
     def one(key):
