@@ -64,7 +64,10 @@ def inferred(method, unit, offset, **estimator):
     return draws.mean(), draws.std()
 
 
-@pytest.mark.parametrize(("method", "normaliser"), [("bayessim", "zscore"), ("bayessim", "asinh"), ("npe", "asinh")])
+@pytest.mark.parametrize(
+    ("method", "normaliser"),
+    [("bayessim", "zscore"), ("bayessim", "asinh"), pytest.param("npe", "asinh", marks=pytest.mark.slow)],
+)
 def test_the_posterior_does_not_depend_on_them(method, normaliser):
     changes = {"normaliser": normaliser} | ({"regression": 1} if method == "npe" else {"components": 1})
     mean, deviation = inferred(method, 1.0, 0.0, **changes)
