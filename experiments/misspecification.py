@@ -52,7 +52,7 @@ BOX = "ok"
 
 
 def oscillator(key: jax.Array, theta: jax.Array) -> jax.Array:
-    """Position and velocity of a damped oscillator at 25 instants, with noise, shape [25, 2]."""
+    """Position and velocity of a damped oscillator at 25 times, with noise, shape [25, 2]."""
     frequency, damping = theta
     time = 0.2 * jnp.arange(25)
     fall = jnp.exp(-damping * time)

@@ -20,7 +20,7 @@ _BEYOND = 0.06
 _POSES = 8
 """Equal parts of the readings' range, all of which a rod goes through that is seen without its direction."""
 _AMBIGUOUS = 0.4
-"""Of the period: from steps as long as this on it is hardly told which way round they went."""
+"""Of the period: steps longer than this may have gone either way round."""
 
 
 class Unwrapped(NamedTuple):

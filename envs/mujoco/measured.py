@@ -85,12 +85,12 @@ def places(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
 def unit(model: mujoco.MjModel, name: str) -> str:
     """The unit that a signal is measured in; "1" of orientations, and "" where its sensor does not say."""
     sensor = _sensor(model, name)
-    kind, thing = mujoco.mjtSensor(int(sensor.type[0])), int(sensor.objid[0])
+    kind, item = mujoco.mjtSensor(int(sensor.type[0])), int(sensor.objid[0])
     if kind in _PER_JOINT:
         of_hinge, of_slide = _PER_JOINT[kind]
-        return of_hinge if model.jnt_type[thing] == mujoco.mjtJoint.mjJNT_HINGE else of_slide
+        return of_hinge if model.jnt_type[item] == mujoco.mjtJoint.mjJNT_HINGE else of_slide
     if kind in _PER_ACTUATOR:
-        return length + _PER_ACTUATOR[kind] if (length := _length(model, thing)) else ""
+        return length + _PER_ACTUATOR[kind] if (length := _length(model, item)) else ""
     return _UNIT.get(kind, "")
 
 
