@@ -69,7 +69,7 @@ def cases_of(task: Task, first: int, observed: np.ndarray) -> Cases:
 def beliefs(task: Task, settings: Settings, cases: Cases, batch: int, console: Console) -> Posterior:
     """The posteriors of all cases, stacked."""
     states, _ = final_states(task, settings, task.support(SUPPORT), Fixed(), cases, batch, console)
-    return jax.vmap(lambda state, x: posterior_after(state.belief, state.network, x))(states, cases.x)
+    return jax.vmap(lambda state, x: posterior_after(state.reported, state.network, x))(states, cases.x)
 
 
 def multiplied(each: GaussianMixture) -> GaussianMixture:

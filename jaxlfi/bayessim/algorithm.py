@@ -32,7 +32,8 @@ class State:
     """What the next round needs.
 
     Attributes:
-        belief: the reference prior p_i on its support Theta_i.
+        belief: the reference prior p_i on its support Theta_i, by which the next round proposes and adapts.
+        reported: what the run believes: the same, unless the correction divides the pooled proposals out.
         proposals: what the rounds so far drew from, stacked, with room for all rounds.
         dataset: all simulations so far.
         network: the density estimator.
@@ -42,6 +43,7 @@ class State:
     """
 
     belief: Belief
+    reported: Belief
     proposals: Belief
     dataset: Dataset
     network: Network
@@ -111,6 +113,7 @@ def init(
         attempts = datasets.empty(room(settings.simulation_budget), task.dim, 1)
     return State(
         belief=belief,
+        reported=belief,
         proposals=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (settings.rounds, *leaf.shape)), belief),
         dataset=datasets.empty(capacity, task.dim, obs),
         network=network,
@@ -174,17 +177,21 @@ def update(
     posterior = network.condition(observed, state.belief.support, key_condition)
     mixture, not_positive_definite = correction.change(task, posterior.mixture, proposed)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
+    reported = belief
+    if correction.report is not None:
+        divided, _ = correction.report(task, mixture, proposals, round, settings.defensive, state.belief.support)
+        reported = belief.replace(mixture=divided)
     info = Round(
         simulations=simulations,
         failed=simulations.failed(len(task.reasons)),
         proposal=proposed,
-        belief=belief,
+        belief=reported,
         adaptation=adaptation,
         correction=CorrectionInfo(effective_size(weights), not_positive_definite, posterior.mass_inside),
         fit=fit_info,
     )
     progress = advanced(state.progress, mixture, settings.min_rounds)
-    after = State(belief, proposals, dataset, network, progress, attempts)
+    after = State(belief, reported, proposals, dataset, network, progress, attempts)
     return _unless_settled(state, after, info) if settings.min_rounds else (after, info)
 
 
@@ -198,7 +205,7 @@ def _unless_settled(before: State, after: State, info: Round) -> tuple[State, Ro
             counted=jnp.zeros_like(simulations.counted), kept=jnp.zeros_like(simulations.kept)
         ),
         failed=jnp.zeros_like(info.failed),
-        belief=before.belief,
+        belief=before.reported,
         adaptation=adaptation.replace(
             low_shift=jnp.zeros_like(adaptation.low_shift), high_shift=jnp.zeros_like(adaptation.high_shift)
         ),

@@ -151,7 +151,7 @@ def update_one(
 def check_draws(run: RunInputs, state: State) -> tuple[Float[Array, "samples dim"], Array]:
     """Draws of the posterior after a run's last round, in inference space, and the key of their simulations."""
     key_draw, key_simulate = run_keys(run.key).of_predictive(state.progress.rounds - 1)
-    posterior = posterior_after(state.belief, state.network, run.x)
+    posterior = posterior_after(state.reported, state.network, run.x)
     return posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference"), key_simulate
 
 

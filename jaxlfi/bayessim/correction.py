@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from jaxlfi.bayessim.pooled import without_pool
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_algebra import product, quotient, reduce
@@ -44,11 +45,14 @@ class Correction:
     Attributes:
         row_weights: (task, dataset, proposals, round, defensive fraction) -> weight of each row in the loss, shape [C].
         change: (task, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
+        report: (task, q, all rounds' proposals, round, defensive fraction, support) -> the mixture that a run reports and
+            the effective share of draws of q, where it differs from what proposals and heuristics go on with; else None.
         accounts_for_prior: whether it does all that is done for a task's own prior; else proposals do.
     """
 
     row_weights: Callable[[Task, Dataset, Belief, Array, Array], Array]
     change: Callable[[Task, GaussianMixture, Belief], tuple[GaussianMixture, Array]]
+    report: Callable[..., tuple[GaussianMixture, Array]] | None = None
     accounts_for_prior: bool = False
 
 
@@ -165,6 +169,7 @@ CORRECTIONS: dict[str, Correction] = {
     # To the letter, which draws from the posterior itself (line 8) and divides by the prior (line 11).
     "paper": Correction(equal_weights, times_reference, accounts_for_prior=True),
     "quotient": Correction(equal_weights, divided_by_proposal),
+    "pooled": Correction(equal_weights, unchanged, report=without_pool),
     "importance": Correction(importance_weights, unchanged, accounts_for_prior=True),
 }
 """Corrections by name."""

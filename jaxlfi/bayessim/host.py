@@ -157,8 +157,8 @@ def _references(task: Task, settings: Settings, observed: np.ndarray, x: np.ndar
     estimator = settings.estimator
     if estimator.normaliser == "none":
         return np.zeros_like(x)
-    record_size = estimator.reading(layout(task.summary, observed.shape[1:], x.shape[1])).record_size
-    return np.stack([reference_of(own, record_size) for own in x])
+    alike = estimator.reading(layout(task.summary, observed.shape[1:], x.shape[1])).alike
+    return np.stack([reference_of(own, alike) for own in x])
 
 
 _check_draws = jax.jit(single(jax.vmap(check_draws)))

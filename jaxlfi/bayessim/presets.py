@@ -24,9 +24,19 @@ ENSEMBLE = {
 """Four networks that start anew every round."""
 
 QUICK = Settings(
-    estimator=MixtureNetwork(hidden=(64, 64), prune=0.1, epochs=100, learning_rate=3e-3, schedule="cosine", **ENSEMBLE),
+    estimator=MixtureNetwork(
+        hidden=(64, 64),
+        parameters="zscore",
+        reduction="regression",
+        prune=0.1,
+        epochs=100,
+        learning_rate=3e-3,
+        schedule="cosine",
+        **ENSEMBLE,
+    ),
     rounds=20,
     min_rounds=10,
+    correction="pooled",
     restriction="mixed",
     inflation=2.0,
 )

@@ -22,7 +22,8 @@ class Settings(Checked):
             (`jaxlfi.bayessim.convergence`); 0 is the paper: all rounds are made.
         simulations_per_round: valid simulations added to the dataset each round, at most.
         simulation_budget: simulations attempted each round, at most, failures included.
-        correction: how q_phi becomes the posterior, "none", "paper", "quotient" or "importance" (reading A).
+        correction: how q_phi becomes the posterior, "none", "paper", "quotient", "pooled" or "importance"
+            (reading A).
         restriction: how proposals are kept in the support, "clip", "reject" or "mixed" (reading E).
         defensive: fraction of each round's proposals drawn from the prior over the current support instead of the
             posterior. 0 is the paper. A leaf.
@@ -69,7 +70,7 @@ class Settings(Checked):
                 f"simulation_budget: expected at least the {self.simulations_per_round} simulations of a round, "
                 f"got {self.simulation_budget}"
             )
-        if self.correction in ("paper", "quotient") and not self.estimator.closed_form:
+        if self.correction in ("paper", "quotient", "pooled") and not self.estimator.closed_form:
             raise ValueError(
                 f"correction: expected 'none' or 'importance' for {type(self.estimator).__name__}, as "
                 f"{self.correction!r} calculates with mixtures of Gaussians, got {self.correction!r}"

@@ -22,6 +22,7 @@ from jaxlfi.estimators.embeddings import EMBEDDINGS, Embedded
 from jaxlfi.estimators.losses import LOSSES, Rows
 from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser, standardiser
 from jaxlfi.estimators.posterior import Posterior, truncated
+from jaxlfi.estimators.regression import Regression, features_size, fit_regression, unfitted
 from jaxlfi.fields import Checked, check_fields, hyperparameter, option
 
 FIT_DRAWS = 1000
@@ -62,7 +63,9 @@ class Estimator(Checked, abc.ABC):
             "trials" of records in no order. With the last two, numbers at the same place of all records are
             normalised alike.
         features: numbers F that the embedding makes of a summary.
-        record_size: numbers of a record in the summary that is embedded: the channels of a series, the length of one
+        reduction: "none", or "regression": in place of summaries the network sees what linear regressions on them, and
+            on the statistics of a series, predict the parameters to be (`jaxlfi.estimators.regression`).
+        record_size: numbers of a record in the summary that is embedded or reduced: the channels of a series, the length of one
             trial. 0 is what the task's summary has (`jaxlfi.tasks.summaries.layout`).
 
     Raises:
@@ -95,6 +98,9 @@ class Estimator(Checked, abc.ABC):
         help="network that makes features of long summaries, trained with the other",
     )
     features: int = option(16, low=1, help="numbers that the embedding makes of a summary")
+    reduction: str = option(
+        "none", choices=("none", "regression"), help="regression: the network sees what regressions predict"
+    )
     record_size: int = option(
         0, low=0, help="numbers of a record (channels of a series, length of a trial) in the summary; 0: the task's"
     )
@@ -125,8 +131,15 @@ class Estimator(Checked, abc.ABC):
                 f"batch_size: expected at least 2, as the loss {self.loss!r} compares the simulations of a minibatch, "
                 f"got {self.batch_size}"
             )
-        if self.record_size and self.embedding == "none":
-            raise ValueError(f"record_size: expected 0 without an embedding, got {self.record_size}")
+        if self.reduction != "none" and self.embedding != "none":
+            raise ValueError(f"embedding: expected 'none' with a reduction, got {self.embedding!r}")
+        if self.reduction != "none" and (self.warm_start or self.of_summaries):
+            raise ValueError(
+                f"reduction: expected 'none' for networks that are trained on (warm_start) or give a density of the "
+                f"summary, got {self.reduction!r}"
+            )
+        if self.record_size and self.embedding == self.reduction == "none":
+            raise ValueError(f"record_size: expected 0 without an embedding or a reduction, got {self.record_size}")
         return self
 
     def check_for(self, dim: int, obs: int = 1) -> None:
@@ -153,12 +166,31 @@ class Estimator(Checked, abc.ABC):
         Raises:
             ValueError: where the summary is not made of whole records.
         """
-        if self.embedding == "none":
+        if self.embedding == self.reduction == "none":
             return self
-        size, record_size = math.prod(layout), self.record_size or EMBEDDINGS[self.embedding].record_size(layout)
+        size = math.prod(layout)
+        default = layout[-1] if self.embedding == "none" else EMBEDDINGS[self.embedding].record_size(layout)
+        record_size = self.record_size or default
         if size % record_size:
             raise ValueError(f"record_size: expected a divisor of the summary's {size} numbers, got {record_size}")
         return self.replace(record_size=record_size)
+
+    @property
+    def standardises(self) -> bool:
+        """Whether the network sees parameters by their mean and standard deviation over the simulations it learns from.
+
+        A density that starts as a standard normal has to.
+        """
+        return True
+
+    @property
+    def alike(self) -> int:
+        """Numbers of a record where numbers at the same place of all records are normalised alike; else 0."""
+        return 0 if self.embedding == "none" else self.record_size
+
+    def inputs(self, dim: int, obs: int) -> int:
+        """How many numbers the network sees of a summary of length S, for D parameters."""
+        return obs if self.reduction == "none" else features_size(dim, obs, self.record_size or 1)
 
     def keys(self, key: jax.Array) -> tuple[jax.Array, jax.Array | None]:
         """Keys to fit by and to condition by; a mixture of Gaussians is read off the network without one."""
@@ -166,8 +198,8 @@ class Estimator(Checked, abc.ABC):
 
     def initialise(self, key: jax.Array, dim: int, obs: int) -> dict:
         """Fresh weights for every network of the ensemble."""
-        module = self.embedded(dim)
-        return jax.vmap(lambda k: module.init(k, jnp.zeros(obs)))(jax.random.split(key, self.ensemble_size))
+        module, inputs = self.embedded(dim), self.inputs(dim, obs)
+        return jax.vmap(lambda k: module.init(k, jnp.zeros(inputs)))(jax.random.split(key, self.ensemble_size))
 
     def begin(
         self, params: dict, theta: Float[Array, "n dim"], x: Float[Array, "n obs"], valid: Bool[Array, " n"]
@@ -203,7 +235,7 @@ class Estimator(Checked, abc.ABC):
     def density(self, network: "Network", x: Float[Array, " obs"]) -> Density:
         """q_phi(theta | x) in inference space, not truncated: the whole ensemble."""
         module = self.embedded(network.scale.dim)
-        each = jax.vmap(lambda params: module.apply(params, network.normaliser(x)))(network.params)
+        each = jax.vmap(lambda params: module.apply(params, network.given(x)))(network.params)
         shift, scale = network.from_network()
         return EnsembleDensity(each, shift, scale, self.ensemble_size)
 
@@ -227,10 +259,11 @@ class Network:
         estimator: the settings it was made with.
         params: Flax parameters with a leading axis of length E.
         normaliser: what summaries are transformed, centred and scaled by.
-        theta_normaliser: what parameters, scaled to [-1, 1]^D, are centred and scaled by for a density that starts as a
-            standard normal; none for a mixture density network (reading D).
+        theta_normaliser: what parameters, scaled to [-1, 1]^D, are centred and scaled by; None where the network sees
+            them as they are (`Estimator.standardises`).
         scale: the box in inference space that [-1, 1]^D stands for, Phi.
         space: the map between inference space and natural units.
+        regression: what the network sees in place of normalised summaries; None for the summaries themselves.
         prior: the task's own prior over inference space, None for a uniform one. A likelihood is multiplied by it; a
             density that is the posterior has it in it, and is cut off where the prior is zero.
         validity: the probability of success by the parameters (`jaxlfi.estimators.validity`), where what is learnt from
@@ -245,6 +278,11 @@ class Network:
     space: Space = struct.field(pytree_node=False)
     prior: Any = struct.field(pytree_node=False, default=None)
     validity: Any = None
+    regression: Regression | None = None
+
+    def given(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n given"]:
+        """What the network sees of raw summaries."""
+        return self.normaliser(x) if self.regression is None else self.regression(x)
 
     def condition(self, x: Float[Array, " obs"], support: Support, key: jax.Array | None = None) -> Posterior:
         """The posterior of a raw summary (Algorithm 1, line 11), truncated to a support.
@@ -274,8 +312,21 @@ class Network:
         """The same fresh weights with all that a network takes from the simulations it starts on."""
         of_x, of_theta = _normalisers(self.estimator, dataset, self.scale)
         network = self.replace(normaliser=of_x, theta_normaliser=of_theta)
-        theta, x = network.to_network(dataset.theta), network.normaliser(dataset.x)
-        return network.replace(params=self.estimator.begin(self.params, theta, x, dataset.valid))
+        theta = network.to_network(dataset.theta)
+        if self.regression is not None:
+            network = network.replace(regression=network._regression_of(dataset)[0])
+        params = self.estimator.begin(self.params, theta, network.given(dataset.x), dataset.valid)
+        return network.replace(params=params)
+
+    def seen(self, dataset: Dataset) -> Float[Array, "cap given"]:
+        """What the network learns from, of the simulations that it began on."""
+        return self.given(dataset.x) if self.regression is None else self._regression_of(dataset)[1]
+
+    def _regression_of(self, dataset: Dataset) -> tuple[Regression, Array]:
+        """The regressions over the later half of the rounds, which are nearer to the observation than those before."""
+        last = jnp.max(jnp.where(dataset.valid, dataset.round, 0))
+        near = dataset.valid & (2 * dataset.round > last - 1)
+        return fit_regression(self.regression, self.to_network(dataset.theta), dataset.x, dataset.valid, near)
 
     def restarted(self, key: jax.Array, dataset: Dataset) -> "Network":
         """Fresh weights, and the normalisers of these simulations."""
@@ -290,11 +341,15 @@ def untrained(
     estimator = jax.tree.map(jnp.asarray, estimator).reading((obs, 1))  # its leaves are carried through loops
     nothing = empty(1, scale.dim, obs)
     params = estimator.initialise(key, scale.dim, obs)
-    return Network(estimator, params, *_normalisers(estimator, nothing, scale), scale, space, prior)
+    regression = None
+    if estimator.reduction != "none":
+        regression = unfitted(scale.dim, obs, estimator.record_size)
+    normalisers = _normalisers(estimator, nothing, scale)
+    return Network(estimator, params, *normalisers, scale, space, prior, regression=regression)
 
 
 def _normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tuple[Normaliser, Normaliser | None]:
-    of_x = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid, estimator.record_size)
-    if estimator.closed_form:
+    of_x = fit_normaliser(estimator.normaliser, dataset.x, dataset.valid, estimator.alike)
+    if not estimator.standardises:
         return of_x, None
     return of_x, standardiser(scale.to_unit(dataset.theta), dataset.valid)

@@ -76,7 +76,7 @@ class SplineFlow(FlowEstimator):
         """Fresh weights, with the regression for the linear term of the first shift of some networks."""
         if not self.regression or self.embedding != "none":
             return params
-        coefficients, intercept = ridge(x, theta, valid)
+        coefficients, intercept, _ = ridge(x, theta, valid)
         start = jnp.concatenate([coefficients, intercept[:, None]], axis=1)
         linear = params["params"][REGRESSION]
         chosen = jnp.arange(len(linear)) < self.regression

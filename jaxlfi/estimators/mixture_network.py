@@ -22,6 +22,9 @@ class MixtureNetwork(Estimator):
     Attributes:
         hidden: units of each hidden layer.
         activation: "relu", "tanh" or "silu".
+        parameters: "feasible" or "zscore": parameters as the network sees them, scaled by Phi to [-1, 1]^D (reading D,
+            the paper's) or by their mean and standard deviation over the simulations. In a wide Phi a posterior is a
+            dot, and small networks learn it slowly.
         prune: components of less weight than this are dropped from each network's mixture. Rarely used components are
             hardly trained: they are wide and anywhere. BayesSim's first implementations prune at 0.005; the paper
             does not say. A leaf.
@@ -33,11 +36,17 @@ class MixtureNetwork(Estimator):
 
     hidden: tuple[int, ...] = option((1024, 1024, 1024), low=1, help="units of each hidden layer")
     activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="relu, tanh or silu")
+    parameters: str = option("feasible", choices=("feasible", "zscore"), help="what parameters are scaled by")
     prune: Float[Array, "*batch"] | float = hyperparameter(
         0.0, low=0.0, high=0.5, help="components of less weight than this are dropped"
     )
 
     closed_form: ClassVar[bool] = True
+
+    @property
+    def standardises(self) -> bool:
+        """Whether parameters are scaled by their spread over the simulations, or by Phi."""
+        return self.parameters == "zscore"
 
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one ensemble member for D parameters."""
@@ -53,7 +62,7 @@ class MixtureNetwork(Estimator):
     def density(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
         """q_phi(theta | x) in inference space, the whole ensemble pooled: E K components."""
         module = self.embedded(network.scale.dim)
-        x = network.normaliser(x)
+        x = network.given(x)
         each = jax.vmap(lambda params: module.apply(params, x).mixture().prune(self.prune))(network.params)
         shift, scale = network.from_network()
         return pool(each).affine(scale, shift)

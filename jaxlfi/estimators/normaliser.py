@@ -14,12 +14,11 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlfi.tasks.reference import RESOLVED
 
-UNITS = np.logspace(-3, 2, 11).astype(np.float32)
-"""Units of asinh that are tried, relative to the median distance from the origin that is tried."""
-ORIGINS = (0.0, 0.5, 1.0)
-"""Origins of asinh that are tried: quantiles of a summary. From the least, asinh is a logarithm of an upper tail."""
-ROWS = 256
-"""Simulations that origin and unit are chosen by, at most; the moments are those of all."""
+ROWS = 255
+"""Simulations that origin and unit are taken from, at most; mean and standard deviation are those of all.
+
+An odd number has one in the middle, which is the same whatever the sign of the summary.
+"""
 
 
 @struct.dataclass
@@ -53,15 +52,15 @@ def untouched(x: Array) -> Array:
 TRANSFORMS: dict[str, Callable[[Array], Array]] = {"none": untouched, "zscore": untouched, "asinh": jnp.arcsinh}
 """What is done to each summary between the two changes of origin and unit, by the normaliser's name.
 
-"asinh" is linear near its origin and logarithmic in the tails: summaries of stochastic simulators (a mean population,
-say) can span many orders of magnitude, and then a plain z-score squeezes everything like the observation into one
-point. Its origin and unit are found for each summary (`likeliest_asinh`); what has no tails stays as it is, but for its
-mean and standard deviation. "none" leaves the unit to the simulator.
+"asinh" is linear about a summary's median and logarithmic many median absolute deviations away: summaries of
+stochastic simulators (a mean population, say) can span many orders of magnitude, and then a plain z-score squeezes
+everything like the observation into one point. A smaller unit, a logarithm about the median, say, fits the tails of
+such summaries better, but blows up the noise of ordinary ones. "none" leaves the unit to the simulator.
 """
 
 
 def fit_normaliser(
-    name: str, x: Float[Array, "cap obs"], valid: Bool[Array, " cap"], record_size: int = 0
+    name: str, x: Float[Array, "cap obs"], valid: Bool[Array, " cap"], record_size: int = 0, linear: float = 1.0
 ) -> Normaliser:
     """Origin, unit, mean and standard deviation of each summary over the valid rows; the identity for "none".
 
@@ -71,17 +70,19 @@ def fit_normaliser(
         valid: the rows that count, shape [C].
         record_size: where it is not 0, summaries are records of so many numbers, all of them normalised alike: a
             series is scaled by channel, not by time, and trials can be exchanged.
+        linear: median absolute deviations in a unit.
     """
     size = x.shape[-1]
     if 0 < record_size < size:
         count = size // record_size
-        one = fit_normaliser(name, x.reshape(-1, record_size), jnp.repeat(valid, count))
+        one = fit_normaliser(name, x.reshape(-1, record_size), jnp.repeat(valid, count), linear=linear)
         return jax.tree.map(lambda leaf: jnp.tile(leaf, count), one)
     if name == "none":
         return identity(size)
     x = jnp.where(valid[:, None], x, x[jnp.argmax(valid)])
     some = some_rows(x, valid)
-    origin, unit = likeliest_asinh(some) if name == "asinh" else (_quantile(some, 0.5), _range(x))
+    origin, unit = middle(some)
+    unit = jnp.where(unit > 0, linear * unit, _range(x))
     unit = jnp.where(varies(x), unit, 1.0)
     mean, deviation = _moments(TRANSFORMS[name]((x - origin) / unit), valid)
     fitted = Normaliser(mean, jnp.where(varies(x), deviation, jnp.inf), name, origin, unit)
@@ -107,42 +108,22 @@ def varies(x: Float[Array, "n obs"]) -> Bool[Array, " obs"]:
 
 
 def some_rows(x: Float[Array, "cap obs"], valid: Bool[Array, " cap"]) -> Float[Array, "rows obs"]:
-    """At most `ROWS` of the valid rows, spread evenly whatever period the rows have (by the golden ratio)."""
-    count = min(ROWS, len(x))
+    """At most `ROWS` of the valid rows, an odd number, spread evenly whatever period the rows have (by the golden ratio)."""
+    count = min(ROWS, len(x) - 1 + len(x) % 2)
     places = np.modf(np.arange(count) * (np.sqrt(5) - 1) / 2)[0].astype(np.float32)
     (rows,) = jnp.nonzero(valid, size=len(x), fill_value=0)
     return x[rows[(places * jnp.sum(valid)).astype(jnp.int32)]]
 
 
-def likeliest_asinh(x: Float[Array, "n obs"]) -> tuple[Float[Array, " obs"], Float[Array, " obs"]]:
-    """Origin c and unit s for each summary by which asinh((x - c) / s) is most like a normal variable.
+def middle(x: Float[Array, "n obs"]) -> tuple[Float[Array, " obs"], Float[Array, " obs"]]:
+    """Median and median absolute deviation of each summary, shape [S] each.
 
-    Of `ORIGINS` and `UNITS` those of maximum likelihood (Burbidge, Magee and Robb 1988). For a summary of many orders
-    of magnitude the unit is small, and asinh nearly a logarithm of the distance from the origin, which is then one end
-    of the summary's range, or its middle where both ends have tails; for one without tails the unit is large, and
-    asinh nearly linear.
+    The mean absolute deviation in place of a zero: most counts of something rare are equal.
     """
-    origins = jnp.stack([_quantile(x, place) for place in ORIGINS])
-
-    def tried(origin):
-        distance = jnp.abs(x - origin)
-        middle = _quantile(distance, 0.5)
-        middle = jnp.where(middle > 0, middle, jnp.mean(distance, axis=0))
-        return jnp.where(middle > 0, middle, 1.0) * UNITS[:, None]
-
-    def log_likelihood(origin, unit):
-        z = (x - origin) / unit
-        _, deviation = _moments(jnp.arcsinh(z), jnp.ones(len(x), bool))
-        # d asinh((x - c) / s) / dx = 1 / (s sqrt(1 + z^2))
-        log_slope = -jnp.log(unit) - jnp.mean(jnp.log(jnp.hypot(1.0, z)), axis=0)
-        return log_slope - jnp.log(jnp.maximum(deviation, 1e-6))
-
-    units = jax.vmap(tried)(origins)  # [origin, unit, S]
-    each_unit = jax.vmap(log_likelihood, in_axes=(None, 0))
-    heights = jax.vmap(each_unit)(origins, units).reshape(-1, x.shape[-1])
-    best = jnp.argmax(heights, axis=0)
-    take = lambda values: jnp.take_along_axis(values.reshape(-1, x.shape[-1]), best[None], axis=0)[0]
-    return take(jnp.broadcast_to(origins[:, None], units.shape)), take(units)
+    median = _quantile(x, 0.5)
+    away = jnp.abs(x - median)
+    deviation = _quantile(away, 0.5)
+    return median, jnp.where(deviation > 0, deviation, jnp.mean(away, axis=0))
 
 
 def _quantile(x: Float[Array, "n obs"], place: float) -> Float[Array, " obs"]:

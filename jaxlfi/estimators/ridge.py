@@ -10,7 +10,7 @@ PENALTIES = np.logspace(0, 5, 11).astype(np.float32)
 
 def ridge(
     x: Float[Array, "cap obs"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"]
-) -> tuple[Float[Array, "dim obs"], Float[Array, " dim"]]:
+) -> tuple[Float[Array, "dim obs"], Float[Array, " dim"], Float[Array, "cap dim"]]:
     """Coefficients W and intercept b of a linear regression, y = W x + b.
 
     The penalty, one of `PENALTIES` for each column of y, has the least generalised cross-validation error (Golub, Heath
@@ -22,7 +22,8 @@ def ridge(
         valid: the rows that count, shape [C].
 
     Returns:
-        W and b; zeros without rows.
+        W and b, zeros without rows; and what each row would be predicted to be, were the regression fitted without it
+        (Allen 1974), shape [C, D], less b.
     """
     rows = jnp.sum(valid)
     x_mean, y_mean = (jnp.sum(v, axis=0, where=valid[:, None]) / jnp.maximum(rows, 1) for v in (x, y))
@@ -36,4 +37,8 @@ def ridge(
     best = jnp.argmin(residual / free[:, None] ** 2, axis=0)
     shrunk = jnp.take_along_axis(kept, best[:, None], axis=0)  # [D, R]
     coefficients = (shrunk * along.T / jnp.where(singular > 0, singular, 1.0)) @ right
-    return coefficients, y_mean - coefficients @ x_mean
+    # The change is the residual times the leverage over one less the leverage; the mean's own is 1 / rows.
+    leverage = jnp.einsum("cr,dr->cd", left**2, shrunk) + 1 / jnp.maximum(rows, 1)
+    fitted = x @ coefficients.T
+    left_out = fitted - (y - fitted) * leverage / jnp.maximum(1 - leverage, 1e-3)
+    return coefficients, y_mean - coefficients @ x_mean, left_out + coefficients @ x_mean

@@ -75,7 +75,7 @@ def fit(
     key_init, key_fit = jax.random.split(key)
     if not estimator.warm_start:
         network = network.restarted(key_init, dataset)
-    x = network.normaliser(dataset.x)
+    x = network.seen(dataset)
     theta = network.to_network(dataset.theta)
     log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
     key_rows = jax.random.fold_in(jax.random.clone(key_init), 1)

@@ -240,7 +240,7 @@ def _run(plan, spec, state, observed, index, rows, seconds, final, place, refere
     """One run of a batch out of the arrays of all."""
     history = stacked_rounds([run_row(row, index, place) for row in rows])
     return Run(
-        belief=state.belief,
+        belief=state.reported,
         history=history
         | {"seconds": np.asarray(seconds)}
         | {name: value[index] for name, value in final.items() if name.startswith(FINAL)},

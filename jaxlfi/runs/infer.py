@@ -256,7 +256,7 @@ def _traced(key, task: Task, observation, support: Support, heuristic, settings:
     state, records = _scan(task, settings, inputs)
     history = {name: value[-1] if name.startswith(FINAL) else value for name, value in records.items()}
     return Run(
-        belief=state.belief,
+        belief=state.reported,
         history=history | {"seconds": jnp.full(settings.rounds, jnp.nan)},
         dataset=state.dataset,
         network=state.network,

@@ -124,7 +124,7 @@ def _by_network(run: Run, key: jax.Array, truth: jax.Array, x: jax.Array, draws:
 @single
 @functools.partial(jax.vmap, in_axes=(0, 0, 0, 0, None))
 def _by_states(key: jax.Array, truth: jax.Array, x: jax.Array, state: Any, draws: int):
-    return described(key, truth, posterior_after(state.belief, state.network, x), draws)
+    return described(key, truth, posterior_after(state.reported, state.network, x), draws)
 
 
 def _keys(plan: CalibrationPlan, purpose: int, first: int, count: int) -> jax.Array:

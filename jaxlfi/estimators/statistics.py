@@ -1,0 +1,66 @@
+"""General statistics of a series: what its raw numbers say of their spread, shape and memory, in a few features."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+LEAST = 10
+"""Records below which a summary is no series, and has no statistics."""
+LAGS = (1, 2, 3, 4, 5)
+"""Lags of the autocorrelations."""
+QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+"""Places of the order statistics."""
+MOST_CHANNELS = 8
+"""Channels up to which each pair's correlation is a statistic."""
+
+
+def statistics_size(records: int, channels: int) -> int:
+    """Length of `statistics` of a series of T records of C channels; 0 for what is too short."""
+    if records < LEAST:
+        return 0
+    pairs = channels * (channels - 1) // 2 if channels <= MOST_CHANNELS else 0
+    return channels * (5 + len(LAGS) + len(QUANTILES)) + pairs
+
+
+def statistics(series: Float[Array, "*n time channels"]) -> Float[Array, "*n stat"]:
+    """Of each channel its mean, log standard deviation, log root mean square of differences, skewness, kurtosis,
+    autocorrelations and quantiles; of each pair of channels their correlation.
+
+    Location and scale are taken out before anything is squared, so that no unit overflows. A channel that is constant
+    has the log of its last place in place of the log of zero, and 0 for what is undefined.
+
+    Args:
+        series: shape [..., T, C], T >= `LEAST`.
+
+    Returns:
+        Shape [..., M], M of `statistics_size`.
+    """
+    count, channels = series.shape[-2:]
+    first = series[..., :1, :]
+    low, high = jnp.min(series, axis=-2), jnp.max(series, axis=-2)
+    last_place = jnp.finfo(series.dtype).eps * jnp.maximum(jnp.abs(low), jnp.abs(high))
+    span = jnp.maximum(jnp.maximum(high - low, last_place), jnp.finfo(series.dtype).tiny)
+    values = (series - first) / span[..., None, :]
+    mean = jnp.mean(values, axis=-2)
+    centred = values - mean[..., None, :]
+    deviation = jnp.sqrt(jnp.mean(centred**2, axis=-2))
+    varies = high - low > last_place
+    floor = jnp.finfo(series.dtype).eps
+    z = jnp.where(varies, 1 / jnp.maximum(deviation, floor), 0.0)[..., None, :] * centred
+    steps = jnp.sqrt(jnp.mean(jnp.diff(values, axis=-2) ** 2, axis=-2))
+    log = lambda value: jnp.log(span) + jnp.log(jnp.maximum(value, floor))
+    ordered = jnp.sort(series, axis=-2)
+    places = [round(place * (count - 1)) for place in QUANTILES]
+    parts = [
+        first[..., 0, :] + span * mean,
+        log(deviation),
+        log(steps),
+        jnp.mean(z**3, axis=-2),
+        jnp.mean(z**4, axis=-2),
+        *(jnp.mean(z[..., lag:, :] * z[..., :-lag, :], axis=-2) for lag in LAGS),
+        *(ordered[..., place, :] for place in places),
+    ]
+    if 1 < channels <= MOST_CHANNELS:
+        one, other = np.triu_indices(channels, 1)
+        parts.append(jnp.mean(z[..., one] * z[..., other], axis=-2))
+    return jnp.concatenate(parts, axis=-1)

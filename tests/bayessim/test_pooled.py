@@ -1,0 +1,113 @@
+"""The posterior without the pooled proposals, against a closed form and a plain NumPy reference."""
+
+import distrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import jaxlfi
+from jaxlfi.bayessim.pooled import log_pool, without_pool
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.support import Support
+
+LOW, HIGH = np.array([-4.0, -2.0]), np.array([4.0, 6.0])
+BOX = Support(LOW, HIGH)
+MEAN, FACTOR = np.array([0.8, 1.5]), np.array([[0.5, 0.0], [0.3, 0.4]])
+
+
+def task_of(prior=None):
+    return jaxlfi.Task(
+        lambda key, theta: theta, names=("a", "b"), supports={"box": BOX}, feasible=BOX, prior=prior
+    )
+
+
+def gaussian(mean=MEAN, factor=FACTOR):
+    return GaussianMixture(jnp.zeros(1), jnp.asarray(mean, jnp.float32)[None], jnp.asarray(factor, jnp.float32)[None])
+
+
+def proposals(*informed):
+    """Of one uninformed round over the box, and of rounds that drew from the Gaussians given."""
+    flat = gaussian(np.zeros(2), np.eye(2))
+    beliefs = [Belief(flat, BOX, jnp.asarray(False))]
+    beliefs += [Belief(mixture, BOX, jnp.asarray(True)) for mixture in informed]
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, jnp.asarray(leaf).dtype) for leaf in leaves]), *beliefs)
+
+
+def test_the_pool_is_the_mixture_of_the_rounds():
+    wide = gaussian(factor=2 * FACTOR)
+    theta = np.array([[0.0, 1.0], [1.0, 3.0], [-3.5, 5.5]], np.float32)
+    found = np.asarray(log_pool(task_of(), proposals(wide, wide), 1, 0.0, jnp.asarray(theta)))
+    normal = stats.multivariate_normal(MEAN, 4 * FACTOR @ FACTOR.T)
+    draws = normal.rvs(400_000, random_state=0)
+    inside = np.mean(np.all((draws > LOW) & (draws < HIGH), axis=1))
+    expected = np.log(1 / 64 + normal.pdf(theta) / inside)  # the third proposal is of a round to come
+    np.testing.assert_allclose(found, expected, atol=0.02)
+    assert np.isneginf(log_pool(task_of(), proposals(wide), 1, 0.0, jnp.array([[5.0, 0.0]])))
+
+
+@pytest.mark.parametrize("inflation", [1.5, 2.0, 3.0])
+def test_what_a_gaussian_lost_by_wide_proposals_it_gets_back(inflation):
+    """q has the precision of the posterior and of the proposals; nearly all rounds proposed the same."""
+    exact = FACTOR @ FACTOR.T
+    proposed = inflation**2 * exact
+    learnt = np.linalg.inv(np.linalg.inv(exact) + np.linalg.inv(proposed))
+    wide = gaussian(factor=inflation * FACTOR)
+    q = gaussian(factor=np.linalg.cholesky(learnt))
+    found, effective = without_pool(task_of(), q, proposals(*[wide] * 40), 40, 0.0, BOX)
+    np.testing.assert_allclose(found.covariance, exact, rtol=0.15, atol=0.01)
+    np.testing.assert_allclose(found.mean, MEAN, atol=0.05)
+    assert 0.4 < effective < 1
+
+
+def test_each_component_is_moved_by_the_slope_of_the_pool():
+    """Against importance resampling of q in NumPy, with two unlike components and a pool that leans to one side."""
+    q = GaussianMixture(
+        jnp.log(jnp.array([0.7, 0.3])),
+        jnp.array([[0.5, 1.0], [-1.0, 2.0]]),
+        jnp.array([[[0.4, 0.0], [0.1, 0.3]], [[0.3, 0.0], [0.0, 0.5]]]),
+    )
+    leaning = gaussian(np.array([1.5, 0.5]), 1.2 * np.eye(2))
+    pool = proposals(leaning, leaning, leaning)
+    found, _ = without_pool(task_of(), q, pool, 3, 0.0, BOX)
+    draws = np.asarray(q.sample(jax.random.key(3), 100_000))
+    density = 1 / 64 + 3 * stats.multivariate_normal([1.5, 0.5], 1.44 * np.eye(2)).pdf(draws) / 0.92
+    weight = 1 / density
+    weight /= weight.sum()
+    mean = weight @ draws
+    np.testing.assert_allclose(found.mean, mean, atol=0.06)
+    np.testing.assert_allclose(found.covariance, (draws - mean).T @ ((draws - mean) * weight[:, None]), atol=0.06)
+    assert np.asarray(found.mean)[0] < np.asarray(q.mean)[0] - 0.1  # away from where most was proposed
+
+
+def test_a_constant_pool_changes_nothing():
+    q = gaussian(np.array([-3.9, 0.0]))  # half of it beyond the bound, where nothing was proposed
+    found, effective = without_pool(task_of(), q, proposals(gaussian()), 0, 0.0, BOX)
+    np.testing.assert_allclose(found.mean, q.mean, atol=1e-4)
+    np.testing.assert_allclose(found.covariance, q.covariance, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(effective, 1.0, rtol=1e-5)
+
+
+def test_a_support_that_nothing_was_proposed_in_leaves_q_as_it_is():
+    other = Support(np.array([10.0, 10.0]), np.array([11.0, 11.0]))
+    found, effective = without_pool(task_of(), gaussian(), proposals(gaussian()), 1, 0.0, other)
+    np.testing.assert_array_equal(found.means, gaussian().means)
+    assert effective == 0
+
+
+def test_a_prior_that_proposals_have_as_a_factor_drops_out(key):
+    prior = distrax.MultivariateNormalDiag(jnp.array([0.5, 1.0]), jnp.array([1.0, 2.0]))
+    theta = jnp.array([[0.0, 0.0], [1.0, 2.0], [2.0, -1.0]])
+    task = task_of(prior)
+    rounds = proposals(gaussian(factor=2 * FACTOR))
+    only_first = np.asarray(log_pool(task, rounds, 0, 0.0, theta))
+    np.testing.assert_allclose(only_first, only_first[0], atol=1e-5)
+    # The second round drew from Gaussian * prior / Z, which relative to the prior is Gaussian / Z.
+    normal = stats.multivariate_normal(MEAN, 4 * FACTOR @ FACTOR.T)
+    draws = normal.rvs(200_000, random_state=1)
+    inside = np.all((draws > LOW) & (draws < HIGH), axis=1)
+    z = np.mean(inside * stats.multivariate_normal([0.5, 1.0], np.diag([1.0, 4.0])).pdf(draws))
+    expected = np.log(normal.pdf(theta) / z + np.exp(only_first))
+    np.testing.assert_allclose(log_pool(task, rounds, 1, 0.0, theta), expected, atol=0.1)
