@@ -179,7 +179,8 @@ def update(
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     reported = belief
     if correction.report is not None:
-        divided, _ = correction.report(task, mixture, proposals, round, settings.defensive, state.belief.support)
+        q = network.estimator.weighted(network, observed)
+        divided, _ = correction.report(task, q, proposals, round, settings.defensive, state.belief.support)
         reported = belief.replace(mixture=divided)
     info = Round(
         simulations=simulations,

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
@@ -64,7 +65,9 @@ class Estimator(Checked, abc.ABC):
             normalised alike.
         features: numbers F that the embedding makes of a summary.
         reduction: "none", or "regression": in place of summaries the network sees what linear regressions on them, and
-            on the statistics of a series, predict the parameters to be (`jaxlfi.estimators.regression`).
+            on the statistics of a series, predict the parameters to be (`jaxlfi.estimators.regression`). "half": half of
+            the ensemble sees the one, half the other, and the posterior that a run reports weights them by their log
+            score on simulations held out (`jaxlfi.estimators.stacking`).
         record_size: numbers of a record in the summary that is embedded or reduced: the channels of a series, the length of one
             trial. 0 is what the task's summary has (`jaxlfi.tasks.summaries.layout`).
 
@@ -99,7 +102,9 @@ class Estimator(Checked, abc.ABC):
     )
     features: int = option(16, low=1, help="numbers that the embedding makes of a summary")
     reduction: str = option(
-        "none", choices=("none", "regression"), help="regression: the network sees what regressions predict"
+        "none",
+        choices=("none", "regression", "half"),
+        help="the networks see what regressions predict; or half of them",
     )
     record_size: int = option(
         0, low=0, help="numbers of a record (channels of a series, length of a trial) in the summary; 0: the task's"
@@ -190,7 +195,22 @@ class Estimator(Checked, abc.ABC):
 
     def inputs(self, dim: int, obs: int) -> int:
         """How many numbers the network sees of a summary of length S, for D parameters."""
-        return obs if self.reduction == "none" else features_size(dim, obs, self.record_size or 1)
+        features = 0 if self.reduction == "none" else features_size(dim, obs, self.record_size or 1)
+        return features if self.reduction == "regression" else obs + features
+
+    def views(self, dim: int, obs: int) -> np.ndarray:
+        """What each network of the ensemble sees of its inputs, as factors, shape [E, G].
+
+        The first half of the ensemble sees the summaries, the other the features of the regressions; the factors leave
+        the sum of the inputs' variances as large as the networks' initial weights are made for.
+        """
+        inputs = self.inputs(dim, obs)
+        sees = np.ones((self.ensemble_size, inputs))
+        if self.reduction == "half":
+            of_summaries = np.arange(inputs) < obs
+            first = np.arange(self.ensemble_size) < (self.ensemble_size + 1) // 2
+            sees = (of_summaries == first[:, None]).astype(float)
+        return (sees * np.sqrt(inputs / sees.sum(axis=1, keepdims=True))).astype(np.float32)
 
     def keys(self, key: jax.Array) -> tuple[jax.Array, jax.Array | None]:
         """Keys to fit by and to condition by; a mixture of Gaussians is read off the network without one."""
@@ -235,7 +255,8 @@ class Estimator(Checked, abc.ABC):
     def density(self, network: "Network", x: Float[Array, " obs"]) -> Density:
         """q_phi(theta | x) in inference space, not truncated: the whole ensemble."""
         module = self.embedded(network.scale.dim)
-        each = jax.vmap(lambda params: module.apply(params, network.given(x)))(network.params)
+        x = network.given(x)
+        each = jax.vmap(lambda params, view: module.apply(params, x * view))(network.params, network.views)
         shift, scale = network.from_network()
         return EnsembleDensity(each, shift, scale, self.ensemble_size)
 
@@ -264,6 +285,7 @@ class Network:
         scale: the box in inference space that [-1, 1]^D stands for, Phi.
         space: the map between inference space and natural units.
         regression: what the network sees in place of normalised summaries; None for the summaries themselves.
+        log_weights: of the ensemble's networks in the posterior that is reported, shape [E].
         prior: the task's own prior over inference space, None for a uniform one. A likelihood is multiplied by it; a
             density that is the posterior has it in it, and is cut off where the prior is zero.
         validity: the probability of success by the parameters (`jaxlfi.estimators.validity`), where what is learnt from
@@ -279,10 +301,14 @@ class Network:
     prior: Any = struct.field(pytree_node=False, default=None)
     validity: Any = None
     regression: Regression | None = None
+    log_weights: Any = None
 
     def given(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n given"]:
         """What the network sees of raw summaries."""
-        return self.normaliser(x) if self.regression is None else self.regression(x)
+        if self.regression is None:
+            return self.normaliser(x)
+        features = self.regression(x)
+        return features if self.estimator.reduction == "regression" else self._beside(x, features)
 
     def condition(self, x: Float[Array, " obs"], support: Support, key: jax.Array | None = None) -> Posterior:
         """The posterior of a raw summary (Algorithm 1, line 11), truncated to a support.
@@ -320,13 +346,23 @@ class Network:
 
     def seen(self, dataset: Dataset) -> Float[Array, "cap given"]:
         """What the network learns from, of the simulations that it began on."""
-        return self.given(dataset.x) if self.regression is None else self._regression_of(dataset)[1]
+        if self.regression is None:
+            return self.normaliser(dataset.x)
+        features = self._regression_of(dataset)[1]
+        return features if self.estimator.reduction == "regression" else self._beside(dataset.x, features)
+
+    def _beside(self, x: Array, features: Array) -> Array:
+        return jnp.concatenate([self.normaliser(x), features], axis=-1)
+
+    @property
+    def views(self) -> Float[Array, "member given"]:
+        """What each network of the ensemble sees of what is given, as factors, shape [E, G]."""
+        return jnp.asarray(self.estimator.views(self.scale.dim, self.normaliser.mean.shape[-1]))
 
     def _regression_of(self, dataset: Dataset) -> tuple[Regression, Array]:
         """The regressions over the later half of the rounds, which are nearer to the observation than those before."""
-        last = jnp.max(jnp.where(dataset.valid, dataset.round, 0))
-        near = dataset.valid & (2 * dataset.round > last - 1)
-        return fit_regression(self.regression, self.to_network(dataset.theta), dataset.x, dataset.valid, near)
+        theta = self.to_network(dataset.theta)
+        return fit_regression(self.regression, theta, dataset.x, dataset.valid, dataset.late)
 
     def restarted(self, key: jax.Array, dataset: Dataset) -> "Network":
         """Fresh weights, and the normalisers of these simulations."""
@@ -345,7 +381,16 @@ def untrained(
     if estimator.reduction != "none":
         regression = unfitted(scale.dim, obs, estimator.record_size)
     normalisers = _normalisers(estimator, nothing, scale)
-    return Network(estimator, params, *normalisers, scale, space, prior, regression=regression)
+    return Network(
+        estimator,
+        params,
+        *normalisers,
+        scale,
+        space,
+        prior,
+        regression=regression,
+        log_weights=jnp.full(estimator.ensemble_size, -jnp.log(estimator.ensemble_size)),
+    )
 
 
 def _normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tuple[Normaliser, Normaliser | None]:

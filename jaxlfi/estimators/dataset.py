@@ -36,6 +36,12 @@ class Dataset:
         """Which rows are filled, shape [C]."""
         return jnp.arange(self.capacity) < self.size
 
+    @property
+    def late(self) -> Bool[Array, " cap"]:
+        """Which rows are of the later half of the rounds: nearer to the observation than those before, shape [C]."""
+        last = jnp.max(jnp.where(self.valid, self.round, 0))
+        return self.valid & (2 * self.round > last - 1)
+
 
 def empty(capacity: int, dim: int, obs: int) -> Dataset:
     """Room for `capacity` simulations of D parameters and S summaries."""

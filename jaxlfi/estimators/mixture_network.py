@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
@@ -61,11 +62,24 @@ class MixtureNetwork(Estimator):
 
     def density(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
         """q_phi(theta | x) in inference space, the whole ensemble pooled: E K components."""
+        return self.members(network, x, jnp.zeros(self.ensemble_size))
+
+    def weighted(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
+        """The same, each network by its weight."""
+        return self.members(network, x, network.log_weights)
+
+    def members(
+        self, network: Network, x: Float[Array, " obs"], log_weights: Float[Array, " member"]
+    ) -> GaussianMixture:
+        """The networks' mixtures as one, by weights of the networks."""
         module = self.embedded(network.scale.dim)
         x = network.given(x)
-        each = jax.vmap(lambda params: module.apply(params, x).mixture().prune(self.prune))(network.params)
+        one = lambda params, view: module.apply(params, x * view).mixture().prune(self.prune)
+        each = jax.vmap(one)(network.params, network.views)
         shift, scale = network.from_network()
-        return pool(each).affine(scale, shift)
+        pooled = pool(each)
+        pooled = pooled.replace(logits=pooled.logits + jnp.repeat(log_weights, self.components))
+        return pooled.affine(scale, shift)
 
     def posterior(
         self, network: Network, x: Float[Array, " obs"], mixture: GaussianMixture, support: Support

@@ -92,9 +92,9 @@ def fit_regression(
         features.append(jnp.where(near[:, None], left_out, z[:, part] @ found.T))
     features = jnp.concatenate(features, axis=-1)
     output = standardiser(features, valid)
-    return before.replace(
-        predictors=predictors, coefficients=jnp.concatenate(coefficients), output=output
-    ), output(features)
+    return before.replace(predictors=predictors, coefficients=jnp.concatenate(coefficients), output=output), output(
+        features
+    )
 
 
 def _predictors(x: Array, origin: Array, channels: int) -> Array:

@@ -8,8 +8,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.estimators.base import SCHEDULES, Network
 from jaxlfi.estimators.dataset import Dataset
-from jaxlfi.estimators.losses import LOSSES
+from jaxlfi.estimators.losses import LOSSES, Rows
 from jaxlfi.estimators.shuffling import shuffled
+from jaxlfi.estimators.stacking import stacked
 
 STEPS_PER_EPOCH = 50
 """Maximum gradient steps in an epoch, where steps are counted; the validation loss is computed after each epoch."""
@@ -82,14 +83,36 @@ def fit(
     from_prior = (dataset.round == 0).astype(weights.dtype)
     data = estimator.rows(key_rows, theta, x, weights, log_prior, from_prior)
 
-    def one(key, params):
-        return _fit_one(key, estimator, params, data, dataset.size, expected_size)
+    # The same rows are held out of all networks, so that these can be compared by them.
+    rows = shuffled(jax.random.fold_in(jax.random.clone(key_init), 2), jnp.arange(dataset.capacity), dataset.size)
 
-    params, info = jax.vmap(one)(jax.random.split(key_fit, estimator.ensemble_size), network.params)
-    return network.replace(params=params), info
+    def one(key, params, view):
+        own = data.replace(given=data.given * view)
+        return _fit_one(key, estimator, params, own, rows, dataset.size, expected_size)
+
+    keys = jax.random.split(key_fit, estimator.ensemble_size)
+    params, info = jax.vmap(one)(keys, network.params, network.views)
+    network = network.replace(params=params)
+    return network.replace(log_weights=_weights(network, dataset, data, rows)), info
 
 
-def _fit_one(key, estimator, params, data, size, expected_size):
+def _weights(network: Network, dataset: Dataset, data: Rows, rows: Array) -> Float[Array, " member"]:
+    """Log-weights of the ensemble's members: stacked where they are of different kinds, else equal.
+
+    By the held-out rows of the later rounds, which are nearer to the observation than those before.
+    """
+    estimator = network.estimator
+    if estimator.reduction != "half" or not estimator.validation:
+        return jnp.full(estimator.ensemble_size, -jnp.log(estimator.ensemble_size))
+    count = jnp.floor(estimator.validation * dataset.size).astype(jnp.int32)
+    places = jnp.arange(max(2, int(estimator.validation * dataset.capacity)))
+    held_out = jnp.take(rows, jnp.maximum(dataset.size - count, 1) + places, mode="clip")
+    own, module = data.take(held_out), estimator.embedded(dataset.theta.shape[-1])
+    score = lambda params, view: module.apply(params, own.given * view).log_prob(own.value)
+    return stacked(jax.vmap(score)(network.params, network.views), (places < count) * dataset.late[held_out])
+
+
+def _fit_one(key_epochs, estimator, params, data, rows, size, expected_size):
     """Training of one network: epochs over the data, each a loop over minibatches."""
     capacity, dim = data.value.shape
     module = estimator.embedded(dim)
@@ -102,8 +125,6 @@ def _fit_one(key, estimator, params, data, size, expected_size):
 
     adam = optax.adamw(rate, weight_decay=estimator.weight_decay)
 
-    key_split, key_epochs = jax.random.split(key)
-    rows = shuffled(key_split, jnp.arange(capacity), size)
     held_out = jnp.floor(estimator.validation * size).astype(jnp.int32)
     training = jnp.maximum(size - held_out, 1)
     held_out_places = jnp.arange(max(2, int(estimator.validation * capacity)))

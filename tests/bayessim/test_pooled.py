@@ -19,9 +19,7 @@ MEAN, FACTOR = np.array([0.8, 1.5]), np.array([[0.5, 0.0], [0.3, 0.4]])
 
 
 def task_of(prior=None):
-    return jaxlfi.Task(
-        lambda key, theta: theta, names=("a", "b"), supports={"box": BOX}, feasible=BOX, prior=prior
-    )
+    return jaxlfi.Task(lambda key, theta: theta, names=("a", "b"), supports={"box": BOX}, feasible=BOX, prior=prior)
 
 
 def gaussian(mean=MEAN, factor=FACTOR):
@@ -33,7 +31,9 @@ def proposals(*informed):
     flat = gaussian(np.zeros(2), np.eye(2))
     beliefs = [Belief(flat, BOX, jnp.asarray(False))]
     beliefs += [Belief(mixture, BOX, jnp.asarray(True)) for mixture in informed]
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, jnp.asarray(leaf).dtype) for leaf in leaves]), *beliefs)
+    return jax.tree.map(
+        lambda *leaves: jnp.stack([jnp.asarray(leaf, jnp.asarray(leaf).dtype) for leaf in leaves]), *beliefs
+    )
 
 
 def test_the_pool_is_the_mixture_of_the_rounds():

@@ -1,0 +1,41 @@
+"""Stacking: weights of an ensemble's members by what they say of simulations that none of them was trained on."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+PASSES = 200
+"""Passes of expectation maximisation; the objective is concave, and little changes after fifty."""
+PSEUDO_ROWS = 1.0
+"""Rows that each member is taken to have explained before there is any: with few rows, weights stay nearly equal."""
+
+
+def stacked(log_scores: Float[Array, "member row"], counts: Float[Array, " row"]) -> Float[Array, " member"]:
+    """Log-weights by which the mixture of the members has the highest log score (Yao et al. 2018).
+
+    Args:
+        log_scores: log-density of each row by each member, shape [E, N].
+        counts: how much each row counts, at most 1; rows of 0 may have any score, shape [N].
+
+    Returns:
+        Shape [E]; equal where nothing counts.
+
+    Example:
+        >>> scores = jnp.log(jnp.array([[0.5] * 40, [0.1] * 40]))
+        >>> jnp.exp(stacked(scores, jnp.ones(40))).round(2).tolist()
+        [0.98, 0.02]
+    """
+    members = len(log_scores)
+    finite = jnp.all(jnp.isfinite(log_scores) | (log_scores == -jnp.inf), axis=0) & jnp.any(
+        log_scores > -jnp.inf, axis=0
+    )
+    counts = jnp.where(finite, counts, 0.0)
+    relative = jnp.exp(jnp.where(finite, log_scores - jnp.max(log_scores, axis=0), 0.0))
+
+    def passed(_, weights):
+        share = weights[:, None] * relative
+        share = share / jnp.sum(share, axis=0)
+        explained = PSEUDO_ROWS + jnp.sum(counts * share, axis=1)
+        return explained / jnp.sum(explained)
+
+    return jnp.log(jax.lax.fori_loop(0, PASSES, passed, jnp.full(members, 1 / members)))
