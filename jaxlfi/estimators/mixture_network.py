@@ -62,16 +62,13 @@ class MixtureNetwork(Estimator):
 
     def density(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
         """q_phi(theta | x) in inference space, the whole ensemble pooled: E K components."""
-        return self.members(network, x, jnp.zeros(self.ensemble_size))
+        return self._pooled(network, x, jnp.zeros(self.ensemble_size))
 
     def weighted(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
         """The same, each network by its weight."""
-        return self.members(network, x, network.log_weights)
+        return self._pooled(network, x, network.log_weights)
 
-    def members(
-        self, network: Network, x: Float[Array, " obs"], log_weights: Float[Array, " member"]
-    ) -> GaussianMixture:
-        """The networks' mixtures as one, by weights of the networks."""
+    def _pooled(self, network: Network, x: Array, log_weights: Float[Array, " member"]) -> GaussianMixture:
         module = self.embedded(network.scale.dim)
         x = network.given(x)
         one = lambda params, view: module.apply(params, x * view).mixture().prune(self.prune)

@@ -6,8 +6,10 @@ from jaxtyping import Array, Float
 
 PASSES = 200
 """Passes of expectation maximisation; the objective is concave, and little changes after fifty."""
-PSEUDO_ROWS = 1.0
-"""Rows that each member is taken to have explained before there is any: with few rows, weights stay nearly equal."""
+PSEUDO_ROWS = 0.25
+"""Rows that each member is taken to have explained before there is any: with very few rows, weights stay nearly equal."""
+LEAST = 0.05
+"""Weight below which a member is left out: a wide one of little weight still adds to the variance."""
 
 
 def stacked(log_scores: Float[Array, "member row"], counts: Float[Array, " row"]) -> Float[Array, " member"]:
@@ -23,7 +25,7 @@ def stacked(log_scores: Float[Array, "member row"], counts: Float[Array, " row"]
     Example:
         >>> scores = jnp.log(jnp.array([[0.5] * 40, [0.1] * 40]))
         >>> jnp.exp(stacked(scores, jnp.ones(40))).round(2).tolist()
-        [0.98, 0.02]
+        [1.0, 0.0]
     """
     members = len(log_scores)
     finite = jnp.all(jnp.isfinite(log_scores) | (log_scores == -jnp.inf), axis=0) & jnp.any(
@@ -38,4 +40,5 @@ def stacked(log_scores: Float[Array, "member row"], counts: Float[Array, " row"]
         explained = PSEUDO_ROWS + jnp.sum(counts * share, axis=1)
         return explained / jnp.sum(explained)
 
-    return jnp.log(jax.lax.fori_loop(0, PASSES, passed, jnp.full(members, 1 / members)))
+    weights = jax.lax.fori_loop(0, PASSES, passed, jnp.full(members, 1 / members))
+    return jax.nn.log_softmax(jnp.where(weights < LEAST, -jnp.inf, jnp.log(weights)))
