@@ -23,7 +23,7 @@ if __name__ == "__main__":  # before jax starts
 
 from experiments.sharpness import runner
 from experiments.sharpness.catalogue import chosen
-from experiments.sharpness.problem import case_of
+from experiments.sharpness.references import referenced_case
 from experiments.sharpness.tables import table
 
 QUICK = ("right/fixed", "one/edge")
@@ -63,7 +63,7 @@ def main(argv: list[str] | None = None) -> None:
     seeds, truths = (QUICK_SEEDS, 0) if arguments.quick else (arguments.seeds, arguments.truths)
     for problem in problems:
         cases = [
-            case_of(problem, kind, arguments.first_seed + number)
+            referenced_case(problem, kind, arguments.first_seed + number)
             for kind, count in (("own", seeds), ("near", min(truths, TRUTHS_KEPT) if problem.kept else truths))
             for number in range(count)
         ]
