@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.distributions.support import Support
+from jaxlfi.tasks.observation import simulate_observation
 from jaxlfi.tasks.task import Task
 
 NEAR = 0.1
@@ -56,6 +57,9 @@ class Problem:
         estimated: whether `log_likelihood` is the logarithm of an unbiased estimate, by a particle filter that draws
             from the key; the key is not used elsewhere.
         linear: of the linear models, in place of a likelihood.
+        host_log_likelihood: of simulators that are not in JAX, in place of a likelihood: `(theta [N, D], x) -> [N]`, of
+            many parameters in natural units.
+        declared: the task, where it is declared elsewhere: its support "box" is the right one.
         prior: over natural units; None for the uniform one over a box in inference space.
         phi_low: lower limits of Phi in natural units, by name, where they are not those of `MARGIN`.
         phi_high: upper limits, alike.
@@ -79,6 +83,8 @@ class Problem:
     log_likelihood: LogLikelihood | None = None
     estimated: bool = False
     linear: Linear | None = None
+    host_log_likelihood: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    declared: Task | None = None
     prior: Any = None
     phi_low: dict[str, float] = dataclasses.field(default_factory=dict)
     phi_high: dict[str, float] = dataclasses.field(default_factory=dict)
@@ -88,12 +94,15 @@ class Problem:
     kept: bool = False
 
     def __post_init__(self):
-        if (self.log_likelihood is None) == (self.linear is None):
-            raise ValueError(f"{self.name}: expected either a log-likelihood or a linear model")
+        given = self.log_likelihood, self.linear, self.host_log_likelihood
+        if sum(one is not None for one in given) != 1:
+            raise ValueError(f"{self.name}: expected one log-likelihood or a linear model")
 
     @functools.cached_property
     def task(self) -> Task:
         """As a user declares it; nothing in it but the simulator, names, units, boxes and the prior."""
+        if self.declared is not None:
+            return self.declared
         logs = np.isin(self.names, self.log)
         inner = lambda values: np.where(logs, np.log(np.where(logs, values, 1.0)), values)
         outer = lambda values: np.where(logs, np.exp(np.where(logs, values, 0.0)), values)
@@ -163,7 +172,7 @@ class Case:
         kind: "own" for the problem's truth, "near" for one drawn near it.
         seed: of the truth and the observation.
         truth: in inference space, shape [D].
-        x: shape [S].
+        x: shape [S], or a trajectory [T, C] where the task summarises it.
     """
 
     problem: Problem
@@ -194,7 +203,11 @@ def case_of(problem: Problem, kind: str, seed: int) -> Case:
         low, high = (np.where(everywhere, bound, truth + side) for bound, side in ((low, -reach), (high, reach)))
         truth = rng.uniform(*(np.clip(bound, *problem.box) for bound in (low, high)))
     key = jax.random.key(zlib.crc32(f"{problem.name} {kind} {seed}".encode()))
-    x = np.asarray(_simulator(problem)(key, task.space.to_natural(jnp.asarray(truth, jnp.float32))))
+    theta = task.space.to_natural(jnp.asarray(truth, jnp.float32))
+    if problem.declared is None:
+        x = np.asarray(_simulator(problem)(key, theta))
+    else:
+        x = np.asarray(simulate_observation(key, dataclasses.replace(task, truth=np.asarray(theta))))
     if not np.isfinite(x).all():
         raise ValueError(f"{problem.name}: {kind} {seed}: expected a finite observation")
     return Case(problem, kind, seed, truth, x)

@@ -33,8 +33,8 @@ DRAWS = 4000
 DRAWS_KEPT = 2000
 LEAST_DRAWS = 1000
 """Draws of the posterior on Phi that a box has to hold; where there are fewer, a new reference is made on the box."""
-ESTIMATED = oracle.Effort(particles=256, moves=3, centres=256, draws=3000)
-"""Of likelihoods that a particle filter estimates, which cost a thousand times as much as others."""
+FEWER = oracle.Effort(particles=256, moves=3, centres=256, draws=3000)
+"""Of likelihoods that a particle filter or MuJoCo computes, which cost a thousand times as much as others."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +78,9 @@ def _likelihoods(problem: Problem):
 
 
 def _log_likelihood(problem: Problem, x: np.ndarray) -> oracle.LogDensity:
+    if problem.host_log_likelihood is not None:
+        natural = lambda theta: np.asarray(problem.task.space.to_natural(jnp.asarray(theta, jnp.float32)), float)
+        return lambda theta, seed: problem.host_log_likelihood(natural(theta), x)
     many, observed = _likelihoods(problem), jnp.asarray(x)
 
     def log_likelihood(theta, seed):
@@ -122,7 +125,7 @@ def made(case: Case, low: np.ndarray, high: np.ndarray, count: int = DRAWS, seed
         found = oracle.linear_draws(matrix, noise, x, low, high, count=count, seed=seed)
         at_truth = -0.5 * np.sum(((matrix @ case.truth - x) / noise) ** 2)
     else:
-        effort = ESTIMATED if problem.estimated else oracle.Effort()
+        effort = FEWER if problem.kept else oracle.Effort()
         log_likelihood = _log_likelihood(problem, case.x)
         log_prior = functools.partial(_log_prior, problem)
         start = _prior_draws(problem, low, high, effort.particles, seed)

@@ -178,9 +178,7 @@ def row_of(job: Job, found: Mapping[str, Any], exact: references.Reference, seco
     }
 
 
-def run_ours(
-    problem: Problem, method: str, simulations: int, jobs: Sequence[Job], settings: Settings, folder: Folder
-) -> None:
+def run_ours(problem: Problem, jobs: Sequence[Job], settings: Settings, folder: Folder) -> None:
     """Run jobs in batches, the last one filled up, and write their rows as each batch ends."""
     count = min(TOGETHER, len(jobs))
     devices = jax.local_devices()
@@ -205,6 +203,35 @@ def run_ours(
             for place, job in enumerate(jobs[start : start + count])
         ]
         folder.add(rows)
+
+
+def run_on_host(problem: Problem, jobs: Sequence[Job], settings: Settings, folder: Folder) -> None:
+    """Run jobs of a simulator that is not in JAX, one after another; the first one's seconds include compiling."""
+    for job in jobs:
+        key, x, truth, low, high, _ = (one[0] for one in arguments_of([job]))
+        key_run, key_draw = jax.random.split(key)
+        began = time.perf_counter()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of bounds: the table says what came of them
+            run = jaxlfi.infer(
+                key_run,
+                problem.task,
+                np.asarray(x),
+                support=Support(np.asarray(low), np.asarray(high)),
+                space="inference",
+                heuristic=RULES[job.heuristic],
+                settings=settings,
+            )
+        seconds = time.perf_counter() - began
+        draws = run.posterior.sample(key_draw, DRAWS, space="inference")
+        density = run.posterior.log_prob(draws, space="inference")
+        found = {
+            "draws": draws,
+            "rank": np.mean(density > run.posterior.log_prob(truth, space="inference")),
+            "low": run.belief.support.low,
+            "high": run.belief.support.high,
+        }
+        folder.add([row_of(job, found, references.reference(job.case), seconds, np.nan)])
 
 
 def run_others(problem: Problem, method: str, simulations: int, jobs: Sequence[Job], folder: Folder) -> None:
@@ -246,8 +273,9 @@ def run(
         ValueError: where the results that are there are of other settings.
     """
     if method in OTHERS:
-        # Adapters have no priors but uniform and normal ones, and no heuristics.
-        jobs = [job for job in jobs if problem.prior is None and job.box == "right" and job.heuristic == "fixed"]
+        # Adapters have no priors but uniform and normal ones, no simulators but those in JAX, and no heuristics.
+        theirs = problem.prior is None and problem.declared is None
+        jobs = [job for job in jobs if theirs and job.box == "right" and job.heuristic == "fixed"]
     folder = Folder(out / problem.name / f"{method}-{simulations}.npz")
     there = set(folder.rows().get("label", np.zeros(0, str)).tolist())
     left = [job for job in jobs if job.label not in there]
@@ -264,5 +292,7 @@ def run(
     )
     if settings is None:
         run_others(problem, method, simulations, left, folder)
+    elif problem.task.on_host:
+        run_on_host(problem, left, settings, folder)
     else:
-        run_ours(problem, method, simulations, left, settings, folder)
+        run_ours(problem, left, settings, folder)
