@@ -93,21 +93,24 @@ def _ranges(theta):
     return jnp.full(10, jnp.sqrt(theta[0] ** 2 + theta[1] ** 2))
 
 
+FREEDOM = 3
+
+
 @dataclasses.dataclass(frozen=True)
 class StudentT:
-    """A prior with heavy tails: independent Student's t of three degrees of freedom and scale 1."""
+    """A prior with heavy tails: independent Student's t of `FREEDOM` degrees of freedom and scale 1."""
 
     dim: int
-    freedom: float = 3.0
 
     def sample(self, *, seed, sample_shape=()):
         """Draws of shape [*sample_shape, D]."""
         shape = (sample_shape,) if isinstance(sample_shape, int) else tuple(sample_shape)
-        return jax.random.t(seed, self.freedom, (*shape, self.dim))
+        normal = jax.random.normal(seed, (FREEDOM + 1, *shape, self.dim))
+        return normal[0] / jnp.sqrt(jnp.mean(normal[1:] ** 2, axis=0))
 
     def log_prob(self, value):
         """Of vectors [..., D]."""
-        half, n = 0.5 * (self.freedom + 1), self.freedom
+        half, n = 0.5 * (FREEDOM + 1), float(FREEDOM)
         constant = special.gammaln(half) - special.gammaln(0.5 * n) - 0.5 * jnp.log(n * math.pi)
         return jnp.sum(constant - half * jnp.log1p(value**2 / n), axis=-1)
 
