@@ -19,7 +19,7 @@ TEMPERED_SIZE = 0.5
 """Effective fraction of particles that a step of tempering keeps."""
 FREEDOM = 5.0
 """Degrees of freedom of the proposal's kernels."""
-ATTEMPTS = 4
+ATTEMPTS = 10
 """Rounds of importance sampling, each from the draws of the one before, until the effective size suffices."""
 MAX_STEPS = 200
 
@@ -202,7 +202,7 @@ def _kernels(rng: np.random.Generator, theta: np.ndarray, effort: Effort) -> tup
         standard = np.einsum("jde,je->jd", inverse, scaled)  # L^-1 c, so that L^-1 (x - c) is one product
         moved = np.einsum("jde,ie->ijd", inverse, proposed[part], optimize=True) - standard
         log_kernel[part] = -0.5 * (FREEDOM + dim) * np.log1p(np.sum(moved**2, axis=-1) / FREEDOM)
-    log_kernel -= np.log(np.abs(np.linalg.det(factor)))
+    log_kernel -= np.log(np.abs(np.linalg.det(factor))) + np.log(count)  # so that rounds can be pooled
     return proposed * spread, special.logsumexp(log_kernel, axis=1)
 
 

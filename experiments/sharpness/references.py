@@ -211,8 +211,10 @@ def main(argv: list[str] | None = None) -> None:
         for kind, count in (("own", arguments.seeds), ("near", arguments.truths)):
             for seed in range(arguments.first_seed, arguments.first_seed + count):
                 case = referenced_case(problem, kind, seed)
-                found = reference(case)
-                print(f"{problem.name} {case.label}: effective size {found.size:.0f}", flush=True)
+                try:
+                    print(f"{problem.name} {case.label}: effective size {reference(case).size:.0f}", flush=True)
+                except ValueError as error:
+                    print(error, flush=True)
 
 
 if __name__ == "__main__":
