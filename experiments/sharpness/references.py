@@ -28,7 +28,7 @@ from jaxlfi.runs.folder import environment
 KEPT = Path("experiments/results/sharpness/references")
 """Of the problems whose references take long."""
 CACHE = Path("runs/sharpness/references")
-"""Of all others, which are made again in a second or two where they are missing."""
+"""Of all others, which are made in a second or two where they are missing; to be removed where a problem changes."""
 DRAWS = 4000
 DRAWS_KEPT = 2000
 LEAST_DRAWS = 1000
