@@ -190,8 +190,9 @@ def _kernels(rng: np.random.Generator, theta: np.ndarray, effort: Effort) -> tup
     near = scaled[neighbours]
     centred = near - near.mean(axis=1, keepdims=True)
     covariance = np.einsum("ikd,ike->ide", centred, centred) / near.shape[1]
-    scale = np.trace(covariance, axis1=1, axis2=2)[:, None, None] / dim
-    factor = np.linalg.cholesky(covariance + (1e-3 * scale + 1e-10) * np.eye(dim))
+    # Regular in the units of each kernel's own axes: a mode may be thousands of times as thin as modes are apart.
+    diagonal = np.einsum("idd->id", covariance)[:, :, None] * np.eye(dim)
+    factor = np.linalg.cholesky(covariance + 1e-2 * diagonal + 1e-14 * np.eye(dim))
     which = rng.integers(count, size=effort.draws)
     step = rng.normal(size=(effort.draws, dim)) / np.sqrt(rng.chisquare(FREEDOM, effort.draws) / FREEDOM)[:, None]
     proposed = scaled[which] + np.einsum("ide,ie->id", factor[which], step)

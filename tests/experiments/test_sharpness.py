@@ -205,7 +205,7 @@ def test_boxes_are_right_or_wrong_as_they_say(name):
 
 def test_references_that_are_kept_are_large_enough_and_calibrated():
     """Truths lie among draws of their posteriors as those of a calibrated one would."""
-    paths = sorted((RESULTS / "references").glob("*/*.npz"))
+    paths = sorted(path for path in (RESULTS / "references").glob("*/*.npz") if path.parent.name in PROBLEMS)
     ranks = []
     for path in paths:
         arrays = atomic.read_arrays(path)
