@@ -1,0 +1,1 @@
+"""How sharp and how honest posteriors are, on problems as users bring them, each with an exact posterior."""

@@ -1,0 +1,36 @@
+"""All problems by name, in the order of tables."""
+
+from experiments.sharpness import counts, curves, held_out, series
+from experiments.sharpness.problem import Problem
+
+PROBLEMS: dict[str, Problem] = {
+    name: problem
+    for name in held_out.NAMES
+    for problem in (*curves.PROBLEMS, *counts.PROBLEMS, *series.PROBLEMS)
+    if problem.name == name
+}
+MODELS = ("mujoco_puck", "mujoco_arm", "mujoco_furuta")
+"""Examples of MuJoCo models."""
+
+
+def chosen(words: list[str]) -> list[Problem]:
+    """The problems that words name: "tuning", "held-out", "all", "mujoco", or names.
+
+    Those of MuJoCo are not among "all": they need an extra, and are neither held out nor tuned on.
+
+    Raises:
+        ValueError: for a word that is none of these.
+        ImportError: for problems of MuJoCo where that is not installed.
+    """
+    sets = {"tuning": held_out.TUNING, "held-out": held_out.HELD_OUT, "all": held_out.NAMES}
+    names = [name for word in words for name in sets.get(word, (word,))]
+    models = [name for name in MODELS if name in names or "mujoco" in names]
+    if unknown := [name for name in names if name not in (*PROBLEMS, *MODELS, "mujoco")]:
+        known = ", ".join((*PROBLEMS, *MODELS))
+        raise ValueError(f"problems: expected {', '.join(sets)}, mujoco or names of {known}, got {unknown[0]!r}")
+    found = [problem for name, problem in PROBLEMS.items() if name in names]
+    if models:
+        from experiments.sharpness import models as of_mujoco  # needs the mujoco extra
+
+        found += [of_mujoco.problem(name) for name in models]
+    return found
