@@ -45,8 +45,8 @@ class Correction:
     Attributes:
         row_weights: (task, dataset, proposals, round, defensive fraction) -> weight of each row in the loss, shape [C].
         change: (task, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
-        report: (task, q, all rounds' proposals, round, defensive fraction, support) -> the mixture that a run reports and
-            the effective share of draws of q, where it differs from what proposals and heuristics go on with; else None.
+        report: (task, q, all rounds' proposals, round, defensive fraction, support) -> the mixture that a run reports
+            and the effective share of q's draws, where it is not what proposals and heuristics go on with; else None.
         accounts_for_prior: whether it does all that is done for a task's own prior; else proposals do.
     """
 
@@ -173,3 +173,5 @@ CORRECTIONS: dict[str, Correction] = {
     "importance": Correction(importance_weights, unchanged, accounts_for_prior=True),
 }
 """Corrections by name."""
+OF_MIXTURES = ("paper", "quotient", "pooled")
+"""Corrections that calculate with mixtures of Gaussians."""

@@ -83,6 +83,17 @@ class HostEngine(BatchEngine):
         super().load(inputs.replace(x=counted_from(self.references, inputs.x)))
         self._last_seen: list[Discrepancy | None] = [None] * self.runs
 
+    def start(self) -> State:
+        """The state before the first round; statistics of a series are those of what is counted and its reference."""
+        state = super().start()
+        regression = state.network.regression
+        if regression is None:
+            return state
+        by_channel = self.references.reshape(self.runs, -1, regression.channels)
+        origin = (by_channel - by_channel.mean(axis=1, keepdims=True)).reshape(self.references.shape)
+        regression = regression.replace(origin=self.place(origin.astype(np.float32)))
+        return state.replace(network=state.network.replace(regression=regression))
+
     def first_round(self) -> Simulations:
         """The given simulations, for every run."""
         given = jax.tree.map(lambda leaf: np.stack([leaf] * self.runs), self.first)

@@ -3,8 +3,10 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from jaxlfi.bayessim.correction import OF_MIXTURES
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.estimators import registry
+from jaxlfi.estimators.base import Estimator
 from jaxlfi.estimators.flow_estimators import SplineFlow
 from jaxlfi.estimators.likelihood_estimators import MixtureLikelihood
 from jaxlfi.estimators.mixture_network import MixtureNetwork
@@ -80,14 +82,19 @@ def all_rounds(settings: Settings) -> Settings:
     return settings.replace(rounds=min(settings.min_rounds or settings.rounds, settings.rounds), min_rounds=0)
 
 
+def with_estimator(settings: Settings, estimator: Estimator) -> Settings:
+    """The same settings with another estimator, without a correction for mixtures of Gaussians where it is none."""
+    needs_mixtures = settings.correction in OF_MIXTURES and not estimator.closed_form
+    return settings.replace(estimator=estimator, correction="none" if needs_mixtures else settings.correction)
+
+
 def apt(settings: Settings) -> Settings:
     """Automatic posterior transformation, SNPE-C: flows, the atomic loss, proposals from the truncated posterior.
 
     Two flows, of which one starts from a linear regression, are better than one, and take twice as long.
     """
-    return all_rounds(settings).replace(
-        estimator=FLOW.replace(ensemble_size=2, regression=1), restriction="reject", inflation=1.0
-    )
+    settings = with_estimator(all_rounds(settings), FLOW.replace(ensemble_size=2, regression=1))
+    return settings.replace(restriction="reject", inflation=1.0)
 
 
 def npe(settings: Settings) -> Settings:
@@ -98,9 +105,9 @@ def npe(settings: Settings) -> Settings:
     the four start from a linear regression: where parameters are nearly linear in the summaries they are far better,
     and where not, the other two are there.
     """
-    settings = all_rounds(settings)
+    estimator = FLOW.replace(loss="likelihood", activation="relu", ensemble_size=4, regression=2)
+    settings = with_estimator(all_rounds(settings), estimator)
     return settings.replace(
-        estimator=FLOW.replace(loss="likelihood", activation="relu", ensemble_size=4, regression=2),
         restriction="reject",
         inflation=1.0,
         rounds=1,
@@ -126,7 +133,8 @@ def snle(settings: Settings) -> Settings:
     As no correction is needed whatever was proposed, proposals are wider than the posterior, and some are the prior's:
     a likelihood is an extrapolation where nothing was simulated, and may be high there by mistake.
     """
-    return all_rounds(settings).replace(estimator=LIKELIHOOD, restriction="reject", inflation=2.0, defensive=0.2)
+    settings = with_estimator(all_rounds(settings), LIKELIHOOD)
+    return settings.replace(restriction="reject", inflation=2.0, defensive=0.2)
 
 
 METHODS: dict[str, Callable[[Settings], Settings]] = {
@@ -176,6 +184,8 @@ def with_fields(settings: Settings, given: Mapping[str, Any]) -> Settings:
         >>> with_fields(QUICK, {"rounds": 5, "epochs": 10}).estimator.epochs
         10
     """
+    if given.get("embedding", "none") != "none" or given.get("warm_start"):
+        given = {"reduction": "none"} | dict(given)  # neither goes with the preset's regression features
     own = {name: value for name, value in given.items() if name in declared(settings)}
     others = {name: value for name, value in given.items() if name not in own}
     estimator = registry.converted(settings.estimator, type(settings.estimator), others)

@@ -4,7 +4,7 @@ import dataclasses
 
 from jaxtyping import Array, Float
 
-from jaxlfi.bayessim.correction import CORRECTIONS
+from jaxlfi.bayessim.correction import CORRECTIONS, OF_MIXTURES
 from jaxlfi.distributions.belief import RESTRICTIONS
 from jaxlfi.estimators.base import Estimator
 from jaxlfi.estimators.mixture_network import MixtureNetwork
@@ -70,7 +70,7 @@ class Settings(Checked):
                 f"simulation_budget: expected at least the {self.simulations_per_round} simulations of a round, "
                 f"got {self.simulation_budget}"
             )
-        if self.correction in ("paper", "quotient", "pooled") and not self.estimator.closed_form:
+        if self.correction in OF_MIXTURES and not self.estimator.closed_form:
             raise ValueError(
                 f"correction: expected 'none' or 'importance' for {type(self.estimator).__name__}, as "
                 f"{self.correction!r} calculates with mixtures of Gaussians, got {self.correction!r}"

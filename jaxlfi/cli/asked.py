@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxlfi.bayessim.presets import settings_for, with_fields
+from jaxlfi.bayessim.presets import settings_for, with_estimator, with_fields
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import registry as estimators
@@ -84,7 +84,7 @@ def build_settings(
         )
     if arguments.estimator is not None:
         kind = estimators.load(arguments.estimator)
-        preset = preset.replace(estimator=estimators.converted(preset.estimator, kind, {}))
+        preset = with_estimator(preset, estimators.converted(preset.estimator, kind, {}))
     return with_fields(preset, given).check()
 
 

@@ -65,11 +65,11 @@ class Estimator(Checked, abc.ABC):
             normalised alike.
         features: numbers F that the embedding makes of a summary.
         reduction: "none", or "regression": in place of summaries the network sees what linear regressions on them, and
-            on the statistics of a series, predict the parameters to be (`jaxlfi.estimators.regression`). "half": half of
-            the ensemble sees the one, half the other, and the posterior that a run reports weights them by their log
+            on the statistics of a series, predict the parameters to be (`jaxlfi.estimators.regression`). "half": half
+            of the ensemble sees the one, half the other, and the posterior that a run reports weights them by their log
             score on simulations held out (`jaxlfi.estimators.stacking`).
-        record_size: numbers of a record in the summary that is embedded or reduced: the channels of a series, the length of one
-            trial. 0 is what the task's summary has (`jaxlfi.tasks.summaries.layout`).
+        record_size: numbers of a record in the summary that is embedded or reduced: the channels of a series, the
+            length of one trial. 0 is what the task's summary has (`jaxlfi.tasks.summaries.layout`).
 
     Raises:
         ValueError: from `check` for settings that contradict each other.
@@ -285,7 +285,7 @@ class Network:
         scale: the box in inference space that [-1, 1]^D stands for, Phi.
         space: the map between inference space and natural units.
         regression: what the network sees in place of normalised summaries; None for the summaries themselves.
-        log_weights: of the ensemble's networks in the posterior that is reported, shape [E].
+        log_weights: of the ensemble's networks in the posterior that is reported, shape [E]; None for equal ones.
         prior: the task's own prior over inference space, None for a uniform one. A likelihood is multiplied by it; a
             density that is the posterior has it in it, and is cut off where the prior is zero.
         validity: the probability of success by the parameters (`jaxlfi.estimators.validity`), where what is learnt from
@@ -377,9 +377,10 @@ def untrained(
     estimator = jax.tree.map(jnp.asarray, estimator).reading((obs, 1))  # its leaves are carried through loops
     nothing = empty(1, scale.dim, obs)
     params = estimator.initialise(key, scale.dim, obs)
-    regression = None
+    regression = log_weights = None
     if estimator.reduction != "none":
         regression = unfitted(scale.dim, obs, estimator.record_size)
+        log_weights = jnp.zeros(estimator.ensemble_size)
     normalisers = _normalisers(estimator, nothing, scale)
     return Network(
         estimator,
@@ -389,7 +390,7 @@ def untrained(
         space,
         prior,
         regression=regression,
-        log_weights=jnp.full(estimator.ensemble_size, -jnp.log(estimator.ensemble_size)),
+        log_weights=log_weights,
     )
 
 

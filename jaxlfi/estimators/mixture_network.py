@@ -62,20 +62,21 @@ class MixtureNetwork(Estimator):
 
     def density(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
         """q_phi(theta | x) in inference space, the whole ensemble pooled: E K components."""
-        return self._pooled(network, x, jnp.zeros(self.ensemble_size))
+        return self._pooled(network, x, None)
 
     def weighted(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
-        """The same, each network by its weight."""
+        """The same, each network by its weight: what a run reports."""
         return self._pooled(network, x, network.log_weights)
 
-    def _pooled(self, network: Network, x: Array, log_weights: Float[Array, " member"]) -> GaussianMixture:
+    def _pooled(self, network: Network, x: Array, log_weights: Array | None) -> GaussianMixture:
         module = self.embedded(network.scale.dim)
         x = network.given(x)
         one = lambda params, view: module.apply(params, x * view).mixture().prune(self.prune)
         each = jax.vmap(one)(network.params, network.views)
         shift, scale = network.from_network()
         pooled = pool(each)
-        pooled = pooled.replace(logits=pooled.logits + jnp.repeat(log_weights, self.components))
+        if log_weights is not None:
+            pooled = pooled.replace(logits=pooled.logits + jnp.repeat(log_weights, self.components))
         return pooled.affine(scale, shift)
 
     def posterior(

@@ -108,7 +108,7 @@ def varies(x: Float[Array, "n obs"]) -> Bool[Array, " obs"]:
 
 
 def some_rows(x: Float[Array, "cap obs"], valid: Bool[Array, " cap"]) -> Float[Array, "rows obs"]:
-    """At most `ROWS` of the valid rows, an odd number, spread evenly whatever period the rows have (by the golden ratio)."""
+    """At most `ROWS` of the valid rows, an odd number, spread evenly whatever their period is (by the golden ratio)."""
     count = min(ROWS, len(x) - 1 + len(x) % 2)
     places = np.modf(np.arange(count) * (np.sqrt(5) - 1) / 2)[0].astype(np.float32)
     (rows,) = jnp.nonzero(valid, size=len(x), fill_value=0)

@@ -6,7 +6,6 @@ fewer simulations than a network does: dozens of raw numbers with little in each
 has a second regression, on its statistics, for what its raw numbers do not tell linearly, such as their spread.
 """
 
-import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 PASSES = 200
 """Passes of expectation maximisation; the objective is concave, and little changes after fifty."""
 PSEUDO_ROWS = 0.25
-"""Rows that each member is taken to have explained before there is any: with very few rows, weights stay nearly equal."""
+"""Rows that each member is taken to have explained before there is any: with very few, weights stay nearly equal."""
 LEAST = 0.05
 """Weight below which a member is left out: a wide one of little weight still adds to the variance."""
 

@@ -23,11 +23,12 @@ def statistics_size(records: int, channels: int) -> int:
 
 
 def statistics(series: Float[Array, "*n time channels"]) -> Float[Array, "*n stat"]:
-    """Of each channel its mean, log standard deviation, log root mean square of differences, skewness, kurtosis,
-    autocorrelations and quantiles; of each pair of channels their correlation.
+    """Moments, memory and quantiles of each channel, and the correlation of each pair of channels.
 
-    Location and scale are taken out before anything is squared, so that no unit overflows. A channel that is constant
-    has the log of its last place in place of the log of zero, and 0 for what is undefined.
+    In this order, each for all channels: mean, log standard deviation, log root mean square of differences, skewness,
+    kurtosis, autocorrelations (`LAGS`), quantiles (`QUANTILES`); then the correlations. Location and scale are taken
+    out before anything is squared, so that no unit overflows. A channel that is constant has the log of its last place
+    in place of the log of zero, and 0 for what is undefined.
 
     Args:
         series: shape [..., T, C], T >= `LEAST`.

@@ -93,17 +93,19 @@ def fit(
     keys = jax.random.split(key_fit, estimator.ensemble_size)
     params, info = jax.vmap(one)(keys, network.params, network.views)
     network = network.replace(params=params)
-    return network.replace(log_weights=_weights(network, dataset, data, rows)), info
+    if network.log_weights is not None:
+        network = network.replace(log_weights=_weights(network, dataset, data, rows))
+    return network, info
 
 
 def _weights(network: Network, dataset: Dataset, data: Rows, rows: Array) -> Float[Array, " member"]:
-    """Log-weights of the ensemble's members: stacked where they are of different kinds, else equal.
+    """Log-weights of the ensemble's members, by stacking; equal where nothing is held out.
 
     By the held-out rows of the later rounds, which are nearer to the observation than those before.
     """
     estimator = network.estimator
-    if estimator.reduction != "half" or not estimator.validation:
-        return jnp.full(estimator.ensemble_size, -jnp.log(estimator.ensemble_size))
+    if not estimator.validation:
+        return jnp.zeros(estimator.ensemble_size)
     count = jnp.floor(estimator.validation * dataset.size).astype(jnp.int32)
     places = jnp.arange(max(2, int(estimator.validation * dataset.capacity)))
     held_out = jnp.take(rows, jnp.maximum(dataset.size - count, 1) + places, mode="clip")

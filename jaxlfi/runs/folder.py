@@ -44,14 +44,15 @@ if TYPE_CHECKING:  # runs know how to save themselves
     from jaxlfi.runs.run import Origin, Run
 
 RUN, RUNS, COMPARE = "jaxlfi-run", "jaxlfi-runs", "jaxlfi-compare"
-VERSION = 3
+VERSION = 4
 """Of the format of all folders; it rises whenever an older one could be misread.
 
 What is added to a folder without a new number, readers must do without: a new setting's default is what was done before
 there was the setting. `tests/golden/formats/` has a folder of each number, and of each state of one.
 """
-READ = (2,)
-"""Older versions of which finished runs are read. In 2, normalisers counted from zero (`jaxlfi.runs.load`)."""
+READ = (2, 3)
+"""Older versions of which finished runs are read. In 2, normalisers counted from zero (`jaxlfi.runs.load`); in 3, an
+unfinished run believed what it proposed by."""
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "distrax", "numpy")
 TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")
 

@@ -276,8 +276,11 @@ def _finite(values: jax.Array, what: str = "finite numbers") -> jax.Array:
 @single
 def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
     prior = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
-    mixture = network.condition(x, support, key).mixture
-    mixture, _ = CORRECTIONS[settings.correction].change(task, mixture, prior)
+    correction = CORRECTIONS[settings.correction]
+    if correction.report is None:
+        mixture, _ = correction.change(task, network.condition(x, support, key).mixture, prior)
+    else:
+        mixture = network.estimator.weighted(network, x)
     belief, _ = heuristic(prior, mixture, feasible)
     return posterior_after(belief, network, x)
 

@@ -1,0 +1,134 @@
+"""Regression features, statistics of series and stacking, against NumPy, SciPy and refits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from jaxlfi.estimators.regression import features_size, fit_regression, unfitted
+from jaxlfi.estimators.ridge import ridge
+from jaxlfi.estimators.stacking import stacked
+from jaxlfi.estimators.statistics import LAGS, QUANTILES, statistics, statistics_size
+
+SERIES = np.random.default_rng(0).gamma(2.0, [1.0, 3.0], (63, 2)).cumsum(0)[::3]
+
+
+def test_statistics_against_numpy():
+    found = np.asarray(statistics(jnp.asarray(SERIES, jnp.float32)))
+    assert found.shape == (statistics_size(21, 2),)
+    z = (SERIES - SERIES.mean(0)) / SERIES.std(0)
+    expected = [
+        SERIES.mean(0),
+        np.log(SERIES.std(0)),
+        0.5 * np.log(np.mean(np.diff(SERIES, axis=0) ** 2, axis=0)),
+        stats.skew(SERIES),
+        stats.kurtosis(SERIES) + 3,
+        *(np.mean(z[lag:] * z[:-lag], axis=0) for lag in LAGS),
+        *np.quantile(SERIES, np.round(np.array(QUANTILES) * 20) / 20, axis=0),
+        [np.corrcoef(SERIES.T)[0, 1]],
+    ]
+    np.testing.assert_allclose(found, np.concatenate(expected), rtol=2e-4, atol=2e-4)
+
+
+@given(power=st.integers(-18, 18), sign=st.sampled_from([-1, 1]))
+def test_a_unit_moves_logarithms_and_scales_the_rest(power, sign):
+    count = 2 * (5 + len(LAGS) + len(QUANTILES))
+    plain = np.asarray(statistics(jnp.asarray(SERIES, jnp.float32)))[:count].reshape(-1, 2)
+    other = np.asarray(statistics(jnp.asarray(sign * 10.0**power * SERIES, jnp.float32)))[:count].reshape(-1, 2)
+    np.testing.assert_allclose(other[1:3] - plain[1:3], power * np.log(10), atol=1e-3)
+    np.testing.assert_allclose(other[3], sign * plain[3], atol=1e-3)
+    np.testing.assert_allclose(other[4:10], plain[4:10], atol=1e-3)
+    quantiles = other[10:] if sign > 0 else other[:9:-1]
+    np.testing.assert_allclose(quantiles / 10.0**power, sign * plain[10:], rtol=1e-4)
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-30, -7.0, 3e30])
+def test_a_constant_series_has_finite_statistics(value):
+    found = np.asarray(statistics(jnp.full((12, 1), value, jnp.float32)))
+    assert np.isfinite(found).all()
+    assert (found[3:10] == 0).all()
+
+
+def test_what_is_short_is_no_series():
+    assert statistics_size(9, 1) == 0 and statistics_size(10, 1) == 17
+    assert features_size(3, 9, 1) == 3 and features_size(3, 20, 2) == 6
+
+
+def test_predictions_without_a_row_are_those_of_a_fit_without_it():
+    rng = np.random.default_rng(1)
+    x = rng.normal(5.0, 2.0, (30, 4))
+    y = x @ rng.normal(size=(4, 2)) + rng.normal(0.0, 1.0, (30, 2))
+    every = jnp.arange(30) < 28
+    x, y = jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
+    _, intercept, left_out = ridge(x, y, every)
+    for row in (0, 5, 27):
+        coefficients, constant, _ = ridge(x, y, every & (jnp.arange(30) != row))
+        np.testing.assert_allclose(left_out[row] + intercept, coefficients @ x[row] + constant, rtol=0.02, atol=0.05)
+
+
+def simulated(n, seed, dim=2, obs=30):
+    """A series whose level and slope are the first parameter's, and whose spread is the second's."""
+    rng = np.random.default_rng(seed)
+    theta = rng.uniform(-1.5, 1.5, (n, dim))
+    noise = np.exp(theta[:, 1:]) * rng.normal(size=(n, obs))
+    return theta.astype(np.float32), (theta[:, :1] * np.linspace(0.5, 2, obs) + noise).astype(np.float32)
+
+
+def test_features_tell_level_and_spread_of_simulations_that_were_not_seen():
+    theta, x = simulated(600, 0)
+    every = jnp.ones(600, bool)
+    regression, features = jax.jit(fit_regression)(
+        unfitted(2, 30, 1), jnp.asarray(theta), jnp.asarray(x), every, jnp.arange(600) >= 200
+    )
+    assert features.shape == (600, 4)
+    np.testing.assert_allclose(features.mean(0), 0, atol=1e-3)
+    np.testing.assert_allclose(features.std(0), 1, rtol=1e-3)
+    new, seen = simulated(400, 1)
+    found = np.asarray(regression(jnp.asarray(seen)))
+    assert np.corrcoef(found[:, 0], new[:, 0])[0, 1] > 0.8  # of the raw numbers
+    assert abs(np.corrcoef(found[:, 1], new[:, 1])[0, 1]) < 0.4  # in which the spread is not linear
+    assert np.corrcoef(found[:, 3], new[:, 1])[0, 1] > 0.95  # of the statistics
+
+
+def test_a_network_learns_from_residuals_as_large_as_those_of_a_new_simulation():
+    """With 60 predictors and 200 rows what is fitted correlates more than what is new."""
+    rng = np.random.default_rng(2)
+    theta = rng.normal(size=(600, 1)).astype(np.float32)
+    x = (theta + rng.normal(0.0, 4.0, (600, 60))).astype(np.float32)
+    fitted = jnp.arange(600) < 200
+    one = unfitted(1, 60, 60)  # a single record of 60 channels: no series
+    regression, features = fit_regression(one, jnp.asarray(theta[:200]), jnp.asarray(x[:200]), *[fitted[:200]] * 2)
+    new = np.asarray(regression(jnp.asarray(x[200:])))
+    correlation = lambda a, b: np.corrcoef(a[:, 0], b[:, 0])[0, 1]
+    own, others = correlation(np.asarray(features), theta[:200]), correlation(new, theta[200:])
+    again = correlation(np.asarray(regression(jnp.asarray(x[:200]))), theta[:200])
+    assert abs(own - others) < 0.02 and again - others > 0.04
+
+
+def test_a_series_that_comes_as_a_difference_has_the_statistics_of_the_sum():
+    theta, x = simulated(300, 3)
+    origin = np.linspace(-3, 3, 30).astype(np.float32)
+    every = jnp.ones(300, bool)
+    plain, _ = fit_regression(unfitted(2, 30, 1), jnp.asarray(theta), jnp.asarray(x), every, every)
+    counted = unfitted(2, 30, 1).replace(origin=jnp.asarray(origin))
+    other, _ = fit_regression(counted, jnp.asarray(theta), jnp.asarray(x - origin), every, every)
+    np.testing.assert_allclose(other(jnp.asarray(x[:9] - origin)), plain(jnp.asarray(x[:9])), atol=2e-2)
+
+
+def test_the_stacked_mixture_has_the_highest_log_score_of_all_weights():
+    rng = np.random.default_rng(4)
+    rows = np.concatenate([rng.normal(-1.0, 0.5, 700), rng.normal(2.0, 1.0, 300)])
+    members = [stats.norm(-1.0, 0.5), stats.norm(2.0, 1.0), stats.norm(0.0, 4.0)]
+    scores = np.stack([member.logpdf(rows) for member in members])
+    found = np.exp(np.asarray(stacked(jnp.asarray(scores, jnp.float32), jnp.ones(1000))))
+    np.testing.assert_allclose(found, [0.7, 0.3, 0.0], atol=0.03)
+
+
+def test_with_nothing_to_judge_by_members_are_equal():
+    scores = jnp.array([[0.0, jnp.nan, -3.0], [-9.0, 0.0, -jnp.inf]])
+    for counts in ([0.0, 0.0, 0.0], [0.0, 1.0, 0.0]):
+        np.testing.assert_allclose(jnp.exp(stacked(scores, jnp.array(counts))), 0.5)
+    assert stacked(scores, jnp.array([1.0, 1.0, 1.0]))[0] > -0.4
