@@ -19,7 +19,7 @@ SETTINGS = Settings(
     simulation_budget=25,
 )
 FLAGS = (
-    "--estimator mdn --hidden 16 --activation tanh --normaliser zscore "
+    "--estimator mdn --hidden 16 --activation tanh --normaliser zscore --parameters feasible --reduction none "
     "--learning-rate 1e-3 --steps 100 --batch-size 20 "
     "--validation 0 --patience 0 --ensemble-size 1 --components 4 --prune 0 --weight-decay 0 --clip-norm inf "
     "--schedule constant --no-warm-start --correction none --restriction clip --inflation 1 "

@@ -199,17 +199,17 @@ class Estimator(Checked, abc.ABC):
         return features if self.reduction == "regression" else obs + features
 
     def views(self, dim: int, obs: int) -> np.ndarray:
-        """What each network of the ensemble sees of its inputs, as factors, shape [E, G].
+        """What each network of the ensemble sees of its inputs, as factors, shape [E, G]; [E, 1] where all see all.
 
         The first half of the ensemble sees the summaries, the other the features of the regressions; the factors leave
         the sum of the inputs' variances as large as the networks' initial weights are made for.
         """
+        if self.reduction != "half":
+            return np.ones((self.ensemble_size, 1), np.float32)
         inputs = self.inputs(dim, obs)
-        sees = np.ones((self.ensemble_size, inputs))
-        if self.reduction == "half":
-            of_summaries = np.arange(inputs) < obs
-            first = np.arange(self.ensemble_size) < (self.ensemble_size + 1) // 2
-            sees = (of_summaries == first[:, None]).astype(float)
+        of_summaries = np.arange(inputs) < obs
+        first = np.arange(self.ensemble_size) < (self.ensemble_size + 1) // 2
+        sees = (of_summaries == first[:, None]).astype(float)
         return (sees * np.sqrt(inputs / sees.sum(axis=1, keepdims=True))).astype(np.float32)
 
     def keys(self, key: jax.Array) -> tuple[jax.Array, jax.Array | None]:
@@ -356,7 +356,7 @@ class Network:
 
     @property
     def views(self) -> Float[Array, "member given"]:
-        """What each network of the ensemble sees of what is given, as factors, shape [E, G]."""
+        """What each network of the ensemble sees of what is given, as factors, shape [E, G] or [E, 1]."""
         return jnp.asarray(self.estimator.views(self.scale.dim, self.normaliser.mean.shape[-1]))
 
     def _regression_of(self, dataset: Dataset) -> tuple[Regression, Array]:

@@ -111,7 +111,7 @@ def _weights(network: Network, dataset: Dataset, data: Rows, rows: Array) -> Flo
     held_out = jnp.take(rows, jnp.maximum(dataset.size - count, 1) + places, mode="clip")
     own, module = data.take(held_out), estimator.embedded(dataset.theta.shape[-1])
     score = lambda params, view: module.apply(params, own.given * view).log_prob(own.value)
-    return stacked(jax.vmap(score)(network.params, network.views), (places < count) * dataset.late[held_out])
+    return stacked(jax.vmap(score)(network.params, network.views), (places < count) * dataset.late[held_out] * 1.0)
 
 
 def _fit_one(key_epochs, estimator, params, data, rows, size, expected_size):

@@ -97,7 +97,7 @@ def test_what_is_refused():
     series = SMALL.replace(embedding="series", record_size=4)
     with pytest.raises(ValueError, match=r"^record_size: expected a divisor of the summary's 302 numbers, got 4$"):
         series.reading((151, 2))
-    with pytest.raises(ValueError, match=r"^record_size: expected 0 without an embedding, got 4$"):
+    with pytest.raises(ValueError, match=r"^record_size: expected 0 without an embedding or a reduction, got 4$"):
         series.replace(embedding="none").check()
     with pytest.raises(ValueError, match=r"^embedding: expected one of none, mlp, series, trials, got 'rnn'$"):
         SMALL.replace(embedding="rnn")

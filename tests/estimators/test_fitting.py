@@ -322,7 +322,7 @@ def test_clipping_bounds_what_an_outlier_does():
         estimator = change(SMALL, clip_norm=norm)
         results = [fitted(estimator, data, network=network)[0].params for data in (DATA, outlier)]
         moved[norm] = distance(*results)
-    assert moved[0.1] < 0.7 * moved[np.inf]
+    assert moved[0.1] < 0.8 * moved[np.inf]
 
 
 def test_weight_decay_shrinks_the_weights():
