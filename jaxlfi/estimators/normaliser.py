@@ -14,6 +14,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlfi.tasks.reference import RESOLVED
 
+LINEAR = 4.0
+"""Unit of asinh in median absolute deviations: a normal variable stays about as it is, and tails become logarithms."""
 ROWS = 255
 """Simulations that origin and unit are taken from, at most; mean and standard deviation are those of all.
 
@@ -60,7 +62,7 @@ such summaries better, but blows up the noise of ordinary ones. "none" leaves th
 
 
 def fit_normaliser(
-    name: str, x: Float[Array, "cap obs"], valid: Bool[Array, " cap"], record_size: int = 0, linear: float = 1.0
+    name: str, x: Float[Array, "cap obs"], valid: Bool[Array, " cap"], record_size: int = 0
 ) -> Normaliser:
     """Origin, unit, mean and standard deviation of each summary over the valid rows; the identity for "none".
 
@@ -70,19 +72,18 @@ def fit_normaliser(
         valid: the rows that count, shape [C].
         record_size: where it is not 0, summaries are records of so many numbers, all of them normalised alike: a
             series is scaled by channel, not by time, and trials can be exchanged.
-        linear: median absolute deviations in a unit.
     """
     size = x.shape[-1]
     if 0 < record_size < size:
         count = size // record_size
-        one = fit_normaliser(name, x.reshape(-1, record_size), jnp.repeat(valid, count), linear=linear)
+        one = fit_normaliser(name, x.reshape(-1, record_size), jnp.repeat(valid, count))
         return jax.tree.map(lambda leaf: jnp.tile(leaf, count), one)
     if name == "none":
         return identity(size)
     x = jnp.where(valid[:, None], x, x[jnp.argmax(valid)])
     some = some_rows(x, valid)
     origin, unit = middle(some)
-    unit = jnp.where(unit > 0, linear * unit, _range(x))
+    unit = jnp.where(unit > 0, LINEAR * unit, _range(x))
     unit = jnp.where(varies(x), unit, 1.0)
     mean, deviation = _moments(TRANSFORMS[name]((x - origin) / unit), valid)
     fitted = Normaliser(mean, jnp.where(varies(x), deviation, jnp.inf), name, origin, unit)

@@ -14,9 +14,6 @@ from jaxlfi.estimators.normaliser import Normaliser, fit_normaliser, identity, s
 from jaxlfi.estimators.ridge import ridge
 from jaxlfi.estimators.statistics import statistics, statistics_size
 
-LINEAR = 4.0
-"""Median absolute deviations within which a predictor is about as it is: far beyond, it is its logarithm."""
-
 
 @struct.dataclass
 class Regression:
@@ -80,7 +77,7 @@ def fit_regression(
         near: those of them that the regressions are fitted to, shape [C].
     """
     every = _predictors(x, before.origin, before.channels)
-    predictors = fit_normaliser("asinh", every, near, linear=LINEAR)
+    predictors = fit_normaliser("asinh", every, near)
     z = jnp.where(valid[:, None], predictors(every), 0.0)
     obs = x.shape[-1]
     parts = [slice(0, obs), slice(obs, None)] if every.shape[-1] > obs else [slice(None)]
