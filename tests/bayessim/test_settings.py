@@ -27,7 +27,10 @@ from jaxlfi.estimators.mixture_network import MixtureNetwork
         ),
         ({"simulations_per_round": 1e12}, r"^simulations_per_round: expected a whole number in"),
         ({"simulation_budget": -1}, r"^simulation_budget: expected a whole number in \[1, 1e\+08\], got -1"),
-        ({"correction": "exact"}, r"^correction: expected one of none, paper, quotient, pooled, importance, got 'exact'"),
+        (
+            {"correction": "exact"},
+            r"^correction: expected one of none, paper, quotient, pooled, importance, got 'exact'",
+        ),
         ({"restriction": "fold"}, r"^restriction: expected one of clip, reject, mixed, got 'fold'"),
         ({"defensive": 2}, r"^defensive: expected a number in \[0, 1\], got 2"),
         ({"inflation": 0.5}, r"^inflation: expected a number in \[1, 100\], got 0.5"),

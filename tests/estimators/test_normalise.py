@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from jaxlfi.estimators.normaliser import (
+    LINEAR,
     TRANSFORMS,
     Normaliser,
     fit_normaliser,
@@ -136,28 +137,27 @@ def test_origin_and_unit_are_median_and_median_absolute_deviation(kind):
     median = np.quantile(some, 0.5, method="lower")
     np.testing.assert_allclose(found.origin[0], median, rtol=1e-6)
     deviation = np.quantile(np.abs(some - median), 0.5, method="lower")
-    np.testing.assert_allclose(found.unit[0], deviation, rtol=1e-5)
+    np.testing.assert_allclose(found.unit[0], LINEAR * deviation, rtol=1e-5)
     np.testing.assert_allclose(deviation, stats.median_abs_deviation(x), rtol=0.4)
 
 
 def test_where_most_values_are_equal_the_mean_deviation_is_the_unit():
     x = jnp.asarray([0.0] * 70 + [4.0] * 30)[:, None]
-    np.testing.assert_allclose(fit("asinh", x, jnp.ones(100, bool)).unit, 1.2, rtol=0.1)
+    np.testing.assert_allclose(fit("asinh", x, jnp.ones(100, bool)).unit, LINEAR * 1.2, rtol=0.1)
 
 
 @pytest.mark.parametrize("kind", ["upwards", "downwards", "both sides"])
 def test_tails_of_many_orders_of_magnitude_stay_within_a_few_deviations(kind):
     x = drawn(kind)
-    assert np.abs(stats.zscore(x)).max() > 8
     values = seen("asinh", x)
-    assert np.abs(values).max() < 5
+    assert np.abs(values).max() < 8 < 0.9 * np.abs(stats.zscore(x)).max()
     # What lies in the middle is neither squeezed into a point nor blown up.
-    assert 0.3 < np.diff(np.quantile(values, [0.25, 0.75]))[0] < 2
+    assert 0.2 < np.diff(np.quantile(values, [0.25, 0.75]))[0] < 2
 
 
 def test_what_has_no_tails_stays_nearly_linear():
     x = drawn("uniform")
-    assert np.corrcoef(x, seen("asinh", x))[0, 1] > 0.97
+    assert np.corrcoef(x, seen("asinh", x))[0, 1] > 0.995
 
 
 def test_rows_are_chosen_evenly_among_the_valid_ones_whatever_their_period():
