@@ -183,7 +183,7 @@ def replaced(name, **arrays):
         (config_with(format="jaxlfi-grid"), "config.json is of format 'jaxlfi-grid'"),
         (
             config_with(version=1),
-            r"expected jaxlfi-run of version 3, got version 1, which jaxlfi 0.* reads; or run its command again",
+            r"expected jaxlfi-run of version 4, got version 1, which jaxlfi 0.* reads; or run its command again",
         ),
         (config_with(status="running"), "expected a finished run; go on with it by jaxlfi resume"),
         (lambda folder: (folder / "posterior.npz").unlink(), "expected a finished run"),

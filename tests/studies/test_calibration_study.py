@@ -371,7 +371,7 @@ def test_folders_that_cannot_be_diagnosed(kind, folder, tmp_path, capsys):
         "compare": ({"format": run_store.COMPARE, "runs": [{"folder": "ok/seed_000"}]}, "one/ok/seed_000"),
         "grid": ({"format": grid.GRID}, "got a grid's"),
         "changed": ({"parameters": ["other", "second"]}, "expected the task as it was when the run was made"),
-        "older": ({"version": 1}, "expected jaxlfi-run of version 3, got version 1, which jaxlfi"),
+        "older": ({"version": 1}, "expected jaxlfi-run of version 4, got version 1, which jaxlfi"),
         "made in Python": ({"task": None}, "--task module:factory names it"),
     }[kind]
     copy = tmp_path / "one"
