@@ -28,11 +28,11 @@ def log_pool(
     round: Int[Array, ""] | int,
     defensive: Float[Array, ""] | float,
     theta: Float[Array, "n dim"],
+    factored: bool = True,
 ) -> Float[Array, " n"]:
-    """Log-density of the pooled proposals relative to the prior, up to a constant that does not depend on theta.
+    """Log-density of the pooled proposals, the equally weighted mixture of all rounds', relative to the prior's.
 
-    Where a proposal has the prior as a factor, it drops out. Clipped proposals have atoms on the bounds, which are left
-    out.
+    Clipped proposals have atoms on the bounds, which are left out.
 
     Args:
         task: for its prior.
@@ -40,20 +40,23 @@ def log_pool(
         round: the last that counts, from 0.
         defensive: fraction of each round's proposals drawn from the prior over its support.
         theta: in inference space, shape [N, D].
+        factored: whether proposals have the prior as a factor, which then drops out.
 
     Returns:
         -inf where no round proposed, shape [N].
     """
     prior = task.inference.prior
-    normals = jax.random.key(0)
+    factor = prior if factored else None
 
     def log_density(proposal: Belief) -> Array:
-        draws = proposal.mixture.sample(normals, MASS_DRAWS)
+        draws = proposal.mixture.sample(jax.random.key(0), MASS_DRAWS)
         inside = region(proposal.support, prior).contains(draws)
-        log_factor = jnp.zeros(MASS_DRAWS) if prior is None else prior.log_prob(draws)
-        highest = jnp.max(jnp.where(inside, log_factor, -jnp.inf), initial=-1e30)
+        log_factor = jnp.zeros(MASS_DRAWS) if factor is None else factor.log_prob(draws)
+        highest = jnp.where(jnp.any(inside), jnp.max(jnp.where(inside, log_factor, -jnp.inf)), 0.0)
         mean = jnp.mean(jnp.where(inside, jnp.exp(log_factor - highest), 0.0)) + 1 / MASS_DRAWS
         informed = proposal.mixture.log_prob(theta) - jnp.log(mean) - highest
+        if factor is not prior:
+            informed = informed - prior.log_prob(theta)
         width = jnp.sum(jnp.log(proposal.support.width))
         flat = -width if prior is None else -jnp.log(prior_mass(prior, proposal.support))
         mixed = jnp.logaddexp(jnp.log1p(-defensive) + informed, jnp.log(defensive) + flat)
