@@ -198,14 +198,14 @@ class Estimator(Checked, abc.ABC):
         features = 0 if self.reduction == "none" else features_size(dim, obs, self.record_size or 1)
         return features if self.reduction == "regression" else obs + features
 
-    def views(self, dim: int, obs: int) -> np.ndarray:
-        """What each network of the ensemble sees of its inputs, as factors, shape [E, G]; [E, 1] where all see all.
+    def views(self, dim: int, obs: int) -> np.ndarray | None:
+        """What each network of the ensemble sees of its inputs, as factors, shape [E, G]; None where all see all.
 
         The first half of the ensemble sees the summaries, the other the features of the regressions; the factors leave
         the sum of the inputs' variances as large as the networks' initial weights are made for.
         """
         if self.reduction != "half":
-            return np.ones((self.ensemble_size, 1), np.float32)
+            return None
         inputs = self.inputs(dim, obs)
         of_summaries = np.arange(inputs) < obs
         first = np.arange(self.ensemble_size) < (self.ensemble_size + 1) // 2
@@ -256,7 +256,7 @@ class Estimator(Checked, abc.ABC):
         """q_phi(theta | x) in inference space, not truncated: the whole ensemble."""
         module = self.embedded(network.scale.dim)
         x = network.given(x)
-        each = jax.vmap(lambda params, view: module.apply(params, x * view))(network.params, network.views)
+        each = jax.vmap(lambda params, view: module.apply(params, viewed(x, view)))(network.params, network.views)
         shift, scale = network.from_network()
         return EnsembleDensity(each, shift, scale, self.ensemble_size)
 
@@ -270,6 +270,11 @@ class Estimator(Checked, abc.ABC):
         inside = support.contains(draws)
         weights = jnp.where(jnp.any(inside), inside, True).astype(draws.dtype)
         return fit_mixture(key_fit, draws, weights, self.ensemble_size * self.components)[0]
+
+
+def viewed(given: Float[Array, "*n given"], view: Float[Array | np.ndarray, " given"] | None) -> Array:
+    """What one network sees of what is given, by its row of `Estimator.views`."""
+    return given if view is None else given * view
 
 
 @struct.dataclass
@@ -355,9 +360,9 @@ class Network:
         return jnp.concatenate([self.normaliser(x), features], axis=-1)
 
     @property
-    def views(self) -> Float[Array, "member given"]:
-        """What each network of the ensemble sees of what is given, as factors, shape [E, G] or [E, 1]."""
-        return jnp.asarray(self.estimator.views(self.scale.dim, self.normaliser.mean.shape[-1]))
+    def views(self) -> np.ndarray | None:
+        """What each network of the ensemble sees of what is given (`Estimator.views`)."""
+        return self.estimator.views(self.scale.dim, self.normaliser.mean.shape[-1])
 
     def _regression_of(self, dataset: Dataset) -> tuple[Regression, Array]:
         """The regressions over the later half of the rounds, which are nearer to the observation than those before."""

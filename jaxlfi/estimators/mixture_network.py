@@ -11,7 +11,7 @@ from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_algebra import pool
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import Place
-from jaxlfi.estimators.base import Estimator, Network
+from jaxlfi.estimators.base import Estimator, Network, viewed
 from jaxlfi.estimators.mdn import ACTIVATIONS, MDN
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.fields import hyperparameter, option
@@ -71,7 +71,7 @@ class MixtureNetwork(Estimator):
     def _pooled(self, network: Network, x: Array, log_weights: Array | None) -> GaussianMixture:
         module = self.embedded(network.scale.dim)
         x = network.given(x)
-        one = lambda params, view: module.apply(params, x * view).mixture().prune(self.prune)
+        one = lambda params, view: module.apply(params, viewed(x, view)).mixture().prune(self.prune)
         each = jax.vmap(one)(network.params, network.views)
         shift, scale = network.from_network()
         pooled = pool(each)

@@ -6,7 +6,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from jaxlfi.estimators.base import SCHEDULES, Network
+from jaxlfi.estimators.base import SCHEDULES, Network, viewed
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.losses import LOSSES, Rows
 from jaxlfi.estimators.shuffling import shuffled
@@ -87,7 +87,7 @@ def fit(
     rows = shuffled(jax.random.fold_in(jax.random.clone(key_init), 2), jnp.arange(dataset.capacity), dataset.size)
 
     def one(key, params, view):
-        own = data.replace(given=data.given * view)
+        own = data.replace(given=viewed(data.given, view))
         return _fit_one(key, estimator, params, own, rows, dataset.size, expected_size)
 
     keys = jax.random.split(key_fit, estimator.ensemble_size)
@@ -110,7 +110,7 @@ def _weights(network: Network, dataset: Dataset, data: Rows, rows: Array) -> Flo
     places = jnp.arange(max(2, int(estimator.validation * dataset.capacity)))
     held_out = jnp.take(rows, jnp.maximum(dataset.size - count, 1) + places, mode="clip")
     own, module = data.take(held_out), estimator.embedded(dataset.theta.shape[-1])
-    score = lambda params, view: module.apply(params, own.given * view).log_prob(own.value)
+    score = lambda params, view: module.apply(params, viewed(own.given, view)).log_prob(own.value)
     return stacked(jax.vmap(score)(network.params, network.views), (places < count) * dataset.late[held_out] * 1.0)
 
 
