@@ -184,8 +184,6 @@ def with_fields(settings: Settings, given: Mapping[str, Any]) -> Settings:
         >>> with_fields(QUICK, {"rounds": 5, "epochs": 10}).estimator.epochs
         10
     """
-    if given.get("embedding", "none") != "none" or given.get("warm_start"):
-        given = {"reduction": "none"} | dict(given)  # neither goes with the preset's regression features
     own = {name: value for name, value in given.items() if name in declared(settings)}
     others = {name: value for name, value in given.items() if name not in own}
     estimator = registry.converted(settings.estimator, type(settings.estimator), others)

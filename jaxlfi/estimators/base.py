@@ -67,7 +67,8 @@ class Estimator(Checked, abc.ABC):
         reduction: "none", or "regression": in place of summaries the network sees what linear regressions on them, and
             on the statistics of a series, predict the parameters to be (`jaxlfi.estimators.regression`). "half": half
             of the ensemble sees the one, half the other, and the posterior that a run reports weights them by their log
-            score on simulations held out (`jaxlfi.estimators.stacking`).
+            score on simulations held out (`jaxlfi.estimators.stacking`). An embedding takes its place, and a network
+            that is trained on (`warm_start`) or gives a density of the summary sees none.
         record_size: numbers of a record in the summary that is embedded or reduced: the channels of a series, the
             length of one trial. 0 is what the task's summary has (`jaxlfi.tasks.summaries.layout`).
 
@@ -136,14 +137,7 @@ class Estimator(Checked, abc.ABC):
                 f"batch_size: expected at least 2, as the loss {self.loss!r} compares the simulations of a minibatch, "
                 f"got {self.batch_size}"
             )
-        if self.reduction != "none" and self.embedding != "none":
-            raise ValueError(f"embedding: expected 'none' with a reduction, got {self.embedding!r}")
-        if self.reduction != "none" and (self.warm_start or self.of_summaries):
-            raise ValueError(
-                f"reduction: expected 'none' for networks that are trained on (warm_start) or give a density of the "
-                f"summary, got {self.reduction!r}"
-            )
-        if self.record_size and self.embedding == self.reduction == "none":
+        if self.record_size and self.embedding == self.sees == "none":
             raise ValueError(f"record_size: expected 0 without an embedding or a reduction, got {self.record_size}")
         return self
 
@@ -171,7 +165,7 @@ class Estimator(Checked, abc.ABC):
         Raises:
             ValueError: where the summary is not made of whole records.
         """
-        if self.embedding == self.reduction == "none":
+        if self.embedding == self.sees == "none":
             return self
         size = math.prod(layout)
         default = layout[-1] if self.embedding == "none" else EMBEDDINGS[self.embedding].record_size(layout)
@@ -189,14 +183,19 @@ class Estimator(Checked, abc.ABC):
         return True
 
     @property
+    def sees(self) -> str:
+        """The reduction, where there is none instead of it."""
+        return "none" if self.embedding != "none" or self.warm_start or self.of_summaries else self.reduction
+
+    @property
     def alike(self) -> int:
         """Numbers of a record where numbers at the same place of all records are normalised alike; else 0."""
         return 0 if self.embedding == "none" else self.record_size
 
     def inputs(self, dim: int, obs: int) -> int:
         """How many numbers the network sees of a summary of length S, for D parameters."""
-        features = 0 if self.reduction == "none" else features_size(dim, obs, self.record_size or 1)
-        return features if self.reduction == "regression" else obs + features
+        features = 0 if self.sees == "none" else features_size(dim, obs, self.record_size or 1)
+        return features if self.sees == "regression" else obs + features
 
     def views(self, dim: int, obs: int) -> np.ndarray | None:
         """What each network of the ensemble sees of its inputs, as factors, shape [E, G]; None where all see all.
@@ -204,7 +203,7 @@ class Estimator(Checked, abc.ABC):
         The first half of the ensemble sees the summaries, the other the features of the regressions; the factors leave
         the sum of the inputs' variances as large as the networks' initial weights are made for.
         """
-        if self.reduction != "half":
+        if self.sees != "half":
             return None
         inputs = self.inputs(dim, obs)
         of_summaries = np.arange(inputs) < obs
@@ -313,7 +312,7 @@ class Network:
         if self.regression is None:
             return self.normaliser(x)
         features = self.regression(x)
-        return features if self.estimator.reduction == "regression" else self._beside(x, features)
+        return features if self.estimator.sees == "regression" else self._beside(x, features)
 
     def condition(self, x: Float[Array, " obs"], support: Support, key: jax.Array | None = None) -> Posterior:
         """The posterior of a raw summary (Algorithm 1, line 11), truncated to a support.
@@ -354,7 +353,7 @@ class Network:
         if self.regression is None:
             return self.normaliser(dataset.x)
         features = self._regression_of(dataset)[1]
-        return features if self.estimator.reduction == "regression" else self._beside(dataset.x, features)
+        return features if self.estimator.sees == "regression" else self._beside(dataset.x, features)
 
     def _beside(self, x: Array, features: Array) -> Array:
         return jnp.concatenate([self.normaliser(x), features], axis=-1)
@@ -383,7 +382,7 @@ def untrained(
     nothing = empty(1, scale.dim, obs)
     params = estimator.initialise(key, scale.dim, obs)
     regression = log_weights = None
-    if estimator.reduction != "none":
+    if estimator.sees != "none":
         regression = unfitted(scale.dim, obs, estimator.record_size)
         log_weights = jnp.zeros(estimator.ensemble_size)
     normalisers = _normalisers(estimator, nothing, scale)

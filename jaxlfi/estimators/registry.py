@@ -54,6 +54,4 @@ def converted(estimator: Estimator, kind: type[Estimator], values: Mapping[str, 
     if isinstance(estimator, kind) and type(estimator) is kind:
         return dataclasses.replace(estimator, **values)
     shared = {name: getattr(estimator, name) for name in declared(estimator) if name in known}
-    if kind.of_summaries:
-        shared.pop("reduction")  # the density of the summary is wanted, not of what it tells of parameters
     return kind(**(shared | dict(values)))
