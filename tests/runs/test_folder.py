@@ -179,7 +179,7 @@ def test_config_says_what_was_run_and_with_what(folder):
     assert config["heuristic"]["hyperparameters"]["mass_threshold"] == 0.005
     assert config["settings"]["rounds"] == 2 and config["settings"]["estimator"]["name"] == "mdn"
     assert config["settings"]["estimator"]["hyperparameters"]["hidden"] == [16]
-    assert config["version"] == 3 and config["task_name"] == "gaussian_linear"
+    assert config["version"] == 4 and config["task_name"] == "gaussian_linear"
     assert config["parameters"] == ["first", "second"] and config["log"] == [False, False]
     assert config["versions"]["jax"] == jax.__version__ and config["platform"]["backend"] == "cpu"
 

@@ -214,6 +214,7 @@ ASKED = {
         "jaxlfi.estimators.base": "declares it: a mixture of Gaussians needs no fit, and no key to be read off",
         "jaxlfi.estimators.mixture_network": "is one",
         "jaxlfi.bayessim.settings": "refuses the paper's correction, a quotient of Gaussians, for other densities",
+        "jaxlfi.bayessim.presets": "leaves such a correction out of a preset whose estimator is replaced",
         "jaxlfi.runs.folder": "a folder keeps the networks that its posterior cannot do without",
         "jaxlfi.runs.load": "and reads them",
     },
