@@ -63,7 +63,7 @@ class Problem:
         prior: over natural units; None for the uniform one over a box in inference space.
         phi_low: lower limits of Phi in natural units, by name, where they are not those of `MARGIN`.
         phi_high: upper limits, alike.
-        informed: names of the parameters that the data tell of by themselves: only their bounds are made wrong. None
+        informed: names of the parameters that the data inform each by itself: only their bounds are made wrong. None
             for all.
         open: names of the parameters of which the data leave much of the box: near truths are drawn over all of the
             right box in these, as a posterior is calibrated under its prior, and under truths near one only where the

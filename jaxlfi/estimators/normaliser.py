@@ -19,7 +19,7 @@ LINEAR = 4.0
 ROWS = 255
 """Simulations that origin and unit are taken from, at most; mean and standard deviation are those of all.
 
-An odd number has one in the middle, which is the same whatever the sign of the summary.
+The number is odd so that the median is one of the values, and changes only its sign with the summary's.
 """
 
 
