@@ -34,7 +34,7 @@ IMPURE = {
     "a generator": lambda key, theta: theta + np.random.default_rng().normal(size=2),
     "one number": lambda key, theta: theta * np.random.default_rng().uniform(),
     "random": lambda key, theta: theta + random.gauss(0, 1),
-    "time": lambda key, theta: theta + time.perf_counter(),
+    "seeded by the clock": lambda key, theta: theta + np.random.default_rng(time.time_ns()).normal(size=2),
     "seeded by it": lambda key, theta: theta + jax.random.normal(jax.random.key(random.getrandbits(31)), (2,)),
     "besides its key": lambda key, theta: theta + jax.random.normal(key, (2,)) + np.random.default_rng().normal(size=2),
     "jitted": jax.jit(lambda key, theta: theta + np.random.normal(size=2)),  # noqa: NPY002
