@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 import jaxlfi
-from jaxlfi.bayessim.pooled import log_pool, without_pool
+from jaxlfi.bayessim.pooled import HIGHEST, log_pool, without_pool
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
@@ -75,11 +75,22 @@ def test_each_component_is_moved_by_the_slope_of_the_pool():
     draws = np.asarray(q.sample(jax.random.key(3), 100_000))
     density = 1 / 64 + 3 * stats.multivariate_normal([1.5, 0.5], 1.44 * np.eye(2)).pdf(draws) / 0.92
     weight = 1 / density
+    assert np.mean(weight > HIGHEST * stats.gmean(weight)) > 0.01
+    weight = np.minimum(weight, HIGHEST * stats.gmean(weight))
     weight /= weight.sum()
     mean = weight @ draws
     np.testing.assert_allclose(found.mean, mean, atol=0.06)
     np.testing.assert_allclose(found.covariance, (draws - mean).T @ ((draws - mean) * weight[:, None]), atol=0.06)
     assert np.asarray(found.mean)[0] < np.asarray(q.mean)[0] - 0.1  # away from where most was proposed
+
+
+def test_a_stray_component_where_nothing_was_proposed_stays_light():
+    """It is e^6 times as far from what was proposed as the other: by the quotient alone it would be most of all."""
+    near, far = gaussian(), gaussian(MEAN - [3.5, 0.0])
+    q = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), near, far).replace(logits=jnp.log(jnp.array([0.98, 0.02])))
+    found, _ = without_pool(task_of(), q, proposals(*[gaussian(factor=2 * FACTOR)] * 9), 9, 0.0, BOX)
+    assert float(found.weights[1]) < HIGHEST * 0.02
+    np.testing.assert_allclose(found.means[1], far.means[0], atol=0.1)
 
 
 def test_a_constant_pool_changes_nothing():

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.regression import features_size, fit_regression, unfitted
 from jaxlfi.estimators.ridge import ridge
 from jaxlfi.estimators.stacking import stacked
@@ -116,6 +117,19 @@ def test_a_series_that_comes_as_a_difference_has_the_statistics_of_the_sum():
     counted = unfitted(2, 30, 1).replace(origin=jnp.asarray(origin))
     other, _ = fit_regression(counted, jnp.asarray(theta), jnp.asarray(x - origin), every, every)
     np.testing.assert_allclose(other(jnp.asarray(x[:9] - origin)), plain(jnp.asarray(x[:9])), atol=2e-2)
+
+
+@pytest.mark.parametrize(("obs", "features"), [(9, 3), (16, 6), (17, 6), (40, 6)])
+def test_networks_of_features_see_the_numbers_of_short_summaries_too(obs, features):
+    """Half of the networks see the summary alone; a summary that is reduced is one of more than 16 numbers."""
+    half = MixtureNetwork(reduction="half", ensemble_size=5, warm_start=False)
+    views = half.views(3, obs)
+    assert views.shape == (5, half.inputs(3, obs)) == (5, obs + features)
+    assert ((views[:3] > 0) == (np.arange(obs + features) < obs)).all()
+    assert (views[3:, :obs] > 0).all() == (obs <= 16) and (views[3:, obs:] > 0).all()
+    np.testing.assert_allclose((views**2).sum(axis=1), obs + features, rtol=1e-5)
+    alone = half.replace(reduction="regression")
+    assert alone.inputs(3, obs) == (obs + features if obs <= 16 else features) and alone.views(3, obs) is None
 
 
 def test_the_stacked_mixture_has_the_highest_log_score_of_all_weights():
