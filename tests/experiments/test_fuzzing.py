@@ -17,7 +17,7 @@ from experiments.fuzzing.words import RIGHT, flags_of
 from jaxlfi.cli import commands
 from tests.small import whole_runs  # noqa: F401 - a fixture
 
-CASES = 500
+CASES = 250
 
 
 @pytest.fixture(scope="module")

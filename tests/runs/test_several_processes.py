@@ -38,6 +38,7 @@ def lost_in_between(folder) -> subprocess.Popen:
     return processes[0]
 
 
+@pytest.mark.slow
 def test_where_a_process_is_lost_the_other_says_so_and_the_run_goes_on_in_one(tmp_path):
     left = lost_in_between(tmp_path)
     began = time.monotonic()
