@@ -27,19 +27,19 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 
 MASS_BEYOND = 0.2
-"""Marginal posterior mass beyond a bound that speaks against it.
+"""Marginal posterior mass beyond a bound that speaks against it by itself: 1 of 448 bounds of right boxes has so much.
 
 On a wrong support the networks of an ensemble extrapolate, each to a place of its own and with little width, so that
-the mass beyond is near a multiple of 1 / ensemble size: this is enough for one of the usual four.
+the mass beyond is often near a multiple of 1 / ensemble size: this is enough for one of the usual four.
 """
-MOST = 0.5
-"""Mass beyond a bound that speaks against it where the simulations are undecided: then the median lies beyond it."""
+SOME = 0.05
+"""Mass beyond a bound that speaks against it together with the run's simulations: 10 of 448 of right boxes have it."""
 LESS = 0.5
 """Fraction of the greatest mass beyond a bound below which the mass beyond others does not count."""
 GAIN = 6.0
 """Fall of the misfit that speaks against a bound by itself: a right one has it in less than 1 % of runs."""
 WEAK_GAIN = 1.0
-"""Fall of the misfit that speaks against a bound together with `MASS_BEYOND`."""
+"""Fall of the misfit that speaks against a bound together with `SOME` mass beyond it."""
 NEXT = 0.3
 """Least gain of a further bound, as a fraction of the greatest."""
 EXPLAINED = 0.5
@@ -142,19 +142,19 @@ def judged(
         mass: beyond each, shape [2, D].
         model: None where there are too few simulations for one: then the mass decides.
     """
-    much = mass > MASS_BEYOND
     if model is None:
-        return BoundEvidence(bounds, mass, np.zeros_like(mass), much)
+        return BoundEvidence(bounds, mass, np.zeros_like(mass), mass > MASS_BEYOND)
+    some = mass > SOME
     gain, before, after = gains(model)
     helps, degrees = gain >= GAIN, len(model.residual)
     if helps.any() and (after <= _usual(degrees, 2.33) or before - after >= EXPLAINED * before):
         wrong = helps
     elif before <= _usual(degrees, 3.09):  # explained within the box
-        wrong = much & ((gain >= WEAK_GAIN) | (mass > MOST))
-    elif helps.any() and much.any() and np.argmax(gain) == np.argmax(mass):  # both point to one bound
+        wrong = (mass > MASS_BEYOND) | (some & (gain >= WEAK_GAIN))
+    elif helps.any() and some.any() and np.argmax(gain) == np.argmax(mass):  # both point to one bound
         wrong = gain == np.max(gain)
     else:
-        wrong = helps | (much & (mass > LESS * np.max(mass)))
+        wrong = helps | (some & (mass > LESS * np.max(mass)))
     return BoundEvidence(bounds, mass, gain, wrong)
 
 
@@ -225,7 +225,7 @@ def bound_warnings(
         value = _range(np.asarray(space.to_natural(bounds[:, side]), float)[:, d])
         share = np.median(mass[:, side, d])
         beyond = f"{'in the median ' if runs > 1 else ''}{share:.2f} of the posterior mass lies beyond it"
-        if share <= MASS_BEYOND:
+        if share <= SOME:
             beyond = "the run's simulations say so, not its posterior" if runs == 1 else ""
         if runs > 1:
             beyond = f"in {np.sum(wrong[:, side, d])} of {runs} runs{'; ' if beyond else ''}{beyond}"

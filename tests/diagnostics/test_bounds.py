@@ -139,7 +139,7 @@ def blamed(truth, simulator=linear, seed: int = 0, n: int = 1000, mass=None) -> 
     theta = rng.uniform(-1, 1, (n, 3))
     observed = simulator(np.array([truth]), rng)[0]
     model = local_model(theta, simulator(theta, rng), observed, UNIT)
-    mass = np.full((2, 3), 0.4) if mass is None else mass
+    mass = np.full((2, 3), 0.15) if mass is None else mass
     found = judged(np.stack([UNIT.low, UNIT.high]), mass, model)
     return {(int(side), int(d)) for side, d in np.argwhere(found.wrong)}
 
