@@ -52,7 +52,10 @@ CLIPPED = QUICK.replace(
     inflation=1.0,
     rounds=10,
     min_rounds=0,
-    estimator=QUICK.estimator.replace(epochs=0, steps=1000, learning_rate=1e-3, schedule="constant"),
+    correction="none",
+    estimator=QUICK.estimator.replace(
+        epochs=0, steps=1000, learning_rate=1e-3, schedule="constant", parameters="feasible", reduction="none"
+    ),
 )
 """Proposals from the posterior itself, clipped, and a thousand gradient steps in every round: what `quick` was before
 the study of widths, and what most studies were made with."""

@@ -19,6 +19,7 @@ from experiments.sota import rows as sota
 from experiments.sota.__main__ import METHODS as SOTA_METHODS
 from experiments.sota.cases import SETTINGS as SOTA_SETTINGS
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
+from jaxlfi.runs.describe import settings_to_json
 
 ROOT = Path(__file__).parents[2] / "experiments"
 RESULTS = ROOT / "results"
@@ -91,6 +92,24 @@ def test_widths_near_bounds():
         held = arrays(path.relative_to(RESULTS).with_suffix(""))["density_rank"][:100] < 0.9 * 201
         row = next(line for line in table.splitlines() if line.startswith(f"| `{path.parent.name}` |"))
         assert np.mean([float(cell) for cell in row.split("|")[2:6]]) == pytest.approx(held.mean(), abs=0.01)
+
+
+def test_flags_of_the_settings_before():
+    """What is printed for `clipped` on the command line gives those settings."""
+    from experiments.ablation import CLIPPED
+    from jaxlfi.cli.asked import build_settings
+    from jaxlfi.cli.parser import parser
+    from jaxlfi.tasks import registry
+
+    (flags,) = re.findall(r"CLIPPED`, on the command line `([^`]+)`", README)
+    arguments = parser().parse_args(["compare", "lotka_volterra", "--out", "x", *flags.split()])
+    found, expected = build_settings(arguments, registry.load("lotka_volterra")), CLIPPED.check()
+    assert settings_to_json(found) == settings_to_json(expected)
+    kept = json.loads((RESULTS / "ablation/clipped.json").read_text())["settings"]["estimator"]["hyperparameters"]
+    now = settings_to_json(CLIPPED)["estimator"]["hyperparameters"]
+    assert {name: now[name] for name in kept if name in now and name != "normaliser"} == {
+        name: value for name, value in kept.items() if name in now and name != "normaliser"
+    }
 
 
 VARIANTS = sorted(path.stem for path in (RESULTS / "ablation").glob("*.npz"))
