@@ -9,6 +9,7 @@ from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlfi.distributions.decomposition import svd
 from jaxlfi.distributions.mixture import GaussianMixture
 
 FLOOR = 0.01
@@ -218,7 +219,7 @@ def _paired(a: GaussianMixture, b: GaussianMixture) -> _Pairs:
     def one_pair(mean_1, factor_1, mean_2, factor_2):
         unwhitened = jnp.concatenate([factor_1, (mean_2 - mean_1)[:, None]], axis=1)
         whitened = solve_triangular(factor_2, unwhitened, lower=True)
-        left, ratio, right = jnp.linalg.svd(whitened[:, :-1])
+        left, ratio, right = svd(whitened[:, :-1])
         log_peak = -jnp.sum(jnp.log(jnp.diagonal(factor_2))) - 0.5 * mean_1.shape[0] * jnp.log(2 * jnp.pi)
         return mean_1, factor_1 @ right.T, ratio, left.T @ whitened[:, -1], log_peak
 

@@ -4,6 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxlfi.distributions.decomposition import svd
+
 PENALTIES = np.logspace(0, 5, 11).astype(np.float32)
 """What is added to the inner products of predictors that have unit variance; 1 weighs as much as one row."""
 
@@ -28,7 +30,7 @@ def ridge(
     rows = jnp.sum(valid)
     x_mean, y_mean = (jnp.sum(v, axis=0, where=valid[:, None]) / jnp.maximum(rows, 1) for v in (x, y))
     x, y = jnp.where(valid[:, None], x - x_mean, 0.0), jnp.where(valid[:, None], y - y_mean, 0.0)
-    left, singular, right = jnp.linalg.svd(x, full_matrices=False)
+    left, singular, right = svd(x)
     along = left.T @ y  # [R, D]
     kept = singular**2 / (singular**2 + PENALTIES[:, None])  # what a penalty leaves of each direction, [P, R]
     outside = jnp.maximum(jnp.sum(y**2, axis=0) - jnp.sum(along**2, axis=0), 0.0)
