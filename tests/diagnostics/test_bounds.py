@@ -157,7 +157,7 @@ def blamed(truth, simulator=linear, seed: int = 0, n: int = 1000, mass=None) -> 
     ],
 )
 def test_the_bound_that_excludes_the_truth_is_blamed_and_no_other(truth, wrong, simulator):
-    """Whatever the posterior's mass says, as the local model holds."""
+    """Whatever mass the posterior has beyond, up to what speaks against a bound by itself, as the local model holds."""
     found = [blamed(truth, simulator, seed) for seed in range(5)]
     assert found.count(wrong) >= 4, found
 
