@@ -9,18 +9,18 @@ from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 from jaxlfi.fields import hyperparameter
-from jaxlfi.heuristics.base import Adaptation, Heuristic, Value
+from jaxlfi.heuristics.base import Adaptation, Value, Wrapper
 
 PLACES = np.linspace(0.0, 1.0, 17, dtype=np.float32)[1:-1]
 """Where distribution functions are compared, as fractions of the support's width."""
 
 
-class Identified(Heuristic):
+class Identified(Wrapper):
     """Another heuristic, for the parameters whose posterior differs from the uniform distribution over the support.
 
     A posterior that is as wide as the support has mass along both bounds, wherever these are: no evidence that either
-    is wrong. EDGE alone moves them on, round by round, until the support is Phi. Networks leave the marginal of a
-    parameter that does nothing at a distance of 0.2 from the uniform, and one that is known at 0.4 and more.
+    is wrong. EDGE alone moves them on, round by round, until the support is Phi. On a linear Gaussian, the learnt
+    marginals of parameters that do nothing are at distances of 0.14 to 0.30 from the uniform, others at 0.39 and more.
 
     Attributes:
         rule: the heuristic to wrap.
@@ -33,25 +33,14 @@ class Identified(Heuristic):
         0.005
     """
 
-    rule: Heuristic
     least_change: Value = hyperparameter(
         0.3, help="distance of a marginal from the uniform below which its bounds stay", low=0, high=1
     )
 
     @property
-    def grows(self) -> bool:
-        """Whether the rule can let the support grow."""
-        return self.rule.grows
-
-    @property
     def compares_components(self) -> bool:
         """Whether the rule compares components."""
         return self.rule.compares_components
-
-    @property
-    def proposes_from_prior(self) -> bool:
-        """Whether the rule always proposes from the prior."""
-        return self.rule.proposes_from_prior
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Apply the rule, and take back what it did to parameters that are not identified."""

@@ -85,7 +85,7 @@ def test_each_component_is_moved_by_the_slope_of_the_pool():
 
 
 def test_a_stray_component_where_nothing_was_proposed_stays_light():
-    """It is e^6 times as far from what was proposed as the other: by the quotient alone it would be most of all."""
+    """By the quotient alone, its weight of 0.02 would become 0.63."""
     near, far = gaussian(), gaussian(MEAN - [3.5, 0.0])
     q = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), near, far).replace(logits=jnp.log(jnp.array([0.98, 0.02])))
     found, _ = without_pool(task_of(), q, proposals(*[gaussian(factor=2 * FACTOR)] * 9), 9, 0.0, BOX)
