@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlfi
+from experiments.sharpness.catalogue import PROBLEMS as OTHERS
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.diagnostics import bound_evidence
 from jaxlfi.diagnostics.bounds import MASS_BEYOND
@@ -99,7 +100,7 @@ class Problem:
         least: below which no lower bound is, in inference space; None for no limit.
         seed: of boxes and observations.
         runs: on wrong boxes, and as many on right ones.
-        held_out: not looked at before the rule was chosen.
+        held_out: not looked at before the rule was chosen; of the others, the boxes were not.
     """
 
     simulate: Callable
@@ -108,24 +109,38 @@ class Problem:
     log: tuple[int, ...] = ()
     informed: int | None = None
     least: tuple[float, ...] | None = None
-    seed: int = 90
+    seed: int = 1000
     runs: int = 7
-    held_out: bool = True
+    held_out: bool = False
 
 
-SEEN = {"seed": 50, "runs": 9, "held_out": False}
+def from_catalogue(name: str) -> Problem:
+    """A problem of `experiments.sharpness`, from its raw numbers."""
+    other = OTHERS[name]
+    low, high = other.box
+    return Problem(
+        other.simulate,
+        other.truth,
+        tuple(high - low),
+        tuple(np.flatnonzero(np.isin(other.names, other.log)).tolist()),
+        informed=len(other.informed or other.names),
+        held_out=True,
+    )
+
+
 PROBLEMS = {
-    "spring": Problem(noisy(spring, 0.05), (12.0, 0.4), (3.7, 3.7), (0, 1), **SEEN),
-    "oscillation": Problem(noisy(oscillation, 0.1), (1.5, 1.7), (4.0, 2.5), **SEEN),
-    "logistic": Problem(noisy(logistic, 2.0), (0.8, 100.0, 3.0), (3.4, 2.7, 3.7), (0, 1, 2), **SEEN),
+    "spring": Problem(noisy(spring, 0.05), (12.0, 0.4), (3.7, 3.7), (0, 1)),
+    "oscillation": Problem(noisy(oscillation, 0.1), (1.5, 1.7), (4.0, 2.5)),
+    "logistic": Problem(noisy(logistic, 2.0), (0.8, 100.0, 3.0), (3.4, 2.7, 3.7), (0, 1, 2)),
     "idle": Problem(noisy(idle, 0.1), (1.0, 1.0, 0.0, 5.0), (3.0, 3.0, 4.0, 8.0), informed=2),
     "polynomial": Problem(
         noisy(lambda theta: sum(theta[i] * GRID**i for i in range(5)), 0.2), (0.5, -1.0, 0.8, 0.3, -0.6), (6.0,) * 5
     ),
     "ridge": Problem(noisy(ridge, np.array([0.03, 0.03, 0.15, 0.2])), (2.0, 3.0, 1.0), (3.0, 3.0, 4.0), (0, 1)),
-    "thermocouple": Problem(noisy(thermocouple, 1e-4), (100.0, 2.0), (120.0, 2.5), least=(5.0, 0.2), seed=91),
+    "thermocouple": Problem(noisy(thermocouple, 1e-4), (100.0, 2.0), (120.0, 2.5), least=(5.0, 0.2)),
+    **{name: from_catalogue(name) for name in ("linear_8", "poisson_regression", "epidemic", "lotka_volterra")},
 }
-"""By name. Boxes of the first three were looked at while the rule was chosen."""
+"""By name."""
 
 
 def problem_task(problem: Problem) -> jaxlfi.Task:

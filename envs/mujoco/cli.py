@@ -69,7 +69,10 @@ def parser() -> argparse.ArgumentParser:
         "wrong, as unmodelled_force and a table [discrepancy] for the task's file.",
     )
     fit.add_argument(
-        "source", metavar="RUN|CONFIG", help="folder of a run, to start from its posterior; or a TOML file, from Phi"
+        "source",
+        metavar="RUN|TASK",
+        help="folder of a run, to start from its posterior; or the TOML file of a task, or a task as `jaxlfi infer` "
+        "takes it, to start from Phi",
     )
     fit.add_argument("--starts", type=_count, default=64, metavar="N", help="draws to choose from (default: 64)")
     fit.add_argument("--keep", type=_count, default=4, metavar="N", help="the best of them to follow (default: 4)")

@@ -20,6 +20,7 @@ from jaxlfi.io import files
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs.folder import environment
 from jaxlfi.runs.run import Run
+from jaxlfi.tasks import registry
 from jaxlfi.tasks.task import Task
 
 ALIKE = 0.95
@@ -41,13 +42,11 @@ def fit(arguments: argparse.Namespace) -> None:
     """
     if arguments.sysid:
         sysid_point.require_sysid()
-    source, out = Path(arguments.source), arguments.out
+    out = arguments.out
     if out is not None and out.exists():
         raise ValueError(f"--out: expected a new folder, got {out}")
-    if not source.exists():
-        raise ValueError(f"{source}: expected the folder of a run, or a TOML file that describes a task; got neither")
-    run = None if source.is_file() else jaxlfi.load(source)
-    task = config.read(source) if run is None else task_of(run)
+    run = jaxlfi.load(arguments.source) if Path(arguments.source).is_dir() else None
+    task = task_named(arguments.source) if run is None else task_of(run)
     starts = _over_feasible(task, arguments.starts) if run is None else np.asarray(run.draws(arguments.starts))
     observation = None if run is None else np.asarray(run.observed)
     console = tables.console()
@@ -98,6 +97,23 @@ def draw(
     log = [name for name, own in zip(names, task.space.log, strict=True) if own]
     truth = None if task.truth is None else np.asarray(task.truth)
     plot.pairs(sets, names=names, units=task.units, log=log, truth=truth, points=points, path=path, dpi=150)
+
+
+def task_named(source: str) -> Task:
+    """The task that a TOML file describes, or that a reference names as `jaxlfi infer` takes it.
+
+    Raises:
+        ValueError: where it is neither.
+    """
+    if Path(source).is_file():
+        return config.read(Path(source))
+    name = source.partition(",")[0]
+    if name not in registry.names() and ":" not in name:
+        raise ValueError(
+            f"{source}: expected the folder of a run, a TOML file that describes a task, or a task such as "
+            "mujoco,config=FILE.toml; got none of them"
+        )
+    return registry.load(source)
 
 
 def task_of(run: Run) -> Task:

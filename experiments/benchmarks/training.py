@@ -81,7 +81,7 @@ def our_steps(estimator: MixtureNetwork, steps: int) -> Callable[[], object]:
         weight=jnp.ones(ROWS),
         size=jnp.asarray(ROWS),
     )
-    network = untrained(key, estimator, OBS, task.inference.feasible, task.space).begun(data)
+    network = untrained(key, estimator, OBS, task.inference.feasible, task.space).begun(data)[0]
     run = jax.jit(lambda key: fit(key, network, data, jnp.ones(ROWS), ROWS)[1].loss)
     return lambda: jax.block_until_ready(run(key))
 

@@ -222,7 +222,9 @@ def _outcomes(simulations: Simulations) -> Simulations:
 
 def _started(state: State, dataset: Dataset) -> Network:
     """A network that is trained on takes its normalisers from the first round that has simulations."""
-    fresh = state.network.begun(dataset)
+    if not state.network.estimator.warm_start:
+        return state.network  # it starts anew with each fit
+    fresh, _ = state.network.begun(dataset)
     return jax.tree.map(lambda kept, new: jnp.where(state.dataset.size > 0, kept, new), state.network, fresh)
 
 

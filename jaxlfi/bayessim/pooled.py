@@ -5,8 +5,11 @@ the mixture of the rounds' proposals, relative to the prior. Divided out in the 
 next, and runs are lost. So proposals and heuristics go on with q as it is, and only what the run reports is q / p_pool.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.distributions.belief import Belief
@@ -16,10 +19,8 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.priors import prior_mass
 from jaxlfi.tasks.task import Task
 
-MASS_DRAWS = 512
-"""Monte Carlo draws for the normalising constant of each proposal (4 % error at mass 0.5)."""
-COMPONENT_DRAWS = 200
-"""Points of each component that its weighted moments are taken over."""
+COMPONENT_POINTS = 64
+"""Points of each component, at least, that its mass in a support and its weighted moments are taken over."""
 HIGHEST = 4.0
 """Highest weight of a point, in geometric means of the weights under q: where the pool is thinner, q is hardly known.
 
@@ -55,11 +56,11 @@ def log_pool(
     factor = prior if factored else None
 
     def log_density(proposal: Belief) -> Array:
-        draws = proposal.mixture.sample(jax.random.key(0), MASS_DRAWS)
-        inside = region(proposal.support, prior).contains(draws)
-        log_factor = jnp.zeros(MASS_DRAWS) if factor is None else factor.log_prob(draws)
+        points, share = _points(proposal.mixture)
+        inside = region(proposal.support, prior).contains(points)
+        log_factor = jnp.zeros(len(points)) if factor is None else factor.log_prob(points)
         highest = jnp.where(jnp.any(inside), jnp.max(jnp.where(inside, log_factor, -jnp.inf)), 0.0)
-        mean = jnp.mean(jnp.where(inside, jnp.exp(log_factor - highest), 0.0)) + 1 / MASS_DRAWS
+        mean = jnp.maximum(jnp.sum(share * jnp.where(inside, jnp.exp(log_factor - highest), 0.0)), 1 / len(points))
         informed = proposal.mixture.log_prob(theta) - jnp.log(mean) - highest
         if factor is not prior:
             informed = informed - prior.log_prob(theta)
@@ -98,12 +99,9 @@ def without_pool(
     Returns:
         The mixture, of as many components, and the effective share of q's draws under the weights.
     """
-    count, dim = q.means.shape
-    points = _normal_points(dim)
-    theta = q.means[:, None] + jnp.einsum("kij,nj->kni", q.scale_tril, points)
-    log_weight = -log_pool(task, proposals, round, defensive, support.clip(theta.reshape(-1, dim)))
-    log_weight = log_weight.reshape(count, -1)
-    share = q.weights[:, None] / COMPONENT_DRAWS
+    theta, share = (leaf.reshape(len(q.logits), -1, *leaf.shape[1:]) for leaf in _points(q))
+    log_weight = -log_pool(task, proposals, round, defensive, support.clip(theta.reshape(-1, theta.shape[-1])))
+    log_weight = log_weight.reshape(share.shape)
     known = jnp.isfinite(log_weight) & (share > 0)
     typical = jnp.sum(share * log_weight, where=known) / jnp.maximum(jnp.sum(share, where=known), 1e-30)
     weight = jnp.where(known, jnp.minimum(jnp.exp(log_weight - typical), HIGHEST), 0.0)
@@ -124,8 +122,16 @@ def without_pool(
     return mixture, jnp.where(jnp.any(sound), effective, 0.0)
 
 
-def _normal_points(dim: int) -> Float[Array, "n dim"]:
+def _points(mixture: GaussianMixture) -> tuple[Float[Array, "n dim"], Float[Array, " n"]]:
+    """Points of all components, one component after another, and how much each counts: in all 1."""
+    normal = _normal_points(mixture.means.shape[-1])
+    points = mixture.means[:, None] + jnp.einsum("kij,nj->kni", mixture.scale_tril, normal)
+    return points.reshape(-1, points.shape[-1]), jnp.repeat(mixture.weights / len(normal), len(normal))
+
+
+@functools.cache
+def _normal_points(dim: int) -> Float[np.ndarray, "n dim"]:
     """Points of the standard normal distribution, with its mean and covariance: constant weights change nothing."""
-    points = jax.random.normal(jax.random.key(1), (COMPONENT_DRAWS // 2, dim))
-    points = jnp.concatenate([points, -points])
-    return jnp.linalg.solve(jnp.linalg.cholesky(points.T @ points / COMPONENT_DRAWS), points.T).T
+    points = np.random.default_rng(0).normal(size=(max(COMPONENT_POINTS // 2, 4 * dim), dim))
+    points = np.concatenate([points, -points])
+    return np.linalg.solve(np.linalg.cholesky(points.T @ points / len(points)), points.T).T.astype(np.float32)

@@ -26,14 +26,14 @@ from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 
-MASS_BEYOND = 0.2
-"""Marginal posterior mass beyond a bound that speaks against it by itself: 1 of 448 bounds of right boxes has so much.
+MASS_BEYOND = 0.12
+"""Marginal posterior mass beyond a bound that speaks against it by itself: hardly any of right boxes has so much.
 
 On a wrong support the networks of an ensemble extrapolate, each to a place of its own and with little width, so that
-the mass beyond is often near a multiple of 1 / ensemble size: this is enough for one of the usual four.
+the mass beyond is often near a multiple of 1 / ensemble size: this is enough for half of one of the usual four.
 """
-SOME = 0.05
-"""Mass beyond a bound that speaks against it together with the run's simulations: 10 of 448 of right boxes have it."""
+SOME = 0.03
+"""Mass beyond a bound that speaks against it together with the run's simulations."""
 LESS = 0.5
 """Fraction of the greatest mass beyond a bound below which the mass beyond others does not count."""
 GAIN = 6.0

@@ -350,21 +350,19 @@ class Network:
             return self.scale.centre, half
         return self.scale.centre + half * self.theta_normaliser.mean, half * self.theta_normaliser.scale
 
-    def begun(self, dataset: Dataset) -> "Network":
-        """The same fresh weights with all that a network takes from the simulations it starts on."""
+    def begun(self, dataset: Dataset) -> tuple["Network", Float[Array, "cap given"]]:
+        """The same fresh weights with all that a network takes from the simulations it starts on, and what it sees.
+
+        What it sees of these simulations is what it learns from: features of a row are those of regressions without it.
+        """
         of_x, of_theta = _normalisers(self.estimator, dataset, self.scale)
         network = self.replace(normaliser=of_x, theta_normaliser=of_theta)
-        theta = network.to_network(dataset.theta)
+        theta, x = network.to_network(dataset.theta), of_x(dataset.x)
         if self.regression is not None:
-            network = network.replace(regression=network._regression_of(dataset)[0])
-        params = self.estimator.begin(self.params, theta, network.given(dataset.x), dataset.valid)
-        return network.replace(params=params)
-
-    def seen(self, dataset: Dataset) -> Float[Array, "cap given"]:
-        """What the network learns from, of the simulations that it began on."""
-        if self.regression is None:
-            return self.normaliser(dataset.x)
-        return self._beside(dataset.x, self._regression_of(dataset)[1])
+            # Those of the later half of the rounds, which are nearer to the observation than those before.
+            fitted, features = fit_regression(self.regression, theta, dataset.x, dataset.valid, dataset.late)
+            network, x = network.replace(regression=fitted), network._beside(dataset.x, features)
+        return network.replace(params=self.estimator.begin(self.params, theta, x, dataset.valid)), x
 
     def _beside(self, x: Array, features: Array) -> Array:
         if self.estimator.replaces(x.shape[-1]):
@@ -376,13 +374,8 @@ class Network:
         """What each network of the ensemble sees of what is given (`Estimator.views`)."""
         return self.estimator.views(self.scale.dim, self.normaliser.mean.shape[-1])
 
-    def _regression_of(self, dataset: Dataset) -> tuple[Regression, Array]:
-        """The regressions over the later half of the rounds, which are nearer to the observation than those before."""
-        theta = self.to_network(dataset.theta)
-        return fit_regression(self.regression, theta, dataset.x, dataset.valid, dataset.late)
-
-    def restarted(self, key: jax.Array, dataset: Dataset) -> "Network":
-        """Fresh weights, and the normalisers of these simulations."""
+    def restarted(self, key: jax.Array, dataset: Dataset) -> tuple["Network", Float[Array, "cap given"]]:
+        """Fresh weights and the normalisers of these simulations, and what the network sees of them."""
         params = self.estimator.initialise(key, self.scale.dim, dataset.x.shape[-1])
         return self.replace(params=params).begun(dataset)
 

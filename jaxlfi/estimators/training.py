@@ -74,9 +74,10 @@ def fit(
     """
     estimator = network.estimator
     key_init, key_fit = jax.random.split(key)
-    if not estimator.warm_start:
-        network = network.restarted(key_init, dataset)
-    x = network.seen(dataset)
+    if estimator.warm_start:
+        x = network.given(dataset.x)
+    else:
+        network, x = network.restarted(key_init, dataset)
     theta = network.to_network(dataset.theta)
     log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
     key_rows = jax.random.fold_in(jax.random.clone(key_init), 1)

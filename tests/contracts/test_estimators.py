@@ -268,7 +268,7 @@ def test_training_lowers_the_loss(case):
     dataset = datasets.empty(80, 2, 3).replace(theta=jnp.asarray(theta), x=jnp.asarray(x), size=jnp.asarray(80))
 
     def train(key, network):
-        return fit(key, network.begun(dataset), dataset, jnp.ones(80), 80)
+        return fit(key, network.begun(dataset)[0], dataset, jnp.ones(80), 80)
 
     network, info = jax.jit(train)(jax.random.key(1), case.start)
     loss = np.asarray(info.loss)

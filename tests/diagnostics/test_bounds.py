@@ -139,7 +139,7 @@ def blamed(truth, simulator=linear, seed: int = 0, n: int = 1000, mass=None) -> 
     theta = rng.uniform(-1, 1, (n, 3))
     observed = simulator(np.array([truth]), rng)[0]
     model = local_model(theta, simulator(theta, rng), observed, UNIT)
-    mass = np.full((2, 3), 0.15) if mass is None else mass
+    mass = np.full((2, 3), 0.1) if mass is None else mass
     found = judged(np.stack([UNIT.low, UNIT.high]), mass, model)
     return {(int(side), int(d)) for side, d in np.argwhere(found.wrong)}
 
@@ -238,7 +238,7 @@ def test_a_posterior_centred_beyond_a_bound_warns_of_that_bound(d, at, begin):
 
 def test_a_bound_that_only_the_simulations_speak_against_is_said_to_be_so():
     bounds, wrong = np.array([[0.0, -2.0], [4.0, 6.0]]), np.array([[False, False], [True, False]])
-    one = BoundEvidence(bounds, np.full((2, 2), 0.05), 20.0 * wrong, wrong)
+    one = BoundEvidence(bounds, np.full((2, 2), 0.02), 20.0 * wrong, wrong)
     (text,) = bound_warnings(SPACE, UNITS, [one], PHI)
     assert text == f"mass reaches its upper bound 4 kg (the run's simulations say so, not its posterior). {ADAPT}"
     (text,) = bound_warnings(SPACE, UNITS, [one, one], PHI)
@@ -292,7 +292,7 @@ def test_a_marginal_far_wider_than_the_box_warns_on_both_sides():
     texts = warnings(centred(0, 2.0, 20.0))
     assert texts[0].startswith("mass reaches its lower bound 0 kg (0.46 of")
     assert texts[1].startswith("mass reaches its upper bound 4 kg (0.46 of")
-    assert evidence(centred(0, 2.0, 2.0))[0][0] < MASS_BEYOND  # a standard deviation of half the width: none
+    assert evidence(centred(0, 2.0, 4 / np.sqrt(12)))[0][0] < MASS_BEYOND  # as wide as the uniform distribution: none
 
 
 # ------------------------------------------------------------------------------------------------------- the messages

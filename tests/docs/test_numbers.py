@@ -443,7 +443,7 @@ def test_bound_warnings():
 
 
 def test_wrong_bounds():
-    """Sums over the problems that the rule was chosen on, and over those that were held out."""
+    """Sums over the problems that the rule was chosen on, over those that were held out, and over all."""
     from experiments.wrong_bounds import PROBLEMS, counts
     from jaxlfi.diagnostics.bounds import MASS_BEYOND
 
@@ -455,6 +455,15 @@ def test_wrong_bounds():
             (row,) = re.findall(rf"\| {title}[^|]* \| [^|]*{rule}[^|]* \|[^|]+\|[^|]+\|[^|]+\|", README)
             for hits, of in total:
                 assert f" {hits} of {of} ({100 * hits / of:.0f} %) |" in row
+    total = sum(
+        np.array(
+            list(counts(arrays(f"wrong-bounds/{name}"), rules["simulations"](arrays(f"wrong-bounds/{name}"))).values())
+        )
+        for name in PROBLEMS
+    )
+    (named, wrong), (false, right), _ = total
+    assert f"Together {named} of {wrong} wrong bounds ({100 * named / wrong:.0f} %)" in README
+    assert f"{false} of {right} right ones of the same boxes" in README
 
 
 # ------------------------------------------------------------------------------------------------------------ policies
