@@ -21,7 +21,7 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
-from jaxlfi.diagnostics.bounds import MASS_BEYOND, edge_mass, mass_beyond
+from jaxlfi.diagnostics.bounds import edge_mass, mass_beyond
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
@@ -224,8 +224,9 @@ RULES: dict[str, tuple[str, Rule]] = {
 
 FORMER = ("along", 0.2)
 """The rule before this study."""
-CHOSEN = ("beyond", MASS_BEYOND)
-"""What the library takes of the posterior; it asks the simulations, too (experiments/wrong_bounds.py)."""
+CHOSEN = ("beyond", 0.2)
+"""The best rule for these runs. The library's threshold is lower, as today's posteriors are narrower, and it asks the
+simulations, too (experiments/wrong_bounds.py)."""
 
 
 @dataclasses.dataclass(frozen=True)
