@@ -43,7 +43,7 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.posterior import Posterior
-from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Identified, Mode, paired
+from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Mode, paired
 from jaxlfi.io import files as atomic
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs.describe import settings_to_json
@@ -64,7 +64,7 @@ TUNING = 1000
 """The first seed of those that settings are chosen on; results are reported on seeds from 0."""
 
 RULES: dict[str, Heuristic] = {"none": Fixed(), "edge": Edge(), "mode": Mode(), "centre": Centre()}
-RULES["identified"] = Identified(Edge())
+RULES["evident"] = Edge(mass_threshold=0.25)
 
 PACED = QUICK.estimator
 """Training in proportion to the simulations there are, where `CLIPPED` makes as many steps in the first round as in the

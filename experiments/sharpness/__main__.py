@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--problems", nargs="+", default=["tuning"], help="tuning, held-out, all, or names")
     parser.add_argument("--boxes", nargs="+", choices=runner.BOXES, default=list(runner.BOXES))
-    parser.add_argument("--heuristics", nargs="+", choices=list(runner.RULES), default=list(runner.RULES))
+    parser.add_argument("--heuristics", nargs="+", choices=list(runner.RULES), default=["fixed", "edge"])
     parser.add_argument("--simulations", nargs="+", type=int, default=[1000], help="in ten rounds, failures included")
     parser.add_argument("--methods", nargs="+", choices=runner.METHODS, default=["bayessim"])
     parser.add_argument("--seeds", type=int, default=8, help="observations of each problem's own truth")
