@@ -301,7 +301,8 @@ class Network:
             them as they are (`Estimator.standardises`).
         scale: the box in inference space that [-1, 1]^D stands for, Phi.
         space: the map between inference space and natural units.
-        regression: features given to the network in place of normalised summaries, or beside them; None without any.
+        regression: makes the features that the network sees instead of, or in addition to, the normalised summaries;
+            None where it sees the summaries alone.
         log_weights: of the ensemble's networks in the posterior that is reported, shape [E]; None for equal ones.
         prior: the task's own prior over inference space, None for a uniform one. A likelihood is multiplied by it; a
             density that is the posterior has it in it, and is cut off where the prior is zero.

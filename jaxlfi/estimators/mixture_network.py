@@ -1,5 +1,6 @@
 """The mixture density network as an estimator: the paper's family."""
 
+import math
 from typing import ClassVar
 
 import flax.linen as nn
@@ -74,12 +75,13 @@ class MixtureNetwork(Estimator):
         declared = jax.eval_shape(self.module(dim).init, key, jnp.zeros(self.inputs(dim, obs)))
         leaves, structure = jax.tree.flatten(declared)
         sizes = [leaf.size if leaf.ndim == 2 else 0 for leaf in leaves]
-        draws = jax.random.truncated_normal(key, -2, 2, (self.ensemble_size, sum(sizes))) / TRUNCATED_DEVIATION
+        members = self.ensemble_size
+        draws = jax.random.truncated_normal(key, -2, 2, (members, sum(sizes)), jnp.float32) / TRUNCATED_DEVIATION
         parts = jnp.split(draws, np.cumsum(sizes)[:-1], axis=1)
         fresh = [
-            part.reshape(-1, *leaf.shape) / np.sqrt(leaf.shape[-1])
-            if leaf.ndim == 2
-            else jnp.zeros((self.ensemble_size, *leaf.shape))
+            part.reshape(members, *leaf.shape) / math.sqrt(leaf.shape[-1])
+            if leaf.ndim == 2  # a kernel [out, in]; the others are biases
+            else jnp.zeros((members, *leaf.shape), leaf.dtype)
             for part, leaf in zip(parts, leaves, strict=True)
         ]
         return jax.tree.unflatten(structure, fresh)
