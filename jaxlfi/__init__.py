@@ -46,7 +46,7 @@ _HOMES = {
     "repeated": "jaxlfi.tasks.trials",
     "settings_for": "jaxlfi.bayessim.presets",
     "stack": "jaxlfi.bayessim.batch",
-    "with_tails": "jaxlfi.tasks.priors",
+    "with_tails": "jaxlfi.tasks.tailed_uniform",
 }
 
 _MODULES = ("plot",)

@@ -53,7 +53,7 @@ from jaxlfi.runs.run import SupportWarning as SupportWarning
 from jaxlfi.tasks.errors import ExecutorError as ExecutorError
 from jaxlfi.tasks.errors import SimulatorError as SimulatorError
 from jaxlfi.tasks.host import HostSimulator as HostSimulator
-from jaxlfi.tasks.priors import with_tails as with_tails
+from jaxlfi.tasks.tailed_uniform import with_tails as with_tails
 from jaxlfi.tasks.task import Task as Task
 from jaxlfi.tasks.trials import repeated as repeated
 

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Callable
 
-import distrax
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -128,6 +127,8 @@ def gaussian_prior(prior) -> GaussianMixture:
     Raises:
         ValueError: for priors that are not Gaussian.
     """
+    import distrax  # takes a second, which no other correction needs
+
     own = prior.distribution if isinstance(prior, InferencePrior) and prior.space is None else prior
     if isinstance(own, distrax.MultivariateNormalTri | distrax.MultivariateNormalDiag):
         covariance = own.covariance()

@@ -1,12 +1,17 @@
 """A mixture of Gaussians with full covariances: what a posterior is in this library."""
 
-import distrax
+import functools
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax.scipy.linalg import solve_triangular
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Int
+
+if TYPE_CHECKING:
+    import distrax
 
 HALVINGS = 40
 """Bisections that find a quantile: 2^-40 of the interval it is known to lie in is below the spacing of float32."""
@@ -53,8 +58,10 @@ class GaussianMixture:
         second = self.covariances + offset[..., :, None] * offset[..., None, :]
         return jnp.sum(self.weights[..., None, None] * second, axis=-3)
 
-    def distribution(self) -> distrax.MixtureSameFamily:
+    def distribution(self) -> "distrax.MixtureSameFamily":
         """The mixture as a distrax distribution (one mixture, not a batch)."""
+        import distrax  # takes a second, which no run needs
+
         return distrax.MixtureSameFamily(
             distrax.Categorical(logits=self.logits),
             distrax.MultivariateNormalTri(self.means, self.scale_tril),
@@ -62,11 +69,15 @@ class GaussianMixture:
 
     def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
         """Log-density at theta."""
-        return self.distribution().log_prob(theta)
+        return jax.nn.logsumexp(jax.nn.log_softmax(self.logits) + component_log_prob(self, theta), axis=-1)
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` independent draws, in random order."""
-        return self.distribution().sample(seed=key, sample_shape=(n,))
+        key_component, key_normal = jax.random.split(key)
+        component = jax.random.categorical(key_component, self.logits, shape=(n,))
+        # As many numbers as distrax draws, so that a key gives the draws that `distribution()` gives.
+        noise = jax.random.normal(key_normal, (n, *self.means.shape))[jnp.arange(n), component]
+        return self.means[component] + jnp.einsum("nij,nj->ni", self.scale_tril[component], noise)
 
     def low_variance_sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` draws whose component counts are within one of n * w_k (systematic resampling), shuffled.
@@ -169,11 +180,11 @@ def systematic(key: jax.Array, weights: Float[Array, " comp"], n: int) -> Int[Ar
     return jnp.searchsorted(cumulated, points, side="right")
 
 
-def component_log_prob(mixture: GaussianMixture, theta: Float[Array, " dim"]) -> Float[Array, " comp"]:
-    """Log-density of one theta under each component, shape [K]."""
-    whitened = jax.vmap(lambda factor, offset: solve_triangular(factor, offset, lower=True))(
-        mixture.scale_tril, theta - mixture.means
-    )
+def component_log_prob(mixture: GaussianMixture, theta: Float[Array, "*n dim"]) -> Float[Array, "*n comp"]:
+    """Log-density of theta under each component."""
+    components, dim = mixture.means.shape
+    offset = (theta[..., None, :] - mixture.means).reshape(-1, components, dim)
+    whitened = jax.vmap(functools.partial(solve_triangular, lower=True))(mixture.scale_tril, offset.transpose(1, 2, 0))
     log_det = jnp.sum(jnp.log(jnp.diagonal(mixture.scale_tril, axis1=-2, axis2=-1)), axis=-1)
-    dim = mixture.means.shape[-1]
-    return -0.5 * jnp.sum(whitened**2, axis=-1) - log_det - 0.5 * dim * jnp.log(2 * jnp.pi)
+    log_prob = -0.5 * jnp.sum(whitened**2, axis=1).T - log_det - 0.5 * dim * jnp.log(2 * jnp.pi)
+    return log_prob.reshape(*theta.shape[:-1], components)

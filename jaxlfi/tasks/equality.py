@@ -1,11 +1,11 @@
 """Whether two values are the same: arrays by their numbers, distributions by what they are made of."""
 
 import functools
+import sys
 import types
 from collections.abc import Mapping
 from typing import Any
 
-import distrax
 import jax
 import numpy as np
 
@@ -23,7 +23,7 @@ def same(a: Any, b: Any) -> bool:
         return False
     if isinstance(a, Mapping):
         return list(a) == list(b) and all(same(a[name], b[name]) for name in a)
-    if isinstance(a, distrax.Distribution | distrax.Bijector):  # as pytrees they hold bound methods, which differ
+    if _is_distribution(a):  # as pytrees they hold bound methods, which differ
         return same(vars(a), vars(b))
     if isinstance(a, types.MethodType):
         return a.__func__ is b.__func__ and same(a.__self__, b.__self__)
@@ -38,3 +38,8 @@ def same(a: Any, b: Any) -> bool:
     if len(leaves) == 1 and leaves[0] is a:
         return bool(a == b)
     return structure == other_structure and all(map(same, leaves, others))
+
+
+def _is_distribution(a: Any) -> bool:
+    distrax = sys.modules.get("distrax")  # nothing is one of its distributions before it has been imported
+    return distrax is not None and isinstance(a, distrax.Distribution | distrax.Bijector)

@@ -360,11 +360,13 @@ def test_examples_are_found():
     assert min(examples.values()) >= 1 and examples["jaxlfi.distributions.support"] >= 2
 
 
-def test_the_library_runs_without_matplotlib():
-    """Importing jaxlfi loads next to nothing; infer brings JAX but no plots."""
+def test_nothing_is_loaded_that_is_not_needed():
+    """Importing jaxlfi loads next to nothing; infer brings JAX but no plots, nor a second of distrax's own imports."""
     script = (
         "import sys, jaxlfi; assert 'jax' not in sys.modules, 'jax'; jaxlfi.infer; jaxlfi.Edge; "
+        "import jaxlfi.cli.commands; "
         "assert 'jax' in sys.modules; assert 'matplotlib' not in sys.modules, 'matplotlib'; "
+        "assert not {'distrax', 'tensorflow_probability'} & set(sys.modules), 'distrax'; "
         f"assert not any((name + '.').startswith('{ENVS}.') for name in sys.modules), 'envs'"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=120)

@@ -367,6 +367,6 @@ def test_diagnose_repeats_its_runs(environment, compared):
     """
     environment.script(script)
     output = environment.jaxlfi("diagnose", *words)
-    assert "rank of ln slope" in output
+    assert "rank of slope" in output
     arrays = np.load(environment.work / "diagnostics" / "diagnostics.npz")
     assert arrays["draws"].shape == (20, 20, 2) and np.isfinite(arrays["log_prob"]).all()

@@ -15,7 +15,8 @@ import jaxlfi
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.tasks.observation import simulate_observation
-from jaxlfi.tasks.priors import MIN_INSIDE, TailedUniform, prior_draws, prior_mass, require_mass, with_tails
+from jaxlfi.tasks.priors import MIN_INSIDE, prior_draws, prior_mass, require_mass
+from jaxlfi.tasks.tailed_uniform import TailedUniform, with_tails
 from jaxlfi.tasks.task import Task
 from tests import small
 
