@@ -25,7 +25,7 @@ from rich.console import Console
 from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.keys import key_of, run_keys
-from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.bayessim.presets import HYPERPARAMETERS, QUICK
 from jaxlfi.bayessim.record import theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
@@ -59,6 +59,8 @@ CLIPPED = QUICK.replace(
 )
 """Proposals from the posterior itself, clipped, and a thousand gradient steps in every round: what `quick` was before
 the study of widths, and what most studies were made with."""
+PAPER_EDGE = Edge(mass_threshold=HYPERPARAMETERS["paper"]["edge"]["mass_threshold"])
+"""EDGE with the paper's threshold, which those studies were made with as well."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +76,7 @@ class Variant:
 
     change: str
     settings: Settings
-    edge: Edge = Edge()
+    edge: Edge = PAPER_EDGE
     configurations: tuple[str, ...] = tuple(MATRIX)
 
     def heuristic(self, name: str) -> Heuristic:
@@ -102,7 +104,9 @@ def variants(quick: Settings = QUICK, clipped: Settings = CLIPPED) -> dict[str, 
         return Variant(change, base, rule, configurations=("misspecified+edge",))
 
     return {
-        "quick": Variant("the preset, ten rounds: wide proposals, training by epochs", quick.replace(rounds=10)),
+        "quick": Variant(
+            "the preset, ten rounds: wide proposals, training by epochs", quick.replace(rounds=10), Edge()
+        ),
         "clipped": Variant("four networks", clipped),
         "single": Variant("one network", base),
         "no-prune": estimator("components of little weight kept", prune=0.0),
@@ -117,8 +121,10 @@ def variants(quick: Settings = QUICK, clipped: Settings = CLIPPED) -> dict[str, 
         "importance": run("importance-weighted loss (reading A, importance)", correction="importance"),
         "reject": run("draws outside the support rejected (reading E)", restriction="reject"),
         "defensive": run("a tenth of the proposals from the prior over the support", defensive=0.1),
-        "zone-only": edge("EDGE: mass in the zone only, no tail (reading G)", Edge(tail=0.0)),
-        "zone-width": edge("EDGE: delta as an absolute width (reading F)", Edge(zone_fraction=0.0, zone_width=0.1)),
+        "zone-only": edge("EDGE: mass in the zone only, no tail (reading G)", PAPER_EDGE.replace(tail=0.0)),
+        "zone-width": edge(
+            "EDGE: delta as an absolute width (reading F)", PAPER_EDGE.replace(zone_fraction=0.0, zone_width=0.1)
+        ),
     }
 
 

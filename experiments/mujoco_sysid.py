@@ -35,8 +35,8 @@ import scipy.optimize
 from rich.console import Console
 from rich.progress import track
 
+from experiments.ablation import PAPER_EDGE
 from experiments.widths import Cases, final_states
-from jaxlfi import Edge
 from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.presets import settings_for
 from jaxlfi.envs.mujoco import least_squares, sysid_point
@@ -164,7 +164,7 @@ def believed(
     cases = Cases(first_seed + np.arange(len(observed)), theta, observed.astype(np.float32), x)
     began = time.perf_counter()
     batch = min(len(observed), SIDE_BY_SIDE)
-    states, _ = final_states(task, settings, task.support(box), Edge(), cases, batch, Console())
+    states, _ = final_states(task, settings, task.support(box), PAPER_EDGE, cases, batch, Console())
     seconds = time.perf_counter() - began
 
     @jax.jit

@@ -18,7 +18,6 @@ _HOMES = {
     "GaussianMixture": "jaxlfi.distributions.mixture",
     "Heuristic": "jaxlfi.heuristics",
     "HostSimulator": "jaxlfi.tasks.host",
-    "Identified": "jaxlfi.heuristics",
     "METHODS": "jaxlfi.bayessim.presets",
     "MaskedFlow": "jaxlfi.estimators.flow_estimators",
     "Matched": "jaxlfi.heuristics",

@@ -34,9 +34,6 @@ from jaxlfi.heuristics import (
     Heuristic as Heuristic,
 )
 from jaxlfi.heuristics import (
-    Identified as Identified,
-)
-from jaxlfi.heuristics import (
     Matched as Matched,
 )
 from jaxlfi.heuristics import (

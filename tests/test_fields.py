@@ -434,7 +434,7 @@ def test_a_description_is_by_registered_names():
     described = describe.heuristic_to_json(Choice(0, (Edge(), Fixed())))
     assert described["name"] == "jaxlfi.heuristics.choice:Choice"
     assert [rule["name"] for rule in described["hyperparameters"]["rules"]] == ["edge", "none"]
-    assert described["hyperparameters"]["rules"][0]["hyperparameters"]["mass_threshold"] == 0.005
+    assert described["hyperparameters"]["rules"][0]["hyperparameters"]["mass_threshold"] == 0.12
 
 
 def test_another_packages_rule_survives_its_description(swelling):

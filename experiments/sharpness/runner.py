@@ -31,8 +31,8 @@ OURS = ("bayessim", "npe", "apt", "snle")
 OTHERS = {"sbi-npe": "sbi-npe", "sbi-npe-c": "sbi-apt", "bayesflow": "bayesflow-npe"}
 """Methods of other libraries, and what they are called in `experiments.sota`, whose adapters run them."""
 METHODS = (*OURS, *OTHERS)
-RULES = {"fixed": Fixed(), "edge": Edge(), "evident": Edge(mass_threshold=0.25)}
-"""A uniform posterior has 0.1 of its mass in EDGE's zone: with the last one a bound moves only where there is more."""
+THRESHOLDS = (0.005, 0.12, 0.18, 0.25)
+RULES = {"fixed": Fixed(), "edge": Edge(), **{f"edge-{tau:g}": Edge(mass_threshold=tau) for tau in THRESHOLDS}}
 BOXES = ("right", "one", "all")
 DRAWS = 2000
 """Of each posterior of ours."""

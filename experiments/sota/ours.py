@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.ablation import PAPER_EDGE
 from experiments.sota.cases import Case
 from experiments.sota.measures import DRAWS, Found, points
 from jaxlfi.bayessim import algorithm
@@ -15,7 +16,7 @@ from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import METHODS, QUICK, all_rounds
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.support import Support
-from jaxlfi.heuristics import Edge, Fixed
+from jaxlfi.heuristics import Fixed
 from jaxlfi.tasks.task import Task
 
 PRESET = all_rounds(QUICK).replace(predictive=False)
@@ -54,7 +55,7 @@ def infer(method: str, case: Case, simulations: int) -> Found:
 def _run(method: str, task: Task, simulations: int, key: jax.Array, x: jax.Array, box: Support, theta: jax.Array):
     """A whole inference: draws of the posterior, its log-density at theta, simulations attempted and failed."""
     settings, keys = settings_of(method, simulations), run_keys(key)
-    rule = Edge() if method.endswith("+edge") else Fixed()
+    rule = PAPER_EDGE if method.endswith("+edge") else Fixed()
     look = lambda index, state, info: (info.simulations.attempted, jnp.sum(info.failed))
     state, (attempted, failed) = algorithm.run(keys.run, task, settings, rule, x, box, look)
     posterior = posterior_after(state.reported, state.network, x)

@@ -177,10 +177,12 @@ def update(
     posterior = network.condition(observed, state.belief.support, key_condition)
     mixture, not_positive_definite = correction.change(task, posterior.mixture, proposed)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
-    reported = belief
+    reported, effective_share = belief, jnp.ones(())
     if correction.report is not None:
         q = network.estimator.weighted(network, observed)
-        divided, _ = correction.report(task, q, proposals, round, settings.defensive, state.belief.support)
+        divided, effective_share = correction.report(
+            task, q, proposals, round, settings.defensive, state.belief.support
+        )
         reported = belief.replace(mixture=divided)
     info = Round(
         simulations=simulations,
@@ -188,7 +190,9 @@ def update(
         proposal=proposed,
         belief=reported,
         adaptation=adaptation,
-        correction=CorrectionInfo(effective_size(weights), not_positive_definite, posterior.mass_inside),
+        correction=CorrectionInfo(
+            effective_size(weights), not_positive_definite, posterior.mass_inside, effective_share
+        ),
         fit=fit_info,
     )
     progress = advanced(state.progress, mixture, settings.min_rounds)

@@ -25,11 +25,14 @@ class CorrectionInfo:
         effective_size: effective number of simulations under the loss weights, (sum w)^2 / sum w^2, shape [].
         not_positive_definite: component pairs whose quotient had no positive definite covariance, shape [].
         mass_inside: of q_phi in the support, before any correction; the rest has leaked, shape [].
+        effective_share: of q_phi's draws, under the weights that make them draws of the mixture that is reported; 1
+            where that is q_phi itself, shape [].
     """
 
     effective_size: Float[Array, "*batch"]
     not_positive_definite: Int[Array, "*batch"]
     mass_inside: Float[Array, "*batch"]
+    effective_share: Float[Array, "*batch"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -54,6 +54,9 @@ not suffice, the posterior still moves, and more are made.
 PRESETS: dict[str, Settings] = {"quick": QUICK, "paper": PAPER}
 """Presets by the name the command line gives them."""
 
+HYPERPARAMETERS: dict[str, dict[str, dict[str, float]]] = {"quick": {}, "paper": {"edge": {"mass_threshold": 0.005}}}
+"""Hyperparameters of heuristics, by their registered names, that a preset has in place of their defaults."""
+
 FLOW = SplineFlow(
     loss="combined",
     hidden=(50, 50),

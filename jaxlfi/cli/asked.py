@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxlfi.bayessim.presets import settings_for, with_estimator, with_fields
+from jaxlfi.bayessim.presets import HYPERPARAMETERS, settings_for, with_estimator, with_fields
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import registry as estimators
@@ -89,11 +89,15 @@ def build_settings(
 
 
 def build_heuristic(arguments: argparse.Namespace, name: str, settings: Settings, task: Task) -> Heuristic:
-    """A heuristic with the hyperparameters that were given, or else those that the task asks for.
+    """A heuristic with the hyperparameters that were given, or else those of the task, or else those of the preset.
 
     Components that it compares are matched first where networks start anew every round.
     """
-    values = {**task.hyperparameters.get(name, {}), **heuristics.own(name, arguments.hyperparameters)}
+    values = {
+        **HYPERPARAMETERS[arguments.preset].get(name, {}),
+        **task.hyperparameters.get(name, {}),
+        **heuristics.own(name, arguments.hyperparameters),
+    }
     return paired(heuristics.build(name, values, task.dim), settings.estimator.warm_start)
 
 

@@ -313,7 +313,11 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     tables.show(summaries.summary_table(plan, runs), console)
     for warning in summaries.warnings(plan, runs):
         _warn(console, warning)
-    for line in (*summaries.failure_lines(runs), *summaries.rounds_lines(plan, runs), *summaries.widths_lines(plan)):
+    for line in (
+        *summaries.failure_lines(runs),
+        *summaries.rounds_lines(plan, runs),
+        *summaries.widths_lines(plan, runs),
+    ):
         _say(console, line)
     kind = "table" if plan.kind == run_store.COMPARE else "results"
     _say(console, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")

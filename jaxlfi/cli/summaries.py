@@ -97,14 +97,30 @@ def _changes(histories: Sequence[Mapping[str, np.ndarray]]) -> str:
     return f"still changed over the last {LAG} rounds: {', '.join(changes)} (--rounds allows for more)"
 
 
-def widths_lines(plan: BatchPlan) -> list[str]:
+def widths_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
     """What is known of the widths of the runs' posteriors, in one line; several where heuristics differ in it."""
-    by_line: dict[str, list[str]] = {}
-    for spec in plan.specs:
-        names = by_line.setdefault(widths_note(plan.settings, spec.heuristic), [])
-        names += [spec.configuration] * (spec.configuration not in names)
-    several = len(by_line) > 1
-    return [f"widths{' of ' + ', '.join(names) if several else ''}: {line}" for line, names in by_line.items()]
+    names: dict[str, list[str]] = {}
+    shares: dict[str, list[float]] = {}
+    for spec, run in zip(plan.specs, runs, strict=True):
+        line = widths_note(plan.settings, spec.heuristic)
+        names.setdefault(line, [])
+        names[line] += [spec.configuration] * (spec.configuration not in names[line])
+        shares.setdefault(line, []).append(_effective_share(run.history))
+    several = len(names) > 1
+    return [
+        f"widths{' of ' + ', '.join(names[line]) if several else ''}: {line}{_of_draws(shares[line])}" for line in names
+    ]
+
+
+def _effective_share(history: Mapping[str, np.ndarray]) -> float:
+    shares = history.get("effective_share", np.ones(1))  # runs from before it was recorded
+    return float(shares[-1]) if len(shares) else 1.0
+
+
+def _of_draws(shares: Sequence[float]) -> str:
+    """How much of a posterior's draws its correction leaves, where one weighs them; the least of several runs."""
+    least = "at least " * (len(shares) > 1)
+    return f"; its weights leave {least}{min(shares):.0%} of the draws" if min(shares) < 1 else ""
 
 
 def warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:

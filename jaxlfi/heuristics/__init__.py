@@ -5,7 +5,6 @@ from jaxlfi.heuristics.centre import Centre
 from jaxlfi.heuristics.choice import Choice
 from jaxlfi.heuristics.edge import Edge
 from jaxlfi.heuristics.fixed import Fixed
-from jaxlfi.heuristics.identified import Identified
 from jaxlfi.heuristics.matching import Matched, paired
 from jaxlfi.heuristics.mode import Mode
 from jaxlfi.heuristics.truncate import Truncate
@@ -17,7 +16,6 @@ __all__ = [
     "Edge",
     "Fixed",
     "Heuristic",
-    "Identified",
     "Matched",
     "Mode",
     "Truncate",

@@ -79,26 +79,6 @@ class Heuristic(Checked, abc.ABC):
         """
 
 
-class Wrapper(Heuristic):
-    """A heuristic around another, which can do what that one can.
-
-    Attributes:
-        rule: the heuristic to wrap.
-    """
-
-    rule: Heuristic
-
-    @property
-    def grows(self) -> bool:
-        """Whether the rule can let the support grow."""
-        return self.rule.grows
-
-    @property
-    def proposes_from_prior(self) -> bool:
-        """Whether the rule always proposes from the prior."""
-        return self.rule.proposes_from_prior
-
-
 def stretch(
     support: Support,
     feasible: Support,

@@ -8,13 +8,13 @@ from jaxtyping import Array, Int
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
-from jaxlfi.heuristics.base import Adaptation, Heuristic, Wrapper
+from jaxlfi.heuristics.base import Adaptation, Heuristic
 
 MAX_EXACT = 6
 """Maximum number of components that are matched exactly, over 6! = 720 permutations; more are matched greedily."""
 
 
-class Matched(Wrapper):
+class Matched(Heuristic):
     """Another heuristic, on a posterior whose components were first paired with the previous ones (reading C).
 
     Networks that start anew every round label their components arbitrarily; without matching, MODE would see
@@ -28,6 +28,18 @@ class Matched(Wrapper):
         >>> Matched(Mode()).rule.proximity
         0.4
     """
+
+    rule: Heuristic
+
+    @property
+    def grows(self) -> bool:
+        """Whether the rule can let the support grow."""
+        return self.rule.grows
+
+    @property
+    def proposes_from_prior(self) -> bool:
+        """Whether the rule always proposes from the prior."""
+        return self.rule.proposes_from_prior
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Reorder the posterior's components (not before the first round), then apply the rule."""

@@ -99,7 +99,7 @@ def test_evidence_is_the_runs_own(stepped):
 def test_one_kind_of_rule_needs_no_choice():
     stacked, places = stack_heuristics([Edge(), Edge(mass_threshold=0.5)])
     assert isinstance(stacked, Edge) and places == [None, None]
-    np.testing.assert_allclose(stacked.mass_threshold, [0.005, 0.5])
+    np.testing.assert_allclose(stacked.mass_threshold, [0.12, 0.5])
 
 
 def test_rules_of_one_structure_share_a_place_in_the_choice():

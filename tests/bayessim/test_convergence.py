@@ -187,7 +187,7 @@ def test_a_host_simulator_is_not_called_for_runs_at_their_end(whole_runs):  # no
 @pytest.mark.slow
 def test_a_run_that_settled_before_it_was_killed_resumes_to_the_same_bits(tmp_path, whole_runs):  # noqa: F811
     rule = Edge()
-    spec = RunSpec("misspecified+edge", "misspecified", gaussian().support("misspecified"), rule, 2)
+    spec = RunSpec("misspecified+edge", "misspecified", gaussian().support("misspecified"), rule, 9)  # settles early
     plan = executing.BatchPlan(RUN, TASK, gaussian(), None, SETTINGS, (spec,), True)
     observed = executing.prepare(plan, OBSERVED)
     executing.begin(tmp_path / "run", plan, observed)

@@ -2,23 +2,33 @@
 
 import types
 
+import numpy as np
+
 from jaxlfi.cli.summaries import widths_lines
 from jaxlfi.heuristics import Edge, Fixed, Truncate
 from tests.small import SETTINGS
 
 
-def plan_of(**rules):
-    """What the lines are made from: the heuristic of each configuration, with two seeds."""
-    specs = [types.SimpleNamespace(configuration=name, heuristic=rule) for name, rule in rules.items()]
-    return types.SimpleNamespace(settings=SETTINGS.replace(correction="none", inflation=1.0), specs=specs * 2)
+def lines_of(rules, correction="none", **history):
+    """The lines of two seeds of each configuration."""
+    specs = [types.SimpleNamespace(configuration=name, heuristic=rule) for name, rule in rules.items()] * 2
+    runs = [types.SimpleNamespace(history={k: np.array(v[i]) for k, v in history.items()}) for i in range(len(specs))]
+    return widths_lines(types.SimpleNamespace(settings=SETTINGS.replace(correction=correction), specs=specs), runs)
 
 
 def test_configurations_corrected_in_the_same_way_share_a_line():
-    (line,) = widths_lines(plan_of(ok=Fixed(), edge=Edge()))
+    (line,) = lines_of({"ok": Fixed(), "edge": Edge()})
     assert line.startswith("widths: not measured; nothing corrects for the proposals") and "\n" not in line
 
 
 def test_configurations_corrected_in_other_ways_are_named():
-    lines = widths_lines(plan_of(ok=Fixed(), truncate=Truncate(), edge=Edge()))
+    lines = lines_of({"ok": Fixed(), "truncate": Truncate(), "edge": Edge()})
     assert [line.partition(":")[0] for line in lines] == ["widths of ok, edge", "widths of truncate"]
     assert "every round drew from the prior" in lines[1]
+
+
+def test_the_share_of_draws_that_weights_leave_is_the_least_of_the_last_rounds():
+    (line,) = lines_of({"ok": Fixed()}, correction="pooled", effective_share=[[0.2, 0.84], [0.3, 0.91]])
+    assert line.endswith("; its weights leave at least 84% of the draws")
+    (line,) = lines_of({"ok": Fixed()}, effective_share=[[1.0], [1.0]])
+    assert "draws" not in line

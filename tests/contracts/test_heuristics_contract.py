@@ -15,13 +15,12 @@ from jaxlfi.distributions.belief import Belief, uninformed
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 from jaxlfi.fields import declared
-from jaxlfi.heuristics import Adaptation, Choice, Heuristic, Identified, Matched, registry
+from jaxlfi.heuristics import Adaptation, Choice, Heuristic, Matched, registry
 from jaxlfi.runs import describe
 
 RULES = {
     **{name: registry.load(name)() for name in registry.names()},
     **{f"matched {name}": Matched(registry.load(name)()) for name in registry.names()},
-    **{f"identified {name}": Identified(registry.load(name)()) for name in registry.names()},
     "choice": Choice(1, tuple(registry.load(name)() for name in registry.names())),
 }
 DIM, COMPONENTS, PROBLEMS = 3, 4, 3
@@ -129,7 +128,7 @@ def test_it_is_a_tree_of_its_hyperparameters(name):
     again = jax.tree.unflatten(structure, leaves)
     assert type(again) is type(rule) and jax.tree.structure(again) == structure
     assert jax.tree.leaves(again) == leaves
-    if not isinstance(rule, Matched | Identified | Choice):
+    if not isinstance(rule, Matched | Choice):
         assert len(leaves) == sum(not field.static for field in declared(rule).values())
 
 
