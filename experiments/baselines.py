@@ -39,7 +39,7 @@ from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs.describe import heuristic_to_json, settings_to_json
 from jaxlfi.runs.folder import environment
 from jaxlfi.tasks.observation import simulate_observation
-from jaxlfi.tasks.priors import with_tails
+from jaxlfi.tasks.tailed_uniform import with_tails
 from jaxlfi.tasks.task import Task
 
 REFERENCE = "misspecified+edge"
