@@ -18,14 +18,14 @@ import pytest
 import jaxlfi
 from jaxlfi import flags, plugins
 from jaxlfi.bayessim import memory
-from jaxlfi.bayessim.presets import METHODS, PRESETS
+from jaxlfi.bayessim.presets import HYPERPARAMETERS, METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli import asked, summaries
 from jaxlfi.cli import parser as cli
 from jaxlfi.envs.gaussian_linear import MIXING, NOISE
 from jaxlfi.estimators import registry as estimators
 from jaxlfi.fields import declared
-from jaxlfi.heuristics import Mode, registry
+from jaxlfi.heuristics import Edge, Mode, registry
 from jaxlfi.io import files as atomic
 from jaxlfi.io.host_devices import FLAG, processors
 from jaxlfi.runs import execute as executing
@@ -498,6 +498,18 @@ def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line
     mode = asked.build_heuristic(parse(), "mode", PRESETS["paper"], task)
     assert mode == Mode()
     assert jaxlfi.settings_for(task) == settings  # the same in Python
+
+
+def test_the_paper_s_threshold_comes_with_its_preset(tmp_path):
+    parse = lambda *words: cli.parser().parse_args(["infer", TASK, "--out", str(tmp_path), *words])
+    edge = lambda task, *words: asked.build_heuristic(parse(*words), "edge", PRESETS["paper"], task).mass_threshold
+    assert edge(gaussian()) == Edge().mass_threshold == 0.12  # more than a uniform posterior has along a bound
+    assert edge(gaussian(), "--preset", "paper") == 0.005
+    assert edge(gaussian(), "--preset", "paper", "--mass-threshold", "0.3") == 0.3
+    np.testing.assert_array_equal(edge(oven(), "--preset", "paper"), [0.125, 0.5])  # the task's own
+    for given in HYPERPARAMETERS.values():
+        for name, values in given.items():
+            assert set(values) <= set(registry.hyperparameters(registry.load(name)))
 
 
 def test_a_setting_that_a_task_asks_for_and_nothing_has_is_refused():
