@@ -25,6 +25,7 @@ from jaxlfi.io import host_devices
 from jaxlfi.io.locks import locked
 from jaxlfi.io.processes import Processes
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.io.shell import quoted
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import export
@@ -310,7 +311,13 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     if not processes.writes:
         return
     executing.finish(folder, plan, runs)
-    tables.show(summaries.summary_table(plan, runs), console)
+    if plan.kind == run_store.RUN:
+        found = RunSummary.read(folder)
+        tables.show(summaries.parameter_table(found), console)
+        for sentence in found.sentences:
+            _say(console, sentence)
+    if plan.kind != run_store.RUN or plan.task.truth is not None:
+        tables.show(summaries.summary_table(plan, runs), console)
     for warning in summaries.warnings(plan, runs):
         _warn(console, warning)
     for line in (

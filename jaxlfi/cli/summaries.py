@@ -11,6 +11,7 @@ from jaxlfi.bayessim.convergence import LAG, SAME_CORRELATION, SAME_WIDTH, STILL
 from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.diagnostics.bounds import bound_warnings
+from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs.execute import BatchPlan
 from jaxlfi.runs.run import Run
@@ -20,6 +21,15 @@ from jaxlfi.tasks import failures
 
 COMMONEST = 3
 """Reasons of failed simulations that are printed, at most."""
+
+
+def parameter_table(found: RunSummary) -> Table:
+    """What is known of each parameter of a run."""
+    headings, rows = found.table()
+    table = Table(*headings)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table
 
 
 def summary_table(plan: BatchPlan, runs: Sequence[Run]) -> Table:

@@ -14,6 +14,7 @@ from jaxlfi.figures import statistics
 from jaxlfi.figures.collection import Collection
 from jaxlfi.figures.history import heuristic_name
 from jaxlfi.figures.style import Look, looks, unit_label
+from jaxlfi.io.run_summary import RunSummary
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +98,13 @@ def render(collection: Collection, pictures: Sequence[Picture]) -> str:
     title = f"{task}: {len(collection.table)} run{'s' if len(collection.table) != 1 else ''} of jaxlfi"
     return _document(
         title,
-        [_widths(collection), _facts(collection), _notes(collection), f"<h2>Results</h2>{_table(collection)}"],
+        [
+            _answer(collection),
+            _widths(collection),
+            _facts(collection),
+            _notes(collection),
+            f"<h2>Results</h2>{_table(collection)}",
+        ],
         pictures,
         config,
     )
@@ -230,6 +237,12 @@ def _document(
         "</main></body></html>",
     ]
     return "\n".join(every) + "\n"
+
+
+def _answer(collection: Collection) -> str:
+    """What a single run found, stated; nothing where its folder does not say."""
+    found = RunSummary.read(collection.folder)
+    return f'<h2>Answer</h2><div class="wide">{found.to_html()}</div>' if found else ""
 
 
 def _widths(collection: Collection) -> str:

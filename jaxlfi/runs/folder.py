@@ -32,7 +32,7 @@ from jaxlfi.bayessim.record import FINAL, ledger_line
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.io import files as atomic
-from jaxlfi.io import trees
+from jaxlfi.io import run_summary, trees
 from jaxlfi.io.formats import require_version
 from jaxlfi.io.serialise import json_safe
 from jaxlfi.io.shell import quoted
@@ -219,6 +219,7 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
     """
     task, history = run.task, jax.device_get(run.history)
     belief, labels = jax.device_get(run.belief), np.asarray(run.space.labels)
+    draws = run.draws()
     atomic.write_arrays(
         folder / "posterior.npz",
         {
@@ -227,13 +228,14 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
             "scale_tril": belief.mixture.scale_tril,
             "support_low": belief.support.low,
             "support_high": belief.support.high,
-            "draws": run.draws(),
+            "draws": draws,
             "parameters": np.asarray(run.space.names),
             "log": np.asarray(run.space.log),
             "names": labels,
         },
         durable=True,
     )
+    atomic.write_json(folder / run_summary.NAME, run.summary(draws).to_dict())
     dataset = jax.device_get(run.dataset)
     rows = slice(int(dataset.size))
     columns = {name: getattr(dataset, name)[rows] for name in ("theta", "x", "round", "weight")}

@@ -27,7 +27,9 @@ from jaxlfi.estimators.base import Network
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Heuristic
+from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.runs import folder as folders
+from jaxlfi.runs.summarise import summarised
 from jaxlfi.runs.unlike import observation_findings
 from jaxlfi.tasks import failures, owned
 from jaxlfi.tasks.errors import SimulatorWarning
@@ -223,6 +225,28 @@ class Run:
         """The run among those of a batch."""
         return RunSpec(
             self.origin.configuration, self.origin.support_name, self.support, self.heuristic, seed_of(self.key)
+        )
+
+    def summary(self, draws: Float[Array, "n dim"] | None = None) -> RunSummary:
+        """The answer, stated: each parameter's median and intervals, and in sentences what follows from them.
+
+        Args:
+            draws: of the posterior, in natural units, where they were made already.
+
+        Example:
+            >>> print(run.summary())  # doctest: +SKIP
+            parameter  median   50 %          90 %          narrower than the guess  identified
+            stiffness  3.1 N/m  [2.9, 3.3]    [2.6, 3.6]    12 times                 identified
+        """
+        _require_one(self, "summary")
+        rule = getattr(self.heuristic, "rule", self.heuristic)
+        return summarised(
+            np.asarray(self.draws() if draws is None else draws),
+            self.space,
+            self.units,
+            (self.support, self.belief.support, self.feasible),
+            None if self.task is None else self.task.truth,
+            type(rule).__name__.upper(),
         )
 
     def draws(self, n: int = DRAWS) -> Float[Array, "n dim"]:

@@ -1,0 +1,139 @@
+"""The answer of a run, stated: intervals against quantiles, and each sentence where it holds and where it does not."""
+
+import dataclasses
+import json
+import math
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+import jaxlfi
+from jaxlfi.distributions.space import Space
+from jaxlfi.io.run_summary import NAME, RunSummary
+from jaxlfi.runs.summarise import summarised
+from tests.small import gaussian, settings
+
+SPACE = Space(("mass", "stiffness"), (False, True))
+GUESS, PHI = jaxlfi.Support([1.0, 0.0], [3.0, 2.0]), jaxlfi.Support([0.0, -2.0], [6.0, 4.0])
+RNG = np.random.default_rng(0)
+NARROW = np.stack([RNG.normal(2.0, 0.1, 4000), np.exp(RNG.normal(1.0, 0.1, 4000))], axis=1)
+
+
+def of(draws=NARROW, guess=GUESS, last=GUESS, space=SPACE, truth=None, units=("kg", "N/m")) -> RunSummary:
+    return summarised(draws, space, units, (guess, last, PHI), truth, "EDGE")
+
+
+def test_intervals_are_those_of_the_draws_in_natural_units():
+    mass, stiffness = of().parameters
+    assert (mass.name, mass.unit, mass.verdict, stiffness.verdict) == ("mass", "kg", "identified", "identified")
+    normal, log_normal = stats.norm(2.0, 0.1), stats.lognorm(0.1, scale=math.e)
+    np.testing.assert_allclose([mass.median, stiffness.median], [2.0, math.e], rtol=0.005)
+    np.testing.assert_allclose(mass.central_50, normal.ppf([0.25, 0.75]), atol=0.01)
+    np.testing.assert_allclose(mass.central_90, normal.ppf([0.05, 0.95]), atol=0.015)
+    np.testing.assert_allclose(stiffness.central_90, log_normal.ppf([0.05, 0.95]), rtol=0.02)
+    # 0.9 of a guess 2 wide, against 3.29 standard deviations, in inference space for both.
+    np.testing.assert_allclose([mass.narrower, stiffness.narrower], 0.9 * 2 / (3.29 * 0.1), rtol=0.05)
+    assert mass.leans == stiffness.leans == () and of().sentences == ()
+
+
+def test_digits_are_as_many_as_another_set_of_draws_would_give():
+    rng = np.random.default_rng(1)
+    for sd, decimals in ((0.1, 2), (20.0, 0), (3000.0, -2)):
+        space, box = Space(("a",), (False,)), jaxlfi.Support([-1e5], [1e5])
+        found = [
+            summarised(rng.normal(288.0, sd, (1000, 1)), space, None, (box, box, box), None, "EDGE").parameters[0]
+            for _ in range(20)
+        ]
+        assert {one.decimals for one in found} == {decimals}
+        error = np.std([one.central_90[0] for one in found])
+        assert 0.3 * 10**-decimals < error < 3.2 * 10**-decimals  # the last digit shown is the first that is not sure
+    assert found[0].shown(12345.0) == "12300"
+
+
+@given(st.floats(-1e9, 1e9, allow_nan=False), st.integers(-6, 9))
+def test_numbers_are_shown_to_within_half_of_the_last_digit(value, decimals):
+    one = dataclasses.replace(of().parameters[0], decimals=decimals)
+    shown = float(one.shown(value))
+    assert abs(shown - value) <= 0.5001 * max(10.0**-decimals, 1e-6 * abs(value)) or abs(value) >= 1e6
+    assert one.shown(math.nan) == "-"
+
+
+def said(summary: RunSummary, words: str) -> bool:
+    return any(words in sentence for sentence in summary.sentences)
+
+
+def test_a_wrong_first_guess_is_said_and_a_right_one_is_not():
+    beyond = np.stack([RNG.normal(4.0, 0.1, 4000), NARROW[:, 1]], axis=1)
+    wider = jaxlfi.Support([1.0, 0.0], [5.5, 2.0])
+    (sentence,) = of(beyond, last=wider).sentences
+    assert sentence == (
+        "The first guess of 1 to 3 kg for mass was wrong: EDGE moved the upper bound to 5.5 kg, and 100.0% of the "
+        "posterior is outside the guess."
+    )
+    (sentence,) = of(last=wider).sentences
+    assert sentence == (
+        "EDGE moved the upper bound to 5.5 kg of mass; 100.0% of the posterior is within the first guess."
+    )
+    assert not said(of(beyond, guess=wider, last=wider), "guess")
+
+
+def test_what_is_not_informed_is_said():
+    flat = np.stack([NARROW[:, 0], np.exp(RNG.uniform(0.0, 2.0, 4000))], axis=1)
+    found = of(flat)
+    assert found.sentences == ("The observation does not inform stiffness: its posterior is about as wide as its box.",)
+    assert [one.verdict for one in found.parameters] == ["identified", "not at all"]
+    half = np.stack([NARROW[:, 0], np.exp(RNG.normal(1.0, 0.4, 4000).clip(0, 2))], axis=1)
+    assert [one.verdict for one in of(half).parameters] == ["identified", "weakly"] and not said(of(half), "inform")
+
+
+def test_a_posterior_that_leans_on_a_bound_is_said():
+    leaning = np.stack([3.0 - RNG.exponential(0.2, 4000).clip(0, 1.9), NARROW[:, 1]], axis=1)
+    found = of(leaning)
+    assert found.parameters[0].leans == ("upper",)
+    assert found.sentences == (
+        "The posterior of mass leans on the box's upper bound, 3 kg: values beyond it were never tried.",
+    )
+    at_phi = summarised(leaning, SPACE, None, (GUESS, GUESS, GUESS), None, "EDGE")
+    assert said(at_phi, "leans on the feasible domain's upper bound, 3:")
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_parameters_that_cannot_be_told_apart_are_named_with_what_is_known(sign):
+    shared, own = RNG.normal(0.0, 0.15, (2, 4000)) * np.array([[1.0], [0.1]])
+    both = Space(("mass", "stiffness"), (True, True))
+    logs = np.stack([1.0 + shared, 1.0 + sign * shared + own], axis=1)
+    (sentence,) = of(np.exp(logs), space=both, guess=PHI, last=PHI).sentences
+    assert "mass and stiffness can hardly be told apart (correlation" in sentence
+    assert sentence.endswith(f"what is known is mass {'/' if sign > 0 else '*'} stiffness.")
+    (sentence,) = of(
+        np.stack([1.0 + 2 * shared, np.exp(1.0 + sign * shared + own)], axis=1), last=PHI, guess=PHI
+    ).sentences
+    assert sentence.split("known is ")[1].startswith(f"mass {'-' if sign > 0 else '+'} 2 * ln stiffness")
+    assert not said(of(np.exp(np.stack([1 + shared, 1 + own], axis=1)), space=both, guess=PHI, last=PHI), "apart")
+
+
+def test_forms_agree_and_come_back_from_a_file(tmp_path):
+    found = of(truth=np.array([2.05, 2.6]), last=jaxlfi.Support([1.0, 0.0], [5.5, 2.0]))
+    (tmp_path / NAME).write_text(json.dumps(found.to_dict()))
+    assert RunSummary.read(tmp_path) == found and RunSummary.read(tmp_path / "none") is None
+    lines = str(found).splitlines()
+    assert lines[0].split()[0] == "parameter" and lines[0].endswith("truth") and lines[-1] == found.sentences[-1]
+    assert lines[1].startswith("mass") and "kg" in lines[1] and lines[1].endswith("2.05")
+    assert found.to_html().count("<tr>") == 3 and found.sentences[0] in found.to_html()
+    assert "&lt;b&gt;" in of(units=("<b>", "")).to_html()
+    (tmp_path / NAME).write_text('{"parameters": [1]}')
+    with pytest.raises(ValueError, match=r"summary.json: expected the summary of a run"):
+        RunSummary.read(tmp_path)
+
+
+def test_a_run_states_what_its_folder_and_page_state(tmp_path):
+    run = jaxlfi.infer(jax.random.key(0), gaussian(), np.array([0.8, -0.6], np.float32), settings=settings(rounds=1))
+    found = run.summary()
+    draws = np.asarray(run.draws())
+    np.testing.assert_allclose([one.median for one in found.parameters], np.median(draws, axis=0), rtol=1e-5)
+    folder = run.save(tmp_path / "run")
+    assert RunSummary.read(folder) == found
