@@ -5,17 +5,28 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 
-def require_key(key: Any, name: str = "key") -> jax.Array:
-    """Refuse what is no typed key.
+def as_key(key: Any, name: str = "key") -> jax.Array:
+    """One typed key: itself, that of a seed, or an untyped one with its type.
 
     Raises:
-        ValueError: for an integer, a raw key, or several keys.
+        ValueError: for anything else, and several keys.
+
+    Example:
+        >>> as_key(7) == jax.random.key(7)
+        Array(True, dtype=bool)
     """
+    if isinstance(key, int | np.integer) and not isinstance(key, bool) and 0 <= key < 2**32:
+        return jax.random.key(int(key))
     dtype = getattr(key, "dtype", None)
+    if dtype == np.uint32 and key.shape == (2,):
+        return jax.random.wrap_key_data(key, impl="threefry2x32")
     if dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key) or key.shape != ():
-        raise ValueError(f"{name}: expected one key such as jax.random.key(0), got {' '.join(repr(key).split())}")
+        raise ValueError(
+            f"{name}: expected one key such as jax.random.key(0), or a seed, got {' '.join(repr(key).split())}"
+        )
     return key
 
 

@@ -10,7 +10,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlfi.distributions.arguments import require_count, require_key
+from jaxlfi.distributions.arguments import as_key, require_count
 from jaxlfi.distributions.mass import log_mass_inside, rare_draws
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.precision import single
@@ -75,12 +75,17 @@ class Posterior:
     def sample(self, key: jax.Array, n: int, space: SpaceName = "natural") -> Float[Array, "n dim"]:
         """`n` independent draws, shape [n, D].
 
+        Args:
+            key: consumed; or a seed.
+            n: number of draws.
+            space: "natural" units, or "inference" space.
+
         Raises:
             ValueError: for what is no key, or a number that is not whole and from 1 to `MAX_DRAWS`.
         """
         require_count(n, "n", most=MAX_DRAWS)
         natural = is_natural(space)
-        draws = _sample(require_key(key), self, int(n))
+        draws = _sample(as_key(key), self, int(n))
         return self.space.to_natural(draws) if natural else draws
 
     def log_prob(self, theta: ArrayLike | Sequence, space: SpaceName = "natural") -> Float[Array, "*n"]:

@@ -1,7 +1,7 @@
 """Run folders: what a run leaves behind, in plain files (JSON, .npz without pickles, CSV).
 
 One run:        config.json ledger.jsonl posterior.npz dataset.npz history.npz observation.npz
-                failures.jsonl, where simulations say why they failed
+                summary.json; failures.jsonl, where simulations say why they failed
 Several seeds:  config.json seed_000/ seed_001/ ...                   each one a run folder
 A comparison:   config.json table.csv CONFIGURATION/seed_000/ ...     each one a run folder
 

@@ -18,7 +18,7 @@ from jaxlfi.bayessim.keys import run_keys, seed_of
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.record import FINAL
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.distributions.arguments import is_concrete, require_key
+from jaxlfi.distributions.arguments import as_key, is_concrete
 from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import SpaceName
 from jaxlfi.distributions.support import Support
@@ -46,12 +46,12 @@ Callback = Callable[[int, dict[str, np.ndarray]], Any]
 
 
 def infer(
-    key: jax.Array,
+    key: jax.Array | int,
     task: Task,
     observation: Any = None,
     *,
     support: str | Support | None = None,
-    heuristic: Heuristic = Edge(),
+    heuristic: Heuristic | str = Edge(),
     settings: Settings = QUICK,
     space: SpaceName = "natural",
     simulations: Mapping[str, Any] | str | Path | None = None,
@@ -69,14 +69,15 @@ def infer(
     takes neither a host simulator nor the last six arguments.
 
     Args:
-        key: consumed.
+        key: consumed; or a seed, as `--first-seed` of the command line.
         task: simulator, names and bounds.
         observation: the real trajectory, in the shape the simulator produces, without missing numbers; or a list of
             several, independent trials of the same parameters, which are believed together (`jaxlfi.repeated`). By
             default the task's own, or, where the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
             box they fill.
-        heuristic: how the support is adapted. Components that it compares are matched first (`jaxlfi.Matched`) where
+        heuristic: how the support is adapted, or its registered name ("edge"), with the hyperparameters that the task
+            asks for. Components that it compares are matched first (`jaxlfi.Matched`) where
             networks start anew every round.
         settings: the numbers of the run; `jaxlfi.PAPER` are the paper's.
         space: whether a box is given in "natural" units or in "inference" space.
@@ -104,11 +105,13 @@ def infer(
         >>> run = infer(jax.random.key(0), task(), support="misspecified", heuristic=Edge())  # doctest: +SKIP
         >>> run.posterior.sample(jax.random.key(1), 1000)  # doctest: +SKIP
     """
-    require_key(key)
+    key = as_key(key)
     if not isinstance(task, Task):
         raise ValueError(f"task: expected a jaxlfi.Task, got {type(task).__name__}")
     if not isinstance(settings, Settings):
         raise ValueError(f"settings: expected jaxlfi.Settings such as jaxlfi.QUICK, got {settings!r}")
+    if isinstance(heuristic, str):
+        heuristic = registry.build(heuristic, task.hyperparameters.get(heuristic, {}), task.dim)
     registry.check(heuristic, task.dim)
     heuristic = paired(heuristic, getattr(settings.estimator, "warm_start", True))  # what it is, is checked later
     learnt = getattr(settings.estimator, "embedding", "none") == "trials"  # what it is, is checked later

@@ -108,18 +108,23 @@ def _value(value: float, one: ParameterSummary) -> str:
 
 def _of_the_guess(one: ParameterSummary, draws: np.ndarray, guess, last, heuristic: str) -> str:
     """Whether the first guess was wrong, where the box has been moved."""
-    width = guess[1] - guess[0]
-    sides = ("lower", "upper")
-    moved = [f"the {side} bound to {_value(b, one)}" for side, a, b in zip(sides, guess, last, strict=True)
-             if abs(b - a) > MOVED * width]  # fmt: skip
-    if not moved:
+    ends = zip(("lower", "upper"), guess, last, strict=True)
+    shifted = [(side, now) for side, was, now in ends if abs(now - was) > MOVED * (guess[1] - guess[0])]
+    if not shifted:
         return ""
     outside = np.mean((draws < guess[0]) | (draws > guess[1]))
-    said = f"the first guess of {guess[0]:.3g} to {_value(guess[1], one)} for {one.name}"
-    how = f"{heuristic} moved {' and '.join(moved)}"
     if outside > OUTSIDE:
-        return f"{said[0].upper()}{said[1:]} was wrong: {how}, and {outside:.1%} of the posterior is outside the guess."
-    return f"{how[0].upper()}{how[1:]} of {one.name}; {1 - outside:.1%} of the posterior is within the first guess."
+        moved = " and ".join(f"its {side} bound to {_value(now, one)}" for side, now in shifted)
+        return (
+            f"The first guess of {guess[0]:.3g} to {_value(guess[1], one)} for {one.name} was wrong: {heuristic} moved "
+            f"{moved}, and {_share(outside)} of the posterior is outside the guess."
+        )
+    moved = " and ".join(f"the {side} bound of {one.name} to {_value(now, one)}" for side, now in shifted)
+    return f"{heuristic} moved {moved}; {_share(1 - outside)} of the posterior is within the first guess."
+
+
+def _share(share: float) -> str:
+    return "all" if share > 0.9995 else f"{share:.1%}"
 
 
 def _of_its_bounds(one: ParameterSummary, last, feasible) -> str:

@@ -5,15 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi.distributions.arguments import is_concrete, require_count, require_key
+from jaxlfi.distributions.arguments import as_key, is_concrete, require_count
 
 
 def test_a_key_is_one_typed_key():
     key = jax.random.key(3)
-    assert require_key(key) is key
-    for wrong in (0, jnp.zeros(2, jnp.uint32), jax.random.split(key), None, "key"):
-        with pytest.raises(ValueError, match=r"^key: expected one key such as jax.random.key\(0\), got"):
-            require_key(wrong)
+    assert as_key(key) is key
+    seeds = (3, np.int64(3), np.array([0, 3], np.uint32), jnp.array([0, 3], jnp.uint32))
+    assert all(bool(as_key(seed) == key) for seed in seeds)
+    for wrong in (-1, 2**32, True, 1.0, jnp.zeros(3, jnp.uint32), jax.random.split(key), None, "key"):
+        with pytest.raises(ValueError, match=r"^key: expected one key such as jax.random.key\(0\), or a seed, got"):
+            as_key(wrong)
 
 
 def test_counts_are_whole_and_large_enough():

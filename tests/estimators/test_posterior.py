@@ -222,8 +222,8 @@ def test_it_is_a_pytree_that_can_be_compiled_and_mapped(key):
 
 
 def test_wrong_arguments_are_refused(key):
-    for wrong in (0, jax.random.split(key), None):
-        with pytest.raises(ValueError, match=r"^key: expected one key such as jax.random.key\(0\), got"):
+    for wrong in (0.5, jax.random.split(key), None):
+        with pytest.raises(ValueError, match=r"^key: expected one key such as jax.random.key\(0\), or a seed, got"):
             POSTERIOR.sample(wrong, 7)
     for wrong in (0, -1, 2.5, "3"):
         with pytest.raises(ValueError, match=r"^n: expected a whole number of at least 1, got"):

@@ -165,8 +165,8 @@ def test_bad_arguments_are_named(ways):
         posterior.log_prob([0.5, 0.5, 0.5])
     with pytest.raises(ValueError, match=r"^theta: expected shape \[\.\.\., 2\], got \[\]$"):
         posterior.log_prob(0.5)
-    with pytest.raises(ValueError, match=r"^key: expected one key such as jax\.random\.key\(0\), got 0$"):
-        posterior.sample(0, 10)
+    with pytest.raises(ValueError, match=r"^key: expected one key such as jax\.random\.key\(0\), or a seed, got -1$"):
+        posterior.sample(-1, 10)
     with pytest.raises(ValueError, match=r"^space: expected 'natural' or 'inference', got 'log'$"):
         posterior.sample(jax.random.key(0), N, space="log")
     assert np.isneginf(posterior.log_prob([-1.0, 0.0]))  # a log parameter that is not positive has no density

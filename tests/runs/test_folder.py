@@ -38,6 +38,7 @@ def test_a_run_leaves_exactly_its_plain_files(folder):
         "dataset.npz",
         "history.npz",
         "observation.npz",
+        "summary.json",
     }
 
 

@@ -362,6 +362,15 @@ def test_mode_pairs_components_as_on_the_command_line(tmp_path):
     np.testing.assert_array_equal(run.mixture.means, other.mixture.means)
 
 
+def test_seeds_and_names_stand_for_keys_and_heuristics():
+    task = dataclasses.replace(gaussian(), hyperparameters={"edge": {"expansion": 0.5}})
+    run = jaxlfi.infer(3, task, OBSERVED, support="misspecified", heuristic="edge", settings=ONE)
+    same = infer(3, task, OBSERVED, heuristic=Edge(expansion=0.5), settings=ONE)
+    assert run.heuristic == same.heuristic
+    np.testing.assert_array_equal(run.mixture.means, same.mixture.means)
+    np.testing.assert_array_equal(run.posterior.sample(4, 7), same.posterior.sample(jax.random.key(4), 7))
+
+
 def test_without_an_observation_one_is_simulated_at_the_truth():
     a, b, c = infer(0, observation=None), infer(0, observation=None), infer(1, observation=None)
     np.testing.assert_array_equal(a.observed, b.observed)
@@ -383,7 +392,7 @@ def test_without_an_observation_one_is_simulated_at_the_truth():
         ({"support": Support([0.0], [1.0])}, "support: expected bounds for 2 parameters, got 1"),
         ({"support": Support([0.0, 0.0], [1.0, 11.0])}, "support: expected a box inside the feasible domain Phi"),
         ({"space": "log"}, "space: expected 'natural' or 'inference', got 'log'"),
-        ({"heuristic": "edge"}, r"heuristic: expected an instance such as jaxlfi\.Edge\(\), got 'edge'"),
+        ({"heuristic": "edgy"}, r"heuristic: expected .*edge.*, got 'edgy'"),
         ({"heuristic": Edge}, r"heuristic: expected an instance such as jaxlfi\.Edge\(\), got the class Edge"),
         ({"heuristic": lambda *_: None}, r"heuristic: expected an instance"),
         ({"heuristic": Edge(expansion=np.ones(3))}, r"heuristic: .*scalars or 2 values, got shape \(3,\)"),
@@ -399,9 +408,9 @@ def test_bad_input_is_named(arguments, message):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("key", [0, "seed", np.zeros(2, np.uint32), jax.random.split(jax.random.key(0), 2)])
+@pytest.mark.parametrize("key", [0.5, "seed", np.zeros(3, np.uint32), jax.random.split(jax.random.key(0), 2)])
 def test_a_key_is_one_typed_key(key):
-    with pytest.raises(ValueError, match=r"^key: expected one key such as jax\.random\.key\(0\), got ") as refused:
+    with pytest.raises(ValueError, match=r"^key: expected one key such as jax\.random\.key\(0\), or a seed, got ") as refused:
         jaxlfi.infer(key, gaussian(), OBSERVED, settings=SETTINGS)
     assert "\n" not in str(refused.value)
 

@@ -71,13 +71,11 @@ def test_a_wrong_first_guess_is_said_and_a_right_one_is_not():
     wider = jaxlfi.Support([1.0, 0.0], [5.5, 2.0])
     (sentence,) = of(beyond, last=wider).sentences
     assert sentence == (
-        "The first guess of 1 to 3 kg for mass was wrong: EDGE moved the upper bound to 5.5 kg, and 100.0% of the "
+        "The first guess of 1 to 3 kg for mass was wrong: EDGE moved its upper bound to 5.5 kg, and all of the "
         "posterior is outside the guess."
     )
     (sentence,) = of(last=wider).sentences
-    assert sentence == (
-        "EDGE moved the upper bound to 5.5 kg of mass; 100.0% of the posterior is within the first guess."
-    )
+    assert sentence == ("EDGE moved the upper bound of mass to 5.5 kg; all of the posterior is within the first guess.")
     assert not said(of(beyond, guess=wider, last=wider), "guess")
 
 
