@@ -59,7 +59,8 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     "line",
     [
         line
-        for folder in sorted([*(RESULTS / "widths").glob("*/*"), *(RESULTS / "normaliser").glob("*/*")])
+        for study in ("widths", "normaliser", "threshold")
+        for folder in sorted((RESULTS / study).glob("*/*"))
         for line in widths.table(folder).splitlines()[2:]
     ],
 )

@@ -410,7 +410,10 @@ def test_bad_input_is_named(arguments, message):
 
 @pytest.mark.parametrize("key", [0.5, "seed", np.zeros(3, np.uint32), jax.random.split(jax.random.key(0), 2)])
 def test_a_key_is_one_typed_key(key):
-    with pytest.raises(ValueError, match=r"^key: expected one key such as jax\.random\.key\(0\), or a seed, got ") as refused:
+    expected = r"^key: expected one key such as jax\.random\.key\(0\), or a seed, got "
+    with pytest.raises(ValueError, match=expected) as refused:
+        ValueError, match=r"^key: expected one key such as jax\.random\.key\(0\), or a seed, got "
+    ) as refused:
         jaxlfi.infer(key, gaussian(), OBSERVED, settings=SETTINGS)
     assert "\n" not in str(refused.value)
 
