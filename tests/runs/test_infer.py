@@ -412,8 +412,6 @@ def test_bad_input_is_named(arguments, message):
 def test_a_key_is_one_typed_key(key):
     expected = r"^key: expected one key such as jax\.random\.key\(0\), or a seed, got "
     with pytest.raises(ValueError, match=expected) as refused:
-        ValueError, match=r"^key: expected one key such as jax\.random\.key\(0\), or a seed, got "
-    ) as refused:
         jaxlfi.infer(key, gaussian(), OBSERVED, settings=SETTINGS)
     assert "\n" not in str(refused.value)
 
