@@ -13,6 +13,8 @@ from scipy import stats
 
 import jaxlfi
 from jaxlfi.distributions.space import Space
+from jaxlfi.figures.collection import open_collection
+from jaxlfi.figures.page import render
 from jaxlfi.io.run_summary import NAME, RunSummary
 from jaxlfi.runs.summarise import summarised
 from tests.small import gaussian, settings
@@ -135,3 +137,7 @@ def test_a_run_states_what_its_folder_and_page_state(tmp_path):
     np.testing.assert_allclose([one.median for one in found.parameters], np.median(draws, axis=0), rtol=1e-5)
     folder = run.save(tmp_path / "run")
     assert RunSummary.read(folder) == found
+    page = render(open_collection(folder), [])
+    assert found.to_html() in page and page.index("<h2>Answer</h2>") < page.index("<h2>Results</h2>")
+    (folder / NAME).unlink()  # as a folder of earlier versions
+    assert "<h2>Answer</h2>" not in render(open_collection(folder), [])
