@@ -85,7 +85,7 @@ def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, .
 
     Args:
         index: the round, from 0.
-        row: its record.
+        row: its record; that of an earlier version says nothing of the effective share.
         reasons: names of the reasons of failure.
         seconds: wall time of the round, divided by the runs that were stepped together.
     """
@@ -105,7 +105,7 @@ def ledger_line(index: int, row: Mapping[str, np.ndarray], reasons: tuple[str, .
         "effective_size": float(row["effective_size"]),
         "not_positive_definite": int(row["not_positive_definite"]),
         "mass_inside": float(row["mass_inside"]),
-        "effective_share": float(row["effective_share"]),
+        "effective_share": float(row.get("effective_share", np.nan)),
         "moved": float(row["moved"]),
         "rescaled": float(row["rescaled"]),
         "turned": float(row["turned"]),
