@@ -128,9 +128,9 @@ def _effective_share(history: Mapping[str, np.ndarray]) -> float:
 
 
 def _of_draws(shares: Sequence[float]) -> str:
-    """How much of a posterior's draws its correction leaves, where one weighs them; the least of several runs."""
+    """The effective sample size of a correction that weights draws, relative to their number; the least of several."""
     least = "at least " * (len(shares) > 1)
-    return f"; its weights leave {least}{min(shares):.0%} of the draws" if min(shares) < 1 else ""
+    return f"; effective sample size {least}{min(shares):.0%} of the draws" if min(shares) < 1 else ""
 
 
 def warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:

@@ -26,7 +26,7 @@ MOVED = 0.05
 OUTSIDE = 0.5
 """Share of the draws outside the first guess above which it was wrong."""
 TOGETHER = 0.9
-"""Correlation above which two parameters cannot be told apart."""
+"""Correlation above which two parameters are not separately identifiable."""
 
 
 def summarised(
@@ -60,12 +60,12 @@ def summarised(
         for text in (
             _of_the_guess(one, draws[:, d], *(_bounds(box, d) for box in (guess, last)), heuristic),
             _of_its_bounds(one, *(_bounds(box, d) for box in (last, feasible))),
-            _not_informed(one),
+            _unconstrained(one),
         )
         if text
     ]
     pairs = itertools.combinations(range(space.dim), 2)
-    sentences += filter(None, (_not_told_apart(space, parameters, inner, *pair) for pair in pairs))
+    sentences += filter(None, (_not_separate(space, parameters, inner, *pair) for pair in pairs))
     return RunSummary(parameters, tuple(sentences))
 
 
@@ -94,8 +94,8 @@ def _parameter(space: Space, d: int, draws, inner, unit: str, boxes, truth) -> P
 
 def _decimals(draws: np.ndarray) -> int:
     """The place of the digit that is as large as the Monte Carlo error of 5 % quantiles, 2.1 sd / sqrt(n)."""
-    error = 2.1 * draws.std() / math.sqrt(len(draws))
-    return int(np.clip(-round(math.log10(error)), -12, 12)) if error > 0 else 6
+    error = max(2.1 * draws.std() / math.sqrt(len(draws)), 1e-7 * np.abs(draws).max())  # or that of float32
+    return -round(math.log10(error)) if 0 < error < math.inf else 6
 
 
 def _bounds(box: Support, d: int) -> tuple[float, float]:
@@ -141,14 +141,14 @@ def _of_its_bounds(one: ParameterSummary, last, feasible) -> str:
     return f"The posterior of {one.name} leans on {' and '.join(texts)}: {advice}."
 
 
-def _not_informed(one: ParameterSummary) -> str:
+def _unconstrained(one: ParameterSummary) -> str:
     if one.verdict != "not at all":
         return ""
-    return f"The observation does not inform {one.name}: its posterior is about as wide as its box."
+    return f"The observation does not constrain {one.name}: its posterior is about as wide as its box."
 
 
-def _not_told_apart(space: Space, parameters, inner: np.ndarray, i: int, j: int) -> str:
-    """Two parameters of which only one combination is known."""
+def _not_separate(space: Space, parameters, inner: np.ndarray, i: int, j: int) -> str:
+    """Two parameters of which only one combination is well determined."""
     scale = inner[:, [i, j]].std(axis=0)
     if not np.all(scale > 0):
         return ""
@@ -164,6 +164,6 @@ def _not_told_apart(space: Space, parameters, inner: np.ndarray, i: int, j: int)
     else:
         combination = f"{space.labels[i]} {'-' if slope > 0 else '+'} {abs(slope):.2g} * {space.labels[j]}"
     return (
-        f"{first} and {second} can hardly be told apart (correlation {correlation:.2f}): "
-        f"what is known is {combination}."
+        f"{first} and {second} are not separately identifiable (correlation {correlation:.2f}): "
+        f"only {combination} is well determined."
     )

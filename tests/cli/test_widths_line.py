@@ -29,6 +29,6 @@ def test_configurations_corrected_in_other_ways_are_named():
 
 def test_the_share_of_draws_that_weights_leave_is_the_least_of_the_last_rounds():
     (line,) = lines_of({"ok": Fixed()}, correction="pooled", effective_share=[[0.2, 0.84], [0.3, 0.91]])
-    assert line.endswith("; its weights leave at least 84% of the draws")
+    assert line.endswith("; effective sample size at least 84% of the draws")
     (line,) = lines_of({"ok": Fixed()}, effective_share=[[1.0], [1.0]])
     assert "draws" not in line

@@ -56,6 +56,15 @@ def test_digits_are_as_many_as_another_set_of_draws_would_give():
     assert found[0].shown(12345.0) == "12300"
 
 
+def test_parameters_of_any_unit_keep_their_digits():
+    """A capacitance of some picofarads, and a pressure known to a pascal."""
+    for middle, sd, shown in ((4.7e-12, 1e-13, "4.70e-12"), (101325.0, 1.0, "101325.0"), (5e15, 1e14, "5.00e+15")):
+        box = jaxlfi.Support([0.5 * middle], [2 * middle])
+        draws = RNG.normal(middle, sd, (1000, 1)).astype(np.float32)
+        (one,) = summarised(draws, Space(("a",), (False,)), None, (box, box, box), None, "EDGE").parameters
+        assert one.shown(middle) == shown
+
+
 @given(st.floats(-1e9, 1e9, allow_nan=False), st.integers(-6, 9))
 def test_numbers_are_shown_to_within_half_of_the_last_digit(value, decimals):
     one = dataclasses.replace(of().parameters[0], decimals=decimals)
@@ -81,13 +90,15 @@ def test_a_wrong_first_guess_is_said_and_a_right_one_is_not():
     assert not said(of(beyond, guess=wider, last=wider), "guess")
 
 
-def test_what_is_not_informed_is_said():
+def test_what_is_not_constrained_is_said():
     flat = np.stack([NARROW[:, 0], np.exp(RNG.uniform(0.0, 2.0, 4000))], axis=1)
     found = of(flat)
-    assert found.sentences == ("The observation does not inform stiffness: its posterior is about as wide as its box.",)
+    assert found.sentences == (
+        "The observation does not constrain stiffness: its posterior is about as wide as its box.",
+    )
     assert [one.verdict for one in found.parameters] == ["identified", "not at all"]
     half = np.stack([NARROW[:, 0], np.exp(RNG.normal(1.0, 0.4, 4000).clip(0, 2))], axis=1)
-    assert [one.verdict for one in of(half).parameters] == ["identified", "weakly"] and not said(of(half), "inform")
+    assert [one.verdict for one in of(half).parameters] == ["identified", "weakly"] and not said(of(half), "constrain")
 
 
 def test_a_posterior_that_leans_on_a_bound_is_said():
@@ -102,18 +113,18 @@ def test_a_posterior_that_leans_on_a_bound_is_said():
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_parameters_that_cannot_be_told_apart_are_named_with_what_is_known(sign):
+def test_parameters_not_separately_identifiable_are_named_with_their_combination(sign):
     shared, own = RNG.normal(0.0, 0.15, (2, 4000)) * np.array([[1.0], [0.1]])
     both = Space(("mass", "stiffness"), (True, True))
     logs = np.stack([1.0 + shared, 1.0 + sign * shared + own], axis=1)
     (sentence,) = of(np.exp(logs), space=both, guess=PHI, last=PHI).sentences
-    assert "mass and stiffness can hardly be told apart (correlation" in sentence
-    assert sentence.endswith(f"what is known is mass {'/' if sign > 0 else '*'} stiffness.")
+    assert "mass and stiffness are not separately identifiable (correlation" in sentence
+    assert sentence.endswith(f"only mass {'/' if sign > 0 else '*'} stiffness is well determined.")
     (sentence,) = of(
         np.stack([1.0 + 2 * shared, np.exp(1.0 + sign * shared + own)], axis=1), last=PHI, guess=PHI
     ).sentences
-    assert sentence.split("known is ")[1].startswith(f"mass {'-' if sign > 0 else '+'} 2 * ln stiffness")
-    assert not said(of(np.exp(np.stack([1 + shared, 1 + own], axis=1)), space=both, guess=PHI, last=PHI), "apart")
+    assert sentence.split("): only ")[1].startswith(f"mass {'-' if sign > 0 else '+'} 2 * ln stiffness")
+    assert not said(of(np.exp(np.stack([1 + shared, 1 + own], axis=1)), space=both, guess=PHI, last=PHI), "separately")
 
 
 def test_forms_agree_and_come_back_from_a_file(tmp_path):
