@@ -224,6 +224,11 @@ class Estimator(Checked, abc.ABC):
         sees = np.where(first, of_summaries, ~of_summaries | (obs <= FEW)).astype(float)
         return (sees * np.sqrt(inputs / sees.sum(axis=1, keepdims=True))).astype(np.float32)
 
+    @property
+    def equal_weights(self) -> Float[Array, " member"]:
+        """Log-weights of the ensemble's networks where nothing tells them apart."""
+        return jnp.full(self.ensemble_size, -math.log(self.ensemble_size))
+
     def keys(self, key: jax.Array) -> tuple[jax.Array, jax.Array | None]:
         """Keys to fit by and to condition by; a mixture of Gaussians is read off the network without one."""
         return (key, None) if self.closed_form else tuple(jax.random.split(key))
@@ -234,9 +239,14 @@ class Estimator(Checked, abc.ABC):
         return jax.vmap(lambda k: module.init(k, jnp.zeros(inputs)))(jax.random.split(key, self.ensemble_size))
 
     def begin(
-        self, params: dict, theta: Float[Array, "n dim"], x: Float[Array, "n obs"], valid: Bool[Array, " n"]
+        self,
+        params: dict,
+        theta: Float[Array, "n dim"],
+        x: Float[Array, "n given"],
+        valid: Bool[Array, " n"],
+        views: np.ndarray | None,
     ) -> dict:
-        """Fresh weights, changed by what the first simulations are, as the network sees them; here nothing is."""
+        """Fresh weights, changed by what the first simulations are, as the networks see them; here nothing is."""
         return params
 
     def rows(
@@ -270,7 +280,8 @@ class Estimator(Checked, abc.ABC):
         x = network.given(x)
         each = jax.vmap(lambda params, view: module.apply(params, viewed(x, view)))(network.params, network.views)
         shift, scale = network.from_network()
-        return EnsembleDensity(each, shift, scale, self.ensemble_size)
+        log_weights = self.equal_weights if network.log_weights is None else network.log_weights
+        return EnsembleDensity(each, shift, scale, log_weights)
 
     def mixture(self, key: jax.Array | None, density: Density, support: Place) -> GaussianMixture:
         """The density as E K Gaussians: fitted to its draws inside the support.
@@ -363,7 +374,7 @@ class Network:
             # Those of the later half of the rounds, which are nearer to the observation than those before.
             fitted, features = fit_regression(self.regression, theta, dataset.x, dataset.valid, dataset.late)
             network, x = network.replace(regression=fitted), network._beside(dataset.x, features)
-        return network.replace(params=self.estimator.begin(self.params, theta, x, dataset.valid)), x
+        return network.replace(params=self.estimator.begin(self.params, theta, x, dataset.valid, self.views)), x
 
     def _beside(self, x: Array, features: Array) -> Array:
         if self.estimator.replaces(x.shape[-1]):
@@ -391,7 +402,7 @@ def untrained(
     regression = log_weights = None
     if estimator.sees != "none":
         regression = unfitted(scale.dim, obs, estimator.record_size)
-        log_weights = jnp.zeros(estimator.ensemble_size)
+        log_weights = estimator.equal_weights
     normalisers = _normalisers(estimator, nothing, scale)
     return Network(
         estimator,

@@ -23,31 +23,32 @@ class Density(Protocol):
 
 @struct.dataclass
 class EnsembleDensity:
-    """The equally weighted mixture of an ensemble's conditional densities.
+    """The mixture of an ensemble's conditional densities.
 
     Attributes:
         each: the networks' outputs for one x, stacked along a leading axis of length E: a pytree with `log_prob` and
             `sample` of parameters as the networks see them.
         shift: from what the networks see to inference space, shape [D].
         scale: shape [D].
-        ensemble_size: E.
+        log_weights: of the networks, normalised, shape [E].
     """
 
     each: Any
     shift: Float[Array, "*batch dim"]
     scale: Float[Array, "*batch dim"]
-    ensemble_size: int = struct.field(pytree_node=False)
+    log_weights: Float[Array, "*batch member"]
 
     def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
-        """Log-density at theta: the mean density of all networks."""
+        """Log-density at theta: the weighted mean of the networks' densities."""
         inner = (theta - self.shift) / self.scale
         log_each = jax.vmap(lambda q: q.log_prob(inner))(self.each)
-        return jax.nn.logsumexp(log_each, axis=0) - jnp.log(self.ensemble_size) - jnp.sum(jnp.log(self.scale))
+        log_weights = self.log_weights.reshape(-1, *[1] * (log_each.ndim - 1))
+        return jax.nn.logsumexp(log_each + log_weights, axis=0) - jnp.sum(jnp.log(self.scale))
 
     def sample(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` independent draws, each of a network chosen at random; some may leave any support."""
-        keys = jax.random.split(key, self.ensemble_size + 1)
+        keys = jax.random.split(key, len(self.log_weights) + 1)
         draws = jax.vmap(lambda key, q: q.sample(key, n))(keys[:-1], self.each)
         # In turn would not do: whoever takes the first of several draws that is inside would prefer the first network.
-        choice = jax.random.randint(keys[-1], (n,), 0, self.ensemble_size)
+        choice = jax.random.categorical(keys[-1], self.log_weights, shape=(n,))
         return self.shift + self.scale * draws[choice, jnp.arange(n)]

@@ -1,10 +1,12 @@
 """Conditional normalizing flows as estimators (appendix A): masked autoregressive, and neural spline."""
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxlfi.estimators.base import Estimator
+from jaxlfi.estimators.base import Estimator, viewed
 from jaxlfi.estimators.flows import MAF, NSF, REGRESSION
 from jaxlfi.estimators.mdn import ACTIVATIONS
 from jaxlfi.estimators.ridge import ridge
@@ -71,16 +73,25 @@ class SplineFlow(FlowEstimator):
     regression: int = option(0, low=0, help="networks that start from a ridge regression on the summaries")
 
     def begin(
-        self, params: dict, theta: Float[Array, "n dim"], x: Float[Array, "n obs"], valid: Bool[Array, " n"]
+        self,
+        params: dict,
+        theta: Float[Array, "n dim"],
+        x: Float[Array, "n given"],
+        valid: Bool[Array, " n"],
+        views: np.ndarray | None,
     ) -> dict:
         """Fresh weights, with the regression for the linear term of the first shift of some networks."""
         if not self.regression or self.embedding != "none":
             return params
-        coefficients, intercept, _ = ridge(x, theta, valid)
-        start = jnp.concatenate([coefficients, intercept[:, None]], axis=1)
+
+        def start(view: Array | None) -> Array:
+            coefficients, intercept, _ = ridge(viewed(x, view), theta, valid)
+            return jnp.concatenate([coefficients, intercept[:, None]], axis=1)
+
+        starts = start(None) if views is None else jax.vmap(start)(views)
         linear = params["params"][REGRESSION]
         chosen = jnp.arange(len(linear)) < self.regression
-        return {"params": params["params"] | {REGRESSION: jnp.where(chosen[:, None, None], start, linear)}}
+        return {"params": params["params"] | {REGRESSION: jnp.where(chosen[:, None, None], starts, linear)}}
 
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one ensemble member for D parameters."""

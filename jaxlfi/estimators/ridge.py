@@ -1,5 +1,6 @@
 """Ridge regression whose penalty is chosen by generalised cross-validation."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -8,6 +9,8 @@ from jaxlfi.distributions.decomposition import svd
 
 PENALTIES = np.logspace(0, 5, 11).astype(np.float32)
 """What is added to the inner products of predictors that have unit variance; 1 weighs as much as one row."""
+FOLDS = 5
+"""Parts that rows are dealt into, each of which is predicted by a regression fitted to the others."""
 
 
 def ridge(
@@ -24,8 +27,8 @@ def ridge(
         valid: the rows that count, shape [C].
 
     Returns:
-        W and b, zeros without rows; and what each row would be predicted to be, were the regression fitted without it
-        (Allen 1974), shape [C, D], less b.
+        W and b, zeros without rows; and what each row is predicted to be by the regression of the same penalty fitted
+        to the other folds, less b, shape [C, D]. Row i is in fold i modulo `FOLDS`.
     """
     rows = jnp.sum(valid)
     x_mean, y_mean = (jnp.sum(v, axis=0, where=valid[:, None]) / jnp.maximum(rows, 1) for v in (x, y))
@@ -39,8 +42,34 @@ def ridge(
     best = jnp.argmin(residual / free[:, None] ** 2, axis=0)
     shrunk = jnp.take_along_axis(kept, best[:, None], axis=0)  # [D, R]
     coefficients = (shrunk * along.T / jnp.where(singular > 0, singular, 1.0)) @ right
-    # The change is the residual times the leverage over one less the leverage; the mean's own is 1 / rows.
-    leverage = jnp.einsum("cr,dr->cd", left**2, shrunk) + 1 / jnp.maximum(rows, 1)
-    fitted = x @ coefficients.T
-    left_out = fitted - (y - fitted) * leverage / jnp.maximum(1 - leverage, 1e-3)
-    return coefficients, y_mean - coefficients @ x_mean, left_out + coefficients @ x_mean
+    others = _by_others(left * singular, y, valid, jnp.asarray(PENALTIES)[best])
+    return coefficients, y_mean - coefficients @ x_mean, others + coefficients @ x_mean
+
+
+def _by_others(
+    z: Float[Array, "cap rank"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"], penalty: Float[Array, " dim"]
+) -> Float[Array, "cap dim"]:
+    """What each row is predicted to be by the regression fitted to the other folds.
+
+    Leaving out one row at a time would not do. The mean of all others is linear in the row that is left out, and so are
+    their coefficients: a network that sees such predictions reads from them what it is to predict.
+
+    Args:
+        z: predictors along their principal axes, zero where not valid, shape [C, R].
+        y: what is predicted, centred, zero where not valid, shape [C, D].
+        valid: the rows that count, shape [C].
+        penalty: of each column of y, shape [D].
+    """
+    dealt = lambda v: jnp.pad(v, [(0, -len(v) % FOLDS), *[(0, 0)] * (v.ndim - 1)]).reshape(-1, FOLDS, *v.shape[1:])
+    in_fold = dealt(z), dealt(y), dealt(valid.astype(z.dtype))
+    moments = lambda z, y, one: (z.T @ z, z.T @ y, jnp.sum(z, axis=0), jnp.sum(y, axis=0), jnp.sum(one))
+    each = jax.vmap(moments, in_axes=1)(*in_fold)
+    squares, products, z_sum, y_sum, count = jax.tree.map(lambda fold: jnp.sum(fold, axis=0) - fold, each)
+    count = jnp.maximum(count, 1)[:, None]
+    z_mean, y_mean = z_sum / count, y_sum / count
+    squares = squares - count[:, :, None] * z_mean[:, :, None] * z_mean[:, None, :]
+    products = products - count[:, :, None] * z_mean[:, :, None] * y_mean[:, None, :]
+    ridged = squares[:, None] + penalty[:, None, None] * jnp.eye(z.shape[-1])  # [K, D, R, R]
+    solved = jax.scipy.linalg.solve(ridged, jnp.swapaxes(products, 1, 2)[..., None], assume_a="pos")[..., 0]
+    predicted = y_mean + jnp.einsum("ckr,kdr->ckd", in_fold[0] - z_mean, solved)
+    return predicted.reshape(-1, y.shape[-1])[: len(y)]

@@ -100,13 +100,13 @@ def fit(
 
 
 def _weights(network: Network, dataset: Dataset, data: Rows, rows: Array) -> Float[Array, " member"]:
-    """Log-weights of the ensemble's members, by stacking; equal where nothing is held out.
+    """Log-weights of the ensemble's members, by stacking; equal where nothing is held out or no likelihood is learnt.
 
     By the held-out rows of the later rounds, which are nearer to the observation than those before.
     """
     estimator = network.estimator
-    if not estimator.validation:
-        return jnp.zeros(estimator.ensemble_size)
+    if not estimator.validation or estimator.loss != "likelihood":
+        return estimator.equal_weights
     count = jnp.floor(estimator.validation * dataset.size).astype(jnp.int32)
     places = jnp.arange(max(2, int(estimator.validation * dataset.capacity)))
     held_out = jnp.take(rows, jnp.maximum(dataset.size - count, 1) + places, mode="clip")

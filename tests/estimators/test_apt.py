@@ -190,7 +190,7 @@ def test_networks_of_an_ensemble_are_scaled_alike():
 def test_networks_of_an_ensemble_take_part_in_random_order():
     one = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 1)), jnp.ones((1, 1, 1)))
     each = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), one).replace(means=jnp.array([[[-50.0]], [[50.0]]]))
-    ensemble = EnsembleDensity(each, jnp.zeros(1), jnp.ones(1), 2)
+    ensemble = EnsembleDensity(each, jnp.zeros(1), jnp.ones(1), jnp.log(jnp.array([0.5, 0.5])))
     draws = jax.jit(lambda key: ensemble.sample(key, 2000))(jax.random.key(1))
     first = np.asarray(draws)[:, 0] < 0
     assert abs(first.mean() - 0.5) < 5 * 0.5 / np.sqrt(2000)

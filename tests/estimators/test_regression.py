@@ -10,7 +10,7 @@ from scipy import stats
 
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.regression import features_size, fit_regression, unfitted
-from jaxlfi.estimators.ridge import ridge
+from jaxlfi.estimators.ridge import FOLDS, PENALTIES, ridge
 from jaxlfi.estimators.stacking import stacked
 from jaxlfi.estimators.statistics import LAGS, QUANTILES, statistics, statistics_size
 
@@ -58,16 +58,42 @@ def test_what_is_short_is_no_series():
     assert features_size(3, 9, 1) == 3 and features_size(3, 20, 2) == 6
 
 
-def test_predictions_without_a_row_are_those_of_a_fit_without_it():
+def test_predictions_by_the_other_folds_are_those_of_fits_to_them():
     rng = np.random.default_rng(1)
-    x = rng.normal(5.0, 2.0, (30, 4))
-    y = x @ rng.normal(size=(4, 2)) + rng.normal(0.0, 1.0, (30, 2))
-    every = jnp.arange(30) < 28
-    x, y = jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
-    _, intercept, left_out = ridge(x, y, every)
-    for row in (0, 5, 27):
-        coefficients, constant, _ = ridge(x, y, every & (jnp.arange(30) != row))
-        np.testing.assert_allclose(left_out[row] + intercept, coefficients @ x[row] + constant, rtol=0.02, atol=0.05)
+    x = rng.normal(5.0, 2.0, (83, 4))
+    y = x @ rng.normal(size=(4, 2)) + rng.normal(0.0, 1.0, (83, 2))
+    x[80:], y[80:] = np.nan, np.inf  # rows that are not there
+    single = lambda values: jnp.asarray(values, jnp.float32)
+    coefficients, intercept, by_others = map(np.asarray, ridge(single(x), single(y), jnp.arange(83) < 80))
+    inner, outer = x[:80] - x[:80].mean(0), y[:80] - y[:80].mean(0)
+    hat = [inner.T @ inner + penalty * np.eye(4) for penalty in PENALTIES]
+    chosen = [
+        PENALTIES[np.argmin([np.abs(np.linalg.solve(one, inner.T @ outer[:, d]) - coefficients[d]).max() for one in hat])]
+        for d in range(2)
+    ]
+    for fold in range(FOLDS):
+        own = np.arange(80) % FOLDS == fold
+        for d, penalty in enumerate(chosen):
+            a, b = x[:80][~own], y[:80, d][~own]
+            a_mean, b_mean = a.mean(0), b.mean()
+            fitted = np.linalg.solve((a - a_mean).T @ (a - a_mean) + penalty * np.eye(4), (a - a_mean).T @ (b - b_mean))
+            expected = b_mean + (x[:80][own] - a_mean) @ fitted
+            np.testing.assert_allclose(by_others[:80][own, d] + intercept[d], expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("seen", ["feature alone", "feature and predictors"])
+def test_features_do_not_tell_a_parameter_that_the_summary_does_not(seen):
+    """Predictions that leave one row out are linear in what it holds: their correlation with it is -1."""
+    rng = np.random.default_rng(5)
+    x, theta = rng.normal(size=(500, 12)), rng.uniform(-1.7, 1.7, (500, 3))
+    *_, by_others = ridge(jnp.asarray(x, jnp.float32), jnp.asarray(theta, jnp.float32), jnp.ones(500, bool))
+    for d in range(3):
+        feature = np.asarray(by_others)[:, d : d + 1]
+        feature = (feature - feature.mean()) / feature.std()
+        seen_by_network = feature if seen == "feature alone" else np.concatenate([feature, x], axis=1)
+        design = np.concatenate([np.ones((500, 1)), seen_by_network], axis=1)
+        residual = theta[:, d] - design @ np.linalg.lstsq(design, theta[:, d], rcond=None)[0]
+        assert np.var(residual) / np.var(theta[:, d]) > 0.9
 
 
 def simulated(n, seed, dim=2, obs=30):
