@@ -66,11 +66,8 @@ def test_predictions_by_the_other_folds_are_those_of_fits_to_them():
     single = lambda values: jnp.asarray(values, jnp.float32)
     coefficients, intercept, by_others = map(np.asarray, ridge(single(x), single(y), jnp.arange(83) < 80))
     inner, outer = x[:80] - x[:80].mean(0), y[:80] - y[:80].mean(0)
-    hat = [inner.T @ inner + penalty * np.eye(4) for penalty in PENALTIES]
-    chosen = [
-        PENALTIES[np.argmin([np.abs(np.linalg.solve(one, inner.T @ outer[:, d]) - coefficients[d]).max() for one in hat])]
-        for d in range(2)
-    ]
+    fits = [np.linalg.solve(inner.T @ inner + penalty * np.eye(4), inner.T @ outer) for penalty in PENALTIES]
+    chosen = [PENALTIES[np.argmin([np.abs(fit[:, d] - coefficients[d]).max() for fit in fits])] for d in range(2)]
     for fold in range(FOLDS):
         own = np.arange(80) % FOLDS == fold
         for d, penalty in enumerate(chosen):
