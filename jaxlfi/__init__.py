@@ -43,6 +43,7 @@ _HOMES = {
     "load": "jaxlfi.runs.load",
     "option": "jaxlfi.fields",
     "repeated": "jaxlfi.tasks.trials",
+    "with_gaps": "jaxlfi.tasks.gaps",
     "settings_for": "jaxlfi.bayessim.presets",
     "stack": "jaxlfi.bayessim.batch",
     "with_tails": "jaxlfi.tasks.tailed_uniform",

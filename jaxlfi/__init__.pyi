@@ -49,6 +49,7 @@ from jaxlfi.runs.run import Run as Run
 from jaxlfi.runs.run import SupportWarning as SupportWarning
 from jaxlfi.tasks.errors import ExecutorError as ExecutorError
 from jaxlfi.tasks.errors import SimulatorError as SimulatorError
+from jaxlfi.tasks.gaps import with_gaps as with_gaps
 from jaxlfi.tasks.host import HostSimulator as HostSimulator
 from jaxlfi.tasks.tailed_uniform import with_tails as with_tails
 from jaxlfi.tasks.task import Task as Task

@@ -29,7 +29,7 @@ def drive(
         engine: of the batch.
         state: before the first of these rounds; it is consumed.
         rounds: indices of the rounds to do.
-        on_round: called as each ends.
+        on_round: called as each ends; it makes this round the last by raising StopIteration.
         on_compiled: called with the seconds that compiling took.
 
     Returns:
@@ -47,7 +47,10 @@ def drive(
         state, row = engine.round(state, index)
         if index == 0:
             require_success(row["succeeded"], row["failed"], engine.task, engine.known_failures)
-        on_round(index, state, row, time.perf_counter() - began)
+        try:
+            on_round(index, state, row, time.perf_counter() - began)
+        except StopIteration:
+            break
         if np.all(row["settled"]):
             break
     return state

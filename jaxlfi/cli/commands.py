@@ -39,6 +39,7 @@ from jaxlfi.studies.grid import Work
 from jaxlfi.tasks import priors
 from jaxlfi.tasks import registry as task_lookup
 from jaxlfi.tasks.errors import ExecutorError, SimulatorError
+from jaxlfi.tasks.observation import with_gaps_of
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.task import Task
 
@@ -132,6 +133,8 @@ def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, fir
     if processes.writes:
         run_store.refuse_occupied(arguments.out)
     observation = asked.observation_of(arguments, plan.task, lambda line: _say(console, line))
+    task = with_gaps_of(plan.task, observation, plan.settings.estimator.embedding != "none")
+    plan = dataclasses.replace(plan, task=task)
     observed = executing.prepare(plan, observation, first, processes)
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
         if (mass := priors.require_mass(plan.task.inference.prior, box, name)) < priors.LOW_INSIDE:

@@ -1,11 +1,14 @@
 """Discrepancies of a posterior from the truth and from the observation (section V)."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from jaxlfi.tasks.gaps import gaps_of
 from jaxlfi.tasks.simulation import summarised, trajectory_and_outcome
 from jaxlfi.tasks.task import Task
 
@@ -69,8 +72,11 @@ def compared(
         observed: the real trajectory.
     """
     # A difference is taken before it is rounded: trajectories from the host are in double precision.
-    difference, spread = jnp.asarray(trajectory - observed), jnp.asarray(observed - observed[:1])
-    error = jnp.where(failure == 0, jax.vmap(lambda one: _distance(one, spread))(difference), jnp.nan)
+    missing = gaps_of(task)
+    first = observed[:1] if missing is None else 0.0
+    difference, spread = jnp.asarray(trajectory - observed), jnp.asarray(observed - first)
+    distance = _distance if missing is None else functools.partial(_distance_between_gaps, missing)
+    error = jnp.where(failure == 0, jax.vmap(lambda one: distance(one, spread))(difference), jnp.nan)
     x = jnp.where((failure == 0)[:, None], x, jnp.nan)
     return Discrepancy(theta, _theta_error(task, theta), error, jnp.asarray(trajectory), x, jnp.asarray(len(theta)))
 
@@ -117,3 +123,12 @@ def _distance(difference: Array, spread: Array) -> Float[Array, ""]:
     deviation = jnp.std(spread, axis=0)
     scale = jnp.where(deviation > 0, deviation, 1.0)
     return jnp.sqrt(jnp.mean((difference.reshape(spread.shape) / scale) ** 2))
+
+
+def _distance_between_gaps(missing: np.ndarray, difference: Array, spread: Array) -> Float[Array, ""]:
+    """The same of what is not missing."""
+    there = ~missing.reshape(len(missing), -1)
+    spread, difference = (jnp.where(there, values.reshape(there.shape), 0.0) for values in (spread, difference))
+    deviation = jnp.std(spread, axis=0, where=there)
+    scale = jnp.where(deviation > 0, deviation, 1.0)
+    return jnp.sqrt(jnp.mean((difference / scale) ** 2, where=there))

@@ -93,7 +93,7 @@ def _robust_limits(axes: Axes, histories: Sequence[History], channel: int) -> No
     """Limits that show all of the observation, and predictions within three times its range."""
     observed = np.concatenate([h.observed[:, channel] for h in histories])
     predicted = np.concatenate([quantiles(h)[..., channel].ravel() for h in histories])
-    low, high = float(observed.min()), float(observed.max())
+    low, high = float(np.nanmin(observed)), float(np.nanmax(observed))  # NaN where a number is missing
     reach = 3.0 * ((high - low) or abs(high) or 1.0)
     bottom, top = min(low, max(predicted.min(), low - reach)), max(high, min(predicted.max(), high + reach))
     margin = 0.05 * ((top - bottom) or 1.0)

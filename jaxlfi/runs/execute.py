@@ -32,7 +32,7 @@ from jaxlfi.tasks import failures, priors, registry
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.failures import FailureLog, Message
 from jaxlfi.tasks.journal import Journal, OnSimulation
-from jaxlfi.tasks.observation import observe
+from jaxlfi.tasks.observation import observe, with_gaps_of
 from jaxlfi.tasks.reference import raw
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.summaries import layout
@@ -344,7 +344,9 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
             f"{folder}: expected the task as it was when the run was begun, with parameters {labels}, "
             f"got {list(plan.task.space.labels)}"
         )
-    return plan, Observed(*Checkpoint(folder).read_start())
+    observed = Observed(*Checkpoint(folder).read_start())
+    task = with_gaps_of(plan.task, observed.trajectory[0], plan.settings.estimator.embedding != "none")
+    return dataclasses.replace(plan, task=task), observed
 
 
 def devices_of(runs: int, processes: Processes) -> int:

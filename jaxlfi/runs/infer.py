@@ -33,7 +33,7 @@ from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.failures import FailureLog
-from jaxlfi.tasks.observation import observe, trials_of
+from jaxlfi.tasks.observation import observe, trials_of, with_gaps_of
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.priors import require_mass
 from jaxlfi.tasks.simulation import Simulations
@@ -71,9 +71,10 @@ def infer(
     Args:
         key: consumed; or a seed, as `--first-seed` of the command line.
         task: simulator, names and bounds.
-        observation: the real trajectory, in the shape the simulator produces, without missing numbers; or a list of
-            several, independent trials of the same parameters, which are believed together (`jaxlfi.repeated`). By
-            default the task's own, or, where the truth is known, a fresh simulation at the truth.
+        observation: the real trajectory, in the shape the simulator produces, with NaN where a number is missing
+            (`jaxlfi.with_gaps`); or a list of several, independent trials of the same parameters, of which shorter ones
+            count as missing their ends, for one posterior given all of them (`jaxlfi.repeated`). By default the task's
+            own, or, where the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
             box they fill.
         heuristic: how the support is adapted, or its registered name ("edge"), with the hyperparameters that the task
@@ -84,7 +85,7 @@ def infer(
         simulations: pairs of parameters and simulations that take the place of the first round's: a mapping of arrays,
             or an .npz file (`jaxlfi.tasks.presimulated.presimulated`). With one round nothing is simulated.
         progress: show a progress bar.
-        callback: called as each round ends.
+        callback: called as each round ends; it makes this round the last by raising StopIteration.
         out: a new folder to keep the run in as it goes on. Where it holds the same run, unfinished or not, the run goes
             on from there, to the same result.
         executor: makes the simulations of a host simulator one by one, each with a generator of its own: any
@@ -114,10 +115,11 @@ def infer(
         heuristic = registry.build(heuristic, task.hyperparameters.get(heuristic, {}), task.dim)
     registry.check(heuristic, task.dim)
     heuristic = paired(heuristic, getattr(settings.estimator, "warm_start", True))  # what it is, is checked later
-    learnt = getattr(settings.estimator, "embedding", "none") == "trials"  # what it is, is checked later
+    embedding = getattr(settings.estimator, "embedding", "none")  # what it is, is checked later
     if executor is not None or simulation_timeout is not None:
         task = one_by_one(task, executor, simulation_timeout)
-    task, observation = trials_of(task, observation, "all" if learnt else "moments")
+    task, observation = trials_of(task, observation, "all" if embedding == "trials" else "moments")
+    task = with_gaps_of(task, observation, embedding != "none")
     if not is_concrete((key, observation, support, heuristic, settings)):
         if task.on_host or simulations is not None or progress or callback is not None or out is not None:
             raise ValueError(
@@ -218,6 +220,9 @@ def _same(first: Any, second: Any) -> bool:
     first, second = np.asarray(first, float), np.asarray(second, float)
     if first.shape != second.shape or not first.size:
         return first.shape == second.shape
+    if not np.array_equal(np.isnan(first), np.isnan(second)):
+        return False
+    first, second = np.nan_to_num(first), np.nan_to_num(second)
     allowed = 1e-4 * np.ptp(first, axis=0) + 1e-6 * np.max(np.abs(first), axis=0)
     return bool(np.all(np.abs(first - second) <= allowed))
 

@@ -29,6 +29,7 @@ from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks import failures, registry
 from jaxlfi.tasks.executors import one_by_one
+from jaxlfi.tasks.observation import with_gaps_of
 from jaxlfi.tasks.task import Task
 
 VALIDITY = ".validity"
@@ -94,6 +95,8 @@ def _read(folder: Path, config: dict[str, Any], task: Task | None) -> Run:
     observation = _arrays(folder / "observation.npz", ("trajectory", "x"))
     history = _arrays(folder / "history.npz", ("theta",))
     observed, x = _precise(observation["trajectory"]), _precise(observation["x"])
+    if task is not None:
+        task = with_gaps_of(task, observation["trajectory"], settings.estimator.embedding != "none")
     layout = tuple(map(int, observation.get("layout", (len(x), 1))))
     return Run(
         belief=_belief(folder / "posterior.npz", space),

@@ -34,6 +34,7 @@ from jaxlfi.runs.unlike import observation_findings
 from jaxlfi.tasks import failures, owned
 from jaxlfi.tasks.errors import SimulatorWarning
 from jaxlfi.tasks.failures import Failure, FailureLog
+from jaxlfi.tasks.gaps import gaps_of
 from jaxlfi.tasks.reference import counted_from, summaries_in_double
 from jaxlfi.tasks.task import Task
 
@@ -269,12 +270,12 @@ class Run:
         return folders.save(self, Path(path))
 
     def _summary(self, observation: Any) -> jax.Array:
-        if missing := owned.missing(observation):
-            raise ValueError(f"observation: expected a number in every place, got {missing} missing (masked)")
         on_host = self.task is not None and self.task.on_host
+        observation = owned.array(observation) if is_concrete(observation) else observation
         observation = np.array(observation, float) if on_host else jnp.array(observation, jnp.float32)
         if observation.shape == self.observed.shape and self.task is not None:
-            _finite(observation)
+            missing = gaps_of(self.task)
+            _finite(observation if missing is None else observation[~missing])
             x = summaries_in_double(self.task, observation[None])[0] if on_host else self.task.summary(observation)
             return _finite(x, "a summary of finite numbers")
         if observation.shape == self.x.shape:

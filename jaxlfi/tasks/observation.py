@@ -17,6 +17,7 @@ from jaxlfi.distributions.precision import single
 from jaxlfi.io import files
 from jaxlfi.tasks import owned, purity
 from jaxlfi.tasks.errors import SimulatorError
+from jaxlfi.tasks.gaps import gaps_of, with_gaps
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.reference import summaries_in_double
 from jaxlfi.tasks.simulation import failure_code, trajectory_and_outcome
@@ -28,6 +29,9 @@ TRIES = 16
 TIME_COLUMNS = ("time", "times", "timestamp", "seconds", "year", "step", "index", "")
 """Headings, without a unit in brackets, of a first column that is no channel where it increases; case does not matter.
 pandas' index has an empty one. A small t is one, too, but no T, which may be a temperature."""
+
+MISSING = ("", "NA", "N/A", "null")
+"""Cells of a table, besides NaN, that say that a number is missing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,19 +117,25 @@ def _summary_size(task: Task, shape: tuple[int, ...]) -> int:
     return summary.shape[0]
 
 
-def checked(observation, shapes: Shapes) -> Any:
+def checked(observation, shapes: Shapes, missing: np.ndarray | None = None) -> Any:
     """An observation in the shape that the simulator produces.
 
+    Args:
+        observation: a trajectory.
+        shapes: of the simulator.
+        missing: true where the task has gaps; None where it has none.
+
     Raises:
-        ValueError: for another shape, or numbers that are not finite.
+        ValueError: for another shape, or numbers that are not finite where none is missing.
     """
+    there = ... if missing is None else ~missing
     if np.shape(observation) != shapes.trajectory:
         raise ValueError(
             f"observation: expected the shape the simulator produces, {list(shapes.trajectory)}, "
             f"got {list(np.shape(observation))}"
         )
-    if not isinstance(observation, jax.core.Tracer) and not np.isfinite(np.asarray(observation, float)).all():
-        raise ValueError("observation: expected finite numbers, got some that are not")
+    if not isinstance(observation, jax.core.Tracer) and not np.isfinite(np.asarray(observation, float))[there].all():
+        raise ValueError("observation: expected finite numbers (NaN where one is missing), got some that are not")
     return observation
 
 
@@ -186,10 +196,10 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
         simulate = simulate_observation if concrete else trace_observation
         observation = simulate(key, task)
     if task.on_host:
-        observed = np.array(checked(observation, observed_shapes(task, np.asarray(observation))), float)
+        observed = np.array(checked(observation, observed_shapes(task, np.asarray(observation)), gaps_of(task)), float)
         x = summaries_in_double(task, observed[None])[0]
     else:
-        observed = jnp.array(checked(observation, simulator_shapes(task)), jnp.float32)
+        observed = jnp.array(checked(observation, simulator_shapes(task), gaps_of(task)), jnp.float32)
         x = jnp.asarray(task.summary(observed), jnp.float32)
     if not isinstance(x, jax.core.Tracer) and not np.isfinite(np.asarray(x)).all():
         raise ValueError(f"observation: expected a finite summary, got {np.asarray(x).tolist()}")
@@ -198,19 +208,14 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
 
 
 def _numbers(observation: Any) -> np.ndarray:
-    """A copy of what was given, of real numbers and none of them missing."""
+    """A copy of what was given, of real numbers, NaN where they are missing."""
     shown = lambda: textwrap.shorten(repr(observation), 200)
     try:
-        array, missing = owned.array(observation), owned.missing(observation)
+        array = owned.array(observation)
     except ValueError as error:
         raise ValueError(f"observation: expected an array, got rows of several shapes in {shown()}") from error
     if array.dtype.kind not in "biuf":
         raise ValueError(f"observation: expected an array of numbers, got {shown()}")
-    if missing:
-        raise ValueError(
-            f"observation: expected a number in every place, got {missing} of {array.size} that are missing (masked): "
-            "leave their places out of what the simulator gives, too"
-        )
     return array
 
 
@@ -218,7 +223,8 @@ def trials_of(task: Task, observation: Any, pooling: str = "moments") -> tuple[T
     """The task and observation of an inference: where a list of trajectories is given, of all of them together.
 
     A simulator in JAX tells whether a list holds trajectories or the records of one. What a host simulator gives is
-    not known yet: for it a list of lists is one trajectory, and a list of arrays [T, C] are trials.
+    not known yet: for it a list of lists is one trajectory, and a list of arrays [T, C] are trials. Trials of different
+    lengths are filled up with NaN, which stands for what is missing.
 
     Raises:
         ValueError: for a list of vectors that may be either.
@@ -228,14 +234,17 @@ def trials_of(task: Task, observation: Any, pooling: str = "moments") -> tuple[T
     if is_concrete(observation):
         for one in observation:
             _numbers(one)
-    first = np.shape(observation[0])
+    shapes = {np.shape(one) for one in observation}
+    first, length = np.shape(observation[0]), None
     if task.on_host:
         trials = hasattr(observation[0], "shape") and (len(first) != 1 or _vectors_are_trials(task, observation))
     else:
-        trials = first == simulator_shapes(task).trajectory
+        length, *rest = simulator_shapes(task).trajectory
+        trials = all(shape[1:] == tuple(rest) and shape[0] <= length for shape in shapes if shape) and () not in shapes
+        trials &= len(shapes) > 1 or first == (length, *rest)
     if not trials or first == ():
         return task, observation
-    return repeated(task, len(observation), pooling), together(observation)
+    return repeated(task, len(observation), pooling), together(observation, length)
 
 
 def _vectors_are_trials(task: Task, vectors: Sequence[Any]) -> bool:
@@ -251,6 +260,21 @@ def _vectors_are_trials(task: Task, vectors: Sequence[Any]) -> bool:
             f"jaxlfi.repeated(task, {count}) for {count} trials"
         )
     return as_trials
+
+
+def with_gaps_of(task: Task, observation: Any, keep_places: bool = False) -> Task:
+    """The task with the gaps of an observation, where NaN stands for what is missing; the given one without any.
+
+    Args:
+        task: of a whole recording, or with gaps already.
+        observation: a trajectory; None for the task's own.
+        keep_places: see `jaxlfi.tasks.gaps.with_gaps`.
+    """
+    observation = task.observation if observation is None else observation
+    if observation is None or not is_concrete(observation) or gaps_of(task) is not None:
+        return task
+    numbers = _numbers(observation)
+    return with_gaps(task, np.isnan(numbers), keep_places) if numbers.dtype.kind == "f" else task
 
 
 Say = Callable[[str], Any]
@@ -312,7 +336,8 @@ def read_for(task: Task, *paths: str | Path, say: Say = lambda line: None) -> np
 
     Several files are the trials of a repeated task (`jaxlfi.repeated`), one after another. `say` is as of `read`.
     """
-    trajectory = together([read(path, Columns.of(task), say) for path in paths])
+    every = [read(path, Columns.of(task), say) for path in paths]
+    trajectory = together(every, None if task.on_host else simulator_shapes(task).trajectory[0] // len(every))
     if task.on_host:
         return trajectory
     shape = simulator_shapes(task).trajectory
@@ -333,11 +358,13 @@ def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
         raise ValueError(f"expected a row of headings or a row of numbers first, got {','.join(rows[0])!r}")
     width = len(rows[0])
     for number, row in enumerate(rows[has_heading:], start=1 + has_heading):
-        if len(row) != width or not all(map(_is_number, row)):
+        if len(row) != width or not all(cell in MISSING or _is_number(cell) for cell in row):
             raise ValueError(f"expected {width} numbers in row {number}, got {','.join(row)!r}")
     if has_heading and len(rows) == 1:
         raise ValueError("expected at least one row of numbers, got headings only")
-    return rows[0] if has_heading else [], np.array([[float(cell) for cell in row] for row in rows[has_heading:]])
+    return rows[0] if has_heading else [], np.array(
+        [[float("nan" if cell in MISSING else cell) for cell in row] for row in rows[has_heading:]]
+    )
 
 
 def _channels(headings: list[str], table: np.ndarray, columns: Columns, say: Say) -> np.ndarray:

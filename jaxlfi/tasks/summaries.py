@@ -43,6 +43,38 @@ def series(trajectory: Float[Array, "time channels"]) -> Float[Array, " obs"]:
     return jnp.concatenate([start + mean, jnp.log1p(variance), jnp.stack(memory, axis=-1).ravel(), coupling])
 
 
+def series_of(trajectory: Float[Array, "time channels"], there: np.ndarray) -> Float[Array, " obs"]:
+    """The same of the records that are there: each mean over them, each product over the pairs that are there.
+
+    Of a series without gaps these are the numbers of `series`.
+
+    Args:
+        trajectory: shape [T, C]; what is missing may be any number.
+        there: true where a number is not missing, shape [T, C].
+    """
+    count, channels = trajectory.shape
+    there = np.asarray(there, bool).reshape(count, channels)
+    records = np.maximum(there.sum(axis=0), 1)
+    start = trajectory[np.argmax(there, axis=0), np.arange(channels)]
+    offset = jnp.where(there, trajectory - start, 0.0)
+    mean = jnp.sum(offset, axis=0) / records
+    constant = jnp.all(jnp.where(there, offset == 0, True), axis=0)
+    centred = jnp.where(there, offset - mean, 0.0)
+    variance = jnp.where(constant, 0.0, jnp.sum(centred**2, axis=0) / np.maximum(records - 1, 1))
+    standardised = centred * jnp.where(constant, 0.0, jax.lax.rsqrt(jnp.where(constant, 1.0, variance)))
+
+    def mean_product(first: Array, second: Array, pairs: np.ndarray, of_all: int) -> Array:
+        return jnp.sum(first * second, axis=0) / np.maximum(pairs.sum(axis=0), 1) * (of_all / (count - 1))
+
+    memory = [
+        mean_product(standardised[lag:], standardised[:-lag], there[lag:] & there[:-lag], count - lag) for lag in (1, 2)
+    ]
+    first, second = np.triu_indices(channels, 1)
+    pairs = there[:, first] & there[:, second]
+    coupling = mean_product(standardised[:, first], standardised[:, second], pairs, count)
+    return jnp.concatenate([start + mean, jnp.log1p(variance), jnp.stack(memory, axis=-1).ravel(), coupling])
+
+
 def cross_correlation(trajectory: Float[Array, "time columns"], actions: int) -> Float[Array, " obs"]:
     """Products of states and actions, moments of states: psi of section VI-F, shape [Ds Da + 2 Ds].
 

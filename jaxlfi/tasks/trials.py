@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.summaries import one_after_another
@@ -99,17 +99,27 @@ def check_pooling(pooling: str) -> None:
         raise ValueError(f"pooling: expected one of {sorted((ALL, *POOLINGS))}, got {pooling!r}")
 
 
-def together(trials: Sequence[Any]) -> np.ndarray:
+def together(trials: Sequence[Any], length: int | None = None) -> np.ndarray:
     """Trajectories [T, ...] of several trials as the one of a repeated task, shape [n T, ...].
 
+    Args:
+        trials: those that are shorter than the longest are filled up with NaN.
+        length: what trials of different lengths are filled up to, T; that of the longest by default.
+
     Raises:
-        ValueError: for none, or trajectories of different shapes.
+        ValueError: for none, or records of different shapes.
     """
     arrays = [np.array(trial) for trial in trials]
     shapes = sorted({array.shape for array in arrays})
-    if len(shapes) != 1 or shapes[0] == ():
+    if len({shape[1:] for shape in shapes}) != 1 or () in shapes:
         raise ValueError(f"observation: expected trials of one shape [T, ...], got {[list(shape) for shape in shapes]}")
-    return np.concatenate(arrays)
+    if len(shapes) == 1:
+        return np.concatenate(arrays)
+    length = max(map(len, arrays)) if length is None else length
+    filled = np.full((len(arrays), length, *arrays[0].shape[1:]), np.nan)
+    for place, array in zip(filled, arrays, strict=True):
+        place[: len(array)] = array
+    return filled.reshape(-1, *filled.shape[2:])
 
 
 STATISTICS: dict[str, Callable[[Array], Array]] = {
@@ -156,7 +166,7 @@ def _pooled(summary: Callable, trials: int, pooling: str) -> Callable:
     """The summary of so many trials."""
     if pooling == ALL:
         return functools.partial(one_after_another, summary, trials)
-    return functools.partial(_summary, summary, trials, pooling)
+    return functools.partial(summary_of_trials, summary, trials, pooling)
 
 
 def _names(names: Sequence[str], trials: int, pooling: str, kind: str) -> list[str]:
@@ -166,7 +176,11 @@ def _names(names: Sequence[str], trials: int, pooling: str, kind: str) -> list[s
     return [f"{statistic} of {name}" for statistic in POOLINGS[pooling] for name in names]
 
 
-def _summary(summary: Callable, trials: int, pooling: str, trajectory: Array) -> Array:
+def summary_of_trials(summary: Callable, trials: int, pooling: str, trajectory: Array) -> Array:
     """The pooled summaries of trials that lie one after another."""
-    each = jax.vmap(summary)(trajectory.reshape(trials, -1, *trajectory.shape[1:]))
+    return pooled(jax.vmap(summary)(trajectory.reshape(trials, -1, *trajectory.shape[1:])), pooling)
+
+
+def pooled(each: Float[Array, "trial obs"], pooling: str) -> Float[Array, " pooled"]:
+    """Summaries of several trials as one, whatever their order."""
     return jnp.concatenate([STATISTICS[kind](each) for kind in POOLINGS[pooling]])

@@ -201,6 +201,18 @@ def test_a_run_in_a_folder_goes_on_where_a_callback_stopped_it(tmp_path):
     np.testing.assert_array_equal(done.mixture.means, whole.mixture.means)
 
 
+def test_a_callback_makes_a_round_the_last_by_stop_iteration(tmp_path):
+    def enough(index, row):
+        if index == 0:
+            raise StopIteration
+
+    short = infer(3, callback=enough, out=tmp_path / "short")
+    assert short.history["theta"].shape[0] == 1 and int(short.dataset.size) == int(short.history["kept"].sum())
+    same = infer(3, settings=settings(rounds=1))
+    np.testing.assert_allclose(short.mixture.means, same.mixture.means, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(load(tmp_path / "short").draws(), short.draws())
+
+
 def test_a_folder_of_another_run_is_refused(tmp_path):
     infer(0, out=tmp_path / "run")
     before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
