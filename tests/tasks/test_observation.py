@@ -152,7 +152,7 @@ def test_what_a_task_knows_of_its_channels(tmp_path):
         ("signal\n", "expected at least one row of numbers, got headings only"),
         (lines() + "1,2\n", "expected 1 numbers in row 5, got '1,2'"),
         (lines(row="{value},"), "expected a row of headings or a row of numbers first, got '8.0000,'"),
-        ("a,b\n1,2\n3,\n", "expected 2 numbers in row 3, got '3,'"),
+        ("a,b\n1,2\n3,?\n", "expected 2 numbers in row 3, got '3,?'"),
         ("signal\n1\nbroken\n2\n", "expected 1 numbers in row 3, got 'broken'"),
         ("hello\nworld\n", "expected 1 numbers in row 2, got 'world'"),
         ("8.0;1\n5.3;1\n", "expected 1 numbers in row 2, got '5.3;1'"),
