@@ -77,7 +77,7 @@ def task(
         engine: the physics: "auto" is the one that suits the platform.
         pooling: how the summaries of several rollouts become one. With few simulations their "mean" serves as well as
             "all" of them, one after another in the order of the objects, which are so many times the numbers
-            (experiments/README.md); "moments" are mean and standard deviation, for rollouts under the same actions.
+            (experiments/studies/whip-rollouts.md); "moments" are mean and standard deviation, for rollouts under the same actions.
 
     Raises:
         ValueError: for unknown names, recordings that do not fit, and recordings that are given twice or have

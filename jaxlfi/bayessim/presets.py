@@ -44,7 +44,7 @@ QUICK = Settings(
 )
 """An ensemble of four small networks that start anew every round: seconds to minutes on two cores.
 
-Chosen by the ablation and the study of widths in experiments/README.md. Where an observation is unlike everything
+Chosen by two studies, experiments/studies/ablation.md and widths.md. Where an observation is unlike everything
 simulated, as it is on a wrong support, one network extrapolates confidently to one place, and the next round learns
 nothing there. Four disagree, and explore. Proposals twice as wide as the posterior keep its width from shrinking with
 every round, and training takes as many passes through the data in the first round as in the last. Where ten rounds do

@@ -8,8 +8,8 @@ bound is taken away, bound by bound, the one that helps most first. One that no 
 
 Where the local model explains the observation, it decides. Where it does not (the simulator is far from linear between
 the box and the truth), the bound is named that it would take away first and that has most mass beyond it; if these are
-two, all bounds are that either of them speaks against. Hits and false alarms of this rule and of the mass alone:
-experiments/README.md.
+two, all bounds are that either of them speaks against. Hits and false alarms of this rule and of the mass alone are in
+experiments/studies/wrong-bounds.md.
 """
 
 import dataclasses
