@@ -118,7 +118,7 @@ def robot_of(word: str, seed: int, remote: bool, sight: Any = None) -> tuple[Rob
 
     Args:
         word: "socket://HOST:PORT", the name of a reference object, or "module:Factory" with options after commas.
-        seed: of a reference object's camera.
+        seed: the seed of a reference object's camera.
         remote: whether other hosts than this one are let.
         sight: what finds keypoints in a reference object's frames; by default `observation.found`.
 

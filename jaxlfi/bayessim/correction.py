@@ -1,4 +1,4 @@
-"""From q_phi to the posterior: corrections for the proposals the simulations were drawn from, by name (reading A)."""
+"""Corrections for proposals that are not the prior, by name (docs/paper.md, reading A)."""
 
 import dataclasses
 from collections.abc import Callable
