@@ -73,7 +73,7 @@ def infer(
         task: simulator, names and bounds.
         observation: the real trajectory, in the shape the simulator produces, without missing numbers; or a list of
             several, independent trials of the same parameters, which are combined into one posterior
-            (`jaxlfi.repeated`). By default the task's own, or, where the truth is known, a fresh simulation at the truth.
+            (`jaxlfi.repeated`). By default the task's own, or, where the truth is known, a fresh simulation at it.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
             box they fill.
         heuristic: how the support is adapted, or its registered name ("edge"), with the hyperparameters that the task
