@@ -60,7 +60,7 @@ def equal_weights(
     round: Int[Array, ""] | int,
     defensive: Float[Array, ""] | float = 0.0,
 ) -> Array:
-    """Every simulation counts the same, but for those given with the density they were drawn from."""
+    """Every simulation counts the same, except those given with the density they were drawn from."""
     return jnp.where(dataset.valid, dataset.weight, 0.0)
 
 

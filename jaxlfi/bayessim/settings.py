@@ -61,7 +61,7 @@ class Settings(Checked):
 
     @property
     def accounts_for_prior(self) -> bool:
-        """Whether posteriors have a task's own prior in them without its being a factor of the proposals."""
+        """Whether posteriors account for a task's own prior even if the proposals do not contain it."""
         by_weights = CORRECTIONS[self.correction].accounts_for_prior
         return self.rounds == 1 or by_weights or self.estimator.accounts_for_prior
 

@@ -179,7 +179,7 @@ def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) 
     Args:
         rank: shape [N].
         draws: L.
-        tests: how many are made together, such as one a parameter: p-value and band are corrected for them, by
+        tests: how many are made together, such as one per parameter: p-value and band are corrected for them, by
             Bonferroni.
 
     Raises:

@@ -85,7 +85,7 @@ def check_intervals(truths: Truths, draws: Draws) -> list[Intervals]:
         draws: from the posterior of each observation, shape [N, L, D], L >= `FEWEST_DRAWS`.
 
     Returns:
-        One a parameter.
+        One per parameter.
 
     Raises:
         ValueError: for shapes that do not fit, too few truths or draws, numbers that are not finite, or draws that do

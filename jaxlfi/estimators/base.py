@@ -133,7 +133,7 @@ class Estimator(Checked, abc.ABC):
 
     @property
     def accounts_for_prior(self) -> bool:
-        """Whether posteriors have a task's own prior in them whatever was proposed."""
+        """Whether posteriors account for a task's own prior, whatever was proposed."""
         return self.of_summaries or self.loss != "likelihood"
 
     @abc.abstractmethod
@@ -208,7 +208,7 @@ class Estimator(Checked, abc.ABC):
         return 0 if self.embedding == "none" else self.record_size
 
     def inputs(self, dim: int, obs: int) -> int:
-        """How many numbers the network sees of a summary of length S, for D parameters."""
+        """The number of inputs of the network for a summary of length S and D parameters."""
         features = 0 if self.sees == "none" else features_size(dim, obs, self.record_size or 1)
         return features if self.replaces(obs) else obs + features
 
@@ -255,7 +255,7 @@ class Estimator(Checked, abc.ABC):
         log_prior: Float[Array, " n"],
         from_prior: Float[Array, " n"],
     ) -> Rows:
-        """What a round trains on (`Rows`), from parameters and summaries as the network sees them."""
+        """The rows that a round trains on (`Rows`), from parameters and summaries as the network sees them."""
         return Rows(value=theta, given=x, weights=weights, log_prior=log_prior, from_prior=from_prior)
 
     def condition(
@@ -292,7 +292,7 @@ class Estimator(Checked, abc.ABC):
 
 
 def viewed(given: Float[Array, "*n given"], view: Float[Array | np.ndarray, " given"] | None) -> Array:
-    """What one network sees of what is given, by its row of `Estimator.views`."""
+    """The part of the inputs that one network sees, by its row of `Estimator.views`."""
     return given if view is None else given * view
 
 
@@ -329,7 +329,7 @@ class Network:
     log_weights: Any = None
 
     def given(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n given"]:
-        """What the network sees of raw summaries."""
+        """The network's inputs for raw summaries."""
         if self.regression is None:
             return self.normaliser(x)
         return self._beside(x, self.regression(x))
