@@ -83,13 +83,13 @@ def recording_of(log: Log, about: Mapping[str, Any]) -> Recording:
 
 
 def arrays(log: Log) -> dict[str, np.ndarray]:
-    """What a log has besides a recording, by names of its own."""
+    """The arrays of a log that are not part of a recording, by names of their own."""
     kept = ("times", "observations", "asked", "actions", "targets", "held", "lateness")
     return {f"log/{name}": getattr(log, name) for name in kept}
 
 
 def summary(log: Log) -> str:
-    """What happened, in a line."""
+    """A line that says what happened."""
     hit = [name for name, flags in zip(COLOURS, log.observations[:, FLAGS:].T, strict=True) if (flags > 0.5).any()]
     over = "" if log.over is None else f", over after {log.over}"
     return (

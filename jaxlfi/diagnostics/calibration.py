@@ -225,7 +225,7 @@ def histogram(rank: Int[Array | np.ndarray, " n"], draws: int) -> Histogram:
 
 
 def ranks_verdict(result: Uniformity) -> str:
-    """What ranks of a parameter say of its posterior, in words.
+    """The verdict of a parameter's ranks, in words.
 
     Ranks that crowd at both ends are those of posteriors too narrow, in the middle of posteriors too wide; truths
     below their draws are those of posteriors too high.

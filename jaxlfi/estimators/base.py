@@ -41,7 +41,7 @@ SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jn
 
 
 class Estimator(Checked, abc.ABC):
-    """What all families of density estimators have in common: the ensemble and its training.
+    """Base of all families of density estimators: the ensemble and its training.
 
     A family is one subclass with the settings that it alone has and one method, `module`; the class is then a frozen
     dataclass and a pytree, without a decorator. Its Flax module maps a normalised summary to a conditional density: a

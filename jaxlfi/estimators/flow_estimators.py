@@ -12,7 +12,7 @@ from jaxlfi.fields import option
 
 
 class FlowEstimator(Estimator):
-    """What both kinds of flow have in common.
+    """Base of both kinds of flow.
 
     Attributes:
         hidden: units of each hidden layer of a conditioner, all the same.

@@ -33,7 +33,7 @@ BLOCK = 256
 
 
 class Likelihood(Estimator):
-    """What all likelihood networks have in common.
+    """Base of all likelihood networks.
 
     Their Flax module maps parameters to a density of the normalised summary; the ensemble's likelihood is the mean of
     its networks'. The posterior on a support is the likelihood of the observation times the prior, drawn from by

@@ -1,4 +1,4 @@
-"""What a heuristic is: (previous belief, posterior, Phi) -> (belief, what it saw and did)."""
+"""The interface of heuristics: (previous belief, posterior, Phi) -> (belief, what it saw and did)."""
 
 import abc
 from typing import ClassVar

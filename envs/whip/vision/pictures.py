@@ -133,7 +133,7 @@ def read(folder: Path) -> Pictures:
 
 
 def check(folder: Path) -> Mapping[str, Any]:
-    """What is said of a folder.
+    """The description of a folder.
 
     Raises:
         PicturesError: where it does not hold a whole data set.
