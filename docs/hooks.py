@@ -62,11 +62,9 @@ def site_name(path: Path) -> str | None:
         return path.relative_to(DOCS).as_posix()
     if path == EXPERIMENTS / "README.md":
         return "experiments.md"
-    if path.is_relative_to(EXPERIMENTS / "studies") or (
-        path.is_relative_to(EXPERIMENTS / "results") and path.suffix in PICTURES
-    ):
-        return path.relative_to(EXPERIMENTS).as_posix()
-    return None
+    study = path.parent == EXPERIMENTS / "studies"
+    picture = path.is_relative_to(EXPERIMENTS / "results") and path.suffix in PICTURES
+    return path.relative_to(EXPERIMENTS).as_posix() if study or picture else None
 
 
 def linked(markdown: str, source: Path) -> str:

@@ -64,6 +64,7 @@ def test_links_hold_in_the_site():
         ),
     ):
         assert made.linked(link, source) == expected
+    assert made.site_name(studies) is None and made.site_name(ROOT / "experiments/results/demo") is None
 
 
 def test_every_study_is_in_the_index():
