@@ -1,18 +1,23 @@
-"""What the documentation's pages are made from besides their text: pictures, fields' metadata, the command line.
+"""What the site is made from besides docs/: studies, fields' metadata, the command line's help, tutorials' outputs.
 
-A page asks for them by comments of a line: `<!-- fields: module:Class -->` becomes the table of the class's fields,
-`<!-- help: command -->` what `jaxlfi command --help` prints, and `<!-- examples -->` the list of examples.
+A page asks for some of it by a comment on a line of its own: `<!-- fields: module:Class -->` becomes the table of the
+class's fields, `<!-- help: command -->` what `jaxlfi command --help` prints, and `<!-- examples -->` the list of
+examples. Tutorials are run (`docs/tutorials.py`). Links are written as they hold in the repository, and are turned into
+the site's: the folder experiments/ lies in the site beside the pages of docs/.
 """
 
 import ast
 import importlib
 import os
+import posixpath
 import re
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-RESULTS = "experiments/results"
+DOCS, EXPERIMENTS = ROOT / "docs", ROOT / "experiments"
+PICTURES = (".png", ".gif")
+LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 SYMBOLS = {
     **{"delta": "δ", "tau": "τ", "eta": "η", "nu_TH": "ν_TH", "rho": "ρ"},
     **{"gamma": "γ", "lambda": "λ", "epsilon": "ε"},
@@ -27,18 +32,54 @@ def on_config(config):
 
 
 def on_files(files, config):
-    """Pictures of the results are part of the site, at the same place: `results/demo/samples.png`."""
+    """The studies' pages and pictures are part of the site."""
     from mkdocs.structure.files import File
 
-    for path in sorted((ROOT / RESULTS).rglob("*.png")):
-        name = f"results/{path.relative_to(ROOT / RESULTS).as_posix()}"
-        files.append(File.generated(config, name, abs_src_path=str(path)))
+    for path in sorted(EXPERIMENTS.rglob("*")):
+        if name := site_name(path):
+            files.append(File.generated(config, name, abs_src_path=str(path)))
     return files
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Replace every directive by what it stands for."""
-    return rendered(markdown)
+    """Run a tutorial, and replace directives and links by what they stand for."""
+    from mkdocs.structure.files import File
+
+    source = Path(page.file.abs_src_path)
+    if source.parent == DOCS / "tutorials":
+        sys.path.insert(0, str(DOCS))
+        import tutorials
+
+        markdown, pictures = tutorials.executed(markdown)
+        for name, content in pictures.items():
+            files.append(File.generated(config, f"tutorials/{name}", content=content))
+    return rendered(linked(markdown, source))
+
+
+def site_name(path: Path) -> str | None:
+    """Where a file of the repository lies in the site; None for one that is no part of it."""
+    if path.is_relative_to(DOCS):
+        return path.relative_to(DOCS).as_posix()
+    if path == EXPERIMENTS / "README.md":
+        return "experiments.md"
+    study = path.parent == EXPERIMENTS / "studies"
+    picture = path.is_relative_to(EXPERIMENTS / "results") and path.suffix in PICTURES
+    return path.relative_to(EXPERIMENTS).as_posix() if study or picture else None
+
+
+def linked(markdown: str, source: Path) -> str:
+    """A page's text with its links to files of the repository as they hold in the site, or as plain text."""
+
+    def replaced(found: re.Match) -> str:
+        mark, text, target, anchor = found[1], found[2], found[3], found[4] or ""
+        path = Path(os.path.normpath(source.parent / target))
+        if ":" in target or not path.exists():
+            return found[0]
+        if (name := site_name(path)) is None:
+            return text
+        return f"{mark}[{text}]({posixpath.relpath(name, posixpath.dirname(site_name(source)))}{anchor})"
+
+    return LINK.sub(replaced, markdown)
 
 
 def rendered(markdown: str) -> str:

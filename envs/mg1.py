@@ -220,10 +220,10 @@ def task(
 ) -> Task:
     """The M/G/1 queue of the paper: infer service bounds and arrival rate from inter-departure times.
 
-    Service times are U(min, max) of theta_1 and theta_2, each of which has a box of its own (reading K). Queues whose
-    first two parameters are swapped are therefore one and the same, and where a support holds both (1, 5) and (5, 1)
-    the posterior has two equal modes; the distance from the truth counts only one of them as right. Papamakarios and
-    Murray (2016) put their box on theta_2 - theta_1 instead, which has one mode.
+    Service times are U(min, max) of theta_1 and theta_2, each of which has a box of its own (docs/paper.md, reading K).
+    Queues whose first two parameters are swapped are therefore one and the same, and where a support holds both (1, 5)
+    and (5, 1) the posterior has two equal modes; the distance from the truth counts only one of them as right.
+    Papamakarios and Murray (2016) put their box on theta_2 - theta_1 instead, which has one mode.
 
     A trajectory is the inter-departure times of all jobs in ascending order. In order of departure they are nearly
     independent noise: record by record, a second simulation at the truth is further from an observed one than a series

@@ -155,7 +155,7 @@ def table(rows: Mapping[str, Mapping[str, np.ndarray]]) -> str:
     dim = max(arrays["theta_error_by_parameter"].shape[1] for arrays in rows.values())
     by_parameter = [f"theta_{d + 1}" for d in range(dim)]
     header = ["row", "what it is", "summed error", f"paired difference to {REFERENCE}", *by_parameter]
-    header += ["trajectory error", "success", "seconds a run"]
+    header += ["trajectory error", "success", "seconds per run"]
     lines = [header, ["---"] * len(header)]
     for name, arrays in rows.items():
         errors = arrays["theta_error"]

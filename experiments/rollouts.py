@@ -1,4 +1,4 @@
-"""The whip: several rollouts of one object, each under its own actions, believed together.
+"""The whip: several rollouts of one object, each under its own actions, combined into one posterior.
 
     python -m experiments.rollouts known --first-seed 0 --out experiments/results/rollouts
     python -m experiments.rollouts objects --first-seed 0 --out experiments/results/rollouts

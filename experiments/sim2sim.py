@@ -46,7 +46,7 @@ HEURISTICS = {
 SETTINGS = QUICK.replace(
     rounds=8, simulations_per_round=60, simulation_budget=75, estimator=QUICK.estimator.replace(batch_size=10)
 )
-"""`quick` with 480 simulations a run, where the paper has 1,500."""
+"""`quick` with 480 simulations per run, where the paper has 1,500."""
 DRAWS = 500
 RUNS_PER_CHUNK = 14
 

@@ -87,7 +87,7 @@ def candidates(clipped: Settings = CLIPPED) -> dict[str, Settings]:
 
 @dataclasses.dataclass(frozen=True)
 class Cases:
-    """Truths and their observations, one a row.
+    """Truths and their observations, one per row.
 
     Attributes:
         seeds: of the runs.

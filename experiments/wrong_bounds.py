@@ -241,7 +241,7 @@ def counts(found: Mapping[str, np.ndarray], named: np.ndarray) -> dict[str, tupl
 
 
 def table(out: Path) -> str:
-    """Markdown: a line a problem and rule, and sums."""
+    """Markdown: one line per problem and rule, and sums."""
     lines = ["| problem | held out | rule | wrong bounds named | right ones of wrong boxes | of right boxes |"]
     lines.append("|---|---|---|---|---|---|")
     rules = {

@@ -28,12 +28,12 @@ class ControlWarning(UserWarning):
 
 
 def sensor_names(names: Sequence[str]) -> list[str]:
-    """Of all sensors: their own, or their numbers."""
+    """Names of all sensors: their own, or their numbers."""
     return [name or f"sensor/{i}" for i, name in enumerate(names)]
 
 
 def control_names(actuators: Sequence[str], sensors: Sequence[str]) -> list[str]:
-    """Of all controls: the actuators' own, or that or their number after "actuator/" where it would be no clear name.
+    """Names of all controls: the actuators' own; after "actuator/", or a number, if that would not be clear.
 
     Args:
         actuators: names of the model's actuators, "" of those without.
@@ -71,7 +71,7 @@ def require_one_control_each(model: mujoco.MjModel) -> None:
 
 
 def signal_name(name: str, sensors: Sequence[str]) -> str:
-    """What is measured, without "sensor/" before it where that is not needed.
+    """The name of a measured signal, without "sensor/" before it unless that is needed.
 
     Args:
         name: of a column, or as a user gives it.
@@ -90,7 +90,7 @@ def signal_name(name: str, sensors: Sequence[str]) -> str:
 
 
 def by_signal(given: Mapping[str, Any] | None, sensors: Sequence[str], what: str) -> dict[str, Any]:
-    """What is given of signals, by their names (`signal_name`).
+    """Values given for signals, by the signals' names (`signal_name`).
 
     Raises:
         ValueError: for two of one signal.

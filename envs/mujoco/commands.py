@@ -131,7 +131,7 @@ def task_of(run: Run) -> Task:
 
 
 def said(task: Task, fits: Sequence[Fit]) -> list[str]:
-    """What the points say, in sentences, and what the file of the task may have of it."""
+    """The findings of the points in sentences, and the lines that the task's file can take from them."""
     best, lines = fits[0], []
     if len(_as_good(fits)) > 1:
         lines.append(f"{len(_as_good(fits))} points explain the recording as well: it does not tell which is right.")

@@ -119,7 +119,7 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def parameters_of(config: Mapping[str, Any]) -> list[Parameter]:
-    """What is inferred.
+    """The inferred parameters.
 
     Raises:
         ValueError: for parameters without bounds, or with other keys.

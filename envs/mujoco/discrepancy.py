@@ -1,4 +1,4 @@
-"""What a model gets wrong of a measured signal, as a random process that simulations are given besides noise.
+"""The error of a model in a measured signal, as a random process that is added to simulations besides noise.
 
 Inference believes its simulator: intervals are too narrow where the real machine has forces that the model does not
 have. A Gaussian process on each signal says how far the model may be wrong, and for how long
@@ -42,7 +42,7 @@ class Discrepancy:
             )
 
     def covariance(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time time"]:
-        """Of its values at some times."""
+        """Covariance of its values at some times."""
         return self.deviation**2 * np.exp(-np.abs(times[:, None] - times) / self.time)
 
     def form(self, times: Float[np.ndarray, " time"], rows: Float[np.ndarray, "time n"]) -> Float[np.ndarray, "n n"]:

@@ -1,4 +1,4 @@
-"""What parameters do: change the model, the state that episodes begin in, the sensors or the controls."""
+"""The effects of parameters: on the model, on the state that episodes begin in, on sensors or on controls."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ _SIZES = {int(mujoco.mjtJoint.mjJNT_FREE): (7, 6), int(mujoco.mjtJoint.mjJNT_BAL
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
-    """What each of D parameters does; its number is the second of each pair.
+    """The effect of each of D parameters; its number is the second of each pair.
 
     Attributes:
         edits: of the model.
@@ -42,7 +42,7 @@ def effects(
     supports: Sequence[tuple[float, float]],
     signals: Sequence[str],
 ) -> Effects:
-    """What parameters do, by their names.
+    """The effects of parameters, by their names.
 
     Args:
         spec: of the model.
@@ -102,7 +102,7 @@ def initial_state(model: mujoco.MjModel, initial: Mapping[str, float]) -> Float[
 
 
 def state_place(model: mujoco.MjModel, rest: str, name: str) -> int:
-    """Where JOINT/qpos, or JOINT/qvel[2], is in a state.
+    """The place of JOINT/qpos, or JOINT/qvel[2], in a state.
 
     Raises:
         ValueError: for joints that the model does not have, and several numbers.

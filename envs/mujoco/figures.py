@@ -56,7 +56,7 @@ class Traces:
 
     @property
     def drawn(self) -> int:
-        """How many signals are drawn."""
+        """The number of signals that are drawn."""
         return min(len(self.names), MOST)
 
 
@@ -93,7 +93,7 @@ class Strip:
 
 
 class Captions:
-    """What is written on pictures: which is which, and the time."""
+    """The legend on pictures, and the time."""
 
     def __init__(self, traces: Traces, size: int):
         """Letters of a size in pixels."""

@@ -30,7 +30,7 @@ SMALLEST, LARGEST = 160, 1280
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """What a film shows.
+    """The content of a film.
 
     Attributes:
         times: of its frames, in s, shape [F].

@@ -36,17 +36,17 @@ class UnmodelledForces:
 
     @property
     def deviations(self) -> Float[np.ndarray, " numbers"]:
-        """All of them."""
+        """All standard deviations in one vector."""
         return np.concatenate([self.stiffness, self.damping, self.friction])
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the numbers, for messages."""
+        """Names of the numbers, for messages."""
         of = {"stiffness": self.stiffness, "damping": self.damping, "friction": self.friction}
         return tuple(f"unmodelled {what}[{i}]" for what, several in of.items() for i in range(len(several)))
 
     def times(self, factor: float) -> "UnmodelledForces":
-        """All larger by a factor."""
+        """The same forces, all larger by a factor."""
         return UnmodelledForces(factor * self.stiffness, factor * self.damping, factor * self.friction)
 
     def draws(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n numbers"]:
@@ -91,7 +91,7 @@ def estimated(
     jacobian: Float[np.ndarray, "rows dim"],
     by_forces: Float[np.ndarray, "rows numbers"],
 ) -> tuple[float, float]:
-    """How large forces that a model lacks are, by what they leave in residuals that parameters cannot make up for.
+    """The size of the forces that a model lacks, from the residuals that parameters cannot make up for.
 
     By moments: with P the projection on what is orthogonal to the parameters' directions J, and F what forces of size 1
     change, |P r|^2 is a^2 tr(P F F^T) + tr(P) in the mean.

@@ -1,4 +1,4 @@
-"""What a policy is to do with a model: what it sees, where signals shall be, and what its controls cost.
+"""The goal of a policy: the signals it sees, their targets, and the cost of its controls.
 
 [policy]
 interval = 0.02                     # s between two controls
@@ -45,7 +45,7 @@ _JOINTS = {
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """What a policy is to do; see above.
+    """The goal of a policy; see above.
 
     Attributes:
         observed: signals that a policy sees.
@@ -100,7 +100,7 @@ class Goal:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """What is observed, and what has a target besides."""
+        """The observed signals, and further ones that have a target."""
         return (*self.observed, *(name for name in self.targets if name not in self.observed))
 
 
@@ -182,7 +182,7 @@ class Reading:
         self.actions = Signals(tuple(self._actuators), blank, tuple(centre.tolist()), tuple(scale.tolist()))
 
     def seen(self, values: Float[Array | np.ndarray, " signals"], xp: Any = jnp) -> Float[Array | np.ndarray, " obs"]:
-        """What a policy sees of signals."""
+        """A policy's observations of signals."""
         parts = []
         for place in range(len(self.goal.observed)):
             value, turning = values[place], self._owners[place][1]
@@ -205,7 +205,7 @@ class Reading:
         return -goal.interval * cost
 
     def off(self, values: Float[Array | np.ndarray, " signals"], xp: Any = jnp) -> dict[str, Any]:
-        """How far signals are from their targets, of angles the shorter way round."""
+        """Distances of signals from their targets; for angles, the shorter way round."""
         found = {}
         for name, (target, _) in self.goal.targets.items():
             place = self.goal.signals.index(name)

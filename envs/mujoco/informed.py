@@ -1,4 +1,4 @@
-"""Which parameters, and which combinations of them, a recording informs: by derivatives of what it measures.
+"""Finds the parameters, and combinations of them, that a recording informs, from derivatives of its signals.
 
 Along a direction in which nothing that was measured changes, or so little that the box of the parameters says more,
 an interval would be made up. Directions are compared in widths of the box, where all parameters have the same scale.

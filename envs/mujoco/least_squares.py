@@ -79,7 +79,7 @@ class Fit:
 
     @property
     def informed(self) -> Bool[np.ndarray, " dim"]:
-        """Which parameters the recording informs."""
+        """The parameters that the recording informs."""
         return np.isfinite(self.interval).all(axis=1)
 
 
@@ -138,7 +138,7 @@ class Residuals:
     def jacobian(
         self, point: Float[np.ndarray, " dim"], low: np.ndarray, high: np.ndarray
     ) -> Float[np.ndarray, "rows dim"]:
-        """By central differences within the box; by one side's where the other fails, and 0 where both do."""
+        """Derivatives by central differences within the box; one-sided if one side fails, and 0 if both do."""
         steps = STEP * (high - low) * np.eye(len(point))
         sides = np.clip(np.concatenate([point + steps, point - steps]), low, high)
         values = self(sides)
@@ -152,7 +152,7 @@ class Residuals:
     def of_forces(
         self, point: Float[np.ndarray, " dim"], besides: UnmodelledForces
     ) -> Float[np.ndarray, "rows numbers"]:
-        """What each of some forces besides the model's own changes at a point, by differences; 0 where one fails."""
+        """The effect of each additional force at a point, by differences; 0 where one fails."""
         steps = FORCE_STEP * np.diag(besides.deviations)
         steps = np.concatenate([np.zeros((1, len(steps))), steps])
         self.simulations += len(steps)

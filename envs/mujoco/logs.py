@@ -1,4 +1,4 @@
-"""What was recorded: controls and sensors over time, by name, in SI units and radians.
+"""Recordings: controls and sensors over time, by name, in SI units and radians.
 
 | file | times | signals |
 |---|---|---|

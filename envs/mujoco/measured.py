@@ -1,4 +1,4 @@
-"""What is measured of a model: its sensors, and positions of joints and bodies that have none."""
+"""Measured signals of a model: its sensors, and positions of joints and bodies that have none."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What parameters do inside of compiled programs, besides the model: to the start, the sensors and the controls."""
+"""The effects of parameters inside compiled programs: on the start, the sensors and the controls."""
 
 import jax.numpy as jnp
 import numpy as np

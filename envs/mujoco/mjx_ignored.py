@@ -127,7 +127,7 @@ def warn_of_saturation(model: mujoco.MjModel) -> None:
 
 
 def option_names() -> list[str]:
-    """All options of the installed MuJoCo."""
+    """All options that the installed MuJoCo has."""
     option = mujoco.MjOption()
     return [name for name in dir(option) if not name.startswith("_") and not callable(getattr(option, name))]
 

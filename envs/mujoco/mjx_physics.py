@@ -22,7 +22,7 @@ INTEGRATORS = {
 
 @struct.dataclass
 class State:
-    """What a step goes on from; all else that MJX holds is derived from it.
+    """The state that a step continues from; everything else that MJX holds is derived from it.
 
     Attributes:
         time: in s.
@@ -108,7 +108,7 @@ class Physics:
 
 
 def state_of(data: mjx.Data) -> State:
-    """What the next step goes on from."""
+    """The state that the next step continues from."""
     return State(data.time, data.qpos, data.qvel, data.act, data.qacc_warmstart)
 
 

@@ -1,4 +1,4 @@
-"""How noisy a recorded signal is, by the signal itself."""
+"""Estimates the noise of a recorded signal from the signal itself."""
 
 import numpy as np
 

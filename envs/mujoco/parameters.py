@@ -1,4 +1,4 @@
-"""What is doubted: numbers of a model by element and attribute, as they are called in MJCF.
+"""Uncertain parameters: numbers of a model by element and attribute, as they are called in MJCF.
 
 | name | what |
 |---|---|
@@ -77,7 +77,7 @@ class Edit:
 
 
 def edit(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Edit:
-    """What gives an attribute of an element a value.
+    """The function that sets an attribute of an element.
 
     Args:
         spec: of the model.
@@ -206,13 +206,13 @@ def check_effect(spec: mujoco.MjSpec, one: Edit, support: tuple[float, float]) -
 
 
 def saved(model: mujoco.MjModel) -> bytes:
-    """All of a compiled model."""
+    """A compiled model as bytes."""
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()
 
 
 def near(got: str, known: Sequence[str]) -> str:
-    """Of names that are known, those most like the one that was given."""
+    """The known names that are most like the given one."""
     near = difflib.get_close_matches(got, known, 4, 0.4) or sorted(known)[:8]
     return f"such as {', '.join(near)}" if near else "(there are none with a name)"

@@ -1,4 +1,4 @@
-"""What of a recording cannot be right, which is refused, and what looks wrong, which is said in one line."""
+"""Refuses what cannot be right in a recording, and reports what looks wrong in one line."""
 
 import warnings
 from collections.abc import Mapping, Sequence

@@ -17,7 +17,7 @@ _OF_BODIES = {mujoco.mjtSensor.mjSENS_FRAMEPOS: 0, mujoco.mjtSensor.mjSENS_FRAME
 
 
 def measured_positions(model: mujoco.MjModel, signals: Sequence[str]) -> dict[int, int]:
-    """Which places of `qpos` are measured, and by which signal.
+    """The places of `qpos` that are measured, and the signals that measure them.
 
     Those of hinges, slides and balls by sensors of the joint, those of a free joint by sensors of its body's frame.
 

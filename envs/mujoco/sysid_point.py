@@ -18,7 +18,7 @@ _MARGIN = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class SysidPoint:
-    """What `mujoco.sysid` finds; the attributes are those of `least_squares.Fit`, as far as it has them.
+    """The result of `mujoco.sysid`; the attributes are those of `least_squares.Fit`, as far as it has them.
 
     Its intervals take the model to be right, and are NaN where the recording does not inform a parameter.
     """
@@ -80,7 +80,7 @@ def solved(
 
 
 def half_widths(left: Float[np.ndarray, " rows"], jacobian: Float[np.ndarray, "rows dim"]) -> Float[np.ndarray, " dim"]:
-    """Of its intervals at a point, by the residuals that are left there."""
+    """Half-widths of its intervals at a point, from the residuals that are left there."""
     from mujoco.sysid import calculate_intervals
 
     with np.errstate(all="ignore"):

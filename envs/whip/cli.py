@@ -92,7 +92,9 @@ def parser() -> argparse.ArgumentParser:
         "--object", nargs="+", required=True, metavar="NAME", help="what to act on: dlo-0, dlo-1, dlo-2, dlo-3"
     )
     options.add_detector(deploy)
-    deploy.add_argument("--repetitions", type=int, default=16, metavar="N", help="places (default: 16)")
+    deploy.add_argument(
+        "--repetitions", type=int, default=16, metavar="N", help="number of places of stack and camera (default: 16)"
+    )
     deploy.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="seed of places and noise (default: 0)")
     deploy.add_argument("--out", type=flags.output, required=True, metavar="DIR", help="a new folder")
 
@@ -102,7 +104,7 @@ def parser() -> argparse.ArgumentParser:
         description="Let a policy control a robot for an episode of 16 steps, within limits, and stop it whatever "
         "happens. Writes what was seen and done as a recording that `jaxlfi infer whip --object` accepts.",
     )
-    control.add_argument("policy", metavar="POLICY", help="as of deploy")
+    control.add_argument("policy", metavar="POLICY", help="a policy.npz (jaxlfi train), a plan, or constant:DX,DZ in m")
     control.add_argument(
         "--robot",
         required=True,
@@ -110,7 +112,7 @@ def parser() -> argparse.ArgumentParser:
         help="socket://HOST:PORT of a driver; dlo-0 to dlo-3, the FEM reference objects; or module:Factory of your "
         "own, whose options follow after commas: module:Factory,key=value",
     )
-    control.add_argument("--rate", type=float, metavar="HZ", help="of commands (default: as the policy was trained)")
+    control.add_argument("--rate", type=float, metavar="HZ", help="rate of commands (default: that of the training)")
     control.add_argument(
         "--holds",
         type=int,
@@ -119,9 +121,13 @@ def parser() -> argparse.ArgumentParser:
         help="control periods in a row without a usable observation in which the set-point is held, before the robot "
         "is stopped (default: 3)",
     )
-    control.add_argument("--max-age", type=float, metavar="S", help="of an observation (default: a control period)")
-    control.add_argument("--max-step", type=float, metavar="M", help="of a command, along x and along z")
-    control.add_argument("--max-speed", type=float, metavar="M/S", help="of the set-point")
+    control.add_argument(
+        "--max-age", type=float, metavar="S", help="largest age of an observation (default: a control period)"
+    )
+    control.add_argument(
+        "--max-step", type=float, metavar="M", help="largest displacement per command, along x and along z"
+    )
+    control.add_argument("--max-speed", type=float, metavar="M/S", help="largest speed of the set-point")
     control.add_argument(
         "--workspace",
         type=float,
@@ -130,9 +136,9 @@ def parser() -> argparse.ArgumentParser:
         help="limits of the set-point's x and z, in m. Limits can be tightened, not loosened (default: the policy's)",
     )
     options.add_detector(control)
-    control.add_argument("--remote", action="store_true", help="let the driver be on another host")
+    control.add_argument("--remote", action="store_true", help="allow a driver on another host")
     control.add_argument(
-        "--seed", type=flags.seed, default=0, metavar="N", help="of a reference object's camera (default: 0)"
+        "--seed", type=flags.seed, default=0, metavar="N", help="seed of a reference object's camera (default: 0)"
     )
     control.add_argument(
         "--out",
@@ -146,7 +152,7 @@ def parser() -> argparse.ArgumentParser:
 
     convert = commands.add_parser(
         "convert",
-        help="recordings in the formats of LeRobot and MCAP",
+        help="convert recordings between formats",
         description="Convert recorded rollouts: NAME.npz with NAME.json, NAME.mcap, or the folder of a LeRobot data "
         "set (extra robotics). Arrays of other names than a recording's are left behind.",
     )

@@ -83,13 +83,13 @@ def recording_of(log: Log, about: Mapping[str, Any]) -> Recording:
 
 
 def arrays(log: Log) -> dict[str, np.ndarray]:
-    """What a log has besides a recording, by names of its own."""
+    """The arrays of a log that are not part of a recording, by names of their own."""
     kept = ("times", "observations", "asked", "actions", "targets", "held", "lateness")
     return {f"log/{name}": getattr(log, name) for name in kept}
 
 
 def summary(log: Log) -> str:
-    """What happened, in a line."""
+    """A line that says what happened."""
     hit = [name for name, flags in zip(COLOURS, log.observations[:, FLAGS:].T, strict=True) if (flags > 0.5).any()]
     over = "" if log.over is None else f", over after {log.over}"
     return (
@@ -118,7 +118,7 @@ def robot_of(word: str, seed: int, remote: bool, sight: Any = None) -> tuple[Rob
 
     Args:
         word: "socket://HOST:PORT", the name of a reference object, or "module:Factory" with options after commas.
-        seed: of a reference object's camera.
+        seed: the seed of a reference object's camera.
         remote: whether other hosts than this one are let.
         sight: what finds keypoints in a reference object's frames; by default `observation.found`.
 

@@ -41,7 +41,7 @@ class Episode:
 
 @struct.dataclass
 class Step:
-    """What a step returns to a learner.
+    """The values that a step returns to a learner.
 
     Attributes:
         observation: the gripper's x and z in m, four DLO and six cube keypoints in normalised pixels, six flags of

@@ -60,7 +60,7 @@ class Film:
 
 
 def draw_sheet(figure: Figure, film: Film, title: str) -> None:
-    """All frames in rows, and a legend of the markers.
+    """Draw all frames in rows, with a legend of the markers.
 
     Args:
         figure: empty, of a page's width and the height `sheet_height`.

@@ -12,7 +12,7 @@ CUBES = 4
 
 
 class Observer:
-    """What is remembered in an episode: where each keypoint was seen last, and which cubes have been hit.
+    """Memory of an episode: where each keypoint was seen last, and which cubes have been hit.
 
     Attributes:
         keypoints: where each was seen last, in normalised pixels, shape [10, 2].

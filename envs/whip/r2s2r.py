@@ -8,7 +8,7 @@ iteration_2/ ...           likewise, with the new policy's rollout besides
 deployed/                  all these policies on the object, at displaced places (jaxlfi whip deploy)
 page.html film.gif sheet.png
 
-Every stage is a command of its own in a folder of its own. The same command again goes on where it was stopped. This
+Every stage is a command of its own in a folder of its own. Repeating the command continues an interrupted run. This
 module imports neither jax nor numpy before it has to, so that `--help` answers at once.
 """
 
@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
         prog="jaxlfi r2s2r",
         description="From a reference object to a policy for it: a first policy on the uniform distribution, its "
         "rollout on the object, inference of the object's parameters, a policy on that posterior, and both on the "
-        "object. The same command again goes on where it was stopped.",
+        "object. Repeating the command continues an interrupted run.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -68,8 +68,8 @@ def task(
         object: the observed object: an FEM reference object by name ("dlo-0" to "dlo-3"), or the path of a recorded
             rollout (`formats`): .npz, which `jaxlfi whip render` writes, too, .mcap, or the folder of a LeRobot data
             set, FOLDER#episode=3 where it has several. Simulations apply its actions and are seen through its camera.
-            Several recorded rollouts of one object, a name or path each, are believed together (`whip_task`). By
-            default, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory actions.
+            Several recorded rollouts of one object, a name or path each, are combined into one posterior (`whip_task`).
+            By default, a simulated DLO of 230 mm and 8 kPa is observed under the exploratory actions.
         detector: the errors of simulated keypoints (`vision.keypoints.DETECTORS`). They should resemble those of the
             detector that the observation was made with: for the reference objects' recordings that come with the
             package "mask", and for those of `jaxlfi whip record` the detector's own name, or "mask" for "centreline".
@@ -77,7 +77,8 @@ def task(
         engine: the physics: "auto" is the one that suits the platform.
         pooling: how the summaries of several rollouts become one. With few simulations their "mean" serves as well as
             "all" of them, one after another in the order of the objects, which are so many times the numbers
-            (experiments/README.md); "moments" are mean and standard deviation, for rollouts under the same actions.
+            (experiments/studies/whip-rollouts.md); "moments" are mean and standard deviation, for rollouts under the
+            same actions.
 
     Raises:
         ValueError: for unknown names, recordings that do not fit, and recordings that are given twice or have

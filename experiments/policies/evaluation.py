@@ -84,7 +84,7 @@ def stills(study: Study) -> None:
 
 
 def fingerprints(study: Study, policy: str) -> np.ndarray:
-    """What tells the files of a policy, one a seed, from those of another training."""
+    """What tells the files of a policy, one per seed, from those of another training."""
     return np.array([hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in _files(study, policy)])
 
 

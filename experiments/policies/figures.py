@@ -47,7 +47,7 @@ def draw_curves(figure: Figure, results: Results) -> None:
 def draw_trajectories(figure: Figure, results: Results, title: str) -> None:
     """Counterpart of the paper's `fig:def-adapt-supp-eef-trajs-plots`, for one set of six policies.
 
-    A row a DLO, a column a policy: accumulated (dx, dz) of the repetitions at the nominal place, and a soft-DTW
+    A row a DLO, one column per policy: accumulated (dx, dz) of the repetitions at the nominal place, and a soft-DTW
     barycentre for each training seed, marked every three steps. Then the returns at displaced places, and measures.
     """
     names = agents(SETS[title])
@@ -104,7 +104,7 @@ def _draw_histogram(axes, found: Mapping[str, Mapping[str, np.ndarray] | None], 
 
 
 def draw_stills(figure: Figure, strips: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Counterpart of the paper's timelapses: a row a policy and object, a column a control step."""
+    """Counterpart of the paper's timelapses: one row per policy and object, a column a control step."""
     grid = figure.subplots(len(strips), len(STILLS), squeeze=False)
     for row, (name, strip) in zip(grid, strips.items(), strict=True):
         policy, dlo = name.split("@")

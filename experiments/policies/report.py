@@ -1,4 +1,4 @@
-"""The report of a study: tables as csv and Markdown, figures, and the text of experiments/README.md about it."""
+"""The report of a study: tables as csv and Markdown, figures, and the text about it on the study's page."""
 
 import csv
 import io
@@ -65,7 +65,7 @@ def _write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def text(found: Results) -> str:
-    """What experiments/README.md says of the study, with the numbers of what is there."""
+    """What the study's page says of the results, with the numbers of what is there."""
     measures = MEASURES.format(*tables.extremes(found, found.displaced))
     parts = [
         _counts(found),

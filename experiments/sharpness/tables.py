@@ -18,7 +18,7 @@ HEADINGS = (
 
 
 def table(out: Path, problems: Sequence[str], methods: Sequence[str] = METHODS) -> str:
-    """Markdown: a line a problem, box, heuristic, method and budget.
+    """Markdown: one line per problem, box, heuristic, method and budget.
 
     Coverage is of truths drawn near the problem's own; all else of all runs.
     """

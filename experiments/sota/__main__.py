@@ -5,7 +5,7 @@
 Each case (setting, method, budget, seed) is one row of OUT/results.csv, written as soon as it is finished; a case that
 is there is not run again, so that the same command continues a run that was stopped. OUT/tables.md is drawn from the
 rows, OUT/config.json has settings and versions. Methods of others need the `bench` extra. What is compared, and how
-fairly, is in experiments/README.md.
+fairly, is in experiments/studies/sota.md.
 """
 
 import argparse

@@ -58,7 +58,7 @@ class State:
 
 @struct.dataclass
 class Round:
-    """What one round did; `run` stacks these.
+    """The outcome of one round; `run` stacks these.
 
     Attributes:
         simulations: what was simulated.
@@ -87,7 +87,7 @@ def init(
     observed: Float[Array, " obs"],
     first: int | None = None,
 ) -> State:
-    """The state before the first round: no data, and nothing believed but the support.
+    """The state before the first round: no data, and a uniform belief on the support.
 
     Args:
         key: consumed.
@@ -123,7 +123,7 @@ def init(
 
 
 def proposal(settings: Settings, belief: Belief) -> Belief:
-    """What a round draws from: the belief, `settings.inflation` times as wide."""
+    """The distribution that a round draws from: the belief, made `settings.inflation` times as wide."""
     return belief.replace(mixture=belief.mixture.inflated(settings.inflation))
 
 
@@ -155,7 +155,7 @@ def update(
     round: Int[Array, ""] | int,
     simulations: Simulations,
 ) -> tuple[State, Round]:
-    """All of a round that comes after its simulations (lines 9-17)."""
+    """The part of a round that follows its simulations (lines 9-17)."""
     dataset = datasets.augment(state.dataset, simulations, round)
     proposed = proposal(settings, state.belief)
     proposals = jax.tree.map(lambda all_, now: all_.at[round].set(now), state.proposals, proposed)

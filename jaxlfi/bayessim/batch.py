@@ -59,7 +59,7 @@ class RunSpec:
 
 @struct.dataclass
 class RunInputs:
-    """What a run brings to the compiled program; stacked along a leading axis for a batch.
+    """The inputs of a run to the compiled program, stacked along a leading axis for a batch.
 
     Attributes:
         key: the run's key.
@@ -113,7 +113,7 @@ def stack_inputs(specs: Sequence[RunSpec], observed: np.ndarray, x: np.ndarray) 
 
 
 def posterior_after(belief: Belief, network: Network, x: Float[Array, " obs"]) -> Posterior:
-    """The posterior a run believes after a round, truncated to the support it adapted.
+    """The posterior of a run after a round, truncated to the adapted support.
 
     Where the density is a mixture of Gaussians it is the belief's own, after correction and heuristic.
     """
@@ -143,7 +143,7 @@ def propose_one(
 def update_one(
     task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, simulations: Simulations
 ) -> tuple[State, Round]:
-    """All of a round that comes after its simulations."""
+    """The part of a round that follows its simulations."""
     keys = round_keys(run_keys(run.key).run, index)
     return algorithm.update(keys.update, task, settings, run.heuristic, run.x, state, index, simulations)
 
@@ -175,7 +175,7 @@ def round_one(
 def given_one(
     task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, simulations: Simulations
 ) -> tuple[State, dict[str, Array]]:
-    """One round of one run on simulations that were given, and its record."""
+    """One round of one run on given simulations, and its record."""
     state, info = update_one(task, settings, run, state, index, simulations)
     return state, record(info, state.progress, check_one(task, settings, run, state))
 
@@ -212,7 +212,7 @@ class BatchEngine:
             task: the task.
             settings: the same for all runs.
             inputs: stacked.
-            devices: defaults to all local devices, at most one a run.
+            devices: defaults to all local devices, at most one per run.
             first: simulations that take the place of the first round's, the same for all runs.
         """
         self.task, self.settings, self.runs = task, settings, inputs.x.shape[0]
@@ -224,7 +224,7 @@ class BatchEngine:
 
     @property
     def known_failures(self) -> str:
-        """What is known of failures, for the end of an error's line: nothing, of simulations that are compiled."""
+        """The known reasons of failures, to end an error's line with; compiled simulations have none."""
         return ""
 
     def start(self) -> State:

@@ -1,4 +1,4 @@
-"""Convergence: whether a run's posterior still changes from round to round, and the end of runs whose does not."""
+"""Convergence: whether a run's posterior still changes from round to round; runs whose posterior does not can end."""
 
 import jax.numpy as jnp
 from flax import struct
@@ -22,7 +22,7 @@ SAME_CORRELATION = 0.5
 
 @struct.dataclass
 class Progress:
-    """How far a run has come. Its posteriors are compared with those `LAG` rounds before, by their moments.
+    """The progress of a run: the moments of its posterior, compared with those of `LAG` rounds before.
 
     Attributes:
         rounds: it has made, shape [].

@@ -1,4 +1,4 @@
-"""From q_phi to the posterior: corrections for the proposals the simulations were drawn from, by name (reading A)."""
+"""Corrections for proposals that are not the prior, by name (docs/paper.md, reading A)."""
 
 import dataclasses
 from collections.abc import Callable
@@ -60,7 +60,7 @@ def equal_weights(
     round: Int[Array, ""] | int,
     defensive: Float[Array, ""] | float = 0.0,
 ) -> Array:
-    """Every simulation counts the same, but for those given with the density they were drawn from."""
+    """Every simulation counts the same, except those given with the density they were drawn from."""
     return jnp.where(dataset.valid, dataset.weight, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""The one way through the rounds of a batch."""
+"""Drives a batch through its rounds."""
 
 import time
 from collections.abc import Callable
@@ -57,7 +57,7 @@ def drive(
 
 
 def require_success(succeeded: np.ndarray, failed: np.ndarray, task: Task, known: str = "") -> None:
-    """Refuse to go on where no simulation of the first round succeeded, in any run.
+    """Stop if no simulation of the first round succeeded in any run.
 
     Args:
         succeeded: number of successes of each run.

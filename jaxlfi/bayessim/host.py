@@ -1,4 +1,4 @@
-"""Rounds around a host simulator: inference is compiled, simulations are made between its parts.
+"""Rounds around a host simulator: inference is compiled, and simulations run between its parts.
 
 What comes before the simulations of a round (drawing parameters) and after (fitting, adapting) is compiled; the
 simulator is called between (`jaxlfi.tasks.simulation.simulate_in_waves`).

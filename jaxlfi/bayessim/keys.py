@@ -27,17 +27,17 @@ class RunKeys:
     check: jax.Array
 
     def of_check(self, index: Int[Array, ""] | int) -> jax.Array:
-        """Of one round's comparison; the last posterior's saved draws come after those of all rounds."""
+        """The key of one round's comparison; the last posterior's saved draws come after those of all rounds."""
         return jax.random.fold_in(self.check, index)
 
     def of_predictive(self, index: Int[Array, ""] | int) -> tuple[jax.Array, jax.Array]:
-        """Of one round's posterior draws, and of their simulations."""
+        """The keys of one round's posterior draws and of their simulations."""
         draw, simulate = jax.random.split(self.of_check(index))
         return draw, simulate
 
 
 class RoundKeys(NamedTuple):
-    """Of one round: proposals, their simulations, and all that comes after."""
+    """Keys of one round: for proposals, for their simulations, and for all that follows."""
 
     propose: jax.Array
     simulate: jax.Array
@@ -50,12 +50,12 @@ def run_keys(key: jax.Array) -> RunKeys:
 
 
 def init_key(run: jax.Array) -> jax.Array:
-    """By which a run's first network is made."""
+    """The key of a run's first network."""
     return jax.random.split(jax.random.clone(run))[0]
 
 
 def round_keys(run: jax.Array, index: Int[Array, ""] | int) -> RoundKeys:
-    """Of one round of a run."""
+    """The keys of one round of a run."""
     return RoundKeys(*jax.random.split(jax.random.fold_in(jax.random.split(jax.random.clone(run))[1], index), 3))
 
 

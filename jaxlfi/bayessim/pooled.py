@@ -1,4 +1,4 @@
-"""Pooled proposals: what a run's simulations were drawn from as a whole, and the posterior without it.
+"""Pooled proposals: the distribution of all of a run's simulations, and the posterior divided by it.
 
 A network trained by the likelihood on the simulations of all rounds learns prior * p_pool * likelihood, where p_pool is
 the mixture of the rounds' proposals, relative to the prior. Divided out in the loop, the errors of one round steer the

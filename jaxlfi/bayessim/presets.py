@@ -44,7 +44,7 @@ QUICK = Settings(
 )
 """An ensemble of four small networks that start anew every round: seconds to minutes on two cores.
 
-Chosen by the ablation and the study of widths in experiments/README.md. Where an observation is unlike everything
+Chosen by two studies, experiments/studies/ablation.md and widths.md. Where an observation is unlike everything
 simulated, as it is on a wrong support, one network extrapolates confidently to one place, and the next round learns
 nothing there. Four disagree, and explore. Proposals twice as wide as the posterior keep its width from shrinking with
 every round, and training takes as many passes through the data in the first round as in the last. Where ten rounds do
@@ -81,7 +81,7 @@ lost.
 
 
 def all_rounds(settings: Settings) -> Settings:
-    """Every run makes as many rounds as the shortest would: equal budgets, whether posteriors have settled or not."""
+    """Settings by which every run makes the same number of rounds, whether its posterior has settled or not."""
     return settings.replace(rounds=min(settings.min_rounds or settings.rounds, settings.rounds), min_rounds=0)
 
 
@@ -150,7 +150,7 @@ METHODS: dict[str, Callable[[Settings], Settings]] = {
 
 
 def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") -> Settings:
-    """A method at a preset, with the numbers that the task asks for in place of the preset's, as `jaxlfi infer` begins.
+    """The settings that `jaxlfi infer` begins with: a method's at a preset, changed as the task asks.
 
     Args:
         task: whose `settings` name fields of `Settings`, or of the estimators of the methods; those of estimators that
@@ -174,7 +174,7 @@ def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") ->
 
 
 def with_fields(settings: Settings, given: Mapping[str, Any]) -> Settings:
-    """Settings with those numbers replaced that are named, be they of the run or of its estimator.
+    """Settings with the named numbers replaced, be they the run's or its estimator's.
 
     Args:
         settings: to begin with.

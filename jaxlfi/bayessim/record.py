@@ -61,7 +61,7 @@ def record(info: Round, progress: Progress, seen: Discrepancy) -> dict[str, jax.
 
 
 def apart(row: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A record in two: what is kept of every round, and what is kept of the last one only."""
+    """Split a record into what is kept of every round and what is kept of the last one only."""
     final = {name: value for name, value in row.items() if name.startswith(FINAL)}
     return {name: value for name, value in row.items() if name not in final}, final
 

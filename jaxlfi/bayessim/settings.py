@@ -23,8 +23,8 @@ class Settings(Checked):
         simulations_per_round: valid simulations added to the dataset each round, at most.
         simulation_budget: simulations attempted each round, at most, failures included.
         correction: how q_phi becomes the posterior, "none", "paper", "quotient", "pooled" or "importance"
-            (reading A).
-        restriction: how proposals are kept in the support, "clip", "reject" or "mixed" (reading E).
+            (docs/paper.md, reading A).
+        restriction: how proposals are kept in the support, "clip", "reject" or "mixed" (docs/paper.md, reading E).
         defensive: fraction of each round's proposals drawn from the prior over the current support instead of the
             posterior. 0 is the paper. A leaf.
         inflation: how many times as wide as the posterior the proposals are drawn, about its mean; 1 is the paper.
@@ -35,27 +35,33 @@ class Settings(Checked):
     """
 
     estimator: Estimator = dataclasses.field(default=MixtureNetwork())
-    rounds: int = option(10, low=1, high=100_000, help="inference rounds, N_LFI, at most")
+    rounds: int = option(10, low=1, high=100_000, help="largest number of inference rounds, N_LFI")
     min_rounds: int = option(
-        0, low=0, high=100_000, help="rounds after which a run ends once its posterior has settled; 0: it makes all"
+        0, low=0, high=100_000, help="rounds after which a run may end, once its posterior has settled; 0: it makes all"
     )
-    simulations_per_round: int = option(100, low=1, high=100_000_000, help="simulations added each round, at most")
+    simulations_per_round: int = option(
+        100, low=1, high=100_000_000, help="largest number of valid simulations added per round"
+    )
     simulation_budget: int = option(
-        125, low=1, high=100_000_000, help="simulations attempted each round, at most, failures included"
+        125, low=1, high=100_000_000, help="largest number of simulations attempted per round, failures included"
     )
-    correction: str = option("none", choices=tuple(CORRECTIONS), help="from the network to the posterior")
+    correction: str = option(
+        "none", choices=tuple(CORRECTIONS), help="how to correct for proposals that are not the prior"
+    )
     restriction: str = option("clip", choices=tuple(RESTRICTIONS), help="how proposals are kept in the support")
     defensive: Float[Array, "*batch"] | float = hyperparameter(
         0.0, low=0.0, high=1.0, help="fraction of proposals drawn from the prior over the support"
     )
     inflation: Float[Array, "*batch"] | float = hyperparameter(
-        1.0, low=1.0, high=100.0, help="how many times as wide as the posterior proposals are drawn"
+        1.0, low=1.0, high=100.0, help="width of the proposals, in widths of the posterior"
     )
-    predictive: bool = option(True, help="simulate 20 draws of each round's posterior, to compare with the observation")
+    predictive: bool = option(
+        True, help="simulate 20 draws of each round's posterior and compare them with the observation"
+    )
 
     @property
     def accounts_for_prior(self) -> bool:
-        """Whether posteriors have a task's own prior in them without its being a factor of the proposals."""
+        """Whether posteriors account for a task's own prior even if the proposals do not contain it."""
         by_weights = CORRECTIONS[self.correction].accounts_for_prior
         return self.rounds == 1 or by_weights or self.estimator.accounts_for_prior
 

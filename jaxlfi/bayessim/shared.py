@@ -1,4 +1,4 @@
-"""A batch whose runs are shared out among several processes, each with the devices of its own host."""
+"""A batch whose runs are divided among several processes, each with the devices of its own host."""
 
 from typing import Any
 

@@ -9,14 +9,14 @@ names and symbols:
 
 MAIN_EXAMPLES = """\
 examples:
-  jaxlfi tasks                                   what there is to infer
+  jaxlfi tasks                                   list the built-in tasks
   jaxlfi infer lotka_volterra --support misspecified --heuristic edge --out runs/edge
   jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
   jaxlfi grid lotka_volterra --vary expansion=0.1,0.2,0.4 --out runs/grid
-  jaxlfi resume runs/comparison                  go on after a crash, to the same result bit for bit
+  jaxlfi resume runs/comparison                  continue an interrupted run; the result is bit-for-bit the same
   jaxlfi sample runs/edge -n 1000                draws from the posterior, in natural units
-  jaxlfi diagnose runs/edge                      whether the posterior can be believed
-  jaxlfi report runs/comparison                  draw the pictures again
+  jaxlfi diagnose runs/edge                      are the credible intervals calibrated?
+  jaxlfi report runs/comparison                  draw the figures again
 
 Bad input ends with one line on stderr and exit status 2; nothing is ever overwritten.
 """

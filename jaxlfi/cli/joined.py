@@ -26,14 +26,14 @@ KEPT = 2**16
 
 def add_flags(command: argparse.ArgumentParser) -> None:
     """The flags of a command that can work in several processes."""
-    hosts = command.add_argument_group("several hosts: the same command on each, the first process writes")
+    hosts = command.add_argument_group("multi-host: run the same command on every host; process 0 writes")
     hosts.add_argument(
         "--coordinator",
         metavar="HOST:PORT",
-        help="where process 0 listens; or auto: Slurm, Open MPI or Kubernetes says where, and which this one is",
+        help="address that process 0 listens on; auto: ask Slurm, Open MPI or Kubernetes for it and for the process id",
     )
-    hosts.add_argument("--process-id", type=int, metavar="I", help="which process this is, from 0")
-    hosts.add_argument("--processes", type=int, metavar="N", help="how many there are")
+    hosts.add_argument("--process-id", type=int, metavar="I", help="index of this process, from 0")
+    hosts.add_argument("--processes", type=int, metavar="N", help="number of processes")
 
 
 def asked(words: Sequence[str]) -> bool:

@@ -154,9 +154,9 @@ def _add_infer(commands: Subparsers, families: Families) -> None:
         nargs="+",
         type=float,
         metavar="X",
-        help="your own support's lower bounds, one a parameter, in natural units",
+        help="lower bounds of a support of your own, one per parameter, in natural units",
     )
-    command.add_argument("--support-high", nargs="+", type=float, metavar="X", help="its upper bounds")
+    command.add_argument("--support-high", nargs="+", type=float, metavar="X", help="upper bounds of that support")
     command.add_argument(
         "--simulations",
         type=Path,
@@ -378,9 +378,9 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         nargs="+",
         action="extend",
         metavar="NAME",
-        help="what is observed, where the task knows several objects (short for TASK,object=NAME); several names or "
-        "files: recordings of one object, each under its own actions, believed together (short for "
-        "TASK,object=NAME;NAME)",
+        help="the observed object or recording, for tasks that have several (short for TASK,object=NAME); several "
+        "names or files are recordings of one object, each under its own actions, and are combined into one posterior "
+        "(short for TASK,object=NAME;NAME)",
     )
     command.add_argument(
         "--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results"
@@ -402,8 +402,8 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         type=Path,
         nargs="+",
         metavar="FILE",
-        help="the observed trajectory, .csv (a row a record, a column a channel) or .npz; several files: independent "
-        "trials of the same parameters, believed together "
+        help="the observed trajectory, .csv (one row per record, one column per channel) or .npz; several files are "
+        "independent trials of the same parameters and are combined into one posterior "
         "(default: the task's own, or one simulated at the known truth)",
     )
     _add_machine(command)
@@ -419,28 +419,28 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         "--estimator", metavar="NAME", help=_registered("the density estimator", families.networks, "the method's")
     )
     flags.add(network, families.networks, into="settings", defaults=False)
-    hyper = command.add_argument_group("heuristics (one number, or one a parameter)")
+    hyper = command.add_argument_group("heuristics (one number, or one per parameter)")
     flags.add(hyper, families.rules, into="hyperparameters", several=True)
     command.set_defaults(settings={}, hyperparameters={})
 
 
 def _add_machine(command: argparse.ArgumentParser) -> None:
     """Arguments about how, not what."""
-    command.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
-    command.add_argument("--debug", action="store_true", help="show where an error came from")
-    command.add_argument("--no-cache", action="store_true", help="compile anew, without the cache of compiled programs")
+    command.add_argument("--no-figures", action="store_true", help="draw no figures at the end")
+    command.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    command.add_argument("--no-cache", action="store_true", help="compile without the cache of compiled programs")
 
 
 def _add_executor(command: argparse.ArgumentParser) -> None:
     """Where simulations of a host simulator are made."""
-    where = command.add_argument_group("host simulators: simulations one by one")
-    where.add_argument("--workers", type=int, metavar="N", help="in so many processes on this machine")
-    where.add_argument("--scheduler", metavar="ADDRESS", help="on a Dask cluster, by its scheduler's address")
+    where = command.add_argument_group("simulators outside JAX")
+    where.add_argument("--workers", type=int, metavar="N", help="number of local worker processes")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, to simulate on its cluster")
     where.add_argument(
         "--simulation-timeout",
         type=float,
         metavar="SECONDS",
-        help="give a simulation up after so long (default: never; resume: as the run was begun)",
+        help="time limit of one simulation (default: none; resume: that of the run)",
     )
 
 

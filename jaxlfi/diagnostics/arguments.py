@@ -1,4 +1,4 @@
-"""What diagnostics are given: numbers of shapes that fit, of which something can be said, or a refusal in one line."""
+"""Checks the arguments of diagnostics, and refuses those that do not fit in one line."""
 
 import operator
 from collections.abc import Sequence

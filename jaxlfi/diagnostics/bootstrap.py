@@ -11,7 +11,7 @@ def bootstrap_interval(values: Float[np.ndarray, " n"], level: float = 0.95) -> 
     """Percentile bootstrap interval of a mean, the same each time it is asked for.
 
     Args:
-        values: one a run, shape [n].
+        values: one per run, shape [n].
         level: of the interval.
 
     Example:

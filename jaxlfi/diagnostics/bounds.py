@@ -8,8 +8,8 @@ bound is taken away, bound by bound, the one that helps most first. One that no 
 
 Where the local model explains the observation, it decides. Where it does not (the simulator is far from linear between
 the box and the truth), the bound is named that it would take away first and that has most mass beyond it; if these are
-two, all bounds are that either of them speaks against. Hits and false alarms of this rule and of the mass alone:
-experiments/README.md.
+two, all bounds are that either of them speaks against. Hits and false alarms of this rule and of the mass alone are in
+experiments/studies/wrong-bounds.md.
 """
 
 import dataclasses
@@ -57,7 +57,7 @@ PHI_ADVICE = "The bound is that of the feasible domain Phi: widen Phi if it can 
 
 @dataclasses.dataclass(frozen=True)
 class BoundEvidence:
-    """What one run says of the bounds of its last support.
+    """The evidence of one run about the bounds of its last support.
 
     Attributes:
         bounds: in inference space, shape [2, D]: the lower ones, the upper ones.
@@ -119,7 +119,7 @@ def bound_evidence(
     x: Float[Array | np.ndarray, "n obs"],
     observed: Float[Array | np.ndarray, " obs"],
 ) -> BoundEvidence:
-    """What a run's posterior and its simulations say of the bounds of its last support.
+    """The evidence of a run's posterior and simulations about the bounds of its last support.
 
     Args:
         belief: the posterior on that support, concrete.

@@ -179,7 +179,7 @@ def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) 
     Args:
         rank: shape [N].
         draws: L.
-        tests: how many are made together, such as one a parameter: p-value and band are corrected for them, by
+        tests: how many are made together, such as one per parameter: p-value and band are corrected for them, by
             Bonferroni.
 
     Raises:
@@ -225,7 +225,7 @@ def histogram(rank: Int[Array | np.ndarray, " n"], draws: int) -> Histogram:
 
 
 def ranks_verdict(result: Uniformity) -> str:
-    """What ranks of a parameter say of its posterior, in words.
+    """The verdict of a parameter's ranks, in words.
 
     Ranks that crowd at both ends are those of posteriors too narrow, in the middle of posteriors too wide; truths
     below their draws are those of posteriors too high.

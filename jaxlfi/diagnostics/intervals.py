@@ -50,7 +50,7 @@ class Estimate:
 
 @dataclasses.dataclass(frozen=True)
 class Intervals:
-    """What intervals of one parameter, or densest regions of all, were found to be worth.
+    """The verdict on the intervals of one parameter, or on the densest regions of all.
 
     Attributes:
         truths: number N of truths.
@@ -85,7 +85,7 @@ def check_intervals(truths: Truths, draws: Draws) -> list[Intervals]:
         draws: from the posterior of each observation, shape [N, L, D], L >= `FEWEST_DRAWS`.
 
     Returns:
-        One a parameter.
+        One per parameter.
 
     Raises:
         ValueError: for shapes that do not fit, too few truths or draws, numbers that are not finite, or draws that do
@@ -129,7 +129,7 @@ def check_regions(rank: Int[np.ndarray, " n"], draws: int) -> Intervals:
 def distances_from_median(
     truths: Float[np.ndarray, "n dim"], draws: Float[np.ndarray, "n draws dim"], level: float
 ) -> Float[np.ndarray, "n dim"]:
-    """Of each truth from its posterior's median, in units of the interval's half on that side; negative below.
+    """Distance of each truth from its posterior's median, in half-intervals of that side; negative below.
 
     The interval holds the truth where this is at most 1 in magnitude. It is infinite where all draws are the same.
     """

@@ -91,7 +91,7 @@ def unlike(
     names: Sequence[str] | None = None,
     channels: Sequence[str] = (),
 ) -> list[Finding]:
-    """In what an observation is unlike all simulations; nothing for one that the model could have given.
+    """Find how an observation is unlike all simulations; nothing if the model could have produced it.
 
     Each summary by itself is compared with the range of the simulations, and what lies beyond it with how fast the
     simulations thin out towards its end: with tails like those of a power or lighter, an observation from the model

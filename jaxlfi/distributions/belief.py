@@ -135,4 +135,7 @@ def _weighted(
 
 
 RESTRICTIONS = {"clip": clipped, "reject": rejected, "mixed": mixed}
-"""Ways to keep *proposals* inside the support, by name (reading E). Draws of a posterior are never clipped."""
+"""Ways to keep *proposals* inside the support, by name (docs/paper.md, reading E).
+
+Draws of a posterior are never clipped.
+"""

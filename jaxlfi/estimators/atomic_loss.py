@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 @struct.dataclass
 class Contrasts:
-    """Which other rows of a minibatch each row is compared with.
+    """The other rows of a minibatch that each row is compared with.
 
     Attributes:
         rows: row numbers, shape [M - 1, B].

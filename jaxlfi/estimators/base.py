@@ -41,7 +41,7 @@ SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jn
 
 
 class Estimator(Checked, abc.ABC):
-    """What all families of density estimators have in common: the ensemble and its training.
+    """Base of all families of density estimators: the ensemble and its training.
 
     A family is one subclass with the settings that it alone has and one method, `module`; the class is then a frozen
     dataclass and a pytree, without a decorator. Its Flax module maps a normalised summary to a conditional density: a
@@ -55,13 +55,13 @@ class Estimator(Checked, abc.ABC):
         clip_norm: global norm the gradients are clipped to.
         components: Gaussians K of each network's mixture, its own or the one fitted to it.
         ensemble_size: networks E; the posterior is their equally weighted mixture, of E K Gaussians.
-        epochs: full passes over the dataset each round (reading B); 0 where `steps` counts instead.
+        epochs: full passes over the dataset each round (docs/paper.md, reading B); 0 where `steps` counts instead.
         steps: gradient steps each round, rounded up to epochs of equal length; 0 where `epochs` counts.
         batch_size: simulations in a minibatch, drawn from the filled rows only.
         schedule: "constant", or "cosine" to zero within the round.
         validation: fraction of the simulations held out to choose the best weights by; 0 keeps the last weights.
         patience: stop after so many epochs without a better validation loss; 0 runs all epochs.
-        warm_start: continue from the last round's weights, or start anew each round (reading C).
+        warm_start: continue from the last round's weights, or start anew each round (docs/paper.md, reading C).
         loss: "likelihood", or "atomic" or "combined", which need no correction for the proposals
             (`jaxlfi.estimators.losses.LOSSES`).
         normaliser: "zscore", "asinh" or "none" (`jaxlfi.estimators.normaliser`): how raw summaries are normalised. It
@@ -84,39 +84,46 @@ class Estimator(Checked, abc.ABC):
         ValueError: from `check` for settings that contradict each other.
     """
 
-    learning_rate: Float[Array, "*batch"] | float = hyperparameter(1e-5, above=0.0, help="Adam's step size")
+    learning_rate: Float[Array, "*batch"] | float = hyperparameter(1e-5, above=0.0, help="learning rate of Adam")
     weight_decay: Float[Array, "*batch"] | float = hyperparameter(0.0, low=0.0, help="decoupled weight decay")
     clip_norm: Float[Array, "*batch"] | float = hyperparameter(
-        math.inf, above=0.0, high=math.inf, help="norm the gradients are clipped to; inf: not clipped"
+        math.inf,
+        above=0.0,
+        high=math.inf,
+        help="largest norm of a gradient, to which longer ones are clipped; inf: no clipping",
     )
-    components: int = option(4, low=1, high=1_000_000, help="Gaussians K in each network's mixture")
-    ensemble_size: int = option(1, low=1, high=1_000_000, help="networks in the ensemble")
-    epochs: int = option(1000, low=0, help="full passes over the data each round")
-    steps: int = option(0, low=0, help="gradient steps each round, in place of epochs")
-    batch_size: int = option(100, low=1, help="simulations in a minibatch")
-    schedule: str = option("constant", choices=tuple(SCHEDULES), help="of the learning rate within a round")
-    validation: float = option(0.0, low=0.0, high=0.9, help="fraction held out to choose the best weights by")
-    patience: int = option(0, low=0, help="epochs without a better validation loss before training stops; 0: no limit")
-    warm_start: bool = option(True, help="train on from the last round's weights, or start anew")
+    components: int = option(4, low=1, high=1_000_000, help="number K of Gaussians in each network's mixture")
+    ensemble_size: int = option(1, low=1, high=1_000_000, help="number of networks in the ensemble")
+    epochs: int = option(1000, low=0, help="passes over the data per round")
+    steps: int = option(0, low=0, help="gradient steps per round, instead of epochs")
+    batch_size: int = option(100, low=1, help="simulations per minibatch")
+    schedule: str = option("constant", choices=tuple(SCHEDULES), help="learning-rate schedule within a round")
+    validation: float = option(
+        0.0, low=0.0, high=0.9, help="fraction of the data held out for validation, which selects the weights"
+    )
+    patience: int = option(
+        0, low=0, help="epochs without a better validation loss before training stops; 0: it never stops early"
+    )
+    warm_start: bool = option(True, help="start each round from the last round's weights, or from new ones")
     loss: str = option(
         "likelihood",
         choices=tuple(LOSSES),
-        help="likelihood; atomic, combined: no correction for the proposals needed",
+        help="training loss; atomic and combined need no correction for the proposals",
     )
     normaliser: str = option("zscore", choices=tuple(TRANSFORMS), help="how summaries are normalised")
     embedding: str = option(
         "none",
         choices=("none", *EMBEDDINGS),
-        help="network that makes features of long summaries, trained with the other",
+        help="network that extracts features from long summaries, trained together with the density",
     )
-    features: int = option(16, low=1, help="numbers that the embedding makes of a summary")
+    features: int = option(16, low=1, help="number of features that the embedding extracts")
     reduction: str = option(
         "none",
         choices=("none", "regression", "half"),
-        help="the networks see what regressions predict; or half of them",
+        help="whether networks see what regressions predict: none, all of them, or half",
     )
     record_size: int = option(
-        0, low=0, help="numbers of a record (channels of a series, length of a trial) in the summary; 0: the task's"
+        0, low=0, help="numbers per record of the summary (channels of a series, length of a trial); 0: the task's"
     )
 
     closed_form: ClassVar[bool] = False
@@ -126,7 +133,7 @@ class Estimator(Checked, abc.ABC):
 
     @property
     def accounts_for_prior(self) -> bool:
-        """Whether posteriors have a task's own prior in them whatever was proposed."""
+        """Whether posteriors account for a task's own prior, whatever was proposed."""
         return self.of_summaries or self.loss != "likelihood"
 
     @abc.abstractmethod
@@ -201,7 +208,7 @@ class Estimator(Checked, abc.ABC):
         return 0 if self.embedding == "none" else self.record_size
 
     def inputs(self, dim: int, obs: int) -> int:
-        """How many numbers the network sees of a summary of length S, for D parameters."""
+        """The number of inputs of the network for a summary of length S and D parameters."""
         features = 0 if self.sees == "none" else features_size(dim, obs, self.record_size or 1)
         return features if self.replaces(obs) else obs + features
 
@@ -258,7 +265,7 @@ class Estimator(Checked, abc.ABC):
         log_prior: Float[Array, " n"],
         from_prior: Float[Array, " n"],
     ) -> Rows:
-        """What a round trains on (`Rows`), from parameters and summaries as the network sees them."""
+        """The rows that a round trains on (`Rows`), from parameters and summaries as the network sees them."""
         return Rows(value=theta, given=x, weights=weights, log_prior=log_prior, from_prior=from_prior)
 
     def condition(
@@ -296,7 +303,7 @@ class Estimator(Checked, abc.ABC):
 
 
 def viewed(given: Float[Array, "*n given"], view: Float[Array | np.ndarray, " given"] | None) -> Array:
-    """What one network sees of what is given, by its row of `Estimator.views`."""
+    """The part of the inputs that one network sees, by its row of `Estimator.views`."""
     return given if view is None else given * view
 
 
@@ -333,7 +340,7 @@ class Network:
     log_weights: Any = None
 
     def given(self, x: Float[Array, "*n obs"]) -> Float[Array, "*n given"]:
-        """What the network sees of raw summaries."""
+        """The network's inputs for raw summaries."""
         if self.regression is None:
             return self.normaliser(x)
         return self._beside(x, self.regression(x))

@@ -33,12 +33,12 @@ class Dataset:
 
     @property
     def valid(self) -> Bool[Array, " cap"]:
-        """Which rows are filled, shape [C]."""
+        """Rows that are filled, shape [C]."""
         return jnp.arange(self.capacity) < self.size
 
     @property
     def late(self) -> Bool[Array, " cap"]:
-        """Which rows are of the later half of the rounds: nearer to the observation than those before, shape [C]."""
+        """Rows from the later half of the rounds, which are nearer to the observation, shape [C]."""
         last = jnp.max(jnp.where(self.valid, self.round, 0))
         return self.valid & (2 * self.round > last - 1)
 

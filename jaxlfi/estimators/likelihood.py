@@ -33,7 +33,7 @@ BLOCK = 256
 
 
 class Likelihood(Estimator):
-    """What all likelihood networks have in common.
+    """Base of all likelihood networks.
 
     Their Flax module maps parameters to a density of the normalised summary; the ensemble's likelihood is the mean of
     its networks'. The posterior on a support is the likelihood of the observation times the prior, drawn from by
@@ -51,9 +51,9 @@ class Likelihood(Estimator):
     """
 
     noise_floor: Float[Array, "*batch"] | float = hyperparameter(
-        0.03, low=0.0, high=1.0, help="noise added to normalised summaries, of a likelihood"
+        0.03, low=0.0, high=1.0, help="noise added to the summaries before training a likelihood"
     )
-    particles: int = option(1000, low=10, help="draws that a likelihood's posterior is found by")
+    particles: int = option(1000, low=10, help="SMC particles (likelihood methods)")
 
     of_summaries: ClassVar[bool] = True
 

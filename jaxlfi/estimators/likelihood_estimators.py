@@ -87,8 +87,8 @@ class MixtureLikelihood(Likelihood):
         True
     """
 
-    hidden: tuple[int, ...] = option((50, 50), low=1, help="units of each hidden layer")
-    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="relu, tanh or silu")
+    hidden: tuple[int, ...] = option((50, 50), low=1, help="units per hidden layer")
+    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="activation function")
 
     def check(self) -> "MixtureLikelihood":
         """Refuse settings that cannot work, by name; returns the settings."""

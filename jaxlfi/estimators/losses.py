@@ -1,4 +1,4 @@
-"""What q_phi is trained by, by name: losses of a minibatch."""
+"""Training losses of a minibatch, by name."""
 
 import dataclasses
 from collections.abc import Callable

@@ -28,9 +28,9 @@ class MixtureNetwork(Estimator):
     Attributes:
         hidden: units of each hidden layer.
         activation: "relu", "tanh" or "silu".
-        parameters: "feasible" or "zscore": parameters as the network sees them, scaled by Phi to [-1, 1]^D (reading D,
-            the paper's) or by their mean and standard deviation over the simulations. In a wide Phi a posterior is a
-            dot, and small networks learn it slowly.
+        parameters: "feasible" or "zscore": parameters as the network sees them, scaled by Phi to [-1, 1]^D as in the
+            paper, or by their mean and standard deviation over the simulations (docs/paper.md, reading D). In a wide
+            Phi a posterior is a dot, and small networks learn it slowly.
         prune: components of less weight than this are dropped from each network's mixture. Rarely used components are
             hardly trained: they are wide and anywhere. BayesSim's first implementations prune at 0.005; the paper
             does not say. A leaf.
@@ -40,11 +40,13 @@ class MixtureNetwork(Estimator):
         8
     """
 
-    hidden: tuple[int, ...] = option((1024, 1024, 1024), low=1, help="units of each hidden layer")
-    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="relu, tanh or silu")
-    parameters: str = option("feasible", choices=("feasible", "zscore"), help="what parameters are scaled by")
+    hidden: tuple[int, ...] = option((1024, 1024, 1024), low=1, help="units per hidden layer")
+    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="activation function")
+    parameters: str = option(
+        "feasible", choices=("feasible", "zscore"), help="how parameters are scaled: by Phi, or to unit variance"
+    )
     prune: Float[Array, "*batch"] | float = hyperparameter(
-        0.0, low=0.0, high=0.5, help="components of less weight than this are dropped"
+        0.0, low=0.0, high=0.5, help="smallest weight of a component; lighter ones are dropped"
     )
 
     closed_form: ClassVar[bool] = True

@@ -38,7 +38,7 @@ ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
 
 @struct.dataclass
 class Posterior:
-    """What an observation says of the parameters: a density on a box. A pytree.
+    """The posterior of an observation: a density on a box, as a pytree.
 
     It is always the density truncated to the support, and zero where a prior that the task brings is zero. Draws are
     rejected until they lie inside, never moved there; where next to no mass is inside, they are picked by weight from

@@ -25,7 +25,7 @@ LogDensity = Callable[[Float[Array, " dim"]], Float[Array, ""]]
 
 @struct.dataclass
 class Tempered:
-    """Where the particles ended.
+    """The final particles.
 
     Attributes:
         theta: equally weighted draws, shape [N, D].

@@ -18,7 +18,7 @@ STEPS_PER_EPOCH = 50
 
 @struct.dataclass
 class FitInfo:
-    """What happened while fitting; P epochs, E networks in the ensemble.
+    """A record of the fit; P epochs, E networks in the ensemble.
 
     Attributes:
         loss: mean training loss of each epoch, negative log-density of theta, or of the

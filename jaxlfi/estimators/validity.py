@@ -50,7 +50,7 @@ class SuccessNetwork(nn.Module):
 class SuccessLikelihood(Likelihood):
     """The likelihood of an outcome, as if it were a summary."""
 
-    hidden: tuple[int, ...] = option((32, 32), low=1, help="units of each hidden layer")
+    hidden: tuple[int, ...] = option((32, 32), low=1, help="units per hidden layer")
 
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one ensemble member."""

@@ -38,7 +38,7 @@ def drawable(runs: Runs) -> bool:
 
 
 def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:
-    """A panel for the trajectory, where trajectories were simulated, and one a parameter, where the truth is known.
+    """A panel for the trajectory, if trajectories were simulated, and one per parameter, if the truth is known.
 
     Args:
         figure: empty.

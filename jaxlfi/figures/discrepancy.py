@@ -68,7 +68,7 @@ class Panel(NamedTuple):
 
 
 def panels(runs: Runs) -> list[Panel]:
-    """A panel for each parameter, where the truth is known, and one for the trajectory."""
+    """One panel per parameter, if the truth is known, and one for the trajectory."""
     first = next(iter(runs.values()))[0]
     thetas, trajectories = {}, {}
     for name in runs:

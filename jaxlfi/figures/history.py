@@ -177,7 +177,7 @@ class History:
 
     @property
     def measured_widths(self) -> str | None:
-        """In words, what diagnostics in the run's folder found of its widths; None where there are none, or others."""
+        """The verdict on its widths by the diagnostics in the run's folder, in words; None without one."""
         try:
             return str(files.read_json(self.folder / "diagnostics" / "diagnostics.json")["line"])
         except (ValueError, KeyError, TypeError):
@@ -429,7 +429,7 @@ def _limits(config: Mapping[str, Any], side: str, dim: int) -> np.ndarray | None
 
 
 def heuristic_name(description: Any) -> str:
-    """The name of a heuristic that config.json describes: of the rule itself where another one wraps it."""
+    """The name of a heuristic in config.json; for a wrapped one, the name of the rule inside."""
     inner = description.get("hyperparameters") if isinstance(description, Mapping) else None
     if isinstance(inner, Mapping) and isinstance(inner.get("rule"), Mapping):
         return heuristic_name(inner["rule"])

@@ -1,4 +1,4 @@
-"""Intervals: how often those of the posteriors held the truth, and how many times as wide they would have to be."""
+"""Intervals: how often posterior intervals held the truth, and by what factor their widths are off."""
 
 from collections.abc import Mapping
 
@@ -66,7 +66,7 @@ def draw(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _marks(axes: Axes, estimates: np.ndarray, shift: float, look: Mapping[str, str], gid: str) -> None:
-    """Estimates [n, 3] with their intervals, one a row."""
+    """Estimates [n, 3] with their intervals, one per row."""
     value, low, high = estimates.T
     rows = np.arange(len(value)) + shift
     axes.hlines(rows, low, high, color=look["color"], linewidth=0.9)

@@ -1,4 +1,4 @@
-"""Learning curves: returns of training episodes, a line a seed and their mean, by domain."""
+"""Learning curves: returns of training episodes by domain, one line per seed and their mean."""
 
 from collections.abc import Sequence
 from pathlib import Path

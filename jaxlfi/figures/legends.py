@@ -1,4 +1,4 @@
-"""Legends outside of the panels."""
+"""Legends outside the panels."""
 
 from collections.abc import Mapping, Sequence
 
@@ -37,7 +37,7 @@ def below(figure: Figure, handles: Sequence[Artist], at_most: int | None = None,
 
 
 def of_configurations(figure: Figure, look: Mapping[str, Look], title: str) -> None:
-    """A legend of configurations drawn as lines, above the panels."""
+    """A legend of configurations, drawn as lines above the panels."""
     handles = [Line2D([], [], **own.line) for own in look.values()]
     above(figure, handles, title, balanced(list(look.values()), figure))
 

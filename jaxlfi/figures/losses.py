@@ -23,7 +23,7 @@ def by_epoch(history: History, panel: str) -> np.ndarray | None:
 
 
 def by_round(history: History, panel: str) -> np.ndarray | None:
-    """One loss a round, shape [R]: the training loss of the last epoch, the lowest validation loss."""
+    """One loss per round, shape [R]: the training loss of the last epoch, the lowest validation loss."""
     values = by_epoch(history, panel)
     if values is None:
         return None
@@ -72,7 +72,7 @@ def draw(figure: Figure, runs: Runs) -> None:
 
 
 def draw_epochs(axes: Axes, history: History, panel: str) -> None:
-    """One line a round over the epochs of its training, coloured by iteration.
+    """One line per round over the epochs of its training, coloured by iteration.
 
     Args:
         axes: to draw on.

@@ -94,7 +94,7 @@ def draw_radar(axes: PolarAxes, errors: np.ndarray, names: Sequence[str], look: 
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """A column for each run: errors by parameter above, by summary below, a row of one scale each.
+    """One column per run: errors by parameter above and by summary below, each row on one scale.
 
     Args:
         figure: empty.

@@ -70,7 +70,7 @@ def closer_limits(histories: Sequence[History], d: int) -> tuple[float, float]:
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """One column a run: proposals by iteration above, the last mixture below, for each pair of parameters.
+    """One column per run: proposals by iteration above, the last mixture below, for each pair of parameters.
 
     A single run has them side by side.
 

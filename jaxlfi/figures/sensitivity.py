@@ -1,4 +1,4 @@
-"""How sensitive a heuristic is to its hyperparameters: heat maps over every pair of them, as in the appendix.
+"""Sensitivity of a heuristic to its hyperparameters: heat maps over every pair of them, as in the appendix.
 
 The maps form a matrix, with one row and one column for each hyperparameter. Trajectory errors are above the diagonal,
 parameter errors below it, and both for single hyperparameters on it. A cell is the mean over seeds and over all other

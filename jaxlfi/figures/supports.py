@@ -50,7 +50,7 @@ def draw_bounds(axes: Axes, histories: Sequence[History], d: int, look: Look) ->
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """One panel a parameter, with the configurations that adapt, the truth and the feasible limits Phi.
+    """One panel per parameter, with the configurations that adapt, the truth and the feasible limits Phi.
 
     Args:
         figure: empty.

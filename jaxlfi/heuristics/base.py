@@ -1,4 +1,4 @@
-"""What a heuristic is: (previous belief, posterior, Phi) -> (belief, what it saw and did)."""
+"""The interface of heuristics: (previous belief, posterior, Phi) -> (belief, what it saw and did)."""
 
 import abc
 from typing import ClassVar
@@ -88,7 +88,7 @@ def stretch(
 ) -> Support:
     """Stretch the chosen bounds by `expansion` times the width, as far as Phi allows (Algorithms 2 and 3).
 
-    A bound that was not chosen stays where it is, also where it touches Phi (reading H).
+    A bound that was not chosen stays where it is, also where it touches Phi (docs/paper.md, reading H).
     """
     step = expansion * support.width
     return Support(

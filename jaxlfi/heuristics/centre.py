@@ -19,7 +19,8 @@ class Centre(Heuristic):
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Algorithm 4; the evidence is the weighted mean mu, shape [D].
 
-        A box that would leave Phi is pushed back in with its width. One that is wider than Phi becomes Phi (reading I).
+        A box that would leave Phi is pushed back in with its width. One that is wider than Phi becomes Phi
+        (docs/paper.md, reading I).
         """
         width = jnp.minimum(previous.support.width, feasible.width)
         centre = posterior.mean

@@ -31,7 +31,7 @@ class Choice(Heuristic):
 
     @property
     def proposes_from_prior(self) -> bool:
-        """Whether all of the rules do."""
+        """Whether all rules always propose from the prior."""
         return all(rule.proposes_from_prior for rule in self.rules)
 
     @property

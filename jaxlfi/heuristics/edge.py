@@ -24,10 +24,10 @@ class Edge(Heuristic):
         mass_threshold: tau, the marginal mass above which a bound moves.
         expansion: eta, the step as a fraction of the current width.
         zone_width: an absolute width added to the zone: delta as Algorithm 2 writes it is
-            `Edge(zone_fraction=0.0, zone_width=0.1)` (reading F).
+            `Edge(zone_fraction=0.0, zone_width=0.1)` (docs/paper.md, reading F).
         tail: the fraction of the mass *beyond* the bound that counts as lying in the zone. 1 counts it all, which is
             where clipping puts it and what keeps EDGE working when the mode itself has left the box; 0 counts the zone
-            alone (reading G).
+            alone (docs/paper.md, reading G).
 
     Example:
         >>> Edge(mass_threshold=0.005).mass_threshold  # the paper's
@@ -35,16 +35,23 @@ class Edge(Heuristic):
     """
 
     zone_fraction: Value = hyperparameter(
-        0.1, help="the zone along a bound, as a fraction of the support's width", symbol="delta", low=0, high=1
+        0.1, help="width of the zone along a bound, as a fraction of the support's width", symbol="delta", low=0, high=1
     )
     mass_threshold: Value = hyperparameter(
-        0.12, help="posterior mass in the zone above which its bound moves", symbol="tau", low=0, high=1
+        0.12, help="posterior mass in the zone above which the bound moves", symbol="tau", low=0, high=1
     )
     expansion: Value = hyperparameter(
         0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
     )
-    zone_width: Value = hyperparameter(0.0, help="an absolute width added to the zone", symbol="delta", low=0)
-    tail: Value = hyperparameter(1.0, help="fraction of the mass beyond the bound that counts", low=0, high=1)
+    zone_width: Value = hyperparameter(
+        0.0,
+        help="width of the zone along a bound, in the parameter's units, added to the fraction",
+        symbol="delta",
+        low=0,
+    )
+    tail: Value = hyperparameter(
+        1.0, help="fraction of the mass beyond the bound that counts as in the zone", low=0, high=1
+    )
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Algorithm 2, over all dimensions at once; the evidence is the two edge masses M_L and M_R, shape [D]."""

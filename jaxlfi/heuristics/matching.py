@@ -15,10 +15,10 @@ MAX_EXACT = 6
 
 
 class Matched(Heuristic):
-    """Another heuristic, on a posterior whose components were first paired with the previous ones (reading C).
+    """Another heuristic, on a posterior whose components were first paired with the previous ones.
 
-    Networks that start anew every round label their components arbitrarily; without matching, MODE would see
-    shifts that are mere relabelling.
+    Networks that start anew every round (docs/paper.md, reading C) label their components arbitrarily; without
+    matching, MODE would see shifts that are mere relabelling.
 
     Attributes:
         rule: the heuristic to wrap.

@@ -37,7 +37,11 @@ class Mode(Heuristic):
         0.4, help="how near a bound a mode must be, as a fraction of the support's width", symbol="rho", low=0, high=1
     )
     mass_threshold: Value = hyperparameter(
-        0.05, help="weight of the modes moving towards a bound above which it moves", symbol="tau", low=0, high=1
+        0.05,
+        help="weight of the modes that move towards a bound, above which the bound moves",
+        symbol="tau",
+        low=0,
+        high=1,
     )
     expansion: Value = hyperparameter(
         0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0

@@ -44,7 +44,7 @@ def build(reference: str, values: Mapping[str, Any], dim: int) -> Heuristic:
 
     Args:
         reference: a registered name, or "module:Class".
-        values: by name; of a hyperparameter one number, or one a dimension.
+        values: by name; of a hyperparameter one number, or one per dimension.
         dim: number of parameters D.
 
     Raises:

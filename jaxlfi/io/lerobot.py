@@ -4,7 +4,7 @@ meta/info.json                              version, frame rate, and the feature
 meta/stats.json                             minimum, maximum, mean, deviation and quantiles of the features
 meta/tasks.parquet                          what was to be done, in words
 meta/episodes/chunk-000/file-000.parquet    a row an episode: where its rows are
-data/chunk-000/file-000.parquet             a row a frame
+data/chunk-000/file-000.parquet             one row per frame
 
 A data set's rows are regular in time: `timestamp` is the number of the frame through the frame rate. The time stamps
 themselves are the feature `time`, in double precision. Signals that are not sampled with the frames, such as actions at

@@ -114,7 +114,7 @@ class Partition:
             ValueError: where there are more processes than runs.
         """
         if processes.count > runs:
-            raise ValueError(f"processes: expected at most one a run, got {processes.count} for {runs}")
+            raise ValueError(f"processes: expected at most one per run, got {processes.count} for {runs}")
         self.processes, self.runs = processes, runs
         self.devices = min(devices, math.ceil(runs / processes.count))
         each = self.devices * math.ceil(runs / (self.devices * processes.count))

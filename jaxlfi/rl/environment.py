@@ -22,9 +22,9 @@ class Signals:
     statistics, a flag that has never been raised would weigh a million when it is raised for the first time.
 
     Attributes:
-        names: one a number.
-        units: one a number; "" without one.
-        centre: in these units, one a number.
+        names: one per number.
+        units: one per number; "" without one.
+        centre: in these units, one per number.
         scale: likewise; positive.
 
     Raises:

@@ -126,11 +126,11 @@ def from_brax(
     if not isinstance(env.observation_size, int | np.integer):
         raise ValueError(f"env: expected observations that are one vector, got {env.observation_size}")
     if len(names) != support.dim:
-        raise ValueError(f"names: expected {support.dim}, one a parameter of the support, got {list(names)}")
+        raise ValueError(f"names: expected {support.dim}, one per parameter of the support, got {list(names)}")
     if unknown := [one for one in log if one not in names]:
         raise ValueError(f"log: expected names of parameters ({', '.join(names)}), got {', '.join(unknown)}")
     if units is not None and len(units) != len(names):
-        raise ValueError(f"units: expected {len(names)}, one a parameter, got {list(units)}")
+        raise ValueError(f"units: expected {len(names)}, one per parameter, got {list(units)}")
     if observations is not None and observations.size != env.observation_size:
         raise ValueError(
             f"observations: expected {env.observation_size}, as the environment has, got {observations.size}"

@@ -2,8 +2,8 @@
 
 One run:        config.json ledger.jsonl posterior.npz dataset.npz history.npz observation.npz
                 summary.json; failures.jsonl, where simulations say why they failed
-Several seeds:  config.json seed_000/ seed_001/ ...                   each one a run folder
-A comparison:   config.json table.csv CONFIGURATION/seed_000/ ...     each one a run folder
+Several seeds:  config.json seed_000/ seed_001/ ...                   each one per run folder
+A comparison:   config.json table.csv CONFIGURATION/seed_000/ ...     each one per run folder
 
 While a command runs its folder also holds `checkpoint/` (`jaxlfi.runs.checkpoint`).
 """

@@ -73,7 +73,7 @@ def infer(
         task: simulator, names and bounds.
         observation: the real trajectory, in the shape the simulator produces, with NaN where a number is missing
             (`jaxlfi.with_gaps`); or a list of several, independent trials of the same parameters, of which shorter ones
-            count as missing their ends, for one posterior given all of them (`jaxlfi.repeated`). By default the task's
+            count as missing their ends, combined into one posterior (`jaxlfi.repeated`). By default the task's
             own, or, where the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
             box they fill.

@@ -131,7 +131,7 @@ def within_budget(
         theta: proposals in the order they are attempted, shape [A, D]; A is the budget of attempts.
         x: summaries, shape [A, S].
         failure: failure codes, shape [A].
-        simulations_per_round: how many simulations a round adds at most.
+        simulations_per_round: how many simulations per round adds at most.
     """
     success = failure == 0
     so_far = jnp.cumsum(success)

@@ -79,7 +79,7 @@ def cross_correlation(trajectory: Float[Array, "time columns"], actions: int) ->
     """Products of states and actions, moments of states: psi of section VI-F, shape [Ds Da + 2 Ds].
 
     In this order: the dot products <S_i, A_j> over time, j fastest; the means of the states; their standard deviations
-    (reading L: what the paper writes as Var).
+    (what the paper writes as Var: docs/paper.md, reading L).
 
     Args:
         trajectory: states [T, Ds] followed by actions [T, Da], shape [T, Ds + Da].

@@ -18,7 +18,7 @@ from jaxlfi.cli import parser as cli
 
 ROOT = Path(__file__).parents[2]
 PAGES = {path.name: path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))}
-BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$|^## ", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SMALL = (
     "--rounds 2 --simulations-per-round 60 --simulation-budget 80 --epochs 5 --hidden 16 --validation 0 --patience 0 "
     "--no-predictive --no-figures"
@@ -59,13 +59,12 @@ ELSEWHERE = {
     "pip": "the installation",
     "python3": "the installation",
     "python3.11": "the installation",
-    ".": "the installation",
     "python -m jaxlfi.robots.simulated": "serves until it is ended: run by tests/robots",
     "python -m timeit": "needs a trained policy, and measures",
 }
 """Commands that are not run, by how they begin, and why."""
 FRAGMENTS = {
-    "with ThreadPoolExecutor(8)": "goes on from the README's example: tests/runs/test_executors.py",
+    "with ThreadPoolExecutor(8)": "for a simulator of the reader's own: tests/runs/test_executors.py",
     "def simulate(rng, theta):": "has three dots: examples/host_simulator.py is whole",
     "task = jaxlfi.Task.from_command(": "needs a program: tests/tasks/test_command.py",
     "from dask_jobqueue": "needs Slurm",
@@ -83,9 +82,9 @@ NOT_CODE = ("text", "toml")
 
 
 def steps(page: str) -> Iterator[tuple[str, str]]:
-    """The kinds and texts of a page's blocks, and where its sections begin."""
+    """The kinds and texts of a page's blocks."""
     for match in BLOCK.finditer(PAGES[page].read_text()):
-        yield (match[1], match[2]) if match[1] else ("section", "")
+        yield match[1], match[2]
 
 
 def commands(body: str) -> list[list[str]]:
@@ -107,8 +106,6 @@ def runnable(page: str) -> list[tuple[str, str | list[str]]]:
         elif kind in ("sh", "bash"):
             run = [words for words in commands(body) if listed(words) in RUN]
             todo += [("command", [*words[1:], *shlex.split(RUN[listed(words)])]) for words in run]
-        elif kind == "section" and page == "README.md":
-            todo.append((kind, body))
     return todo
 
 
@@ -121,9 +118,7 @@ def work(todo: str) -> None:
     jaxlfi.infer = lambda *given, **named: infer(*given, **({"settings": SETTINGS} | named))
     namespace: dict = {}
     for kind, body in json.loads(todo):
-        if kind == "section":
-            namespace = {}
-        elif kind == "python" and (name := re.match(r"# (\w+\.py)\n", body)):
+        if kind == "python" and (name := re.match(r"# (\w+\.py)\n", body)):
             Path(name[1]).write_text(body)
         elif kind == "python":
             exec(compile(body, "block", "exec"), namespace)
@@ -134,7 +129,7 @@ def work(todo: str) -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_every_block_is_run_or_listed(page):
     for kind, body in steps(page):
-        assert kind in ("python", "sh", "bash", "section", *NOT_CODE), kind
+        assert kind in ("python", "sh", "bash", *NOT_CODE), kind
         for words in commands(body) if kind in ("sh", "bash") else ():
             assert listed(words), words
 
@@ -188,9 +183,9 @@ def test_a_page_runs_in_a_fresh_process(page, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_readmes_second_example_runs_as_printed(tmp_path):
+def test_a_task_in_a_file_runs_as_printed(tmp_path):
     """In a shell, with the settings that are printed."""
-    blocks = list(steps("README.md"))
+    blocks = list(steps("quickstart.md"))
     place = next(place for place, (_, body) in enumerate(blocks) if body.startswith("# decay.py\n"))
     (_, file), (_, python), (_, sh) = blocks[place : place + 3]
     for name, text in {

@@ -1,4 +1,4 @@
-"""Numbers in experiments/README.md are those of the arrays that are kept: each text is made anew and looked up there.
+"""Numbers on the studies' pages are those of the arrays that are kept: each text is made anew and looked up there.
 
 What a passage says is written here once more, with every number computed from a file of experiments/results.
 """
@@ -23,7 +23,15 @@ from jaxlfi.runs.describe import settings_to_json
 
 ROOT = Path(__file__).parents[2] / "experiments"
 RESULTS = ROOT / "results"
-README = " ".join((ROOT / "README.md").read_text().split())
+PAGES = {path.stem: path.read_text() for path in sorted((ROOT / "studies").glob("*.md"))}
+PAGES["index"] = (ROOT / "README.md").read_text()
+
+
+def page(name: str) -> str:
+    """The text of a study's page, without line breaks."""
+    return " ".join(PAGES[name].split())
+
+
 SUPPORTS = ("ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre")
 
 
@@ -65,7 +73,7 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     ],
 )
 def test_widths(line):
-    assert " ".join(line.split()) in README
+    assert " ".join(line.split()) in page("widths")
 
 
 EMBEDDING = RESULTS / "embedding/lotka_volterra/misspecified+edge"
@@ -73,7 +81,7 @@ EMBEDDING = RESULTS / "embedding/lotka_volterra/misspecified+edge"
 
 @pytest.mark.parametrize("line", embedding.table(EMBEDDING).splitlines()[2:])
 def test_embeddings(line):
-    assert " ".join(line.split()) in README
+    assert " ".join(line.split()) in page("embedding")
 
 
 def test_runs_that_embeddings_lose():
@@ -82,13 +90,13 @@ def test_runs_that_embeddings_lose():
         for name in embedding.NAMES
     }
     assert lost["series"] == lost["summaries"] == 1
-    assert_printed([f"`raw` loses {lost['raw']} runs of 10 and `mlp` {lost['mlp']}"])
+    assert_printed("embedding", [f"`raw` loses {lost['raw']} runs of 10 and `mlp` {lost['mlp']}"])
 
 
 def test_widths_near_bounds():
     folder = RESULTS / "widths/lotka_volterra"
     table = (folder / "near_bounds.md").read_text()
-    assert " ".join(table.split()) in README
+    assert " ".join(table.split()) in page("widths")
     for path in folder.glob("*/quick-drawn.npz"):
         held = arrays(path.relative_to(RESULTS).with_suffix(""))["density_rank"][:100] < 0.9 * 201
         row = next(line for line in table.splitlines() if line.startswith(f"| `{path.parent.name}` |"))
@@ -102,7 +110,7 @@ def test_flags_of_the_settings_before():
     from jaxlfi.cli.parser import parser
     from jaxlfi.tasks import registry
 
-    (flags,) = re.findall(r"CLIPPED`, on the command line `([^`]+)`", README)
+    (flags,) = re.findall(r"CLIPPED`, on the command line `([^`]+)`", page("index"))
     arguments = parser().parse_args(["compare", "lotka_volterra", "--out", "x", *flags.split()])
     found, expected = build_settings(arguments, registry.load("lotka_volterra")), CLIPPED.check()
     assert settings_to_json(found) == settings_to_json(expected)
@@ -122,7 +130,7 @@ def test_ablation(variant):
     errors = ablation(variant)
     cells = [with_interval(errors[name]) if name in errors else "" for name in SUPPORTS]
     row = " | ".join([f"| `{variant}`", change, *cells])
-    assert " ".join(row.split()) in README
+    assert " ".join(row.split()) in page("ablation")
 
 
 def difference(errors: dict[str, np.ndarray], one: str, other: str) -> str:
@@ -156,12 +164,12 @@ def test_claims_at_twenty_seeds():
             errors["misspecified+mode"].mean(), np.median(errors["misspecified+mode"])
         ),
     ]
-    assert_printed(texts)
+    assert_printed("lotka-volterra", texts)
 
 
-def assert_printed(texts: list[str]) -> None:
-    missing = [text for text in texts if " ".join(text.split()) not in README]
-    assert missing == [], "computed from the arrays, and not in experiments/README.md"
+def assert_printed(name: str, texts: list[str]) -> None:
+    missing = [text for text in texts if " ".join(text.split()) not in page(name)]
+    assert missing == [], f"computed from the arrays, and not on the page {name}"
 
 
 def test_wider_and_wider_supports():
@@ -169,17 +177,18 @@ def test_wider_and_wider_supports():
     errors = {name: column("wide", "theta_error", configuration=name) for name in names}
     shown = [f"{values.mean():.2f} ({np.median(values):.2f})" for values in errors.values()]
     first = f"from {errors['ok'].mean():.2f} (median {np.median(errors['ok']):.2f})"
-    assert_printed([f"{first} on the OK support to {shown[1]}, {shown[2]} and {shown[3]}"])
+    assert_printed("lotka-volterra", [f"{first} on the OK support to {shown[1]}, {shown[2]} and {shown[3]}"])
 
 
 def test_flows():
     apt = lambda folder, name: column(folder, "theta_error", configuration=name)
     assert_printed(
+        "flows",
         [
             f"{with_interval(apt('apt', 'ok'))} on the OK support",
             f"{with_interval(apt('apt', 'misspecified+edge'))} on the misspecified one with EDGE",
             f"bring it to {with_interval(apt('apt-fast', 'misspecified+edge'))}",
-        ]
+        ],
     )
 
 
@@ -189,6 +198,7 @@ def test_edge_grid():
     chosen = error[1, 1, 1]
     by_step, by_threshold = error.mean(axis=(0, 1)), error.mean(axis=(0, 2))
     assert_printed(
+        "sensitivity",
         [
             f"ends between {error.min():.2f} and {error.max():.2f}",
             f"They give {chosen:.2f} ({np.sum(error < chosen)} of {error.size} combinations are lower",
@@ -196,7 +206,7 @@ def test_edge_grid():
             f"({by_step[2]:.2f} at 0.4, {by_step[1]:.2f} at 0.2, {by_step[0]:.2f} at 0.1)",
             f"{success.min():.0%} to {success.max():.0%}, {success.mean():.0%} in the mean".replace("%", " %"),
             f"they have the least ({success[1, 1, 1]:.0%})".replace("%", " %"),
-        ]
+        ],
     )
     assert success[1, 1, 1] == success.min()
 
@@ -208,6 +218,7 @@ def test_mode_grid():
     assert pairs.min() == pairs[1, 1]
     assert np.sum(error < chosen) == 9
     assert_printed(
+        "sensitivity",
         [
             f"are the best pair ({pairs[1, 1]:.2f} ±",
             f"the chosen four together, {chosen:.2f}, are tenth of {error.size}",
@@ -216,7 +227,7 @@ def test_mode_grid():
                 *(100 * value for value in (success[1, 1, 1, 1], success.min(), success.max()))
             ),
             f"{success.mean():.0%} here in the mean".replace("%", " %"),
-        ]
+        ],
     )
 
 
@@ -224,7 +235,7 @@ def test_mode_grid():
 def test_mg1(name):
     kept = arrays("mg1/errors")
     cells = [f"{kept[f'{name}/{measure}'].mean():.2f}" for measure in ("plain", "sorted", "trajectory", "entropy")]
-    assert_printed([f"| {name} | {' | '.join(cells)} |"])
+    assert_printed("mg1", [f"| {name} | {' | '.join(cells)} |"])
 
 
 UNMIRRORED = ("ok", "unmirrored", "unmirrored+edge", "unmirrored+mode", "unmirrored+centre")
@@ -236,7 +247,7 @@ def test_mg1_unmirrored(name):
     low, high = bootstrap_interval(kept[f"{name}/sorted"])
     cells = [f"{kept[f'{name}/{measure}'].mean():.2f}" for measure in ("sorted", "trajectory", "entropy")]
     row = f"| {name} | {cells[0]} [{low:.2f}, {high:.2f}] | {cells[1]} | {cells[2]} |"
-    assert row in README.replace("**", "")
+    assert row in page("mg1").replace("**", "")
 
 
 BASELINES = sorted(
@@ -251,7 +262,7 @@ def test_baselines(folder, name):
     gap = "" if name == "misspecified+edge" else with_interval(error - edge["theta_error"], median=False)
     success = np.mean(kept["succeeded"].sum(axis=-1) / kept["attempted"].sum(axis=-1))
     row = f"| `{name}` | {with_interval(error)} | {gap} | {np.nanmean(kept['trajectory_error']):.2f} | {success:.0%} |"
-    assert_printed([row.replace("% |", " % |")])
+    assert_printed("baselines", [row.replace("% |", " % |")])
 
 
 def test_diagnostics():
@@ -271,7 +282,7 @@ def test_diagnostics():
     held = [re.search(r"\d+ of \d+", text)[0] for text in support]
     at = lambda texts: [re.search(r"90%: ([\d.]+)", text)[1] for text in texts]
     densest, points = at(regions), at(tarp)
-    plain = README.replace("**", "")
+    plain = page("calibration").replace("**", "")
     for text in (
         f"| {held[0]} truths | {held[1]} | {held[2]} |",
         f"hold | {densest[0]}, ok | {densest[1]} | {densest[2]}, over-confident |",
@@ -284,7 +295,7 @@ def test_diagnostics():
 def test_paper_preset():
     ledger = [json.loads(line) for line in (RESULTS / "paper/ledger.jsonl").read_text().splitlines()]
     errors = ", ".join(f"{line['theta_error']:.1f}" for line in ledger)
-    assert_printed([f"Summed error by round: {errors}."])
+    assert_printed("paper-preset", [f"Summed error by round: {errors}."])
 
 
 def test_sbibm():
@@ -293,7 +304,7 @@ def test_sbibm():
     with (RESULTS / "sbibm/table.csv").open(newline="") as file:
         for row in csv.DictReader(file):
             values.setdefault((row["task"], row["method"], row["simulations"]), []).append(float(row["c2st"]))
-    printed = np.array(re.findall(r"(0\.\d{3}) ± (0\.\d{3})", README), float)
+    printed = np.array(re.findall(r"(0\.\d{3}) ± (0\.\d{3})", page("sbibm")), float)
     assert len(printed) == len(values)
     for cell, found in values.items():  # the table keeps four digits
         off = np.abs(printed - [np.mean(found), np.std(found, ddof=1)])
@@ -305,7 +316,7 @@ SOTA_TABLES = sota.tables(sota.read(RESULTS / "sota/results.csv"), list(SOTA_SET
 
 @pytest.mark.parametrize("line", sorted({line for line in SOTA_TABLES.splitlines() if line}))
 def test_sota(line):
-    assert " ".join(line.split()) in README
+    assert " ".join(line.split()) in page("sota")
 
 
 def same(text: str, value: float) -> bool:
@@ -314,8 +325,11 @@ def same(text: str, value: float) -> bool:
     return abs(float(text) - value) <= 0.51 * 10.0**-digits
 
 
-SIM2SIM = {"sim2sim": "## The whip: known truth", "sim2sim-learnt": "**Known truths.**"}
-"""Where the results of a folder are printed."""
+SIM2SIM = {
+    "sim2sim": ("whip-known-truth", "# The whip: known truth"),
+    "sim2sim-learnt": ("whip-vision", "**Known truths.**"),
+}
+"""Where the results of a folder are printed: the page, and what the table comes after."""
 
 
 @pytest.mark.parametrize(
@@ -326,7 +340,8 @@ SIM2SIM = {"sim2sim": "## The whip: known truth", "sim2sim-learnt": "**Known tru
 def test_sim2sim(name, row):
     """Errors as printed are the table's."""
     label = {"fixed": "fixed", "edge": "EDGE"}[row["support"]]
-    section = README[README.index(SIM2SIM[name]) :]
+    where, heading = SIM2SIM[name]
+    section = page(where).partition(heading)[2]
     section = section[section.index(f"| {row['detector']} | 20 inside") :]
     section = section if row["truths"] == "inside" else section[section.index("| 8 outside") :]
     cells = [cell.strip() for cell in section[section.index(f"| {label} |") :].split("|")[2:6]]
@@ -343,7 +358,7 @@ def test_sim2sim(name, row):
 def test_real2sim(dlo, configuration):
     """Median and interval of seed 0, medians of the other seeds, and the final support of the modulus."""
     found = [row for row in rows("real2sim") if row["object"] == dlo and row["configuration"] == configuration]
-    section = README[README.index(f"| {dlo}: ") :]
+    section = page("whip-real2sim").partition(f"| {dlo}: ")[2]
     label = "EDGE" if "edge" in configuration else "fixed"
     cells = [cell.strip() for cell in section[section.index(f"| {label} |") :].split("|")[2:7]]
     numbers = lambda text: re.findall(r"[\d.]+(?:e\+\d+)?", text)
@@ -365,10 +380,11 @@ def test_several_rollouts(name):
     held = ((low <= theta) & (theta <= high)).sum(axis=0)
     label = {"1": "| 1 | 0", "tuning/4-mean": "| 4, `mean` | 1000", "tuning/4-all": "| 4, `all` | 1000"}[name]
     assert_printed(
+        "whip-rollouts",
         [
             f"{label} | {error[0]:.1f} | {error[1]:.2f} | {deviation[0]:.1f}, {deviation[1]:.2f} "
             f"| {held[0]}, {held[1]} of {len(theta)} |"
-        ]
+        ],
     )
 
 
@@ -384,7 +400,9 @@ def test_several_rollouts_of_the_reference_objects(dlo, rollouts):
     runs = reference_objects(dlo, rollouts)
     length, modulus = (", ".join(row[name] for row in runs) for name in ("length [mm]", "E [kPa]"))
     held = sum(row["holds E by sag"] == "True" for row in runs)
-    assert_printed([f"| {rollouts.removesuffix(' mean')} | {length} | {modulus} | {held} of {len(runs)} |"])
+    assert_printed(
+        "whip-rollouts", [f"| {rollouts.removesuffix(' mean')} | {length} | {modulus} | {held} of {len(runs)} |"]
+    )
 
 
 @pytest.mark.parametrize("dlo", ["dlo-2", "dlo-3"])
@@ -393,7 +411,7 @@ def test_mean_moduli_of_the_reference_objects(dlo):
         np.mean([float(row["E [kPa]"].split()[0]) for row in reference_objects(dlo, rollouts)])
         for rollouts in ("1", "4 mean")
     )
-    assert_printed([f"from {one:.1f} to {four:.1f} kPa"])
+    assert_printed("whip-rollouts", [f"from {one:.1f} to {four:.1f} kPa"])
 
 
 def test_engines_of_the_whip():
@@ -404,7 +422,7 @@ def test_engines_of_the_whip():
         ("MJX, two shards", "mjx"),
     ):
         cells = " | ".join(f"{measured[name][batch]['steps/s']:,.0f}" for batch in ("1", "12", "100", "1024"))
-        assert_printed([f"| {printed} | {cells} |"])
+        assert_printed("benchmarks", [f"| {printed} | {cells} |"])
 
 
 def test_front_page():
@@ -438,7 +456,7 @@ def test_bound_warnings():
         if not beyond.any():
             alarms, right = alarms + np.sum(named), right + named.size
             warned, runs = warned + np.sum(named.any(axis=(0, 2))), runs + named.shape[1]
-    (row,) = re.findall(r"\| \*\*more than 0.2 of the mass [^|]+\|[^|]+\|[^|]+\|[^|]+\|", README)
+    (row,) = re.findall(r"\| \*\*more than 0.2 of the mass [^|]+\|[^|]+\|[^|]+\|[^|]+\|", page("wrong-bounds"))
     for count, of in ((hits, wrong), (alarms, right), (warned, runs)):
         assert f"({count} of {of})" in row
 
@@ -453,14 +471,14 @@ def test_wrong_bounds():
         for rule, named in rules.items():
             own = [arrays(f"wrong-bounds/{name}") for name, one in PROBLEMS.items() if one.held_out == held_out]
             total = np.sum([list(counts(found, named(found)).values()) for found in own], axis=0)
-            (row,) = re.findall(rf"\| {title}[^|]* \| [^|]*{rule}[^|]* \|[^|]+\|[^|]+\|[^|]+\|", README)
+            (row,) = re.findall(rf"\| {title}[^|]* \| [^|]*{rule}[^|]* \|[^|]+\|[^|]+\|[^|]+\|", page("wrong-bounds"))
             for hits, of in total:
                 assert f" {hits} of {of} ({100 * hits / of:.0f} %) |" in row
     every = [arrays(f"wrong-bounds/{name}") for name in PROBLEMS]
     total = np.sum([list(counts(found, found["wrong"]).values()) for found in every], axis=0)
     (named, wrong), (false, right), _ = total
-    assert f"Together {named} of {wrong} wrong bounds ({100 * named / wrong:.0f} %)" in README
-    assert f"{false} of {right} right ones of the same boxes" in README
+    assert f"Together {named} of {wrong} wrong bounds ({100 * named / wrong:.0f} %)" in page("wrong-bounds")
+    assert f"{false} of {right} right ones of the same boxes" in page("wrong-bounds")
 
 
 # ------------------------------------------------------------------------------------------------------------ policies
@@ -477,12 +495,12 @@ def test_settings_of_ppo(table):
     for row in policy_rows(table):
         returns.setdefault(row["settings"], []).append(float(row["return"]))
     for own in returns.values():
-        assert f" | {np.mean(own):.2f} | {', '.join(f'{value:.2f}' for value in own)} |" in README
+        assert f" | {np.mean(own):.2f} | {', '.join(f'{value:.2f}' for value in own)} |" in page("whip-policies")
 
 
 def test_the_study_of_policies():
     """Its text is the one that is made of what is kept."""
-    written = (ROOT / "README.md").read_text().split(report.BEGIN)[1].split(report.END)[0]
+    written = PAGES["whip-policies"].split(report.BEGIN)[1].split(report.END)[0]
     assert written.strip() == report.text(policies.load(RESULTS / "policies" / "study"))
 
 
@@ -494,7 +512,9 @@ def test_what_the_study_says():
     found = policies.load(RESULTS / "policies" / "study")
     at_truth = lambda policy, dlo: found.simulated(policy, f"{dlo}-true")
     ahead = lambda dlo, other: at_truth(f"{dlo}-edge", dlo).mean() - at_truth(other, dlo).mean()
-    text = " ".join(README.split("**What this says.**")[1].split("**Beside the paper's learner.**")[0].split())
+    text = " ".join(
+        page("whip-policies").split("**What this says.**")[1].split("**Beside the paper's learner.**")[0].split()
+    )
     stiff = ahead("sim-stiff", "uniform"), ahead("sim-stiff", "sim-stiff-none")
     assert "{:.2f} ahead of PPO-U and {:.2f} ahead of policies on the fixed".format(*stiff) in text
     for dlo in ("sim-in", "sim-long"):
@@ -514,13 +534,13 @@ def test_what_the_study_says():
 def test_the_learner_of_the_paper(learner, steps, name, policies):
     own = [row for row in policy_rows(name) if row["policy"].startswith(policies) and row["domain"] == "uniform"]
     cells = [mean_and_each([float(row[measure]) for row in own]) for measure in ("return", "hit", "clean_hit")]
-    assert f"| {learner} | {steps} | {' | '.join(cells)} |" in README
+    assert f"| {learner} | {steps} | {' | '.join(cells)} |" in page("whip-policies")
 
 
 def test_how_long_the_learner_of_the_paper_took():
     kept = arrays("policies/sb3/curves")
     minutes = np.concatenate([kept["16/seconds"], kept["2048/seconds"]]) / 60
-    assert f"A training took {minutes.min():.0f} to {minutes.max():.0f} minutes" in README
+    assert f"A training took {minutes.min():.0f} to {minutes.max():.0f} minutes" in page("whip-policies")
 
 
 @pytest.mark.parametrize("detector", ["centreline", "learnt"])
@@ -528,7 +548,7 @@ def test_how_long_the_learner_of_the_paper_took():
 def test_real2sim_through_pictures(dlo, detector):
     """Medians and intervals of seed 0, and medians of the other seeds."""
     found = [row for row in rows(f"real2sim-{detector}") if row["object"] == dlo]
-    section = README[README.index("**What seeing costs Real2Sim.**") :]
+    section = page("whip-vision").partition("**What seeing costs Real2Sim.**")[2]
     section = section[section.index(f"| {dlo}: ") :]
     cells = [cell.strip() for cell in section[section.index(f"| {detector} |") :].split("|")[2:6]]
     numbers = lambda text: re.findall(r"[\d.]+", text)
@@ -542,12 +562,12 @@ def test_real2sim_through_pictures(dlo, detector):
 def test_learnt_vision(name):
     with (RESULTS / "vision" / f"{name}.csv").open(newline="") as file:
         for row in csv.reader(file):
-            assert f"| {' | '.join(row)} |".replace("|  |", "| |") in README
+            assert f"| {' | '.join(row)} |".replace("|  |", "| |") in page("whip-vision")
 
 
 def test_mujoco_models():
     for line in (RESULTS / "mujoco-sysid/table.md").read_text().splitlines():
-        assert " ".join(line.split()) in README
+        assert " ".join(line.split()) in page("mujoco-sysid")
     names = {"posterior": "posterior of EDGE", "uniform": "uniform over Theta_0"}
     names |= {
         "fit": "least squares within Theta_0",
@@ -557,13 +577,15 @@ def test_mujoco_models():
     for domain, name in names.items():
         values = column("mujoco-policies", "return", domain=domain)
         each = ", ".join(f"{value:.3f}" for value in values)
-        assert f"| {name} | {values.mean():.3f} | {each} |" in README
+        assert f"| {name} | {values.mean():.3f} | {each} |" in page("mujoco-policies")
     found = arrays("mujoco-policies/episodes")
     ahead = (found["return/posterior"] - found["return/uniform"]).mean(axis=1)
     first, second, third = (f"{value:.3f}" for value in ahead)
-    assert f"{ahead.mean():.3f} ahead of the uniform distribution ({first}, {second} and {third} by seed" in README
+    assert f"{ahead.mean():.3f} ahead of the uniform distribution ({first}, {second} and {third} by seed" in page(
+        "mujoco-policies"
+    )
     positive = (arrays("mujoco-sysid/puck-wrong-apt")["draws"][..., 2] > 0).mean(axis=1)
-    assert f"kept both in all five ({100 * positive.min():.0f} to {100 * positive.max():.0f} %)" in README
+    assert f"kept both in all five ({100 * positive.min():.0f} to {100 * positive.max():.0f} %)" in page("mujoco-sysid")
 
 
 def test_points_and_posteriors_of_mujoco_models():
@@ -605,6 +627,7 @@ def test_points_and_posteriors_of_mujoco_models():
     ]
     assert len(puck) == 1 and (folder / "table.md").exists()
     assert_printed(
+        "mujoco-sysid",
         [
             f"sysid finds the truth of {sum(found(name, 'wrong', 'sysid') for name in three)} of 150 recordings",
             "finds {}: {}, {} and {} of 50. From the right boxes it finds {}, {} and {}.".format(
@@ -624,14 +647,17 @@ def test_points_and_posteriors_of_mujoco_models():
             ),
             "more than 0.1 in {} and {} of 50".format(*(off(one, 1) for one in restitution)),
             "in {} of 50 posteriors from the right box and {} of 50 from the wrong one".format(*both),
-        ]
+        ],
     )
     assert found("puck", "right", "scipy") == 0
+    least = sum(found(name, "wrong", "sysid") for name in three)
+    text = f"EDGE finds the truth of {sum(by_edge['wrong'])} of 150 recordings, and `mujoco.sysid` of {least}"
+    assert text in " ".join((ROOT.parent / "README.md").read_text().split())
 
 
 @pytest.mark.parametrize("task", ["gaussian_linear", "lotka_volterra"])
 def test_several_trials(task):
-    assert_printed((RESULTS / "trials" / task / "table.md").read_text().splitlines())
+    assert_printed("trials", (RESULTS / "trials" / task / "table.md").read_text().splitlines())
 
 
 BOXES = ("right", "wrong")
@@ -640,7 +666,7 @@ BOXES = ("right", "wrong")
 def test_summaries_of_mujoco_models():
     lines = (RESULTS / "mujoco-summaries/table.md").read_text().splitlines()
     cells = [[cell.strip().strip("`") for cell in line.strip("|").split("|")] for line in lines]
-    assert_printed([*lines])
+    assert_printed("mujoco-summaries", [*lines])
     found = {tuple(own[:3]): dict(zip(cells[0][3:], own[3:], strict=True)) for own in cells[2:]}
     recordings = lambda *key: (
         f"{float(found[key]['truth found']) * int(found[key]['recordings']):.0f} of " + (found[key]["recordings"])
@@ -662,6 +688,7 @@ def test_summaries_of_mujoco_models():
         low, high = np.quantile(draws, [0.05, 0.95], axis=1)
         delay[summary] = np.median(high - low) / 2 / 0.04
     assert_printed(
+        "mujoco-summaries",
         [
             f"It finds the truth in {recordings('all', 'right', 'samples')} recordings from either box",
             f"{correlations[0]} and {correlations[1]} against {error('arm', 'right', 'samples')}",
@@ -672,7 +699,7 @@ def test_summaries_of_mujoco_models():
             f"the truth is found in {recordings('puck', 'right', 'cross-correlation')} recordings",
             f"has a half-width of {delay['spectrum']:.3f} from the right box in place of {delay['samples']:.3f}",
             f"hold {100 * min(held):.0f} to {100 * max(held):.0f} % of truths by samples and correlations",
-        ]
+        ],
     )
 
 
@@ -689,10 +716,11 @@ def test_ten_thousand_bad_inputs():
     assert found["outcomes"].keys() == names.keys() and sum(found["outcomes"].values()) == 10_000
     slowest, memory = found["slowest"]["seconds"], found["most_memory_gib"]
     assert_printed(
+        "fuzzing",
         [
             *(f"| {names[name]} | {count:,} |" for name, count in found["outcomes"].items()),
             f"The slowest case took {slowest} s, and the most memory was {memory:.1f} GiB",
-        ]
+        ],
     )
 
 
@@ -702,8 +730,8 @@ def test_what_survives():
         with (RESULTS / f"reliability/{name}.csv").open(newline="") as file:
             found[name] = list(csv.DictReader(file))
     kills = found["kills"]
-    assert f"{len({row['trial'] for row in kills})} trials with {len(kills)} kills" in README
-    assert f"{len(found['adversities'])} other adversities" in README
+    assert f"{len({row['trial'] for row in kills})} trials with {len(kills)} kills" in page("reliability")
+    assert f"{len(found['adversities'])} other adversities" in page("reliability")
     kills += found["kills-r2s2r"]
     assert all(row["result"] == "same bits" for row in kills)
     names = {name: f"`{name}`" for name in ("infer", "compare", "grid", "train", "r2s2r")} | {
@@ -712,7 +740,7 @@ def test_what_survives():
     for name, words in names.items():
         how = [row["how"] for row in kills if row["command"] == name]
         line = rf"\| {re.escape(words)} \| \d+ \| {how.count('in a window')} \| {how.count('at a moment')} \| all \|"
-        assert re.search(line, README), line
+        assert re.search(line, page("reliability")), line
 
 
 def test_the_table_of_observations_unlike_simulations():

@@ -17,6 +17,7 @@ from jaxlfi.runs import folder
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
+STUDIES = [ROOT / "experiments/README.md", *sorted((ROOT / "experiments/studies").glob("*.md"))]
 
 
 def hooks():
@@ -43,21 +44,49 @@ def test_directives_are_replaced_by_what_they_stand_for():
     assert "## own_heuristic.py" in made.rendered(text("examples.md"))
 
 
+def test_links_hold_in_the_site():
+    made, studies = hooks(), ROOT / "experiments/studies"
+    for source, link, expected in (
+        (ROOT / "docs/paper.md", "[a](../experiments/studies/mg1.md#x)", "[a](studies/mg1.md#x)"),
+        (ROOT / "docs/index.md", "![](../experiments/results/demo/samples.png)", "![](results/demo/samples.png)"),
+        (ROOT / "docs/tutorials/arm.md", "[a](../mujoco.md) [b](../../examples/mujoco)", "[a](../mujoco.md) b"),
+        (studies / "sota.md", "[a](../../docs/calibration.md) [b](mg1.md)", "[a](../calibration.md) [b](mg1.md)"),
+        (
+            studies / "mg1.md",
+            "[a](../README.md#settings) [b](../results/mg1/table.md)",
+            "[a](../experiments.md#settings) b",
+        ),
+        (ROOT / "experiments/README.md", "[a](studies/mg1.md) [b](results)", "[a](studies/mg1.md) b"),
+        (
+            ROOT / "docs/paper.md",
+            "[a](https://example.org) [b](no-such.md)",
+            "[a](https://example.org) [b](no-such.md)",
+        ),
+    ):
+        assert made.linked(link, source) == expected
+    assert made.site_name(studies) is None and made.site_name(ROOT / "experiments/results/demo") is None
+
+
+def test_every_study_is_in_the_index():
+    index = (ROOT / "experiments/README.md").read_text()
+    for page in STUDIES[1:]:
+        (row,) = [line for line in index.splitlines() if line.startswith(f"| [{page.read_text().splitlines()[0][2:]}]")]
+        cells = row.strip("| ").split(" | ")
+        assert f"](studies/{page.name})" in cells[0] and len(cells) == 5 and all(cells)
+
+
 def test_every_page_is_in_the_menu():
     yaml = pytest.importorskip("yaml")
     menu = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
     named = set(re.findall(r"'([\w/-]+\.md)'", str(menu)))
-    assert named == {path.relative_to(ROOT / "docs").as_posix() for path in PAGES}
+    assert named == {path.relative_to(ROOT / "docs").as_posix() for path in PAGES} | {"experiments.md"}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("page", [*PAGES, *STUDIES], ids=lambda path: path.stem)
 def test_links_and_modules_exist(page):
     body = page.read_text()
     for target in re.findall(r"\]\(([^)#\s]+)", re.sub(r"`[^`]*`", "", body)):
-        place = page.parent / target
-        if target.lstrip("./").startswith("results/"):
-            place = ROOT / "experiments" / target.lstrip("./")
-        assert place.exists(), target
+        assert ":" in target or (page.parent / target).exists(), target
     for module in re.findall(r"^::: (\S+)$", body, re.MULTILINE):
         assert importlib.util.find_spec(module), module
     for reference in re.findall(r"\]\[(jaxlfi[\w.]+)\]", body):

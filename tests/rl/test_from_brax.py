@@ -159,7 +159,7 @@ def test_what_does_not_fit_is_refused(slider):
     for arguments, expected in (
         ((wrapped, heavier, MASSES, ("mass",)), "env: expected an environment that is not wrapped, got EpisodeWrapper"),
         ((object(), heavier, MASSES, ("mass",)), "env: expected an environment with a model"),
-        ((slider.env, mass_of, MASSES, ("mass", "friction")), "names: expected 1, one a parameter"),
+        ((slider.env, mass_of, MASSES, ("mass", "friction")), "names: expected 1, one per parameter"),
     ):
         with pytest.raises(ValueError, match=expected):
             from_brax(*arguments)
@@ -169,7 +169,7 @@ def test_what_does_not_fit_is_refused(slider):
     ("changes", "expected"),
     [
         ({"log": ("mas",)}, r"log: expected names of parameters \(mass\), got mas"),
-        ({"units": ("kg", "m")}, r"units: expected 1, one a parameter, got \['kg', 'm'\]"),
+        ({"units": ("kg", "m")}, r"units: expected 1, one per parameter, got \['kg', 'm'\]"),
         ({"feasible": Support([0.1, 0.1], [5.0, 5.0])}, "support: expected bounds for 2 parameters, got 1"),
         ({"feasible": Support([1.0], [5.0])}, "support: expected "),
         ({"nominal": (9.0,)}, r"nominal: expected 1 numbers within Phi, got \[9.0\]"),

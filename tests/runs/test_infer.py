@@ -398,7 +398,7 @@ def test_without_an_observation_one_is_simulated_at_the_truth():
     ("arguments", "message"),
     [
         ({"observation": np.zeros(3)}, r"observation: expected the shape the simulator produces, \[2\], got \[3\]"),
-        ({"observation": np.array([np.nan, 0])}, "observation: expected finite"),
+        ({"observation": np.array([np.nan, np.inf])}, "observation: expected finite"),
         ({"support": "unknown"}, "support: expected one of"),
         ({"support": ([0, 0], [1, 1])}, r"support: expected one of .* or a box such as jaxlfi\.Support"),
         ({"support": Support([0.0], [1.0])}, "support: expected bounds for 2 parameters, got 1"),

@@ -97,7 +97,7 @@ def test_a_host_simulator_makes_all_trials_in_one_call():
             r"pooling: expected one of \['all', 'mean', 'moments'\], got 'median'",
         ),
         (lambda: registry.load(f"{TASK},trials=two"), "trials: expected a value of type int, got 'two'"),
-        (lambda: together([np.zeros(2), np.zeros(3)]), r"observation: expected trials of one shape .*\[2\], \[3\]"),
+        (lambda: together([np.zeros((3, 2)), np.zeros((3, 1))]), r"observation: expected trials of one shape .*\[3, 1\], \[3, 2\]"),
     ],
 )
 def test_what_is_refused(call, said):

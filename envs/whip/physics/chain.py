@@ -18,7 +18,7 @@ SECOND_MOMENT = SECTION**4 / 12
 
 @dataclasses.dataclass(frozen=True)
 class Chain:
-    """How the DLO is divided into links.
+    """The division of the DLO into links.
 
     Attributes:
         elements: number of elements N.

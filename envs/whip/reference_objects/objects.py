@@ -39,7 +39,7 @@ class ReferenceObject:
 
     @property
     def density(self) -> float:
-        """In kg/m^3."""
+        """Density in kg/m^3."""
         return self.mass / (SECTION**2 * self.length)
 
     @property

@@ -119,7 +119,7 @@ def _row(name: str, dlo: str, place: int, one: Deployed) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Of each policy on each object: mean return and its standard error, worst return, rates of hits and exits."""
+    """Tabulate each policy on each object: mean return with standard error, worst return, rates of hits and exits."""
     pairs = dict.fromkeys((row["policy"], row["object"]) for row in rows)
     out = []
     for policy, dlo in pairs:

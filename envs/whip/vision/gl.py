@@ -111,7 +111,7 @@ class _Stage:
         self._gl.free()
 
     def render(self, camera: Camera, frame: Frames, cube_side: float, look: Look) -> tuple[np.ndarray, np.ndarray]:
-        """As above."""
+        """Draw one picture, as above."""
         self._light(look)
         for name in ("table", "wall"):
             self._cover(name, getattr(look, name), float(look.grain[1]), look)

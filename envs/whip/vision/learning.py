@@ -20,7 +20,7 @@ CHUNK = 50
 
 
 class Loss(Protocol):
-    """What is minimised; it draws its own batch."""
+    """The loss; it draws its own batch."""
 
     def __call__(self, params: Any, key: jax.Array, data: Any) -> Float[Array, ""]:
         """The loss of a batch."""

@@ -24,7 +24,7 @@ PALETTE = np.array([RGBA[name][:3] for name in (*COLOURS, "dlo")])
 
 @struct.dataclass
 class Surface:
-    """What a table or a wall is covered with.
+    """The pattern of a table or a wall.
 
     Attributes:
         colours: two, shape [2, 3].

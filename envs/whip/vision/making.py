@@ -27,7 +27,7 @@ STREWN = 3
 
 @dataclasses.dataclass(frozen=True)
 class Asked:
-    """What data set is asked for.
+    """The data set that is asked for.
 
     Attributes:
         count: number of pictures.
@@ -46,7 +46,7 @@ class Asked:
 
 @dataclasses.dataclass(frozen=True)
 class Sight:
-    """What is to be seen in one picture.
+    """The content of one picture.
 
     Attributes:
         frame: of the scene.

@@ -11,7 +11,7 @@ TAPS = 7
 
 @struct.dataclass
 class Shot:
-    """How one picture is taken.
+    """The camera settings of one picture.
 
     Attributes:
         defocus: standard deviation of the blur, in pixels.

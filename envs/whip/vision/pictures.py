@@ -1,7 +1,7 @@
 """A data set of pictures: a folder of PNG files, and an index of them.
 
 pictures.json                  what the folder holds: schema, version, size, names of the labels, where it comes from
-index.jsonl                    a line a picture: its file, that of its labels, and what else is known of it
+index.jsonl                    one line per picture: its file, that of its labels, and what else is known of it
 000000.png 000000_labels.png   a picture, and the label of each of its pixels as a shade of grey, 0 to 7
 
 A folder is whole once `pictures.json` counts the lines of its index.
@@ -133,7 +133,7 @@ def read(folder: Path) -> Pictures:
 
 
 def check(folder: Path) -> Mapping[str, Any]:
-    """What is said of a folder.
+    """The description of a folder.
 
     Raises:
         PicturesError: where it does not hold a whole data set.

@@ -73,7 +73,7 @@ def labelled(frames: Frames, cube_side: Float[Array, ""] | float, width: Float[A
 
 
 def first_hits(camera: Camera, bodies: Bodies, size: int) -> Hits:
-    """What is seen of some bodies, none of which the camera is inside of."""
+    """The visible parts of some bodies, none of which contains the camera."""
     numbers = jnp.arange(bodies.offsets.shape[0]) + 1
     faces, towards = planes(camera, bodies)
     axis = slopes(camera, size)

@@ -1,4 +1,4 @@
-"""How well pictures are segmented, and keypoints found."""
+"""Scores of segmentations and keypoints."""
 
 from collections.abc import Mapping
 
@@ -44,7 +44,7 @@ def summary(
     lines_true: Float[np.ndarray, "n 4 2"],
     lines_found: Float[np.ndarray, "n 4 2"],
 ) -> Mapping[str, float]:
-    """What a table says of a segmentation.
+    """A segmentation's row in a table.
 
     Args:
         true: labels.

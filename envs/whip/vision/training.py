@@ -32,7 +32,7 @@ POINTS = 33
 
 @dataclasses.dataclass(frozen=True)
 class Preset:
-    """How both networks are trained.
+    """Settings for training both networks.
 
     Attributes:
         networks: the segmenter and the transporter.

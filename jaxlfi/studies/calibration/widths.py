@@ -31,7 +31,7 @@ class Widths:
     Attributes:
         plan: where truths were drawn.
         names: of the parameters in inference space.
-        parameters: one a parameter.
+        parameters: one per parameter.
         regions: densest regions of all parameters together.
     """
 
