@@ -29,6 +29,7 @@ from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip import require_mujoco
 from jaxlfi.envs.whip.vision import options
 from jaxlfi.io.shell import quoted
+from jaxlfi.registry import HEURISTICS
 
 EXAMPLES = """\
 examples:
@@ -116,7 +117,6 @@ def _begin(arguments: argparse.Namespace) -> None:
     from jaxlfi.envs.whip.real2sim import recorded
     from jaxlfi.envs.whip.reference_objects import objects
     from jaxlfi.envs.whip.vision.commands import sights
-    from jaxlfi.heuristics import registry as heuristics
     from jaxlfi.io import files
     from jaxlfi.rl import policy
     from jaxlfi.rl.settings import PRESETS
@@ -126,7 +126,7 @@ def _begin(arguments: argparse.Namespace) -> None:
     if arguments.iterations < 1:
         raise ValueError(f"iterations: expected at least 1, got {arguments.iterations}")
     train.check_seeds(arguments.seed, 1, "seed")
-    heuristics.load(arguments.heuristic)
+    HEURISTICS.load(arguments.heuristic)
     if arguments.total_steps is not None:
         PRESETS[arguments.preset].replace(total_steps=arguments.total_steps)
     if arguments.policy:

@@ -19,7 +19,6 @@ from jaxlfi.bayessim.presets import all_rounds
 from jaxlfi.cli import asked, interrupts, summaries, tables, train
 from jaxlfi.cli.exit_status import resuming
 from jaxlfi.distributions.truncation import TRIES
-from jaxlfi.heuristics import registry as heuristics
 from jaxlfi.io import files as atomic
 from jaxlfi.io import host_devices
 from jaxlfi.io.locks import locked
@@ -27,6 +26,7 @@ from jaxlfi.io.processes import Processes
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.io.shell import quoted
+from jaxlfi.registry import TASKS
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import export
 from jaxlfi.runs import folder as run_store
@@ -37,7 +37,6 @@ from jaxlfi.studies import calibration, grid
 from jaxlfi.studies.calibration.widths import sentence
 from jaxlfi.studies.grid import Work
 from jaxlfi.tasks import priors
-from jaxlfi.tasks import registry as task_lookup
 from jaxlfi.tasks.errors import ExecutorError, SimulatorError
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.task import Task
@@ -54,15 +53,15 @@ DIAGNOSTICS = "diagnostics"
 def tasks(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi tasks [NAME]`."""
     if arguments.name:
-        _describe_task(task_lookup.load(arguments.name), console)
+        _describe_task(TASKS.load(arguments.name), console)
         return
     table = Table("task", "parameters", "supports", "observation")
-    for name in task_lookup.names():
+    for name in TASKS.names():
         try:
-            if wanted := task_lookup.wanted(name):
+            if wanted := TASKS.wanted(name):
                 table.add_row(escape(name), "", "", escape(f"give it as {wanted}"))
                 continue
-            task = task_lookup.load(name)
+            task = TASKS.load(name)
         except ValueError as error:  # one broken package must not hide the others
             table.add_row(escape(name), "", "", escape(str(error).splitlines()[0]))
             continue
@@ -97,8 +96,8 @@ def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
         own = arguments.support is not None or arguments.support_low is not None or arguments.support_high is not None
         support_name, support = asked.support_of(arguments, task) if own else ("own", None)
         first, support = presimulated(task, read_simulations(arguments.simulations), support)
-    rule = asked.build_heuristic(arguments, arguments.heuristic, settings, task)
-    heuristics.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
+    kinds = asked.heuristics_of(arguments, [arguments.heuristic])
+    rule = asked.build_heuristic(arguments, arguments.heuristic, kinds, settings, task)
     configuration = support_name if arguments.heuristic == "none" else f"{support_name}+{arguments.heuristic}"
     specs = tuple(RunSpec(configuration, support_name, support, rule, seed) for seed in asked.seeds_of(arguments))
     kind = run_store.RUN if len(specs) == 1 else run_store.RUNS
@@ -114,10 +113,11 @@ def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
     if len(set(configurations)) < len(configurations):
         raise ValueError(f"configurations: expected distinct ones, got {configurations}")
     parts = [asked.configuration_parts(name) for name in configurations]
-    heuristics.refuse_foreign(arguments.hyperparameters, [heuristic for _, heuristic in parts])
+    kinds = asked.heuristics_of(arguments, [heuristic for _, heuristic in parts])
+    build = lambda heuristic: asked.build_heuristic(arguments, heuristic, kinds, settings, task)
     # Seeds are the slow index, so that every device gets all configurations, fast and slow ones.
     specs = tuple(
-        RunSpec(name, support, task.support(support), asked.build_heuristic(arguments, heuristic, settings, task), seed)
+        RunSpec(name, support, task.support(support), build(heuristic), seed)
         for seed in asked.seeds_of(arguments)
         for name, (support, heuristic) in zip(configurations, parts, strict=True)
     )
@@ -155,10 +155,10 @@ def _hold(arguments: argparse.Namespace, folder: Path) -> None:
 
 def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi grid`."""
-    task = task_lookup.load(arguments.task)
+    task = TASKS.load(arguments.task)
     settings = asked.build_settings(arguments, task, all_rounds)
     axes = grid.parse_axes(arguments.vary)
-    heuristics.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
+    kinds = asked.heuristics_of(arguments, [arguments.heuristic])
     for axis in axes:
         if axis.name in arguments.hyperparameters:
             raise ValueError(f"{axis.name}: expected it on an axis or as a flag of its own, got both")
@@ -166,7 +166,7 @@ def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
     plan = grid.Grid(
         task=task,
         support=task.support(name),
-        rule=asked.build_heuristic(arguments, arguments.heuristic, settings, task),
+        rule=asked.build_heuristic(arguments, arguments.heuristic, kinds, settings, task),
         axes=axes,
         seeds=tuple(asked.seeds_of(arguments)),
         settings=settings,
@@ -260,7 +260,7 @@ def sample(arguments: argparse.Namespace, console: Console) -> None:
 
 def diagnose(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi diagnose DIR`."""
-    task = None if arguments.task is None else task_lookup.load(arguments.task)
+    task = None if arguments.task is None else TASKS.load(arguments.task)
     run = calibration.read_run(arguments.folder, task)
     run = run.replace(task=asked.simulated_again(arguments, arguments.folder, run.task))
     references = arguments.reference

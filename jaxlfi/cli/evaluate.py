@@ -13,6 +13,7 @@ from jaxlfi import flags
 from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import exit_status
 from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.registry import ENVIRONMENTS
 
 EXAMPLES = f"""\
 {DOMAINS}
@@ -61,7 +62,6 @@ def _run(arguments: argparse.Namespace) -> None:
     from rich.table import Table
 
     from jaxlfi.cli import tables
-    from jaxlfi.rl import registry
     from jaxlfi.rl.evaluation import cross_evaluate
     from jaxlfi.rl.policy import load
 
@@ -69,7 +69,7 @@ def _run(arguments: argparse.Namespace) -> None:
         raise ValueError(f"out: expected a new .csv file, got {arguments.out}")
     if arguments.out is not None:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)  # which may fail, and then does so before the work
-    environment = registry.load(arguments.environment)
+    environment = ENVIRONMENTS.load(arguments.environment)
     policies = {str(path): load(path) for path in arguments.policies}
     draws = domains_of(environment, arguments.domain)
     rows = cross_evaluate(environment, policies, draws, arguments.episodes, arguments.seed)

@@ -10,27 +10,23 @@ before jax starts can be set after the arguments are known.
 import argparse
 import contextlib
 import dataclasses
-import itertools
 import json
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import jaxlfi
-from jaxlfi import factories, flags, plugins, source_fields
+from jaxlfi import flags, references
 from jaxlfi.cli import help_texts, interrupts, joined, warned
 from jaxlfi.cli.exit_status import refuse, resuming
-from jaxlfi.fields import Declared
+from jaxlfi.cli.own_fields import FIELDS
+from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, Classes, package_of
 
 Subparsers = argparse._SubParsersAction  # argparse has no public name for it
 PRESETS = ("quick", "paper")
 METHODS = ("bayessim", "apt", "npe", "snle")
-HEURISTICS, ESTIMATORS = "jaxlfi.heuristics", "jaxlfi.estimators"
-"""The entry-point groups of classes whose fields have flags."""
-COMMANDS = "jaxlfi.commands"
-"""The entry-point group of commands that packages add."""
 OWN_COMMANDS = ("tasks", "infer", "compare", "grid", "resume", "sample", "diagnose", "report")
 SETTINGS = "jaxlfi.bayessim.settings:Settings"
 """The class whose fields are the settings of a run."""
@@ -57,46 +53,41 @@ class OneLineParser(argparse.ArgumentParser):
 
 @dataclasses.dataclass(frozen=True)
 class Families:
-    """Classes whose fields have flags, by the names they are registered by or as `module:Class`.
+    """Classes whose fields have flags: by name what they declare, which is nothing of packages not imported.
 
     Attributes:
-        heuristics: their sources.
-        estimators: their sources.
+        rules: the heuristics.
+        networks: the estimators.
     """
 
-    heuristics: Mapping[str, source_fields.Source]
-    estimators: Mapping[str, source_fields.Source]
+    rules: flags.Families = dataclasses.field(default_factory=lambda: _own(HEURISTICS))
+    networks: flags.Families = dataclasses.field(default_factory=lambda: _own(ESTIMATORS))
 
-    @staticmethod
-    def of(words: Sequence[str]) -> "Families":
-        """All that are installed, and those that the words name, as their sources describe them."""
-        heuristics = [*_values(words, "--heuristic"), *(word.partition("+")[2] for word in words)]
-        return Families(
-            *(
-                source_fields.of_group(group) | {name: source_fields.of_class(name) for name in named if ":" in name}
-                for group, named in ((HEURISTICS, heuristics), (ESTIMATORS, _values(words, "--estimator")))
-            )
-        )
-
-    @property
-    def rules(self) -> flags.Families:
-        """Fields of the heuristics."""
-        return {name: source.fields for name, source in self.heuristics.items()}
-
-    @property
-    def networks(self) -> flags.Families:
-        """Fields of the estimators."""
-        return {name: source.fields for name, source in self.estimators.items()}
+    def __add__(self, others: "Families") -> "Families":
+        """Both, and where both have a class what the others say of it."""
+        return Families({**self.rules, **others.rules}, {**self.networks, **others.networks})
 
 
-def _values(words: Sequence[str], flag: str) -> list[str]:
-    """What the words give for a flag."""
-    after = [value for word, value in itertools.pairwise([*words, ""]) if word == flag]
-    return after + [word.removeprefix(f"{flag}=") for word in words if word.startswith(f"{flag}=")]
+def _own(family: Classes) -> flags.Families:
+    """All registered names, and of our own classes the fields."""
+    registered = family.points().items()
+    return {name: {} if others else FIELDS.get(point.value, {}) for name, (point, *others) in registered}
 
 
-def _run_fields() -> Mapping[str, Declared]:
-    return source_fields.of_class(SETTINGS).fields
+def _imported(arguments: argparse.Namespace) -> Families:
+    """What the classes of other packages that arguments name declare; they are imported, and jax with them.
+
+    Raises:
+        ValueError: where they cannot be.
+    """
+    from jaxlfi.fields import declared
+
+    def fields_of(family: Classes, names: set[str]) -> flags.Families:
+        foreign = {name for name, (point, *_) in family.points().items() if point.value not in FIELDS}
+        return {name: declared(family.load(name)) for name in sorted(names) if ":" in name or name in foreign}
+
+    networks = {getattr(arguments, "estimator", None)} - {None}
+    return Families(fields_of(HEURISTICS, _rules_used(arguments)), fields_of(ESTIMATORS, networks))
 
 
 def parser(families: Families | None = None) -> argparse.ArgumentParser:
@@ -105,7 +96,7 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
     Args:
         families: classes whose fields have flags; by default all that are installed.
     """
-    families = Families.of(()) if families is None else families
+    families = families or Families()
     top = OneLineParser(
         prog="jaxlfi",
         description="Likelihood-free inference that notices when the prior's support is wrong, and moves it.",
@@ -122,7 +113,7 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
     _add_sample(commands)
     _add_diagnose(commands)
     _add_report(commands)
-    for name in plugins.names(COMMANDS):
+    for name in COMMANDS.names():
         if name not in OWN_COMMANDS:
             shown = name.replace("%", "%%")
             commands.add_parser(name, add_help=False, help=f"commands of its own: jaxlfi {shown} --help")
@@ -314,46 +305,38 @@ def foreign_command(name: str) -> Callable[[list[str]], int] | None:
     Raises:
         ValueError: where several packages add it, or it cannot be imported.
     """
-    packages = [plugins.package_of(point) for point in plugins.points(COMMANDS).get(name, ())]
+    packages = [package_of(point) for point in COMMANDS.points().get(name, ())]
     if packages and name in OWN_COMMANDS:
-        plugins.refuse_clash("command", name, ["jaxlfi", *packages])
-    return plugins.find(COMMANDS, "command", name) if packages else None
+        COMMANDS.refuse_clash(name, ["jaxlfi", *packages])
+    return COMMANDS.find(name) if packages else None
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """The arguments.
 
-    Where the source of a class does not show all its fields, and there are flags that nothing else knows, the class is
-    imported, and jax with it.
+    Classes of other packages are imported where they are named and there are flags that nothing else knows.
 
     Raises:
         ValueError: if that fails.
     """
-    families = Families.of(words)
+    families = Families()
+    if {"-h", "--help"} & set(words):
+        with contextlib.suppress(ValueError):  # help has to be shown, whatever is wrong with a package
+            families += _imported(_named_by(words))
     arguments, unknown = parser(families).parse_known_args(words)
     if not unknown:
         return arguments
-    rules, networks = _rules_used(arguments), {getattr(arguments, "estimator", None)} - {None}
-    if any(not families.heuristics[name].complete for name in rules & set(families.heuristics)) or any(
-        not families.estimators[name].complete for name in networks & set(families.estimators)
-    ):
-        prepare_jax(arguments)
-        families = _imported(families, rules, networks)
-    return parser(families).parse_args(words)
+    prepare_jax(arguments)
+    return parser(families + _imported(arguments)).parse_args(words)
 
 
-def _imported(families: Families, rules: set[str], networks: set[str]) -> Families:
-    """The families with what some classes really declare."""
-    from jaxlfi.estimators import registry as estimators
-    from jaxlfi.fields import declared
-    from jaxlfi.heuristics import registry as heuristics
-
-    real = lambda registry, names: {
-        name: source_fields.Source(declared(registry.load(name)), complete=True) for name in names
-    }
-    return Families(
-        {**families.heuristics, **real(heuristics, rules)}, {**families.estimators, **real(estimators, networks)}
-    )
+def _named_by(words: Sequence[str]) -> argparse.Namespace:
+    """The classes that words name, be they the arguments of a command or not."""
+    finder = OneLineParser(add_help=False)
+    finder.add_argument("--heuristic", nargs="?")
+    finder.add_argument("--estimator", nargs="?")
+    finder.add_argument("--configurations", nargs="*")
+    return finder.parse_known_args([word for word in words if word not in ("-h", "--help")])[0]
 
 
 def _rules_used(arguments: argparse.Namespace) -> set[str]:
@@ -413,7 +396,7 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
 
     rounds = command.add_argument_group("rounds (default: the preset's)")
-    flags.add(rounds, {"run": _run_fields()}, into="settings", defaults=False)
+    flags.add(rounds, {"run": FIELDS[SETTINGS]}, into="settings", defaults=False)
     network = command.add_argument_group("network and training (default: the preset's)")
     network.add_argument(
         "--estimator", metavar="NAME", help=_registered("the density estimator", families.networks, "the method's")
@@ -586,17 +569,17 @@ def _reference(arguments: argparse.Namespace) -> str:
     """The task's reference, with the options that other arguments ask for."""
     reference = arguments.task
     if arguments.object is not None:
-        reference = factories.with_option(reference, "object", *arguments.object)
-    options = factories.parse(reference)[1]
+        reference = references.with_option(reference, "object", *arguments.object)
+    options = references.parse(reference)[1]
     if len(arguments.observation or ()) > 1 and "trials" not in options:
-        reference = factories.with_option(reference, "trials", str(len(arguments.observation)))
+        reference = references.with_option(reference, "trials", str(len(arguments.observation)))
         if arguments.settings.get("embedding") == "trials" and "pooling" not in options:
-            reference = factories.with_option(reference, "pooling", "all")
+            reference = references.with_option(reference, "pooling", "all")
     return reference
 
 
 def _advice(words: Sequence[str]) -> str:
     """What to do where a process of several was lost."""
-    arguments, _ = parser(Families.of(words)).parse_known_args(words)
+    arguments, _ = parser().parse_known_args(words)
     folder = arguments.folder if arguments.command == "resume" else arguments.out
     return resuming(folder) if (folder / "config.json").exists() else ""

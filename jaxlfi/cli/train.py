@@ -11,11 +11,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxlfi import flags, source_fields
+from jaxlfi import flags
 from jaxlfi.cli import joined
 from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import exit_status, resuming
+from jaxlfi.cli.own_fields import FIELDS
 from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.registry import ENVIRONMENTS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -74,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--debug", action="store_true", help="show where an error came from")
     joined.add_flags(top)
     group = top.add_argument_group("PPO (default: the preset's)")
-    flags.add(group, {"PPO": source_fields.of_class(SETTINGS).fields}, into="settings", defaults=False)
+    flags.add(group, {"PPO": FIELDS[SETTINGS]}, into="settings", defaults=False)
     top.set_defaults(settings={})
     return top
 
@@ -103,10 +105,12 @@ def _train(arguments: argparse.Namespace) -> None:
 
     compile_cache.enable()
     processes = joined.join(arguments)
-    from jaxlfi.rl import registry, training
+    from jaxlfi.rl import training
 
     if not processes.writes:
-        training.resumed(arguments.out, registry.load(arguments.environment), lambda updates, curves: None, processes)
+        training.resumed(
+            arguments.out, ENVIRONMENTS.load(arguments.environment), lambda updates, curves: None, processes
+        )
         processes.leave()
         return
     plan = _plan(arguments)
@@ -201,7 +205,7 @@ def is_training(out: Path) -> bool:
 
 def resume(out: Path, console: "Console", figures: bool, processes: "Processes") -> None:
     """Go on with a training that was stopped; see `run`. Every process reads the folder."""
-    from jaxlfi.rl import registry, training
+    from jaxlfi.rl import training
     from jaxlfi.runs.execute import changed_machine
 
     config = training.read_config(out)
@@ -217,7 +221,7 @@ def resume(out: Path, console: "Console", figures: bool, processes: "Processes")
     if changed := changed_machine(config, processes):
         warning = f"begun with {', '.join(changed)}: the policies may be other than without an interruption"
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True, highlight=False)
-    environment = registry.load(config["environment"])
+    environment = ENVIRONMENTS.load(config["environment"])
     if processes.writes:
         run(out, environment, console, figures, processes)
     else:
@@ -245,11 +249,10 @@ def _plan(arguments: argparse.Namespace) -> Any:
     if arguments.seeds > MAX_SEEDS:
         raise ValueError(f"seeds: expected at most {MAX_SEEDS}, got {arguments.seeds}")
     check_seeds(arguments.first_seed, arguments.seeds, "first_seed")
-    from jaxlfi.rl import registry
     from jaxlfi.rl.settings import PRESETS as SETTINGS_OF
     from jaxlfi.rl.training import Plan
 
-    environment = registry.load(arguments.environment)
+    environment = ENVIRONMENTS.load(arguments.environment)
     return Plan(
         reference=arguments.environment,
         environment=environment,

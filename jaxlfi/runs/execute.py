@@ -23,12 +23,13 @@ from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
 from jaxlfi.io.processes import ALONE, Partition, Processes
+from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import Checkpoint
 from jaxlfi.runs.folder import COMPARE, RUN, RUNS, StoreError
 from jaxlfi.runs.run import Origin, Run
-from jaxlfi.tasks import failures, priors, registry
+from jaxlfi.tasks import failures, priors
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.failures import FailureLog, Message
 from jaxlfi.tasks.journal import Journal, OnSimulation
@@ -325,7 +326,7 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
         plan = BatchPlan(
             kind=config["format"],
             reference=config["task"],
-            task=task or registry.load(config["task"]),
+            task=task or TASKS.load(config["task"]),
             preset=config["preset"],
             settings=describe.settings_from_json(config["settings"]),
             specs=tuple(_spec(run) for run in config["runs"]),

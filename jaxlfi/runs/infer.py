@@ -23,9 +23,11 @@ from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import SpaceName
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset
-from jaxlfi.heuristics import Edge, Heuristic, paired, registry
+from jaxlfi.heuristics import Edge, Heuristic, paired
+from jaxlfi.heuristics.hyperparameters import build, check
 from jaxlfi.io.locks import locked
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.registry import HEURISTICS
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.execute import BatchPlan, Observed
@@ -111,8 +113,8 @@ def infer(
     if not isinstance(settings, Settings):
         raise ValueError(f"settings: expected jaxlfi.Settings such as jaxlfi.QUICK, got {settings!r}")
     if isinstance(heuristic, str):
-        heuristic = registry.build(heuristic, task.hyperparameters.get(heuristic, {}), task.dim)
-    registry.check(heuristic, task.dim)
+        heuristic = build(HEURISTICS.load(heuristic), task.hyperparameters.get(heuristic, {}), task.dim)
+    check(heuristic, task.dim)
     heuristic = paired(heuristic, getattr(settings.estimator, "warm_start", True))  # what it is, is checked later
     learnt = getattr(settings.estimator, "embedding", "none") == "trials"  # what it is, is checked later
     if executor is not None or simulation_timeout is not None:

@@ -23,11 +23,12 @@ from jaxlfi.io import files as atomic
 from jaxlfi.io import trees
 from jaxlfi.io.formats import written_by
 from jaxlfi.io.shell import quoted
+from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.run import Origin, Run
-from jaxlfi.tasks import failures, registry
+from jaxlfi.tasks import failures
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.task import Task
 
@@ -133,7 +134,7 @@ def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space
     task = given
     if task is None and config["task"] is not None:
         try:
-            task = registry.load(config["task"])
+            task = TASKS.load(config["task"])
         except ValueError:  # the posterior can be used without it
             return None
     if task is not None and (task.space != space or list(task.units) != list(config.get("units") or task.units)):

@@ -34,7 +34,7 @@ LAYERS = (
     ("cli",),
 )
 """Packages of jaxlfi, from the ground up: each imports those below it, and none beside or above it."""
-LEAVES = ("io", "factories", "fields", "plugins", "source_fields", "flags")
+LEAVES = ("io", "fields", "flags", "references", "registry")
 """Modules that every layer may import, and that import no layer."""
 BESIDE = {"figures": {"figures", "io"}, "plot": {"figures"}, "__main__": {"cli"}}
 """Modules that are no part of the layers, and all of jaxlfi that they import."""

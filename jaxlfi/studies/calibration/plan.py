@@ -5,12 +5,12 @@ from pathlib import Path
 
 import jax
 
-from jaxlfi.heuristics import registry
+from jaxlfi.heuristics.hyperparameters import check
+from jaxlfi.registry import TASKS
 from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Run
 from jaxlfi.studies import grid
-from jaxlfi.tasks import registry as registry_of_tasks
 from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.task import Task
 
@@ -117,7 +117,7 @@ def read_run(folder: Path, task: Task | None = None) -> Run:
     run = load(folder, task)
     if run.task is None and run.origin.reference is not None:
         try:
-            registry_of_tasks.load(run.origin.reference)
+            TASKS.load(run.origin.reference)
         except ValueError as error:
             raise StoreError(
                 f"{folder}: expected its task {run.origin.reference!r}, which cannot be loaded from here (--task names "
@@ -139,5 +139,5 @@ def read_run(folder: Path, task: Task | None = None) -> Run:
             f"{folder}: expected the task as it was when the run was made, with {run.x.shape[0]} summaries, "
             f"got {simulator_shapes(run.task).summary}"
         )
-    registry.check(run.heuristic, run.task.dim)
+    check(run.heuristic, run.task.dim)
     return run

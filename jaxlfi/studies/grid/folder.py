@@ -28,6 +28,7 @@ from jaxlfi.io import files as atomic
 from jaxlfi.io import serialise
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.folder import StoreError
@@ -35,7 +36,6 @@ from jaxlfi.runs.run import Origin
 from jaxlfi.studies.chunk_store import ChunkStore
 from jaxlfi.studies.grid.chunks import MEASURES, Work, arranged, prepare, run_chunk
 from jaxlfi.studies.grid.grid import Axis, Grid, combinations, hyperparameters, observations
-from jaxlfi.tasks import registry as tasks
 
 GRID = "jaxlfi-grid"
 """The format of a grid's folder."""
@@ -167,7 +167,7 @@ def reopen(folder: Path) -> Work:
     config = read_config(folder)
     try:
         grid = Grid(
-            task=tasks.load(config["task"]),
+            task=TASKS.load(config["task"]),
             support=describe.support_from_json(config["support"]),
             rule=describe.heuristic_from_json(config["heuristic"]),
             axes=tuple(Axis(axis["name"], tuple(axis["values"])) for axis in config["axes"]),
