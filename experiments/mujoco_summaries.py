@@ -25,9 +25,9 @@ import numpy as np
 from experiments.mujoco_sysid import BOXES, EXAMPLES, FOLDER, believed, judged, load, recordings
 from jaxlfi.bayessim.presets import settings_for
 from jaxlfi.io import files
+from jaxlfi.io.provenance import environment
 from jaxlfi.registry import TASKS
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import environment
 from jaxlfi.tasks.task import Task
 
 SUMMARIES = ("samples", "cross-correlation", "spectrum", "learnt")

@@ -41,8 +41,8 @@ from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.presets import settings_for
 from jaxlfi.envs.mujoco import least_squares, sysid_point
 from jaxlfi.io import files
+from jaxlfi.io.provenance import environment
 from jaxlfi.registry import TASKS
-from jaxlfi.runs.folder import environment
 from jaxlfi.tasks.task import Task
 
 FOLDER = Path("examples/mujoco")

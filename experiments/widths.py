@@ -46,9 +46,9 @@ from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Mode, paired
 from jaxlfi.io import files as atomic
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.io.provenance import environment
 from jaxlfi.registry import TASKS
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import environment
 from jaxlfi.studies.calibration.repeat import described
 from jaxlfi.studies.calibration.truths import simulated_truths
 from jaxlfi.tasks.observation import simulate_observation, simulator_shapes

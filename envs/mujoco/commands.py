@@ -18,8 +18,8 @@ from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.envs.mujoco.sysid_point import SysidPoint
 from jaxlfi.io import files
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.io.provenance import environment
 from jaxlfi.registry import TASKS
-from jaxlfi.runs.folder import environment
 from jaxlfi.runs.run import Run
 from jaxlfi.tasks.task import Task
 

@@ -117,10 +117,11 @@ def _begin(arguments: argparse.Namespace) -> None:
     from jaxlfi.envs.whip.real2sim import recorded
     from jaxlfi.envs.whip.reference_objects import objects
     from jaxlfi.envs.whip.vision.commands import sights
-    from jaxlfi.io import files
+    from jaxlfi.io import files, workfolder
+    from jaxlfi.io.formats import CONFIG, FORMATS, LOOP
+    from jaxlfi.io.provenance import environment
     from jaxlfi.rl import policy
     from jaxlfi.rl.settings import PRESETS
-    from jaxlfi.runs.folder import environment
 
     objects.load(arguments.object)
     if arguments.iterations < 1:
@@ -142,17 +143,13 @@ def _begin(arguments: argparse.Namespace) -> None:
         for name, value in vars(arguments).items()
         if name not in ("out", "debug")
     }
-    path = arguments.out / "config.json"
-    if path.exists():
+    path = arguments.out / CONFIG
+    if workfolder.begun(arguments.out, CONFIG, "a new folder, or one of the same command"):
         found = json.loads(path.read_text()).get("asked")
         if found != asked:
             raise ValueError(f"out: expected a new folder, or one of the same command, got {arguments.out} of {found}")
         return
-    # A kill while config.json is written leaves config.json.part.
-    if arguments.out.exists() and any(path.suffix != ".part" for path in arguments.out.iterdir()):
-        raise ValueError(f"out: expected a new folder, or one of the same command, got {arguments.out}")
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    files.write_json(path, {"format": "jaxlfi-r2s2r", "version": 1, "asked": asked, **environment()})
+    files.write_json(path, {"format": LOOP, "version": FORMATS[LOOP].version, "asked": asked, **environment()})
 
 
 def _round_and_round(arguments: argparse.Namespace) -> list[Path]:

@@ -40,7 +40,7 @@ from experiments.reliability.comparing import LEFT_OUT, differences
 from experiments.reliability.injection import Blow
 from experiments.reliability.process import Ended, Running, run
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import environment
+from jaxlfi.io.provenance import environment
 
 KILLS_PER_TRIAL = 3
 AT_A_MOMENT, IN_A_WINDOW = "at a moment", "in a window"

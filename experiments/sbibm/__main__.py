@@ -31,8 +31,8 @@ from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.heuristics import Fixed
 from jaxlfi.io import compile_cache
 from jaxlfi.io import files as atomic
+from jaxlfi.io.provenance import environment
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import environment
 
 OBSERVATIONS = (1, 2, 3)
 ROUNDS = 10

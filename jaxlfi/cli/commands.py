@@ -20,16 +20,16 @@ from jaxlfi.cli import asked, interrupts, summaries, tables, train
 from jaxlfi.cli.exit_status import resuming
 from jaxlfi.distributions.truncation import TRIES
 from jaxlfi.io import files as atomic
-from jaxlfi.io import host_devices
+from jaxlfi.io import host_devices, workfolder
+from jaxlfi.io.formats import COMPARE, GRID, RUN, RUNS, TRAINING
 from jaxlfi.io.locks import locked
-from jaxlfi.io.processes import Processes
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.io.shell import quoted
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.registry import TASKS
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import export
-from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.checkpoint import CheckpointError
 from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
@@ -42,7 +42,9 @@ from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.task import Task
 
 Prepared = tuple[Path, tuple[BatchPlan, Observed] | Work]
-EXPECTED = (SimulatorError, CheckpointError, run_store.StoreError, OSError)
+REPORTED = (RUN, RUNS, COMPARE, GRID)
+"""Formats of the folders that `report` draws."""
+EXPECTED = (SimulatorError, CheckpointError, StoreError, OSError)
 """Errors that the input of a run causes, and the disk; they are reported in one line."""
 LOW_MASS = 0.01
 """Mass of the posterior inside its support below which `jaxlfi sample` warns."""
@@ -100,7 +102,7 @@ def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
     rule = asked.build_heuristic(arguments, arguments.heuristic, kinds, settings, task)
     configuration = support_name if arguments.heuristic == "none" else f"{support_name}+{arguments.heuristic}"
     specs = tuple(RunSpec(configuration, support_name, support, rule, seed) for seed in asked.seeds_of(arguments))
-    kind = run_store.RUN if len(specs) == 1 else run_store.RUNS
+    kind = RUN if len(specs) == 1 else RUNS
     plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
     return _begun(arguments, plan, console, first)
 
@@ -121,7 +123,7 @@ def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
         for seed in asked.seeds_of(arguments)
         for name, (support, heuristic) in zip(configurations, parts, strict=True)
     )
-    kind = run_store.COMPARE
+    kind = COMPARE
     plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
     return _begun(arguments, plan, console, None)
 
@@ -130,7 +132,7 @@ def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, fir
     """The folder of a plan, after everything was checked."""
     processes = arguments.joined
     if processes.writes:
-        run_store.refuse_occupied(arguments.out)
+        workfolder.refuse_occupied(arguments.out)
     observation = asked.observation_of(arguments, plan.task, lambda line: _say(console, line))
     observed = executing.prepare(plan, observation, first, processes)
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
@@ -176,7 +178,7 @@ def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
     )
     observation = asked.observation_of(arguments, task, lambda line: _say(console, line))
     if arguments.joined.writes:
-        run_store.refuse_occupied(arguments.out)
+        workfolder.refuse_occupied(arguments.out)
     _say(console, f"{task.name}: compiling for {plan.size} runs")
     work = grid.begin(arguments.out, plan, observation, arguments.runs_per_chunk, arguments.joined)
     _hold(arguments, arguments.out)
@@ -188,44 +190,32 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     folder = arguments.folder
     if folder.is_dir():
         _hold(arguments, folder)
-    if grid.is_grid(folder):
-        return _resume_grid(folder, arguments.joined, console)
-    if train.is_training(folder):
+    config = workfolder.read(folder, *REPORTED, TRAINING)
+    if config["format"] == TRAINING:
         train.resume(folder, console, not arguments.no_figures, arguments.joined)
         return None
-    config = run_store.read_config(folder)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
         if arguments.joined.writes:
             executing.clean(folder)
-        _say(console, _complete(folder))
+        _say(console, f"{folder} is complete: nothing to resume. Its pictures: {quoted('jaxlfi', 'report', folder)}")
         return None
-    plan, observed = executing.reopen(folder)
-    if config.get("executor", False) and (arguments.workers, arguments.scheduler) == (None, None):
-        arguments.workers = host_devices.processors()
-        _say(console, f"simulations: in {arguments.workers} processes on this machine")
-    plan = dataclasses.replace(plan, task=asked.simulated_again(arguments, folder, plan.task))
+    if config["format"] == GRID:
+        work, what = grid.reopen(folder), "results differ by rounding"
+    else:
+        plan, observed = executing.reopen(folder)
+        if config.get("executor", False) and (arguments.workers, arguments.scheduler) == (None, None):
+            arguments.workers = host_devices.processors()
+            _say(console, f"simulations: in {arguments.workers} processes on this machine")
+        work = dataclasses.replace(plan, task=asked.simulated_again(arguments, folder, plan.task)), observed
+        what = "the result may differ in rounding from an uninterrupted one"
     if changed := executing.changed_machine(config, arguments.joined):
-        _warn(console, f"begun with {', '.join(changed)}: the result may differ in rounding from an uninterrupted one")
-    return folder, (plan, observed)
-
-
-def _complete(folder: Path) -> str:
-    return f"{folder} is complete: nothing to resume. Its pictures: {quoted('jaxlfi', 'report', folder)}"
-
-
-def _resume_grid(folder: Path, processes: Processes, console: Console) -> Prepared | None:
-    config = grid.read_config(folder)
-    if config.get("status") == "finished":
-        _say(console, _complete(folder))
-        return None
-    if changed := executing.changed_machine(config, processes):
-        _warn(console, f"begun with {', '.join(changed)}: results differ by rounding")
-    return folder, grid.reopen(folder)
+        _warn(console, f"begun with {', '.join(changed)}: {what}")
+    return folder, work
 
 
 def report(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi report`."""
-    (grid if grid.is_grid(arguments.folder) else run_store).read_config(arguments.folder)
+    workfolder.read(arguments.folder, *REPORTED)
     draw(arguments.folder, console)
 
 
@@ -311,12 +301,12 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     if not processes.writes:
         return
     executing.finish(folder, plan, runs)
-    if plan.kind == run_store.RUN:
+    if plan.kind == RUN:
         found = RunSummary.read(folder)
         tables.show(summaries.parameter_table(found), console)
         for sentence in found.sentences:
             _say(console, sentence)
-    if plan.kind != run_store.RUN or plan.task.truth is not None:
+    if plan.kind != RUN or plan.task.truth is not None:
         tables.show(summaries.summary_table(plan, runs), console)
     for warning in summaries.warnings(plan, runs):
         _warn(console, warning)
@@ -326,7 +316,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
         *summaries.widths_lines(plan, runs),
     ):
         _say(console, line)
-    kind = "table" if plan.kind == run_store.COMPARE else "results"
+    kind = "table" if plan.kind == COMPARE else "results"
     _say(console, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")
     if not arguments.no_figures:
         draw(folder, console)
@@ -367,7 +357,7 @@ def _figures():
     try:
         import jaxlfi.figures.checks
     except ImportError as error:
-        raise run_store.StoreError(f"pictures: expected matplotlib to be installed, got: {error}") from error
+        raise StoreError(f"pictures: expected matplotlib to be installed, got: {error}") from error
     return jaxlfi.figures
 
 

@@ -10,7 +10,6 @@ before jax starts can be set after the arguments are known.
 import argparse
 import contextlib
 import dataclasses
-import json
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -22,6 +21,7 @@ from jaxlfi import flags, references
 from jaxlfi.cli import help_texts, interrupts, joined, warned
 from jaxlfi.cli.exit_status import refuse, resuming
 from jaxlfi.cli.own_fields import FIELDS
+from jaxlfi.io.formats import PLAN, recorded
 from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, Classes, package_of
 
 Subparsers = argparse._SubParsersAction  # argparse has no public name for it
@@ -478,16 +478,10 @@ def _runs(arguments: argparse.Namespace) -> int:
 def _recorded(arguments: argparse.Namespace) -> dict:
     """What the work to go on with says of itself, where there is some; whether it is sound is checked later."""
     if arguments.command == "resume":
-        path = arguments.folder / "config.json"
-    elif arguments.command == "diagnose":
-        path = (arguments.out or arguments.folder / "diagnostics") / "plan.json"
-    else:
-        return {}
-    try:
-        config = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return config if isinstance(config, dict) else {}
+        return recorded(arguments.folder)
+    if arguments.command == "diagnose":
+        return recorded(arguments.out or arguments.folder / "diagnostics", PLAN)
+    return {}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -5,7 +5,6 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 
 import argparse
 import contextlib
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +16,7 @@ from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import exit_status, resuming
 from jaxlfi.cli.own_fields import FIELDS
 from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.io.formats import TRAINING, recorded
 from jaxlfi.registry import ENVIRONMENTS
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0; 2 for bad input; 130 where it was interrupted.
     """
     arguments = parser().parse_args(argv)
-    begun = lambda: resuming(arguments.out) if is_training(arguments.out) else ""
+    begun = lambda: resuming(arguments.out) if recorded(arguments.out).get("format") == TRAINING else ""
     command = lambda: exit_status("jaxlfi train", lambda: _train(arguments), arguments.debug, begun)
     if arguments.coordinator is None:
         return command()
@@ -192,15 +192,6 @@ def draw(out: Path, console: "Console") -> None:
     values = files.read_arrays(out / "curves.npz")["value"]
     learning.save_curves(out / "curves.png", names, values, training.settings_of(config).steps_per_update)
     console.print(f"learning curves: {out / 'curves.png'}", markup=False, soft_wrap=True)
-
-
-def is_training(out: Path) -> bool:
-    """Whether a folder is that of trainings; it may be damaged."""
-    try:
-        config = json.loads((out / "config.json").read_text())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(config, dict) and config.get("format") == "jaxlfi-training"
 
 
 def resume(out: Path, console: "Console", figures: bool, processes: "Processes") -> None:

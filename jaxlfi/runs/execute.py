@@ -22,12 +22,14 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
+from jaxlfi.io import provenance, workfolder
+from jaxlfi.io.formats import COMPARE, RUN, RUNS
 from jaxlfi.io.processes import ALONE, Partition, Processes
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import Checkpoint
-from jaxlfi.runs.folder import COMPARE, RUN, RUNS, StoreError
 from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks import failures, priors
 from jaxlfi.tasks.executors import one_by_one
@@ -304,7 +306,7 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed, processes: Processe
             (staging / name).mkdir(parents=True)
             atomic.write_json(staging / name / "config.json", run)
 
-    folders.create(folder, config, fill)
+    workfolder.create(folder, config, fill)
 
 
 def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]:
@@ -356,7 +358,7 @@ def devices_of(runs: int, processes: Processes) -> int:
 def changed_machine(config: Mapping[str, Any], processes: Processes = ALONE) -> list[str]:
     """In words, what is other than when a folder was begun, of what bits depend on: versions, devices, processes."""
     recorded = config.get("versions", {})
-    now = folders.versions()
+    now = provenance.versions()
     changed = [name for name in VERSIONS if recorded.get(name) not in (None, now[name])]
     words = [f"{name} {recorded[name]}, now {now[name]}" for name in changed]
     runs, devices = config.get("runs", config.get("trainings")), jax.local_device_count() * processes.count
@@ -404,7 +406,7 @@ def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
         order = list(dict.fromkeys(line["configuration"] for line in lines))
         lines.sort(key=lambda line: (order.index(line["configuration"]), line["seed"]))
         folders.write_table(folder / "table.csv", lines)
-    atomic.write_json(folder / "config.json", folders.read_config(folder) | {"status": "finished"})
+    workfolder.finish(folder)
     clean(folder)
 
 

@@ -27,11 +27,11 @@ from jaxlfi.fields import declared
 from jaxlfi.heuristics import Edge, Mode
 from jaxlfi.heuristics.hyperparameters import all_declared
 from jaxlfi.io import files as atomic
+from jaxlfi.io import formats
 from jaxlfi.io.host_devices import FLAG, processors
 from jaxlfi.registry import ESTIMATORS, HEURISTICS, TASKS
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import folder as run_store
-from jaxlfi.studies import grid
 from jaxlfi.tasks import observation
 from jaxlfi.tasks.trials import repeated
 from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
@@ -190,7 +190,7 @@ def test_a_grid_has_as_many_devices_as_it_was_begun_with(tmp_path, monkeypatch):
     vary = ["--vary", "tail=0,1", "expansion=1,2,3"]
     begun = cli.parser().parse_args(["grid", TASK, *vary, "--vary", "zone_width=0", "--seeds", "4", "--out", "x"])
     assert cli._runs(begun) == 24
-    atomic.write_json(tmp_path / "config.json", {"format": grid.GRID, "axes": [{}], "devices": 7})
+    atomic.write_json(tmp_path / "config.json", {"format": formats.GRID, "axes": [{}], "devices": 7})
     monkeypatch.setenv("XLA_FLAGS", "")
     cli.prepare_jax(cli.parser().parse_args(["resume", str(tmp_path), "--no-cache"]))
     assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=7"
@@ -198,14 +198,14 @@ def test_a_grid_has_as_many_devices_as_it_was_begun_with(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("damaged", ["7", {}, -7, 0, None, 10**9, 1.5])
 def test_a_damaged_number_of_devices_is_not_asked_for(damaged, tmp_path, monkeypatch):
-    atomic.write_json(tmp_path / "config.json", {"format": grid.GRID, "axes": [{}], "devices": damaged})
+    atomic.write_json(tmp_path / "config.json", {"format": formats.GRID, "axes": [{}], "devices": damaged})
     monkeypatch.setenv("XLA_FLAGS", "")
     cli.prepare_jax(cli.parser().parse_args(["resume", str(tmp_path), "--no-cache"]))
     assert os.environ["XLA_FLAGS"] in ("", *(f"--{FLAG}={n}" for n in (1, processors())))  # of one run, or more
 
 
 def test_report_refuses_a_grid_that_is_not_finished(tmp_path, capsys):
-    atomic.write_json(tmp_path / "config.json", {"format": grid.GRID, "version": run_store.VERSION})
+    atomic.write_json(tmp_path / "config.json", {"format": formats.GRID, "version": formats.VERSION})
     assert "expected a finished grid, found no grid.npz" in error_line(capsys, "report", tmp_path)
 
 
@@ -271,7 +271,7 @@ def test_compare_warns_of_posteriors_beyond_the_bounds_of_fixed_supports(compari
     names = [run["folder"] for run in run_store.read_config(comparison)["runs"]]
     runs = [jaxlfi.load(comparison / name) for name in names]
     specs = tuple(run.spec for run in runs)
-    plan = executing.BatchPlan(run_store.COMPARE, TASK, runs[0].task, None, runs[0].settings, specs)
+    plan = executing.BatchPlan(formats.COMPARE, TASK, runs[0].task, None, runs[0].settings, specs)
     warnings = summaries.support_warnings(plan, runs)
     assert any(text.startswith("misspecified: first reaches its upper bound 0 (in 2 of 2 runs") for text in warnings)
     assert not any(text.startswith("misspecified+edge") for text in warnings)
@@ -281,7 +281,7 @@ def test_compare_warns_in_one_line_of_observations_unlike_all_simulations(compar
     names = [run["folder"] for run in run_store.read_config(comparison)["runs"]]
     runs = [jaxlfi.load(comparison / name) for name in names]
     plan = executing.BatchPlan(
-        run_store.COMPARE, TASK, runs[0].task, None, runs[0].settings, tuple(run.spec for run in runs)
+        formats.COMPARE, TASK, runs[0].task, None, runs[0].settings, tuple(run.spec for run in runs)
     )
     assert summaries.observation_warnings(plan, runs) == []
     foreign = [run.replace(x=run.x + 1e6) if run.origin.configuration == "ok" else run for run in runs]

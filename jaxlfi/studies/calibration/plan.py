@@ -6,11 +6,11 @@ from pathlib import Path
 import jax
 
 from jaxlfi.heuristics.hyperparameters import check
+from jaxlfi.io import formats
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.registry import TASKS
-from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Run
-from jaxlfi.studies import grid
 from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.task import Task
 
@@ -112,7 +112,7 @@ def read_run(folder: Path, task: Task | None = None) -> Run:
         ValueError: for a folder that holds no finished run of one seed, a run of several rounds that began with given
             simulations, a task that cannot be found or has changed, or a heuristic that is not installed.
     """
-    if grid.is_grid(folder):
+    if formats.recorded(folder).get("format") == formats.GRID:
         raise StoreError(f"{folder}: expected the folder of one run, got a grid's, which keeps no posteriors")
     run = load(folder, task)
     if run.task is None and run.origin.reference is not None:
