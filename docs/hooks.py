@@ -69,7 +69,7 @@ def help_text(command: str) -> str:
     from jaxlfi.cli.parser import foreign_command, parser
 
     if main := foreign_command(command):
-        return f"```text\n{sys.modules[main.__module__].parser().format_help().strip()}\n```"
+        return f"```text\n{main.parser().format_help().strip()}\n```"
     words = [command] if command != "jaxlfi" else []
     top = parser()
     (commands,) = [action for action in top._actions if getattr(action, "choices", None) and action.dest == "command"]

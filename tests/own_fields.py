@@ -1,4 +1,4 @@
-"""Writes jaxlfi/cli/own_fields.py: `python -m tests.own_fields`, after a field of ours was changed."""
+"""Writes jaxlfi/cli/own_fields.py: `python -m tests.own_fields`, after a field or a command of ours was changed."""
 
 import math
 import re
@@ -14,7 +14,7 @@ from jaxlfi.estimators.base import Estimator
 from jaxlfi.rl.settings import PPO
 
 PLACE = Path(jaxlfi.__file__).parent / "cli" / "own_fields.py"
-HEAD = '''"""Fields of our own classes, for `--help` without an import of jax; written by tests/own_fields.py."""
+HEAD = '''"""What `--help` says of our classes and commands, none of which it imports; by tests/own_fields.py."""
 
 from math import inf
 
@@ -26,6 +26,10 @@ FIELDS: dict[str, dict[str, Declared]] = {{
 {entries}
 }}
 \"\"\"Fields by the class that declares them, as "module:Class", and by their own name.\"\"\"
+HELP = {{
+{commands}
+}}
+\"\"\"What our commands do, by what their entry points lead to.\"\"\"
 """
 
 
@@ -35,6 +39,13 @@ def kinds() -> list[type]:
     points = [point for family in families for several in family.points().values() for point in several]
     ours = [registry.named("class", point.value) for point in points if registry.package_of(point) == "jaxlfi"]
     return [Estimator, *sorted(ours, key=lambda kind: (kind.__module__, kind.__name__)), PPO, Settings]
+
+
+def commands() -> dict[str, str]:
+    """What our commands do, by their entry points."""
+    points = [point for several in registry.COMMANDS.points().values() for point in several]
+    ours = [point.value for point in points if registry.package_of(point) == "jaxlfi"]
+    return {place: registry.named("command", place).help for place in ours}
 
 
 def call(field: fields.Declared) -> str:
@@ -65,7 +76,8 @@ def source() -> str:
         text += f"{names[kind]} = {f'{names[base]} | ' if base else ''}{{\n"
         text += "".join(f'    "{name}": {call(one)},\n' for name, one in new.items()) + "}\n"
         entries.append(f'    "{kind.__module__}:{kind.__qualname__}": described({names[kind]}),')
-    return text + FOOT.format(entries="\n".join(entries))
+    helps = "\n".join(f"    {shown(place)}: {shown(text)}," for place, text in commands().items())
+    return text + FOOT.format(entries="\n".join(entries), commands=helps)
 
 
 if __name__ == "__main__":

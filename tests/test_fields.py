@@ -17,7 +17,7 @@ import jaxlfi
 from jaxlfi import fields, flags
 from jaxlfi.bayessim.presets import PRESETS
 from jaxlfi.cli import parser as cli
-from jaxlfi.cli.own_fields import FIELDS
+from jaxlfi.cli.own_fields import FIELDS, HELP
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.fields import Checked, hyperparameter, option
@@ -111,12 +111,13 @@ def test_our_heuristics_are_registered_by_the_names_of_the_paper():
     assert all(HEURISTICS.name_of(kind) == name for name, kind in OWN.items())
 
 
-def test_the_table_is_what_our_classes_declare():
+def test_the_table_is_what_our_classes_and_commands_declare():
     """`python -m tests.own_fields` writes it anew."""
     declared = {f"{kind.__module__}:{kind.__qualname__}": fields.declared(kind) for kind in own_fields.kinds()}
     assert {name: list(found.items()) for name, found in FIELDS.items()} == {
         name: list(found.items()) for name, found in declared.items()
     }
+    assert own_fields.commands() == HELP
     assert all(field.info.help for found in FIELDS.values() for field in found.values())
 
 

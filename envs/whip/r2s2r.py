@@ -22,12 +22,12 @@ from pathlib import Path
 from jaxlfi import flags
 from jaxlfi.cli import parser as command_line
 from jaxlfi.cli import train
-from jaxlfi.cli.exit_status import exit_status
+from jaxlfi.cli.command import Command
 from jaxlfi.cli.interrupts import INTERRUPTED
-from jaxlfi.cli.parser import OneLineParser
 from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip import require_mujoco
 from jaxlfi.envs.whip.vision import options
+from jaxlfi.io.formats import CONFIG, FORMATS, LOOP
 from jaxlfi.io.shell import quoted
 from jaxlfi.registry import HEURISTICS
 
@@ -39,8 +39,6 @@ examples:
   jaxlfi r2s2r --object dlo-0 --detector learnt --out runs/seen
 
 """
-REPETITIONS = 16
-"""Places at which policies are compared in the end."""
 
 
 class StageError(Exception):
@@ -51,60 +49,39 @@ class StageError(Exception):
         self.status = status
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
-    top = OneLineParser(
-        prog="jaxlfi r2s2r",
-        description="From a reference object to a policy for it: a first policy on the uniform distribution, its "
-        "rollout on the object, inference of the object's parameters, a policy on that posterior, and both on the "
-        "object. The same command again goes on where it was stopped.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    top.add_argument("--object", required=True, metavar="NAME", help="dlo-0, dlo-1, dlo-2 or dlo-3")
-    top.add_argument(
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--object", required=True, metavar="NAME", help="dlo-0, dlo-1, dlo-2 or dlo-3")
+    parser.add_argument(
         "--out", type=flags.output, required=True, metavar="DIR", help="a folder, new or of the same command"
     )
-    top.add_argument("--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)")
-    top.add_argument("--preset", choices=("quick", "paper"), default="quick", help="of all stages (default: quick)")
-    top.add_argument("--seed", type=int, default=0, metavar="N", help="of all stages (default: 0)")
-    top.add_argument("--iterations", type=int, default=1, metavar="N", help="times to go round (default: 1)")
-    top.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")
-    top.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz in place of the first training")
-    top.add_argument("--recording", type=Path, metavar="FILE", help="a recorded rollout in place of the first one")
-    top.add_argument("--posterior", type=Path, metavar="RUN", help="a finished run in place of the first inference")
-    options.add_detector(top)
-    top.add_argument("--debug", action="store_true", help="show where an error came from")
-    return top
+    parser.add_argument(
+        "--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)"
+    )
+    parser.add_argument("--preset", choices=("quick", "paper"), default="quick", help="of all stages (default: quick)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all stages (default: 0)")
+    parser.add_argument("--iterations", type=int, default=1, metavar="N", help="times to go round (default: 1)")
+    parser.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")
+    parser.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz in place of the first training")
+    parser.add_argument("--recording", type=Path, metavar="FILE", help="a recorded rollout in place of the first one")
+    parser.add_argument("--posterior", type=Path, metavar="RUN", help="a finished run in place of the first inference")
+    options.add_detector(parser)
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: the words after `jaxlfi r2s2r`; by default those of the process.
-
-    Returns:
-        0; 2 for bad input; 130 where it was interrupted.
-    """
-    arguments = parser().parse_args(argv)
-    go_on = lambda: "; the same command goes on from here" if (arguments.out / "config.json").exists() else ""
-    try:
-        return exit_status("jaxlfi r2s2r", lambda: _loop(arguments), arguments.debug, go_on)
-    except StageError as stage:  # which has said why
-        return stage.status
-
-
-def _loop(arguments: argparse.Namespace) -> None:
+def _loop(arguments: argparse.Namespace) -> int:
     require_mujoco()
     _begin(arguments)
     from jaxlfi.envs.whip.r2s2r_page import write
     from jaxlfi.io.locks import locked
 
     with locked(arguments.out):
-        policies = _round_and_round(arguments)
-        _deploy(arguments, policies)
+        try:
+            policies = _round_and_round(arguments)
+            _deploy(arguments, policies)
+        except StageError as stage:  # which has said why
+            return stage.status
         print(f"wrote {write(arguments, policies)}")
+        return 0
 
 
 # ------------------------------------------------------------------------------------------------------------ stages
@@ -118,7 +95,6 @@ def _begin(arguments: argparse.Namespace) -> None:
     from jaxlfi.envs.whip.reference_objects import objects
     from jaxlfi.envs.whip.vision.commands import sights
     from jaxlfi.io import files, workfolder
-    from jaxlfi.io.formats import CONFIG, FORMATS, LOOP
     from jaxlfi.io.provenance import environment
     from jaxlfi.rl import policy
     from jaxlfi.rl.settings import PRESETS
@@ -239,6 +215,8 @@ def _infer(arguments: argparse.Namespace, rollouts: Sequence[Path], out: Path) -
 
 
 def _deploy(arguments: argparse.Namespace, policies: Sequence[Path]) -> None:
+    from jaxlfi.envs.whip.r2s2r_page import REPETITIONS
+
     out = arguments.out / "deployed"
     if not (out / "table.csv").exists():
         shutil.rmtree(out, ignore_errors=True)
@@ -258,6 +236,20 @@ def _command(run: Callable[[list[str]], int], words: list[str], what: str) -> No
 
 def _say(text: str) -> None:
     print(f"\n== {text}", flush=True)
+
+
+main = Command(
+    "r2s2r",
+    "from a reference object to a policy for it, in one command",
+    _arguments,
+    _loop,
+    description="From a reference object to a policy for it: a first policy on the uniform distribution, its "
+    "rollout on the object, inference of the object's parameters, a policy on that posterior, and both on the "
+    "object. The same command again goes on where it was stopped.",
+    epilog=EXAMPLES,
+    begun=lambda arguments: "; the same command goes on from here" if (arguments.out / CONFIG).exists() else "",
+)
+parser = main.parser
 
 
 if __name__ == "__main__":

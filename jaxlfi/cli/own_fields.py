@@ -1,4 +1,4 @@
-"""Fields of our own classes, for `--help` without an import of jax; written by tests/own_fields.py."""
+"""What `--help` says of our classes and commands, none of which it imports; by tests/own_fields.py."""
 
 from math import inf
 
@@ -158,3 +158,12 @@ FIELDS: dict[str, dict[str, Declared]] = {
     "jaxlfi.bayessim.settings:Settings": described(SETTINGS),
 }
 """Fields by the class that declares them, as "module:Class", and by their own name."""
+HELP = {
+    "jaxlfi.cli.evaluate:main": "evaluate saved policies on other domains",
+    "jaxlfi.cli.export:main": "write a policy as one file for a robot",
+    "jaxlfi.envs.mujoco.cli:main": "films and least squares after inference of a MuJoCo model",
+    "jaxlfi.envs.whip.r2s2r:main": "from a reference object to a policy for it, in one command",
+    "jaxlfi.cli.train:main": "train policies on the domains that inference found",
+    "jaxlfi.envs.whip.cli:main": "render, plan, act on, record and see the whipping task",
+}
+"""What our commands do, by what their entry points lead to."""

@@ -1,7 +1,7 @@
 """The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | diagnose | report`, and those of tasks.
 
-A package adds commands of its own by `[project.entry-points."jaxlfi.commands"]` in pyproject.toml: a name, and a
-function that takes the words after it and returns the exit status.
+A package adds commands by `[project.entry-points."jaxlfi.commands"]` in pyproject.toml: a name, and a
+`jaxlfi.cli.command.Command`, or any function that takes the words after the name and returns the exit status.
 
 This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set
 before jax starts can be set after the arguments are known.
@@ -14,41 +14,21 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
 
 import jaxlfi
 from jaxlfi import flags, references
 from jaxlfi.cli import help_texts, interrupts, joined, warned
+from jaxlfi.cli.command import Command, OneLineParser
 from jaxlfi.cli.exit_status import refuse, resuming
-from jaxlfi.cli.own_fields import FIELDS
+from jaxlfi.cli.own_fields import FIELDS, HELP
 from jaxlfi.io.formats import PLAN, recorded
 from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, Classes, package_of
 
-Subparsers = argparse._SubParsersAction  # argparse has no public name for it
 PRESETS = ("quick", "paper")
 METHODS = ("bayessim", "apt", "npe", "snle")
 OWN_COMMANDS = ("tasks", "infer", "compare", "grid", "resume", "sample", "diagnose", "report")
 SETTINGS = "jaxlfi.bayessim.settings:Settings"
 """The class whose fields are the settings of a run."""
-
-
-class OneLineParser(argparse.ArgumentParser):
-    """A parser whose errors are one line, and whose flags are written out: `--seed 3` is not `--seeds 3`."""
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        """As argparse's."""
-        super().__init__(*args, allow_abbrev=False, **kwargs)
-
-    def error(self, message: str) -> NoReturn:
-        """One line on stderr, and exit status 2."""
-        self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
-
-    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
-        """The values of a flag; argparse takes the value of `--flag=--` for none, and no value for a right one."""
-        values = super()._get_values(action, arg_strings)
-        if values == [] and action.option_strings and action.nargs in (None, "+"):
-            raise argparse.ArgumentError(action, "expected at least one argument")
-        return values
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,38 +85,83 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"jaxlfi {jaxlfi.__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_tasks(commands)
-    _add_infer(commands, families)
-    _add_compare(commands, families)
-    _add_grid(commands, families)
-    _add_resume(commands)
-    _add_sample(commands)
-    _add_diagnose(commands)
-    _add_report(commands)
-    for name in COMMANDS.names():
+    for command in own_commands(families):
+        command.add_to(commands)
+    for name, points in COMMANDS.points().items():
         if name not in OWN_COMMANDS:
-            shown = name.replace("%", "%%")
-            commands.add_parser(name, add_help=False, help=f"commands of its own: jaxlfi {shown} --help")
+            help = HELP.get(points[0].value, f"commands of its own: jaxlfi {name} --help").replace("%", "%%")
+            commands.add_parser(name, add_help=False, help=help)
     return top
 
 
-def _add_tasks(commands: Subparsers) -> None:
-    command = commands.add_parser(
-        "tasks", help="list tasks, or describe one", description="List tasks, or describe one."
-    )
+def own_commands(families: Families) -> list[Command]:
+    """The commands of inference; those of policies, of tasks and of other packages are entry points."""
+    glossary = help_texts.GLOSSARY + flags.glossary(families.rules)
+    return [
+        Command("tasks", "list tasks, or describe one", _tasks, _work, "List tasks, or describe one."),
+        Command(
+            "infer",
+            "infer a task's parameters",
+            lambda command: _infer(command, families),
+            _work,
+            "Infer a task's parameters from one observed trajectory, adapting the support.",
+            help_texts.INFER_EXAMPLES + glossary,
+        ),
+        Command(
+            "compare",
+            "run supports and heuristics side by side",
+            lambda command: _compare(command, families),
+            _work,
+            "Run supports and heuristics side by side, over several seeds, and tabulate the errors.",
+            help_texts.COMPARE_EXAMPLES + glossary,
+        ),
+        Command(
+            "grid",
+            "run a heuristic over a grid of its hyperparameters",
+            lambda command: _grid(command, families),
+            _work,
+            "Run a heuristic over a grid of its hyperparameters, to see how sensitive it is to them.",
+            help_texts.GRID_EXAMPLES + glossary,
+        ),
+        Command(
+            "resume",
+            "go on with a run that was stopped",
+            _resume,
+            _work,
+            "Go on with a run that was stopped or killed.",
+        ),
+        Command(
+            "sample",
+            "draw from the posterior of a run",
+            _sample,
+            _work,
+            "Draw parameters from the posterior of a finished run, in natural units.",
+        ),
+        Command(
+            "diagnose",
+            "check whether the posterior of a run can be believed",
+            _diagnose,
+            _work,
+            "Check whether the posteriors of a run's method are calibrated, and whether its own fits.",
+            help_texts.DIAGNOSE_EXAMPLES,
+        ),
+        Command(
+            "report",
+            "draw the pictures of a run",
+            _report,
+            _work,
+            "Draw all pictures of a folder from its saved files.",
+        ),
+    ]
+
+
+def _tasks(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "name", nargs="?", metavar="TASK", help="describe this one: parameters, units, supports, truth"
     )
 
 
-def _add_infer(commands: Subparsers, families: Families) -> None:
-    command = commands.add_parser(
-        "infer",
-        help="infer a task's parameters",
-        description="Infer a task's parameters from one observed trajectory, adapting the support.",
-        epilog=help_texts.INFER_EXAMPLES + _glossary(families),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _infer(command: argparse.ArgumentParser, families: Families) -> None:
     command.add_argument(
         "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
     )
@@ -164,14 +189,7 @@ def _add_infer(commands: Subparsers, families: Families) -> None:
     _add_shared(command, families, seeds=1)
 
 
-def _add_compare(commands: Subparsers, families: Families) -> None:
-    command = commands.add_parser(
-        "compare",
-        help="run supports and heuristics side by side",
-        description="Run supports and heuristics side by side, over several seeds, and tabulate the errors.",
-        epilog=help_texts.COMPARE_EXAMPLES + _glossary(families),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _compare(command: argparse.ArgumentParser, families: Families) -> None:
     command.add_argument(
         "--configurations",
         nargs="+",
@@ -181,14 +199,7 @@ def _add_compare(commands: Subparsers, families: Families) -> None:
     _add_shared(command, families, seeds=4)
 
 
-def _add_grid(commands: Subparsers, families: Families) -> None:
-    command = commands.add_parser(
-        "grid",
-        help="run a heuristic over a grid of its hyperparameters",
-        description="Run a heuristic over a grid of its hyperparameters, to see how sensitive it is to them.",
-        epilog=help_texts.GRID_EXAMPLES + _glossary(families),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _grid(command: argparse.ArgumentParser, families: Families) -> None:
     command.add_argument(
         "--vary",
         nargs="+",
@@ -215,24 +226,14 @@ def _add_grid(commands: Subparsers, families: Families) -> None:
     _add_shared(command, families, seeds=4, networks=False)
 
 
-def _add_resume(commands: Subparsers) -> None:
-    command = commands.add_parser(
-        "resume",
-        help="go on with a run that was stopped",
-        description="Go on with a run that was stopped or killed.",
-    )
+def _resume(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
     _add_executor(command)
     joined.add_flags(command)
     _add_machine(command)
 
 
-def _add_sample(commands: Subparsers) -> None:
-    command = commands.add_parser(
-        "sample",
-        help="draw from the posterior of a run",
-        description="Draw parameters from the posterior of a finished run, in natural units.",
-    )
+def _sample(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
     command.add_argument("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
     command.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="seed of the draws (default: 0)")
@@ -244,14 +245,7 @@ def _add_sample(commands: Subparsers) -> None:
     )
 
 
-def _add_diagnose(commands: Subparsers) -> None:
-    command = commands.add_parser(
-        "diagnose",
-        help="check whether the posterior of a run can be believed",
-        description="Check whether the posteriors of a run's method are calibrated, and whether its own fits.",
-        epilog=help_texts.DIAGNOSE_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _diagnose(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
     command.add_argument(
         "--reference",
@@ -286,17 +280,8 @@ def _add_diagnose(commands: Subparsers) -> None:
     _add_machine(command)
 
 
-def _add_report(commands: Subparsers) -> None:
-    command = commands.add_parser(
-        "report",
-        help="draw the pictures of a run",
-        description="Draw all pictures of a folder from its saved files.",
-    )
+def _report(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="a folder that infer, compare or grid wrote")
-
-
-def _glossary(families: Families) -> str:
-    return help_texts.GLOSSARY + flags.glossary(families.rules)
 
 
 def foreign_command(name: str) -> Callable[[list[str]], int] | None:
@@ -505,7 +490,7 @@ def _run(words: list[str]) -> int:
     except ValueError as error:
         return refuse("jaxlfi", error)
     if foreign:
-        with interrupts.orderly(not foreign.__module__.startswith("jaxlfi.")):
+        with interrupts.orderly(not getattr(foreign, "run", foreign).__module__.startswith("jaxlfi.")):
             return foreign(words[1:])
     if joined.asked(words):
         return joined.work(lambda: _main(words), lambda: _advice(words), "jaxlfi", "--debug" in words)
@@ -518,17 +503,18 @@ def _main(words: Sequence[str]) -> int:
     again = "; the same command goes on from here" if words[:1] == ["diagnose"] else ""
     with interrupts.advising("jaxlfi", lambda: resuming(begun[0]) if begun else again):
         try:
-            return _done(words, begun)
+            try:
+                arguments = parse(words)
+            except ValueError as error:
+                return refuse("jaxlfi", error)
+            arguments.begun = begun
+            return _work(arguments)
         except KeyboardInterrupt:
             return interrupts.report()
 
 
-def _done(words: Sequence[str], begun: list[Path]) -> int:
-    """The same, with the folder that can be resumed added to `begun`."""
-    try:
-        arguments = parse(words)
-    except ValueError as error:
-        return refuse("jaxlfi", error)
+def _work(arguments: argparse.Namespace) -> int:
+    """Do what arguments ask for, and add the folder that can be resumed to `arguments.begun`."""
     debug = getattr(arguments, "debug", False)
     try:
         if arguments.command in ("infer", "compare", "grid"):
@@ -548,7 +534,7 @@ def _done(words: Sequence[str], begun: list[Path]) -> int:
                 raise
             return refuse("jaxlfi", error, debug)
         if prepared is not None:
-            begun.append(prepared[0])
+            arguments.begun.append(prepared[0])
             try:
                 commands.run(*prepared, arguments, console)
             except commands.EXPECTED as error:
