@@ -153,13 +153,13 @@ class Objects(Family):
         Raises:
             ValueError: where the name cannot be loaded.
         """
-        return missing(name, self.find(name))
+        return _missing(name, self.find(name))
 
     def _made(self, reference: str, factory: Any, options: dict[str, str]) -> Any:
         """What a factory makes with these options; or the object itself, if it was given ready-made."""
         made = factory
         if callable(factory) and (isinstance(factory, type) or not isinstance(factory, self.kind)):
-            signature = signature_of(factory)
+            signature = _signature(factory)
             if signature is not None:
                 try:
                     signature.bind_partial(**options)
@@ -168,7 +168,7 @@ class Objects(Family):
                     raise ValueError(
                         f"{self.word}: expected options among {known}, got {reference!r}: {error}"
                     ) from error
-                if whole := missing(reference, factory, options):
+                if whole := _missing(reference, factory, options):
                     raise ValueError(f"{self.word}: expected {whole}, got {reference!r}")
             try:
                 made = factory(**references.converted(signature, options))
@@ -197,7 +197,7 @@ class Tasks(Objects):
         """
         name, options = references.parse(reference, self.word)
         factory = self.find(name)
-        signature = signature_of(factory)
+        signature = _signature(factory)
         own_pooling = signature is not None and "pooling" in signature.parameters
         ours = ("trials", "pooling") if "trials" in options or not own_pooling else ()
         together = {option: options.pop(option) for option in ours if option in options}
@@ -244,7 +244,7 @@ def package_of(point: EntryPoint) -> str:
     return point.dist.name if point.dist is not None else point.value.partition(":")[0].partition(".")[0]
 
 
-def signature_of(factory: Any) -> inspect.Signature | None:
+def _signature(factory: Any) -> inspect.Signature | None:
     """The signature of a factory, where it has one."""
     try:
         return inspect.signature(factory, eval_str=True)
@@ -252,15 +252,15 @@ def signature_of(factory: Any) -> inspect.Signature | None:
         return None
 
 
-def missing(reference: str, factory: Any, options: Mapping[str, str] = MappingProxyType({})) -> str:
+def _missing(reference: str, factory: Any, options: Mapping[str, str] = MappingProxyType({})) -> str:
     """The reference with the options besides those given that a factory cannot do without; empty where there are none.
 
     Example:
         >>> def arm(config: Path, mass: float, gain: float = 1.0): ...
-        >>> missing("arm", arm)
+        >>> _missing("arm", arm)
         'arm,config=FILE,mass=FLOAT'
     """
-    signature = signature_of(factory) if callable(factory) else None
+    signature = _signature(factory) if callable(factory) else None
     if signature is None:
         return ""
     several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)

@@ -12,7 +12,7 @@ import contextlib
 import dataclasses
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jaxlfi
@@ -21,6 +21,7 @@ from jaxlfi.cli import help_texts, interrupts, joined, warned
 from jaxlfi.cli.command import Command, OneLineParser
 from jaxlfi.cli.exit_status import refuse, resuming
 from jaxlfi.cli.own_fields import FIELDS, HELP
+from jaxlfi.fields import declared
 from jaxlfi.io.formats import PLAN, recorded
 from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, Classes, package_of
 
@@ -54,20 +55,24 @@ def _own(family: Classes) -> flags.Families:
     return {name: {} if others else FIELDS.get(point.value, {}) for name, (point, *others) in registered}
 
 
-def _imported(arguments: argparse.Namespace) -> Families:
-    """What the classes of other packages that arguments name declare; they are imported, and jax with them.
+def _foreign(arguments: argparse.Namespace) -> dict[Classes, list[str]]:
+    """Names of classes of other packages that arguments name."""
+    configured = getattr(arguments, "configurations", None) or ()
+    rules = {getattr(arguments, "heuristic", None), *(word.partition("+")[2] for word in configured)}
+    found = {}
+    for family, names in ((HEURISTICS, rules), (ESTIMATORS, {getattr(arguments, "estimator", None)})):
+        others = {name for name, (point, *_) in family.points().items() if point.value not in FIELDS}
+        found[family] = sorted(name for name in names if name and (":" in name or name in others))
+    return found
+
+
+def _imported(foreign: Mapping[Classes, Sequence[str]]) -> Families:
+    """What these classes declare; they are imported, and jax with them.
 
     Raises:
         ValueError: where they cannot be.
     """
-    from jaxlfi.fields import declared
-
-    def fields_of(family: Classes, names: set[str]) -> flags.Families:
-        foreign = {name for name, (point, *_) in family.points().items() if point.value not in FIELDS}
-        return {name: declared(family.load(name)) for name in sorted(names) if ":" in name or name in foreign}
-
-    networks = {getattr(arguments, "estimator", None)} - {None}
-    return Families(fields_of(HEURISTICS, _rules_used(arguments)), fields_of(ESTIMATORS, networks))
+    return Families(*({name: declared(family.load(name)) for name in names} for family, names in foreign.items()))
 
 
 def parser(families: Families | None = None) -> argparse.ArgumentParser:
@@ -307,12 +312,14 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     families = Families()
     if {"-h", "--help"} & set(words):
         with contextlib.suppress(ValueError):  # help has to be shown, whatever is wrong with a package
-            families += _imported(_named_by(words))
+            families += _imported(_foreign(_named_by(words)))
     arguments, unknown = parser(families).parse_known_args(words)
     if not unknown:
         return arguments
-    prepare_jax(arguments)
-    return parser(families + _imported(arguments)).parse_args(words)
+    if any((foreign := _foreign(arguments)).values()):
+        prepare_jax(arguments)
+        families += _imported(foreign)
+    return parser(families).parse_args(words)
 
 
 def _named_by(words: Sequence[str]) -> argparse.Namespace:
@@ -322,13 +329,6 @@ def _named_by(words: Sequence[str]) -> argparse.Namespace:
     finder.add_argument("--estimator", nargs="?")
     finder.add_argument("--configurations", nargs="*")
     return finder.parse_known_args([word for word in words if word not in ("-h", "--help")])[0]
-
-
-def _rules_used(arguments: argparse.Namespace) -> set[str]:
-    """Names of the heuristics that a command is going to use, right or wrong."""
-    configured = getattr(arguments, "configurations", None) or ()
-    named = [getattr(arguments, "heuristic", None), *(word.partition("+")[2] for word in configured)]
-    return {name for name in named if name}
 
 
 def _registered(what: str, families: flags.Families, default: str) -> str:
