@@ -106,7 +106,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 main = Command(
     "mujoco",
-    "films and least squares after inference of a MuJoCo model",
+    "film and refine the posterior of a MuJoCo model",
     _arguments,
     _run,
     description="What follows inference of a MuJoCo model: films of its posterior, and points of least squares.",

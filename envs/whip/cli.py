@@ -179,7 +179,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 main = Command(
     "whip",
-    "render, plan, act on, record and see the whipping task",
+    "whipping: render, plan, deploy, control, record, see",
     _arguments,
     _run,
     description="Render rollouts of the DLO whipping task, plan whips, let policies whip, control robots, learn to "

@@ -240,7 +240,7 @@ def _say(text: str) -> None:
 
 main = Command(
     "r2s2r",
-    "from a reference object to a policy for it, in one command",
+    "run the full Real2Sim2Real loop on a reference object",
     _arguments,
     _loop,
     description="From a reference object to a policy for it: a first policy on the uniform distribution, its "

@@ -66,7 +66,7 @@ def _policy_of(path: Path) -> Path:
 
 main = Command(
     "export",
-    "write a policy as one file for a robot",
+    "write a policy as one file for a robot's computer",
     _arguments,
     _export,
     description="Write a trained policy as one file that runs elsewhere.",

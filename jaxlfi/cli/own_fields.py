@@ -160,10 +160,10 @@ FIELDS: dict[str, dict[str, Declared]] = {
 """Fields by the class that declares them, as "module:Class", and by their own name."""
 HELP = {
     "jaxlfi.cli.evaluate:main": "evaluate saved policies on other domains",
-    "jaxlfi.cli.export:main": "write a policy as one file for a robot",
-    "jaxlfi.envs.mujoco.cli:main": "films and least squares after inference of a MuJoCo model",
-    "jaxlfi.envs.whip.r2s2r:main": "from a reference object to a policy for it, in one command",
-    "jaxlfi.cli.train:main": "train policies on the domains that inference found",
-    "jaxlfi.envs.whip.cli:main": "render, plan, act on, record and see the whipping task",
+    "jaxlfi.cli.export:main": "write a policy as one file for a robot's computer",
+    "jaxlfi.envs.mujoco.cli:main": "film and refine the posterior of a MuJoCo model",
+    "jaxlfi.envs.whip.r2s2r:main": "run the full Real2Sim2Real loop on a reference object",
+    "jaxlfi.cli.train:main": "train policies by PPO on domains, such as a posterior",
+    "jaxlfi.envs.whip.cli:main": "whipping: render, plan, deploy, control, record, see",
 }
 """What our commands do, by what their entry points lead to."""

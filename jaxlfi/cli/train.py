@@ -234,7 +234,7 @@ def _plan(arguments: argparse.Namespace) -> Any:
 
 main = Command(
     "train",
-    "train policies on the domains that inference found",
+    "train policies by PPO on domains, such as a posterior",
     _arguments,
     _train,
     description="Train policies by PPO on environments whose parameters are drawn from a domain.",
