@@ -52,7 +52,7 @@ class BatchPlan:
     """What is going to be run.
 
     Attributes:
-        kind: the format of its folder (`jaxlfi.runs.folder.RUN`, `RUNS` or `COMPARE`).
+        kind: the format of its folder (`jaxlfi.io.formats.RUN`, `RUNS` or `COMPARE`).
         reference: by which the task was found; None for one made in Python.
         task: the task.
         preset: the settings were made from; None for others.
