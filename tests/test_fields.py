@@ -23,6 +23,7 @@ from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.fields import Checked, hyperparameter, option
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate
 from jaxlfi.heuristics import hyperparameters as rules
+from jaxlfi.io.processes import ALONE
 from jaxlfi.registry import HEURISTICS, named
 from jaxlfi.runs import describe
 from tests import own_fields, small
@@ -219,6 +220,17 @@ def test_help_is_shown_whatever_is_named(words):
     with pytest.raises(SystemExit) as stop:
         cli.main([words.split()[0], "--help", *words.split()[1:]])
     assert stop.value.code == 0
+
+
+def test_jax_is_started_once_where_a_package_is_imported_for_its_flags(swelling, monkeypatch):
+    joins = []
+    monkeypatch.setattr(cli.joined, "join", lambda arguments: joins.append(arguments) or ALONE)
+    arguments = cli.parse("infer x --heuristic swell --gain 0.25 --no-cache --out x".split())
+    cli.prepare_jax(arguments)
+    assert len(joins) == 1 and arguments.joined is ALONE
+    with pytest.raises(SystemExit):
+        cli.parse("infer x --heuristic edge --gian 0.25 --out x".split())
+    assert len(joins) == 1
 
 
 def test_arguments_reach_the_rule(swelling):

@@ -316,10 +316,10 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     arguments, unknown = parser(families).parse_known_args(words)
     if not unknown:
         return arguments
-    if any((foreign := _foreign(arguments)).values()):
-        prepare_jax(arguments)
-        families += _imported(foreign)
-    return parser(families).parse_args(words)
+    if not any((foreign := _foreign(arguments)).values()):
+        return parser(families).parse_args(words)
+    prepare_jax(arguments)
+    return parser(families + _imported(foreign)).parse_args(words, argparse.Namespace(joined=arguments.joined))
 
 
 def _named_by(words: Sequence[str]) -> argparse.Namespace:
@@ -423,6 +423,8 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
     """
     from jaxlfi.io import host_devices
 
+    if hasattr(arguments, "joined"):  # it was started already, for a class of another package
+        return
     if not getattr(arguments, "no_cache", True):
         from jaxlfi.io import compile_cache
 
