@@ -107,12 +107,12 @@ def fields_table(reference: str) -> str:
 def help_text(command: str) -> str:
     """What a command prints about itself."""
     os.environ["COLUMNS"] = "100"
-    from jaxlfi.cli.parser import Families, foreign_command, parser
+    from jaxlfi.cli.parser import foreign_command, parser
 
     if main := foreign_command(command):
-        return f"```text\n{sys.modules[main.__module__].parser().format_help().strip()}\n```"
+        return f"```text\n{main.parser().format_help().strip()}\n```"
     words = [command] if command != "jaxlfi" else []
-    top = parser(Families.of(words))
+    top = parser()
     (commands,) = [action for action in top._actions if getattr(action, "choices", None) and action.dest == "command"]
     chosen = commands.choices[command] if words else top
     return f"```text\n{chosen.format_help().strip()}\n```"

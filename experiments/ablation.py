@@ -32,8 +32,8 @@ from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.envs.lotka_volterra import task as lotka_volterra
 from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Mode, paired
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.io.provenance import environment
 from jaxlfi.runs.describe import heuristic_to_json, settings_to_json
-from jaxlfi.runs.folder import environment
 from jaxlfi.tasks.observation import simulate_observation
 
 MATRIX: dict[str, tuple[str, str]] = {

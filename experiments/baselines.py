@@ -36,8 +36,8 @@ from jaxlfi.figures import style
 from jaxlfi.heuristics import Fixed, Heuristic, Truncate
 from jaxlfi.io import files as atomic
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.io.provenance import environment
 from jaxlfi.runs.describe import heuristic_to_json, settings_to_json
-from jaxlfi.runs.folder import environment
 from jaxlfi.tasks.observation import simulate_observation
 from jaxlfi.tasks.tailed_uniform import with_tails
 from jaxlfi.tasks.task import Task

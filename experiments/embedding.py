@@ -29,7 +29,7 @@ from jaxlfi.bayessim.presets import settings_for
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.io import files as atomic
-from jaxlfi.tasks import registry
+from jaxlfi.registry import TASKS
 from jaxlfi.tasks.task import Task
 
 NAMES = ("summaries", "raw", "mlp", "series")
@@ -99,7 +99,7 @@ def main() -> None:
     arguments = parser.parse_args()
     folder = arguments.out / arguments.task.replace(",", "-") / arguments.configuration
     folder.mkdir(parents=True, exist_ok=True)
-    named, console = registry.load(arguments.task), Console()
+    named, console = TASKS.load(arguments.task), Console()
     support, _, rule = arguments.configuration.partition("+")
     box = named.support(arguments.box)
     for name in arguments.candidates:

@@ -35,7 +35,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.envs import gaussian_linear, lotka_volterra, mg1
 from jaxlfi.heuristics import Edge
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import environment
+from jaxlfi.io.provenance import environment
 from jaxlfi.runs.infer import infer
 from jaxlfi.runs.unlike import names_of
 from jaxlfi.studies.calibration.truths import simulated_truths

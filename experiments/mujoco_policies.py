@@ -43,7 +43,7 @@ from jaxlfi.envs.mujoco.effects import STATE, built, effects, initial_state, sta
 from jaxlfi.envs.mujoco.environment import MujocoEnvironment, environment
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.model_task import specification
-from jaxlfi.io import files, serialise
+from jaxlfi.io import files, formats, provenance, serialise
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.rl import training
 from jaxlfi.rl.policy import Policy, load
@@ -170,7 +170,7 @@ def trained(
 ):
     """Train all policies side by side, unless they are there."""
     console = Console()
-    if not training_cli.is_training(out):
+    if not formats.recorded(out).get("format") == formats.TRAINING:
         training.begin(training.Plan(reference, env, settings, None, draws, tuple(range(seeds))), out)
     if not training.finished(out):
         training_cli.run(out, env, console, figures=True)
@@ -240,10 +240,10 @@ def main() -> None:
         {f"return/{name}": values for name, values in returns.items()}
         | {f"point/{name}": theta for name, theta in points.items()},
     )
-    command = run_store.command_line(["python", "-m", "experiments.mujoco_policies", *sys.argv[1:]])
+    command = provenance.command_line(["python", "-m", "experiments.mujoco_policies", *sys.argv[1:]])
     used = serialise.fields_to_json(training.settings_of(training.read_config(folder)), serialise.class_name)
     recorded = {"command_line": command, "settings": used, "episodes": arguments.episodes}
-    files.write_json(arguments.out / "config.json", run_store.environment() | recorded)
+    files.write_json(arguments.out / "config.json", provenance.environment() | recorded)
     for row in rows:
         print(row)
     for name, values in returns.items():

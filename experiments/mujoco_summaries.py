@@ -25,9 +25,9 @@ import numpy as np
 from experiments.mujoco_sysid import BOXES, EXAMPLES, FOLDER, believed, judged, load, recordings
 from jaxlfi.bayessim.presets import settings_for
 from jaxlfi.io import files
+from jaxlfi.io.provenance import environment
+from jaxlfi.registry import TASKS
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import environment
-from jaxlfi.tasks import registry
 from jaxlfi.tasks.task import Task
 
 SUMMARIES = ("samples", "cross-correlation", "spectrum", "learnt")
@@ -41,7 +41,7 @@ ALL = "all"
 
 def summarised(name: str, summary: str) -> Task:
     """The task of an example with a summary."""
-    return registry.load(f"mujoco,config={FOLDER / name}.toml,summary={summary}")
+    return TASKS.load(f"mujoco,config={FOLDER / name}.toml,summary={summary}")
 
 
 def measured(out: Path, name: str, box: str, summary: str) -> dict[str, np.ndarray] | None:

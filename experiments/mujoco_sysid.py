@@ -41,8 +41,8 @@ from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.presets import settings_for
 from jaxlfi.envs.mujoco import least_squares, sysid_point
 from jaxlfi.io import files
-from jaxlfi.runs.folder import environment
-from jaxlfi.tasks import registry
+from jaxlfi.io.provenance import environment
+from jaxlfi.registry import TASKS
 from jaxlfi.tasks.task import Task
 
 FOLDER = Path("examples/mujoco")
@@ -317,7 +317,7 @@ def table(out: Path) -> str:
 
 def load(name: str) -> Task:
     """The task of an example."""
-    return registry.load(f"mujoco,config={FOLDER / name}.toml")
+    return TASKS.load(f"mujoco,config={FOLDER / name}.toml")
 
 
 def main() -> None:

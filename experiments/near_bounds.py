@@ -14,8 +14,8 @@ import numpy as np
 
 from experiments.widths import DRAWS
 from jaxlfi.io import files
+from jaxlfi.registry import TASKS
 from jaxlfi.studies.calibration.truths import simulated_truths
-from jaxlfi.tasks import registry
 from jaxlfi.tasks.observation import simulator_shapes
 
 TRUTHS = 100
@@ -25,7 +25,7 @@ PARTS = 4
 
 def distances(name: str, box: str, first_seed: int = 0) -> np.ndarray:
     """Of the truths that `experiments.widths` draws over a box, shape [`TRUTHS`]."""
-    task = registry.load(name)
+    task = TASKS.load(name)
     support, key = task.support(box), jax.random.key(first_seed + 500_000)
     theta = simulated_truths(key, task, support, TRUTHS, simulator_shapes(task))["theta"]
     place = (theta - np.asarray(support.low)) / np.asarray(support.width)

@@ -19,7 +19,8 @@ from rich.table import Table
 from jaxlfi.cli.domains import domain
 from jaxlfi.io import files
 from jaxlfi.io.progress import RoundProgress
-from jaxlfi.rl import ppo, registry
+from jaxlfi.registry import ENVIRONMENTS
+from jaxlfi.rl import ppo
 from jaxlfi.rl.domains import POOL, Domain
 from jaxlfi.rl.evaluation import evaluate
 from jaxlfi.rl.settings import PPO
@@ -67,7 +68,7 @@ def main() -> None:
     alike = collections.defaultdict(list)
     for row, one in enumerate(settings):
         alike[jax.tree.structure(one)].append(row)
-    environment = registry.load("whip")
+    environment = ENVIRONMENTS.load("whip")
     name, draw = domain(environment, arguments.domain)
 
     curves, table = {}, {}

@@ -31,6 +31,7 @@ from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip.episode import OBSERVATION
 from jaxlfi.figures import History, open_collection, samples, style
 from jaxlfi.io import files as atomic
+from jaxlfi.io import provenance
 from jaxlfi.runs import folder as run_store
 
 OBJECTS = ("dlo-0", "dlo-1", "dlo-2", "dlo-3")
@@ -212,8 +213,8 @@ def main() -> None:
     writer.writeheader()
     writer.writerows(lines)
     atomic.write_bytes(arguments.out / "table.csv", stream.getvalue().encode())
-    command = run_store.command_line(["python", "-m", "experiments.real2sim", *sys.argv[1:]])
-    atomic.write_json(arguments.out / "config.json", run_store.environment() | {"command_line": command})
+    command = provenance.command_line(["python", "-m", "experiments.real2sim", *sys.argv[1:]])
+    atomic.write_json(arguments.out / "config.json", provenance.environment() | {"command_line": command})
     histories = {name: {label: seeds[0] for label, seeds in own.items()} for name, own in runs.items()}
     found = {name: {label: gaps(run.folder) for label, run in own.items()} for name, own in histories.items()}
     arrays = {

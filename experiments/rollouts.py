@@ -44,7 +44,7 @@ from jaxlfi.envs.whip.reference_objects.objects import TABLE
 from jaxlfi.envs.whip.reference_objects.objects import load as reference_object
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
-from jaxlfi.runs import folder as run_store
+from jaxlfi.io import provenance
 from jaxlfi.studies.calibration.repeat import described
 from jaxlfi.tasks.simulation import trajectory_and_outcome
 from jaxlfi.tasks.task import Task
@@ -204,8 +204,8 @@ def write(path: Path, lines: list[dict[str, object]]) -> None:
     writer.writeheader()
     writer.writerows({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in lines)
     atomic.write_bytes(path, stream.getvalue().encode())
-    command = run_store.command_line(["python", "-m", "experiments.rollouts", *sys.argv[1:]])
-    atomic.write_json(path.with_suffix(".json"), run_store.environment() | {"command_line": command})
+    command = provenance.command_line(["python", "-m", "experiments.rollouts", *sys.argv[1:]])
+    atomic.write_json(path.with_suffix(".json"), provenance.environment() | {"command_line": command})
 
 
 def main() -> None:

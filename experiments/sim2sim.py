@@ -31,7 +31,7 @@ from jaxlfi.envs.whip.physics.chain import elasto_gravity
 from jaxlfi.envs.whip.real2sim import task
 from jaxlfi.figures import style
 from jaxlfi.io import files as atomic
-from jaxlfi.runs import folder as run_store
+from jaxlfi.io import provenance
 from jaxlfi.tasks.simulation import trajectory_and_outcome
 
 INSIDE = 20
@@ -187,8 +187,8 @@ def main() -> None:
     atomic.write_bytes(arguments.out / "table.csv", stream.getvalue().encode())
     for name, own in found.items():
         atomic.write_arrays(arguments.out / f"{name}.npz", {k.replace("/", "_"): v for k, v in own.items()})
-    command = run_store.command_line(["python", "-m", "experiments.sim2sim", *sys.argv[1:]])
-    atomic.write_json(arguments.out / "config.json", run_store.environment() | {"command_line": command})
+    command = provenance.command_line(["python", "-m", "experiments.sim2sim", *sys.argv[1:]])
+    atomic.write_json(arguments.out / "config.json", provenance.environment() | {"command_line": command})
     shown = Table(*table[0])
     for line in table:
         shown.add_row(*(f"{v:.3g}" if isinstance(v, float) else str(v) for v in line.values()))

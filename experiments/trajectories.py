@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from jaxlfi.figures import style
 from jaxlfi.io import files as atomic
-from jaxlfi.tasks import registry as tasks
+from jaxlfi.registry import TASKS
 from jaxlfi.tasks.task import Task
 
 SEEDS = 3
@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--task", default="lotka_volterra", help="a task whose truth is known")
     parser.add_argument("--out", type=Path, default=Path("experiments/results/trajectories"))
     given = parser.parse_args(arguments)
-    task = tasks.load(given.task)
+    task = TASKS.load(given.task)
     if task.truth is None or task.on_host:
         parser.error(f"--task: expected one in JAX whose truth is known, got {given.task}")
     trajectories = simulations(task)

@@ -39,8 +39,8 @@ from jaxlfi.envs import gaussian_linear
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Fixed
 from jaxlfi.io import files as atomic
+from jaxlfi.registry import TASKS
 from jaxlfi.studies.calibration.repeat import described
-from jaxlfi.tasks import registry
 from jaxlfi.tasks.observation import simulate_observation
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.trials import repeated
@@ -174,7 +174,7 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.folder = arguments.out / arguments.task
     arguments.folder.mkdir(parents=True, exist_ok=True)
-    compare(registry.load(arguments.task), arguments, Console())
+    compare(TASKS.load(arguments.task), arguments, Console())
     print(table(arguments.folder))
 
 

@@ -46,11 +46,11 @@ from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.heuristics import Centre, Edge, Fixed, Heuristic, Mode, paired
 from jaxlfi.io import files as atomic
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.io.provenance import environment
+from jaxlfi.registry import TASKS
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import environment
 from jaxlfi.studies.calibration.repeat import described
 from jaxlfi.studies.calibration.truths import simulated_truths
-from jaxlfi.tasks import registry
 from jaxlfi.tasks.observation import simulate_observation, simulator_shapes
 from jaxlfi.tasks.task import Task
 
@@ -286,7 +286,7 @@ def main() -> None:
     parser.add_argument("--runs-per-batch", type=int, default=20)
     parser.add_argument("--out", type=Path, default=Path("runs/widths"))
     arguments = parser.parse_args()
-    task, console = registry.load(arguments.task), Console()
+    task, console = TASKS.load(arguments.task), Console()
     box, _, rule = arguments.configuration.partition("+")
     start, on, margin = task.support(box), None, ""
     if arguments.margin:

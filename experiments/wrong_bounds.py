@@ -33,8 +33,8 @@ from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics import Fixed
 from jaxlfi.io import files as atomic
+from jaxlfi.io.provenance import environment
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import environment
 from jaxlfi.tasks.observation import simulate_observation
 
 SETTINGS = QUICK.replace(rounds=10, min_rounds=0, predictive=False, estimator=QUICK.estimator.replace(epochs=40))

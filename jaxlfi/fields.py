@@ -7,6 +7,7 @@ imports neither jax nor numpy before they are needed, so that the command line c
 import dataclasses
 import math
 import sys
+from collections.abc import Mapping
 from typing import Any, Self, dataclass_transform
 
 KEY = "jaxlfi"
@@ -153,14 +154,16 @@ def declared(kind: Any) -> dict[str, Declared]:
         >>> declared(Truncate)["quantile"].info.interval
         '[0, 0.5)'
     """
-    return {field.name: described for field in dataclasses.fields(kind) if (described := describe(field.name, field))}
+    return described({field.name: field for field in dataclasses.fields(kind)})
 
 
-def describe(name: str, field: dataclasses.Field) -> Declared | None:
-    """What a field declares; None where it was made neither by `hyperparameter` nor by `option`."""
-    if KEY not in field.metadata:
-        return None
-    return Declared(name, field.default, field.metadata[KEY], not field.metadata["pytree_node"])
+def described(every: Mapping[str, dataclasses.Field]) -> dict[str, Declared]:
+    """What fields declare, by name; those that were made neither by `hyperparameter` nor by `option` are left out."""
+    return {
+        name: Declared(name, field.default, field.metadata[KEY], not field.metadata["pytree_node"])
+        for name, field in every.items()
+        if KEY in field.metadata
+    }
 
 
 def check_fields(value: Any) -> None:

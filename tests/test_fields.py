@@ -1,4 +1,4 @@
-"""Declared fields: what they refuse, what the source shows of them without being run, and rules of other packages."""
+"""Declared fields: what they refuse, the table of our own, and rules of other packages."""
 
 import argparse
 import dataclasses
@@ -14,15 +14,19 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import fields, flags, plugins, source_fields
+from jaxlfi import fields, flags
 from jaxlfi.bayessim.presets import PRESETS
 from jaxlfi.cli import parser as cli
+from jaxlfi.cli.own_fields import FIELDS, HELP
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.fields import Checked, hyperparameter, option
-from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate, registry
+from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate
+from jaxlfi.heuristics import hyperparameters as rules
+from jaxlfi.io.processes import ALONE
+from jaxlfi.registry import HEURISTICS, named
 from jaxlfi.runs import describe
-from tests import small
+from tests import own_fields, small
 
 OWN = {"centre": Centre, "edge": Edge, "mode": Mode, "none": Fixed, "truncate": Truncate}
 
@@ -99,49 +103,23 @@ def test_flax_leaves_a_checked_class_as_it_is():
     assert struct.dataclass(Everything) is Everything
 
 
-# ------------------------------------------------------------------------------ what the source shows
+# ------------------------------------------------------------------------------ the table of our own
 
 
 def test_our_heuristics_are_registered_by_the_names_of_the_paper():
     """After `pip install -e .`, which `make` does anew where pyproject.toml has changed."""
-    assert {name: registry.load(name) for name in registry.names()} == OWN
-    assert all(registry.name_of(kind()) == name for name, kind in OWN.items())
+    assert {name: HEURISTICS.load(name) for name in HEURISTICS.names()} == OWN
+    assert all(HEURISTICS.name_of(kind) == name for name, kind in OWN.items())
 
 
-@pytest.mark.parametrize("name", OWN)
-def test_the_source_shows_what_the_class_declares(name):
-    source = source_fields.of_group(registry.GROUP)[name]
-    assert source.complete and source.fields == registry.hyperparameters(OWN[name])
-    assert all(field.info.help for field in source.fields.values())
-
-
-READABLE = """
-    import abc
-    import math
-    from math import inf as endless
-    import jax.numpy as jnp
-    from jaxlfi import Heuristic
-    from jaxlfi import fields
-    from jaxlfi.fields import hyperparameter as number, option
-    from .constants import KINDS, HALF
-
-    LIMIT = 2 * 0.25
-    EXTRA = ("c",)
-
-    class Base(Heuristic, abc.ABC):
-        first: float = number(HALF, help="one " "text", low=-1, high=LIMIT)
-        second: float = fields.hyperparameter(1, help="b", high=math.inf)
-
-    class Rule(Base):
-        second: float = number(endless, help="c", symbol="s", low=-jnp.inf, high=float("inf"))
-        kind: str = option("b", help="d", choices=(*KINDS, *EXTRA))
-        layers: tuple = option(default=(1, 2), help="e", low=1)
-        note: int = 3
-
-        def __call__(self, previous, posterior, feasible):
-            'Never called: only the fields are read.'
-"""
-CONSTANTS = 'HALF = 0.5\nKINDS = {"a": print, "b": len}\n'
+def test_the_table_is_what_our_classes_and_commands_declare():
+    """`python -m tests.own_fields` writes it anew."""
+    declared = {f"{kind.__module__}:{kind.__qualname__}": fields.declared(kind) for kind in own_fields.kinds()}
+    assert {name: list(found.items()) for name, found in FIELDS.items()} == {
+        name: list(found.items()) for name, found in declared.items()
+    }
+    assert own_fields.commands() == HELP
+    assert all(field.info.help for found in FIELDS.values() for field in found.values())
 
 
 def package(folder, name: str, points: str = "", **modules: str) -> None:
@@ -164,48 +142,6 @@ def path(tmp_path, monkeypatch):
     for name in set(sys.modules) - before:
         if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
             del sys.modules[name]
-
-
-def test_constants_bases_and_imports_are_followed_without_importing(path):
-    package(path, "readable", rules=READABLE, constants=CONSTANTS, __init__="from readable.rules import Rule")
-    found = source_fields.of_class("readable:Rule")
-    assert "readable" not in sys.modules
-    assert found.complete
-    from readable import Rule
-
-    assert found.fields == fields.declared(Rule) and list(found.fields) == ["first", "second", "kind", "layers"]
-
-
-UNREADABLE = {
-    "a computed default": "x: float = hyperparameter(len([1]), help='x')",
-    "computed arguments": "x: float = hyperparameter(1.0, **dict(help='x'))",
-    "an unknown maker": "x: float = own('x')",
-    "a constant of elsewhere": "x: float = hyperparameter(sys.maxsize, help='x')",
-    "wrong arguments": "x: float = hyperparameter(1.0, what='x')",
-}
-
-
-@pytest.mark.parametrize("case", UNREADABLE)
-def test_what_cannot_be_read_is_left_out_and_owned_to(case, path):
-    package(path, "unreadable", rule=f"""
-        import sys
-        from jaxlfi import Heuristic, hyperparameter
-        class Rule(Heuristic):
-            {UNREADABLE[case]}
-            y: float = hyperparameter(2.0, help="y")
-    """)  # fmt: skip
-    found = source_fields.of_class("unreadable.rule:Rule")
-    assert not found.complete and list(found.fields) == ["y"]
-
-
-@pytest.mark.parametrize(
-    "reference", ["nothing:Rule", "unparsable:Rule", "builtins:dict", "jaxlfi.fields:KEY", "itself:A"]
-)
-def test_classes_without_a_readable_source_declare_nothing(reference, path):
-    (path / "unparsable.py").write_text("class Rule(:\n")
-    (path / "itself.py").write_text("from itself import A\n")
-    found = source_fields.of_class(reference)
-    assert not found.complete and not found.fields
 
 
 # ------------------------------------------------------------------------------ another package's rule
@@ -242,61 +178,78 @@ def swelling(path):
     return path
 
 
-def run_help(folder, *words: str) -> str:
-    """What `--help` prints in a process of its own, which must not import jax."""
+def run_help(folder, *words: str, imported: bool) -> str:
+    """What `--help` prints in a process of its own, which imports jax with the class of a package that is named."""
     script = (
         "import atexit, sys; heavy = {'jax', 'numpy', 'swelling'}; "
-        "atexit.register(lambda: print('imported:', [name for name in sys.modules if name in heavy])); "
+        "atexit.register(lambda: print('imported:', sorted(name for name in sys.modules if name in heavy))); "
         f"sys.path.insert(0, {str(folder)!r}); import jaxlfi.cli.parser as c; c.main(sys.argv[1:])"
     )
     done = subprocess.run([sys.executable, "-c", script, *words, "--help"], capture_output=True, text=True, check=True)
     *shown, last = done.stdout.splitlines()
-    assert last == "imported: []"
+    assert last == f"imported: {['jax', 'numpy', 'swelling'] if imported else []}"
     return " ".join(" ".join(shown).split())
 
 
-def test_help_lists_the_flags_of_all_installed_heuristics(swelling):
-    text = run_help(swelling, "infer")
+def test_help_lists_the_flags_of_a_packages_heuristic_that_is_named(swelling):
+    text = run_help(swelling, "infer", imported=False)
+    assert "--gain" not in text and "none, swell, truncate, or your own as module:Class" in text
+    assert "--expansion X [X ...] edge, mode: how far" in text
+    text = run_help(swelling, "infer", "--heuristic", "swell", imported=True)
     assert "--gain X [X ...] swell: how far bounds move (kappa; [0, 2]; default: 0.5)" in text
     assert "gain kappa, how far bounds move" in text
     assert "--side NAME swell: which bounds (both, low; default: both)" in text
     assert "edge, mode: how far a bound moves, as a fraction of the support's width; swell: another step (eta; " in text
     assert "default: 0.2 (edge), 0.2 (mode), 0.3 (swell)" in text
     assert "--hyperparameter-seeds X [X ...] swell: as a flag of the command is called" in text
-    assert "none, swell, truncate, or your own as module:Class" in text
 
 
 def test_flags_of_a_class_that_is_not_registered_are_found_by_its_name(path):
     package(path, "swelling", rule=RULE)
-    assert "--gain" not in run_help(path, "infer")
-    for words in (["infer", "--heuristic", "swelling.rule:Swell"], ["grid", "--heuristic=swelling.rule:Swell"]):
-        assert "swelling.rule:Swell: how far bounds move" in run_help(path, *words)
-    assert "how far bounds move" in run_help(path, "compare", "--configurations", "ok+swelling.rule:Swell")
+    assert "swelling.rule:Swell: how far bounds move" in run_help(
+        path, "grid", "--heuristic=swelling.rule:Swell", imported=True
+    )
+    named = run_help(path, "compare", "--configurations", "ok+swelling.rule:Swell", imported=True)
+    assert "how far bounds move" in named
+
+
+@pytest.mark.parametrize(
+    "words", ["infer --heuristic nowhere:Rule", "grid --heuristic", "compare --configurations x+y"]
+)
+def test_help_is_shown_whatever_is_named(words):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([words.split()[0], "--help", *words.split()[1:]])
+    assert stop.value.code == 0
+
+
+def test_jax_is_started_once_where_a_package_is_imported_for_its_flags(swelling, monkeypatch):
+    joins = []
+    monkeypatch.setattr(cli.joined, "join", lambda arguments: joins.append(arguments) or ALONE)
+    arguments = cli.parse("infer x --heuristic swell --gain 0.25 --no-cache --out x".split())
+    cli.prepare_jax(arguments)
+    assert len(joins) == 1 and arguments.joined is ALONE
+    with pytest.raises(SystemExit):
+        cli.parse("infer x --heuristic edge --gian 0.25 --out x".split())
+    assert len(joins) == 1
 
 
 def test_arguments_reach_the_rule(swelling):
     words = "infer x --heuristic swell --gain 0.25 1.5 --hyperparameter-seeds 3 --side low --seeds 2 --out x".split()
     arguments = cli.parse(words)
     assert arguments.seeds == 2
-    rule = registry.build(arguments.heuristic, arguments.hyperparameters, dim=2)
+    rule = rules.build(HEURISTICS.load(arguments.heuristic), arguments.hyperparameters, dim=2)
     np.testing.assert_array_equal(rule.gain, np.float32([0.25, 1.5]))
     assert (rule.seeds, rule.side, rule.expansion) == (3.0, "low", 0.3)
     assert cli.parse(["infer", "x", "--out", "x"]).hyperparameters == {}
 
 
-def test_flags_that_the_source_does_not_show_work_all_the_same(path):
-    package(
-        path, "hidden", "[jaxlfi.heuristics]\nhidden = hidden.rule:Rule\n", rule=RULE.replace("0.5", "len('x') / 2")
-    )
-    source = source_fields.of_group(registry.GROUP)["hidden"]
-    assert "gain" not in source.fields
-    words = ["infer", "x", "--gain", "0.25", "--heuristic", "hidden", "--out", "x"]
+def test_a_package_that_cannot_be_imported_is_named_where_its_flags_are_used(path):
+    package(path, "broken", "[jaxlfi.heuristics]\nbroken = broken.rule:Rule\n", rule=RULE)
+    words = ["infer", "x", "--gain", "0.25", "--heuristic", "broken", "--out", "x"]
     with pytest.raises(ValueError, match="'Rule'"):
         cli.parse(words)
-    (path / "hidden" / "rule.py").write_text(
-        textwrap.dedent(RULE.replace("0.5", "len('x') / 2").replace("Swell", "Rule"))
-    )
-    del sys.modules["hidden.rule"]
+    (path / "broken" / "rule.py").write_text(textwrap.dedent(RULE.replace("Swell", "Rule")))
+    del sys.modules["broken.rule"]
     assert cli.parse(words).hyperparameters == {"gain": [0.25]}
 
 
@@ -316,7 +269,7 @@ def test_flags_read_values_of_the_type_of_the_default():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("infer x --gain 1 --heuristic edge --out x", "gain: expected a hyperparameter of edge"),
+        ("infer x --tail 1 --gain 1 --heuristic swell --out x", "tail: expected a hyperparameter of swell"),
         ("infer x --gain 3 --heuristic swell --out x", r"gain: expected a number in \[0, 2\], got 3"),
         ("infer x --side up --heuristic swell --out x", "side: expected one of both, low, got 'up'"),
         ("infer x --gain 1 1 1 --heuristic swell --out x", "gain: expected one finite number or 2"),
@@ -325,8 +278,9 @@ def test_flags_read_values_of_the_type_of_the_default():
 def test_wrong_arguments_are_refused(swelling, words, message):
     arguments = cli.parse(words.split())
     with pytest.raises(ValueError, match=f"^{message}"):
-        registry.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
-        registry.build(arguments.heuristic, arguments.hyperparameters, dim=2)
+        kind = HEURISTICS.load(arguments.heuristic)
+        rules.refuse_foreign(arguments.hyperparameters, {arguments.heuristic: kind})
+        rules.build(kind, arguments.hyperparameters, dim=2)
 
 
 BAD_REFERENCES = {
@@ -336,7 +290,10 @@ BAD_REFERENCES = {
     "no class": ("os:getcwd", "heuristic: expected 'os:getcwd' to be a class derived from Heuristic"),
     "another class": ("jaxlfi:Support", "heuristic: expected 'jaxlfi:Support' to be a class derived from Heuristic"),
     "an abstract class": ("jaxlfi:Heuristic", "heuristic: expected 'jaxlfi:Heuristic' to be a class derived"),
-    "a wrapper": ("jaxlfi:Matched", "heuristic: 'jaxlfi:Matched' cannot be made of its hyperparameters"),
+    "a wrapper": (
+        "jaxlfi:Matched",
+        "heuristic: 'jaxlfi.heuristics.matching:Matched' cannot be made",
+    ),
 }
 
 
@@ -344,32 +301,32 @@ BAD_REFERENCES = {
 def test_bad_references_are_one_line(case):
     reference, message = BAD_REFERENCES[case]
     with pytest.raises(ValueError, match=f"^{message}") as caught:
-        registry.build(reference, {}, dim=2)
+        rules.build(HEURISTICS.load(reference), {}, dim=2)
     assert "\n" not in str(caught.value)
 
 
 def test_what_is_no_heuristic_is_refused():
     for wrong, shown in ((Edge, "the class Edge"), ("edge", "'edge'"), (lambda *_: None, "<function")):
         with pytest.raises(ValueError, match=rf"^heuristic: expected an instance such as jaxlfi.Edge\(\), got {shown}"):
-            registry.check(wrong, 2)
+            rules.check(wrong, 2)
     for leaf in (np.ones(3), jnp.ones((2, 2))):
         with pytest.raises(ValueError, match="scalars or 2 values, got shape"):
-            registry.check(Matched(Edge(expansion=leaf)), 2)
+            rules.check(Matched(Edge(expansion=leaf)), 2)
     negative = jax.tree.map(lambda leaf: -leaf, Choice(0, (Fixed(), Edge())))
     with pytest.raises(ValueError, match="zone_fraction: expected a number"):
-        registry.check(negative, 2)
+        rules.check(negative, 2)
 
 
 def test_hyperparameters_are_seen_and_replaced_through_wrappers():
     rule = Choice(1, (Edge(), Matched(Mode()), Fixed()))
-    assert set(registry.hyperparameters(rule)) == {*registry.hyperparameters(Edge), *registry.hyperparameters(Mode)}
-    edge, matched, fixed = registry.replaced(rule, {"expansion": 0.7, "proximity": 0.9}).rules
+    assert set(rules.all_declared(rule)) == {*rules.all_declared(Edge), *rules.all_declared(Mode)}
+    edge, matched, fixed = rules.replaced(rule, {"expansion": 0.7, "proximity": 0.9}).rules
     assert (edge.expansion, matched.rule.expansion, matched.rule.proximity, edge.tail) == (0.7, 0.7, 0.9, 1.0)
     assert fixed is rule.rules[2] or fixed == Fixed()
     with pytest.raises(ValueError, match=r"^gain: expected a hyperparameter of "):
-        registry.replaced(rule, {"gain": 1.0})
+        rules.replaced(rule, {"gain": 1.0})
     with pytest.raises(ValueError, match=r"^proximity: expected a number"):
-        registry.replaced(rule, {"proximity": 2.0})
+        rules.replaced(rule, {"proximity": 2.0})
 
 
 # ------------------------------------------------------------------------------ described and read back
@@ -438,7 +395,7 @@ def test_a_description_is_by_registered_names():
 
 
 def test_another_packages_rule_survives_its_description(swelling):
-    rule = Matched(registry.build("swell", {"gain": [0.25, 0.5], "side": "low"}, dim=2))
+    rule = Matched(rules.build(HEURISTICS.load("swell"), {"gain": [0.25, 0.5], "side": "low"}, dim=2))
     described = json.loads(json.dumps(describe.heuristic_to_json(rule)))
     assert described["hyperparameters"]["rule"]["name"] == "swell"
     assert identical(describe.heuristic_from_json(described), rule)
@@ -478,7 +435,7 @@ def test_settings_hold_their_estimator_by_name(preset):
 
 
 def test_name_of_a_class_leads_back_to_it():
-    assert plugins.named("class", plugins.name_of("jaxlfi.heuristics", jaxlfi.Support)) is jaxlfi.Support
+    assert named("class", HEURISTICS.name_of(jaxlfi.Support)) is jaxlfi.Support
 
 
 @pytest.mark.slow

@@ -5,11 +5,9 @@ from pathlib import Path
 import pytest
 from test_fields import package, path  # noqa: F401  a fixture
 
-from jaxlfi import factories, plugins, source_fields
+from jaxlfi import references
 from jaxlfi.cli import parser as cli
-from jaxlfi.heuristics import registry as heuristics
-from jaxlfi.rl import registry as environments
-from jaxlfi.tasks import registry as tasks
+from jaxlfi.registry import ENVIRONMENTS, HEURISTICS, TASKS
 
 TWIN = """
     from jaxlfi import Heuristic, hyperparameter
@@ -54,9 +52,9 @@ def twins(path):  # noqa: F811
 def used(kind: str) -> None:
     """Use a name that two packages register."""
     {
-        "heuristic": lambda: heuristics.load("same"),
-        "task": lambda: tasks.load("same"),
-        "environment": lambda: environments.load("same,size=3"),
+        "heuristic": lambda: HEURISTICS.load("same"),
+        "task": lambda: TASKS.load("same"),
+        "environment": lambda: ENVIRONMENTS.load("same,size=3"),
         "command": lambda: cli.foreign_command("same"),
     }[kind]()
 
@@ -86,26 +84,26 @@ def test_the_command_line_names_both_packages_of_a_clash(twins, tmp_path, capsys
 def test_a_clash_is_nothing_to_those_who_do_not_use_the_name(twins):
     shown = cli.parser().format_help()
     assert shown.count("\n    infer ") == 1 and "jaxlfi same --help" in shown
-    assert not source_fields.of_group(heuristics.GROUP)["same"].complete
-    assert heuristics.load("edge").__name__ == "Edge" and tasks.load("gaussian_linear").name == "gaussian_linear"
-    assert heuristics.load("anna_alone").__name__ == "Same"
-    kind = heuristics.load("bert.own:Same")
-    assert plugins.name_of(heuristics.GROUP, kind) == "bert_alone"  # the name that leads back
-    assert "same" in plugins.names(heuristics.GROUP)
+    assert cli.Families().rules["same"] == {}
+    assert HEURISTICS.load("edge").__name__ == "Edge" and TASKS.load("gaussian_linear").name == "gaussian_linear"
+    assert HEURISTICS.load("anna_alone").__name__ == "Same"
+    kind = HEURISTICS.load("bert.own:Same")
+    assert HEURISTICS.name_of(kind) == "bert_alone"  # the name that leads back
+    assert "same" in HEURISTICS.names()
 
 
 def test_one_object_by_two_packages_is_no_clash(path):  # noqa: F811
     package(path, "home", "[jaxlfi.tasks]\nmine = jaxlfi.envs.gaussian_linear:task\n")
     package(path, "renamed", "[jaxlfi.tasks]\nmine = jaxlfi.envs.gaussian_linear:task\n")
-    assert tasks.load("mine").name == "gaussian_linear"
+    assert TASKS.load("mine").name == "gaussian_linear"
 
 
 def test_names_that_lead_nowhere_hurt_nobody_else(path, capsys):  # noqa: F811
     package(path, "odd", "[jaxlfi.heuristics]\nodd = no reference at all!\n[jaxlfi.commands]\n100%s = odd\n")
     assert "100%s --help" in " ".join(cli.parser().format_help().split())
-    assert not source_fields.of_group(heuristics.GROUP)["odd"].complete
+    assert cli.Families().rules["odd"] == {}
     with pytest.raises(ValueError, match=r"^heuristic: cannot load 'odd' \(no reference at all!\): "):
-        heuristics.load("odd")
+        HEURISTICS.load("odd")
     assert cli.main(["100%s"]) == 2 and "command: cannot load '100%s' (odd)" in capsys.readouterr().err
 
 
@@ -116,36 +114,36 @@ NAMES = ["monday,rope.npz", "a;b.npz", "a=b.npz", "k=1,v=2.npz", "x,trials=3", "
 @pytest.mark.parametrize("name", NAMES)
 def test_values_pass_untouched_whatever_they_contain(name):
     for kind in (tuple[str, ...], tuple[str, ...] | str | None):
-        reference = factories.with_option("whip", "object", name, "other", name)
-        found, options = factories.parse(factories.with_option(reference, "trials", "2"))
+        reference = references.with_option("whip", "object", name, "other", name)
+        found, options = references.parse(references.with_option(reference, "trials", "2"))
         assert found == "whip" and list(options) == ["object", "trials"]
-        assert factories.convert(options["object"], kind, "object") == (name, "other", name)
-    options = factories.parse(factories.with_option("mujoco", "config", name))[1]
-    assert factories.convert(options["config"], Path, "config") == Path(name)
-    assert factories.convert(options["config"], str, "config") == name
+        assert references.convert(options["object"], kind, "object") == (name, "other", name)
+    options = references.parse(references.with_option("mujoco", "config", name))[1]
+    assert references.convert(options["config"], Path, "config") == Path(name)
+    assert references.convert(options["config"], str, "config") == name
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith(('"', ","))])
 def test_a_path_that_exists_needs_no_quotation_marks(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).touch()
-    assert factories.parse(f"mujoco,config={name},engine=mjx") == ("mujoco", {"config": name, "engine": "mjx"})
-    options = factories.parse(f"whip,object={name}")[1]
-    assert factories.convert(options["object"], tuple[str, ...], "object") == (name,)
-    assert factories.convert(f"first;{name};other", tuple[str, ...], "object") == ("first", name, "other")
+    assert references.parse(f"mujoco,config={name},engine=mjx") == ("mujoco", {"config": name, "engine": "mjx"})
+    options = references.parse(f"whip,object={name}")[1]
+    assert references.convert(options["object"], tuple[str, ...], "object") == (name,)
+    assert references.convert(f"first;{name};other", tuple[str, ...], "object") == ("first", name, "other")
 
 
 def test_a_path_with_a_comma_that_begins_no_option_needs_none_either():
-    assert factories.parse("mujoco,config=a,b.toml,engine=mjx")[1] == {"config": "a,b.toml", "engine": "mjx"}
+    assert references.parse("mujoco,config=a,b.toml,engine=mjx")[1] == {"config": "a,b.toml", "engine": "mjx"}
     for wrong in ("config=a,b", "config=a, engine=mjx", "config=a,engine=", "config=a,b=1,b=2", "a,b.toml"):
         with pytest.raises(ValueError, match=r"^task: expected options as NAME,key=value"):
-            factories.parse(f"mujoco,{wrong}")
+            references.parse(f"mujoco,{wrong}")
 
 
 def test_the_command_line_passes_names_of_files_on(tmp_path, monkeypatch):
     arguments = cli.parser().parse_args(
         ["infer", "whip", "--object", *NAMES[:-1], "--observation", "a,b.csv", "c d.csv", "--out", "x"]
     )
-    name, options = factories.parse(cli._reference(arguments))
+    name, options = references.parse(cli._reference(arguments))
     assert name == "whip" and options["trials"] == "2"
-    assert factories.convert(options["object"], tuple[str, ...], "object") == tuple(NAMES[:-1])
+    assert references.convert(options["object"], tuple[str, ...], "object") == tuple(NAMES[:-1])

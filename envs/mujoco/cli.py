@@ -5,12 +5,10 @@ This module imports neither jax nor numpy, so that `--help` answers at once.
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from jaxlfi import flags
-from jaxlfi.cli.exit_status import exit_status
-from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.cli.command import Command
 from jaxlfi.envs.mujoco import require_mujoco
 
 EXAMPLES = """\
@@ -24,16 +22,8 @@ examples:
 """
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
-    formatter = argparse.RawDescriptionHelpFormatter
-    top = OneLineParser(
-        prog="jaxlfi mujoco",
-        description="What follows inference of a MuJoCo model: films of its posterior, and points of least squares.",
-        epilog=EXAMPLES,
-        formatter_class=formatter,
-    )
-    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     film = commands.add_parser(
         "film",
@@ -87,7 +77,6 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="also find the point estimate of mujoco.sysid (pip install 'mujoco[sysid]')",
     )
-    return top
 
 
 def _count(text: str) -> int:
@@ -103,33 +92,27 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
+def _run(arguments: argparse.Namespace) -> None:
+    require_mujoco()
+    from jaxlfi.io import compile_cache
 
-    Args:
-        argv: the words after `jaxlfi mujoco`; by default those of the process.
+    compile_cache.enable()
+    if arguments.command == "film":
+        from jaxlfi.envs.mujoco.film import film as command
+    else:
+        from jaxlfi.envs.mujoco.commands import fit as command
+    command(arguments)
 
-    Returns:
-        0; 2 for bad input; 130 where it was interrupted.
-    """
-    arguments = parser().parse_args(argv)
 
-    def work() -> None:
-        require_mujoco()
-        from jaxlfi.io import compile_cache
-
-        compile_cache.enable()
-        if arguments.command == "film":
-            from jaxlfi.envs.mujoco.film import film
-
-            film(arguments)
-        else:
-            from jaxlfi.envs.mujoco.commands import fit
-
-            fit(arguments)
-
-    return exit_status("jaxlfi mujoco", work)
-
+main = Command(
+    "mujoco",
+    "film and refine the posterior of a MuJoCo model",
+    _arguments,
+    _run,
+    description="What follows inference of a MuJoCo model: films of its posterior, and points of least squares.",
+    epilog=EXAMPLES,
+)
+parser = main.parser
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -18,9 +18,9 @@ from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.envs.mujoco.sysid_point import SysidPoint
 from jaxlfi.io import files
 from jaxlfi.io.progress import RoundProgress
-from jaxlfi.runs.folder import environment
+from jaxlfi.io.provenance import environment
+from jaxlfi.registry import TASKS
 from jaxlfi.runs.run import Run
-from jaxlfi.tasks import registry
 from jaxlfi.tasks.task import Task
 
 ALIKE = 0.95
@@ -108,12 +108,12 @@ def task_named(source: str) -> Task:
     if Path(source).is_file():
         return config.read(Path(source))
     name = source.partition(",")[0]
-    if name not in registry.names() and ":" not in name:
+    if name not in TASKS.names() and ":" not in name:
         raise ValueError(
             f"{source}: expected the folder of a run, a TOML file that describes a task, or a task such as "
             "mujoco,config=FILE.toml; got none of them"
         )
-    return registry.load(source)
+    return TASKS.load(source)
 
 
 def task_of(run: Run) -> Task:

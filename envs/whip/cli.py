@@ -5,12 +5,10 @@ This module imports neither jax nor numpy, so that `--help` answers at once.
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from jaxlfi import flags
-from jaxlfi.cli.exit_status import exit_status
-from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.cli.command import Command
 from jaxlfi.envs.whip import require_mujoco
 from jaxlfi.envs.whip.vision import options
 
@@ -32,17 +30,8 @@ examples:
 """
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
-    formatter = argparse.RawDescriptionHelpFormatter
-    top = OneLineParser(
-        prog="jaxlfi whip",
-        description="Render rollouts of the DLO whipping task, plan whips, let policies whip, control robots, learn to "
-        "see, and record and convert rollouts.",
-        epilog=EXAMPLES,
-        formatter_class=formatter,
-    )
-    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     render = commands.add_parser(
         "render",
@@ -163,7 +152,6 @@ def parser() -> argparse.ArgumentParser:
         help="a recording; FOLDER#episode=N of a data set of several; several, for a data set",
     )
     convert.add_argument("out", type=Path, metavar="OUT", help="a new NAME.npz, NAME.mcap, or folder without a suffix")
-    return top
 
 
 def _add_scene(command: argparse.ArgumentParser) -> None:
@@ -183,30 +171,28 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
+def _run(arguments: argparse.Namespace) -> None:
+    require_mujoco()
+    from jaxlfi.io import compile_cache
 
-    Args:
-        argv: the words after `jaxlfi whip`; by default those of the process.
+    compile_cache.enable()
+    if arguments.command in options.COMMANDS:
+        from jaxlfi.envs.whip.vision import commands
+    else:
+        from jaxlfi.envs.whip import commands
+    getattr(commands, options.COMMANDS.get(arguments.command, arguments.command))(arguments)
 
-    Returns:
-        0; 2 for bad input; 130 where it was interrupted.
-    """
-    arguments = parser().parse_args(argv)
 
-    def work() -> None:
-        require_mujoco()
-        from jaxlfi.io import compile_cache
-
-        compile_cache.enable()
-        if arguments.command in options.COMMANDS:
-            from jaxlfi.envs.whip.vision import commands
-        else:
-            from jaxlfi.envs.whip import commands
-        getattr(commands, options.COMMANDS.get(arguments.command, arguments.command))(arguments)
-
-    return exit_status("jaxlfi whip", work)
-
+main = Command(
+    "whip",
+    "whipping: render, plan, deploy, control, record, see",
+    _arguments,
+    _run,
+    description="Render rollouts of the DLO whipping task, plan whips, let policies whip, control robots, learn to "
+    "see, and record and convert rollouts.",
+    epilog=EXAMPLES,
+)
+parser = main.parser
 
 if __name__ == "__main__":
     sys.exit(main())

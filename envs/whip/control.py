@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi import factories, plugins
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.environment import ACTIONS, LIMITS, OBSERVATIONS
 from jaxlfi.envs.whip.frames import COLOURS
@@ -20,6 +19,7 @@ from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.envs.whip.vision.camera import Camera, side_camera
 from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS
 from jaxlfi.io.serialise import json_safe
+from jaxlfi.registry import ROBOTS
 from jaxlfi.rl import deployment
 from jaxlfi.rl.policy import Policy
 from jaxlfi.robots.client import SocketRobot
@@ -129,15 +129,12 @@ def robot_of(word: str, seed: int, remote: bool, sight: Any = None) -> tuple[Rob
     if word.startswith("socket:"):
         robot = SocketRobot(word, OBSERVATIONS.names, ACTIONS.names, remote)
     elif ":" in word:
-        name, options = factories.parse(word, "robot")
-        robot = factories.made("robot", word, plugins.find("", "robot", name), options, Robot)
+        robot = ROBOTS.load(word)
     else:
         from jaxlfi.envs.whip.reference_objects import objects
         from jaxlfi.envs.whip.reference_objects.robot import ReferenceRobot
 
         robot = ReferenceRobot(jax.random.key(seed), objects.load(word), sight=sight)
-    if not isinstance(robot, Robot):
-        raise ValueError(f"robot: expected {word!r} to have observe, act and stop, got {type(robot).__name__}")
     try:
         return robot, described(getattr(robot, "about", {}))
     except BaseException:

@@ -22,13 +22,14 @@ from pathlib import Path
 from jaxlfi import flags
 from jaxlfi.cli import parser as command_line
 from jaxlfi.cli import train
-from jaxlfi.cli.exit_status import exit_status
+from jaxlfi.cli.command import Command
 from jaxlfi.cli.interrupts import INTERRUPTED
-from jaxlfi.cli.parser import OneLineParser
 from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip import require_mujoco
 from jaxlfi.envs.whip.vision import options
+from jaxlfi.io.formats import CONFIG, FORMATS, LOOP
 from jaxlfi.io.shell import quoted
+from jaxlfi.registry import HEURISTICS
 
 EXAMPLES = """\
 examples:
@@ -38,8 +39,6 @@ examples:
   jaxlfi r2s2r --object dlo-0 --detector learnt --out runs/seen
 
 """
-REPETITIONS = 16
-"""Places at which policies are compared in the end."""
 
 
 class StageError(Exception):
@@ -50,60 +49,39 @@ class StageError(Exception):
         self.status = status
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
-    top = OneLineParser(
-        prog="jaxlfi r2s2r",
-        description="From a reference object to a policy for it: a first policy on the uniform distribution, its "
-        "rollout on the object, inference of the object's parameters, a policy on that posterior, and both on the "
-        "object. Repeating the command continues an interrupted run.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    top.add_argument("--object", required=True, metavar="NAME", help="dlo-0, dlo-1, dlo-2 or dlo-3")
-    top.add_argument(
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--object", required=True, metavar="NAME", help="dlo-0, dlo-1, dlo-2 or dlo-3")
+    parser.add_argument(
         "--out", type=flags.output, required=True, metavar="DIR", help="a folder, new or of the same command"
     )
-    top.add_argument("--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)")
-    top.add_argument("--preset", choices=("quick", "paper"), default="quick", help="of all stages (default: quick)")
-    top.add_argument("--seed", type=int, default=0, metavar="N", help="of all stages (default: 0)")
-    top.add_argument("--iterations", type=int, default=1, metavar="N", help="times to go round (default: 1)")
-    top.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")
-    top.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz in place of the first training")
-    top.add_argument("--recording", type=Path, metavar="FILE", help="a recorded rollout in place of the first one")
-    top.add_argument("--posterior", type=Path, metavar="RUN", help="a finished run in place of the first inference")
-    options.add_detector(top)
-    top.add_argument("--debug", action="store_true", help="show where an error came from")
-    return top
+    parser.add_argument(
+        "--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)"
+    )
+    parser.add_argument("--preset", choices=("quick", "paper"), default="quick", help="of all stages (default: quick)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all stages (default: 0)")
+    parser.add_argument("--iterations", type=int, default=1, metavar="N", help="times to go round (default: 1)")
+    parser.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")
+    parser.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz in place of the first training")
+    parser.add_argument("--recording", type=Path, metavar="FILE", help="a recorded rollout in place of the first one")
+    parser.add_argument("--posterior", type=Path, metavar="RUN", help="a finished run in place of the first inference")
+    options.add_detector(parser)
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: the words after `jaxlfi r2s2r`; by default those of the process.
-
-    Returns:
-        0; 2 for bad input; 130 where it was interrupted.
-    """
-    arguments = parser().parse_args(argv)
-    go_on = lambda: "; the same command goes on from here" if (arguments.out / "config.json").exists() else ""
-    try:
-        return exit_status("jaxlfi r2s2r", lambda: _loop(arguments), arguments.debug, go_on)
-    except StageError as stage:  # which has said why
-        return stage.status
-
-
-def _loop(arguments: argparse.Namespace) -> None:
+def _loop(arguments: argparse.Namespace) -> int:
     require_mujoco()
     _begin(arguments)
     from jaxlfi.envs.whip.r2s2r_page import write
     from jaxlfi.io.locks import locked
 
     with locked(arguments.out):
-        policies = _round_and_round(arguments)
-        _deploy(arguments, policies)
+        try:
+            policies = _round_and_round(arguments)
+            _deploy(arguments, policies)
+        except StageError as stage:  # which has said why
+            return stage.status
         print(f"wrote {write(arguments, policies)}")
+        return 0
 
 
 # ------------------------------------------------------------------------------------------------------------ stages
@@ -116,17 +94,16 @@ def _begin(arguments: argparse.Namespace) -> None:
     from jaxlfi.envs.whip.real2sim import recorded
     from jaxlfi.envs.whip.reference_objects import objects
     from jaxlfi.envs.whip.vision.commands import sights
-    from jaxlfi.heuristics import registry as heuristics
-    from jaxlfi.io import files
+    from jaxlfi.io import files, workfolder
+    from jaxlfi.io.provenance import environment
     from jaxlfi.rl import policy
     from jaxlfi.rl.settings import PRESETS
-    from jaxlfi.runs.folder import environment
 
     objects.load(arguments.object)
     if arguments.iterations < 1:
         raise ValueError(f"iterations: expected at least 1, got {arguments.iterations}")
     train.check_seeds(arguments.seed, 1, "seed")
-    heuristics.load(arguments.heuristic)
+    HEURISTICS.load(arguments.heuristic)
     if arguments.total_steps is not None:
         PRESETS[arguments.preset].replace(total_steps=arguments.total_steps)
     if arguments.policy:
@@ -142,17 +119,13 @@ def _begin(arguments: argparse.Namespace) -> None:
         for name, value in vars(arguments).items()
         if name not in ("out", "debug")
     }
-    path = arguments.out / "config.json"
-    if path.exists():
+    path = arguments.out / CONFIG
+    if workfolder.begun(arguments.out, CONFIG, "a new folder, or one of the same command"):
         found = json.loads(path.read_text()).get("asked")
         if found != asked:
             raise ValueError(f"out: expected a new folder, or one of the same command, got {arguments.out} of {found}")
         return
-    # A kill while config.json is written leaves config.json.part.
-    if arguments.out.exists() and any(path.suffix != ".part" for path in arguments.out.iterdir()):
-        raise ValueError(f"out: expected a new folder, or one of the same command, got {arguments.out}")
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    files.write_json(path, {"format": "jaxlfi-r2s2r", "version": 1, "asked": asked, **environment()})
+    files.write_json(path, {"format": LOOP, "version": FORMATS[LOOP].version, "asked": asked, **environment()})
 
 
 def _round_and_round(arguments: argparse.Namespace) -> list[Path]:
@@ -242,6 +215,8 @@ def _infer(arguments: argparse.Namespace, rollouts: Sequence[Path], out: Path) -
 
 
 def _deploy(arguments: argparse.Namespace, policies: Sequence[Path]) -> None:
+    from jaxlfi.envs.whip.r2s2r_page import REPETITIONS
+
     out = arguments.out / "deployed"
     if not (out / "table.csv").exists():
         shutil.rmtree(out, ignore_errors=True)
@@ -261,6 +236,20 @@ def _command(run: Callable[[list[str]], int], words: list[str], what: str) -> No
 
 def _say(text: str) -> None:
     print(f"\n== {text}", flush=True)
+
+
+main = Command(
+    "r2s2r",
+    "run the full Real2Sim2Real loop on a reference object",
+    _arguments,
+    _loop,
+    description="From a reference object to a policy for it: a first policy on the uniform distribution, its "
+    "rollout on the object, inference of the object's parameters, a policy on that posterior, and both on the "
+    "object. Repeating the command continues an interrupted run.",
+    epilog=EXAMPLES,
+    begun=lambda arguments: "; the same command goes on from here" if (arguments.out / CONFIG).exists() else "",
+)
+parser = main.parser
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxlfi.envs.whip.r2s2r import REPETITIONS
 from jaxlfi.envs.whip.reference_objects import film
 from jaxlfi.envs.whip.reference_objects.deployment import deploy
 from jaxlfi.envs.whip.reference_objects.objects import load as load_object
@@ -19,6 +18,8 @@ from jaxlfi.rl import policy
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Run
 
+REPETITIONS = 16
+"""Places at which policies are compared in the end."""
 STYLE = (
     "body{font-family:sans-serif;max-width:60em;margin:2em auto}td,th{padding:.2em .8em;text-align:left}"
     "img{max-width:100%}"

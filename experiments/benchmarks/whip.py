@@ -49,7 +49,7 @@ from jaxlfi.envs.whip.physics.native import NativeEngine
 from jaxlfi.envs.whip.physics.scene import CUBES, Scene
 from jaxlfi.envs.whip.rig import START
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import command_line, environment
+from jaxlfi.io.provenance import command_line, environment
 
 SCENE = Scene()
 EPISODE = rules.STEPS * SCENE.substeps

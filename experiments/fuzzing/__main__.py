@@ -25,7 +25,7 @@ from rich.table import Table
 
 from experiments.fuzzing.running import Ended, fuzz, prepared_folder
 from jaxlfi.io import files
-from jaxlfi.runs.folder import environment
+from jaxlfi.io.provenance import environment
 
 ADDRESSES = 24 * 2**30
 """Bytes of addresses that the process may ask for, so that a case that would fill the machine ends itself."""

@@ -29,7 +29,7 @@ import jax
 from matplotlib.figure import Figure
 
 from experiments.fuzzing.words import OWN
-from jaxlfi import plugins, source_fields
+from jaxlfi import registry
 from jaxlfi.bayessim import programs
 from jaxlfi.cli import parser as cli
 
@@ -124,11 +124,8 @@ def alarmed(seconds: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def sped_up() -> Iterator[None]:
-    """Read what is installed, and its sources, once for all cases."""
-    found, read = functools.cache(importlib.metadata.entry_points), functools.cache(source_fields.of_group)
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(mock.patch.object(plugins, "entry_points", found))
-        stack.enter_context(mock.patch.object(source_fields, "of_group", read))
+    """Read what is installed once for all cases."""
+    with mock.patch.object(registry, "entry_points", functools.cache(importlib.metadata.entry_points)):
         yield
 
 

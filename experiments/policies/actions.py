@@ -11,9 +11,8 @@ from experiments.policies.study import FEM, Study
 from jaxlfi.envs.whip import planner, rules
 from jaxlfi.envs.whip.environment import WhipEnvironment
 from jaxlfi.envs.whip.parameters import MEDIAN, MILLIMETRES, median
-from jaxlfi.io import files
+from jaxlfi.io import files, provenance
 from jaxlfi.rl import domains
-from jaxlfi.runs import folder
 
 OWN = {f"plan-{dlo}": f"{dlo}-mean" for dlo in FEM}
 """Plans for an object's posterior mean."""
@@ -33,7 +32,7 @@ def search(study: Study, environment: WhipEnvironment, name: str) -> Path:
         print(f"\n== actions: {name}", flush=True)
         arrays = constant(environment) if name == "constant" else plan(study, environment, name)
         path.parent.mkdir(parents=True, exist_ok=True)
-        files.write_json(path.with_suffix(".json"), {"name": name, **folder.environment()})
+        files.write_json(path.with_suffix(".json"), {"name": name, **provenance.environment()})
         files.write_arrays(path, arrays)
     return path
 

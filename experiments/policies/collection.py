@@ -24,8 +24,8 @@ from experiments.policies.evaluation import STILLS, domains_of, fingerprints, ob
 from experiments.policies.results import grouped
 from experiments.policies.study import FEM, HEURISTICS, NOMINAL, OBJECTS, PAPER, Study, truth
 from jaxlfi.io import files
+from jaxlfi.io.provenance import environment
 from jaxlfi.rl import training
-from jaxlfi.runs.folder import environment
 
 PER_EPISODE = ("value", "hit", "clean", "outside", "failed", "steps", "fingerprints")
 

@@ -19,8 +19,7 @@ from jaxlfi.envs.whip.parameters import FEASIBLE, INITIAL, MILLIMETRES, median
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.vision.camera import project
 from jaxlfi.envs.whip.vision.keypoints import MASK, ON_DLO, along
-from jaxlfi.io import files
-from jaxlfi.runs import folder
+from jaxlfi.io import files, provenance
 
 ARCS = (0.25, 0.5, 0.75, 1.0)
 """Places of the detector's keypoints on the DLO, as fractions of its length."""
@@ -81,6 +80,6 @@ def fit(path: Path, rollout: recordings.Recording) -> None:
             "confidence": CONFIDENCE,
             "mean_square_residual": float(np.mean(np.square(left))),
             "at_a_bound": bool(np.any((found.x < low + 1e-3) | (found.x > high - 1e-3))),
-            **folder.environment(),
+            **provenance.environment(),
         },
     )

@@ -36,11 +36,12 @@ import jaxlfi.cli.commands
 import jaxlfi.rl.training  # noqa: F401 - likewise
 from experiments.reliability import adversities
 from experiments.reliability.commands import Command, commands
-from experiments.reliability.comparing import LEFT_OUT, differences
+from experiments.reliability.comparing import LEFT_OUT
 from experiments.reliability.injection import Blow
-from experiments.reliability.process import Ended, Running, run
+from experiments.reliability.process import Ended, Running
+from experiments.reliability.undisturbed import Undisturbed
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import environment
+from jaxlfi.io.provenance import environment
 
 KILLS_PER_TRIAL = 3
 AT_A_MOMENT, IN_A_WINDOW = "at a moment", "in a window"
@@ -49,32 +50,6 @@ OFF_ROUTE = ("infer", "grid", "train")
 COLUMNS = (
     "command", "trial", "kill", "of", "how", "second", "window", "operation", "file", "moment", "result", "beside",
 )  # fmt: skip
-
-
-class Undisturbed:
-    """What a command comes to when nobody disturbs it."""
-
-    def __init__(self, command: Command, root: Path):
-        """Run it in a process of its own, and once more as the trials are, to know its windows and its time."""
-        self.command = command
-        fresh = root / f"{command.name}-undisturbed"
-        self.folder = fresh / "run"
-        if not self.folder.exists():
-            fresh.mkdir(parents=True, exist_ok=True)
-            words, env = [sys.executable, "-m", command.program], os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-            subprocess.run([*words, *command.start], cwd=fresh, check=True, stdout=subprocess.DEVNULL, env=env)
-        trial = root / f"{command.name}-forked"
-        shutil.rmtree(trial, ignore_errors=True)
-        trial.mkdir()
-        self.ended = run(trial, command.start, program=command.program)
-        if self.ended.status or (found := self.compared(trial / "run")):
-            raise RuntimeError(f"{command.name}: {self.ended.errors}{'' if self.ended.status else found}")
-        windows = enumerate(self.ended.windows)
-        self.blows = [Blow(number, moment) for number, window in windows for moment in window.moments]
-
-    def compared(self, folder: Path) -> list[str]:
-        """What differs from it in a folder."""
-        return differences(folder, self.folder)
 
 
 def trial(

@@ -6,14 +6,12 @@ import signal
 import subprocess
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from experiments.reliability.comparing import content, files
 from experiments.reliability.injection import Blow
 from experiments.reliability.process import Ended, Running, run
-
-if TYPE_CHECKING:
-    from experiments.reliability.__main__ import Undisturbed
+from experiments.reliability.undisturbed import Undisturbed
 
 COLUMNS = ("command", "adversity", "status", "lines", "said", "then")
 DAY = 86400.0
@@ -21,7 +19,7 @@ SIZES = (8, 24, 48, 72, 96, 128, 192)
 """KiB of the disks that become full."""
 
 
-def all_of(undisturbed: "Undisturbed", root: Path) -> list[dict[str, Any]]:
+def all_of(undisturbed: Undisturbed, root: Path) -> list[dict[str, Any]]:
     """Every adversity, one row each."""
     rows = []
     for one in (full_disk, read_only, moved, moved_meanwhile, clock, future, two_resumes, resumed_meanwhile):
@@ -46,7 +44,7 @@ def _row(adversity: str, ended: Ended, then: str) -> dict[str, Any]:
     }
 
 
-def _gone_on(undisturbed: "Undisturbed", folder: Path, name: str = "run") -> str:
+def _gone_on(undisturbed: Undisturbed, folder: Path, name: str = "run") -> str:
     """Go on where it was stopped, to the end; what came of it."""
     command = undisturbed.command
     begun = (folder / name / "config.json").exists()
@@ -58,13 +56,13 @@ def _gone_on(undisturbed: "Undisturbed", folder: Path, name: str = "run") -> str
     return ("resumed: " if begun else "begun anew: ") + ("; ".join(found) or "same bits")
 
 
-def _stop(undisturbed: "Undisturbed", folder: Path) -> None:
+def _stop(undisturbed: Undisturbed, folder: Path) -> None:
     """A folder as a kill in the middle of the run leaves it."""
     folder.mkdir(exist_ok=True)
     assert run(folder, undisturbed.command.start, blow=Blow(_middle(undisturbed), "after")).killed
 
 
-def _middle(undisturbed: "Undisturbed") -> int:
+def _middle(undisturbed: Undisturbed) -> int:
     """The window after which there is something to go on from."""
     kept = ("checkpoint/state.npz.part", "chunks/000.npz.part", "run/checkpoint.npz.part")
     windows = enumerate(undisturbed.ended.windows)
@@ -75,7 +73,7 @@ def _mount(folder: Path, options: str) -> None:
     subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], check=True)
 
 
-def full_disk(undisturbed: "Undisturbed", folder: Path):
+def full_disk(undisturbed: Undisturbed, folder: Path):
     """Disks of some sizes; then there is room again."""
     for size in SIZES:
         disk = folder / f"disk-{size}"
@@ -93,7 +91,7 @@ def full_disk(undisturbed: "Undisturbed", folder: Path):
         yield _row(f"a disk of {size} KiB", ended, then)
 
 
-def read_only(undisturbed: "Undisturbed", folder: Path):
+def read_only(undisturbed: Undisturbed, folder: Path):
     """A new run in a read-only folder, and one to go on with."""
     disk = folder / "disk"
     disk.mkdir()
@@ -115,7 +113,7 @@ def read_only(undisturbed: "Undisturbed", folder: Path):
         subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
-def moved(undisturbed: "Undisturbed", folder: Path):
+def moved(undisturbed: Undisturbed, folder: Path):
     """Killed, moved to another place by another name, resumed there."""
     _stop(undisturbed, folder / "here")
     (folder / "there").mkdir()
@@ -126,7 +124,7 @@ def moved(undisturbed: "Undisturbed", folder: Path):
     yield _row("a folder moved between kill and resume", ended, f"resumed: {then}")
 
 
-def moved_meanwhile(undisturbed: "Undisturbed", folder: Path):
+def moved_meanwhile(undisturbed: Undisturbed, folder: Path):
     """Moved while the run goes on, which so comes to an end; resumed where it is now."""
     process = _held_up(undisturbed, folder)
     (folder / "run").rename(folder / "other")
@@ -135,14 +133,14 @@ def moved_meanwhile(undisturbed: "Undisturbed", folder: Path):
     yield _row("a folder moved while its run goes on", ended, _gone_on(undisturbed, folder, "other"))
 
 
-def _held_up(undisturbed: "Undisturbed", folder: Path) -> Running:
+def _held_up(undisturbed: Undisturbed, folder: Path) -> Running:
     """A run that has stopped itself after its first round."""
     process = Running(folder, undisturbed.command.start, blow=Blow(_middle(undisturbed), "after", signal.SIGSTOP))
     assert process.stopped()
     return process
 
 
-def clock(undisturbed: "Undisturbed", folder: Path):
+def clock(undisturbed: Undisturbed, folder: Path):
     """A day back while the run goes on, and while it is resumed."""
     ended = Running(folder, undisturbed.command.start, clock=True).wait()
     then = "; ".join(undisturbed.compared(folder / "run")) or "same bits"
@@ -153,7 +151,7 @@ def clock(undisturbed: "Undisturbed", folder: Path):
     yield _row("a clock that jumps back by a day in the resumed run", ended, then)
 
 
-def future(undisturbed: "Undisturbed", folder: Path):
+def future(undisturbed: Undisturbed, folder: Path):
     """Files that were written tomorrow."""
     _stop(undisturbed, folder)
     for path in files(folder / "run"):
@@ -162,7 +160,7 @@ def future(undisturbed: "Undisturbed", folder: Path):
     yield _row("files of tomorrow", ended, "; ".join(undisturbed.compared(folder / "run")) or "same bits")
 
 
-def two_resumes(undisturbed: "Undisturbed", folder: Path, times: int = 3):
+def two_resumes(undisturbed: Undisturbed, folder: Path, times: int = 3):
     """Two processes that resume the same folder at once."""
     _stop(undisturbed, folder / "stopped")
     for number in range(times):
@@ -177,7 +175,7 @@ def two_resumes(undisturbed: "Undisturbed", folder: Path, times: int = 3):
         yield _row("two resumes at once: the other one", lost, f"the first: status {won.status}, {then}")
 
 
-def resumed_meanwhile(undisturbed: "Undisturbed", folder: Path):
+def resumed_meanwhile(undisturbed: Undisturbed, folder: Path):
     """A resume while the run itself still goes on."""
     process = _held_up(undisturbed, folder)
     before = {path: path.is_file() and path.suffix != ".notes" and content(path) for path in files(folder / "run")}
@@ -190,7 +188,7 @@ def resumed_meanwhile(undisturbed: "Undisturbed", folder: Path):
     yield _row("resume while the run goes on", ended, then)
 
 
-def run_beside(folder: Path, undisturbed: "Undisturbed") -> Ended:
+def run_beside(folder: Path, undisturbed: Undisturbed) -> Ended:
     """A resume by a process with notes of its own."""
     beside = folder.parent / f"{folder.name}-beside"
     shutil.rmtree(beside, ignore_errors=True)

@@ -168,8 +168,8 @@ def turn_back(seconds: float, after: int) -> None:
         def now(cls, tz: Any = None) -> datetime:
             return datetime.fromtimestamp(time.time(), tz)
 
-    from jaxlfi.runs import folder
+    from jaxlfi.io import provenance
 
     time.time = lambda: true() - late()
     time.time_ns = lambda: true_ns() - int(1e9 * late())
-    folder.datetime = Clock
+    provenance.datetime = Clock

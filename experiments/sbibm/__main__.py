@@ -26,13 +26,13 @@ from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.batch import posterior_after
 from jaxlfi.bayessim.presets import FLOW, METHODS
 from jaxlfi.bayessim.settings import Settings
+from jaxlfi.estimators.base import converted
 from jaxlfi.estimators.mixture_network import MixtureNetwork
-from jaxlfi.estimators.registry import converted
 from jaxlfi.heuristics import Fixed
 from jaxlfi.io import compile_cache
 from jaxlfi.io import files as atomic
+from jaxlfi.io.provenance import environment
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import environment
 
 OBSERVATIONS = (1, 2, 3)
 ROUNDS = 10

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.sharpness.problem import Problem
-from jaxlfi.tasks import registry
+from jaxlfi.registry import TASKS
 from jaxlfi.tasks.host import HostSimulator
 
 FOLDER = Path("examples/mujoco")
@@ -23,7 +23,7 @@ def problem(name: str) -> Problem:
     The forces that its model lacks are left out, so that the likelihood is that of white noise on the rows that the
     summary keeps; observations are simulated by the model itself.
     """
-    example = registry.load(f"mujoco,config={FOLDER / name.removeprefix('mujoco_')}.toml")
+    example = TASKS.load(f"mujoco,config={FOLDER / name.removeprefix('mujoco_')}.toml")
     simulator = copy.copy(example.simulate.function)
     # What is drawn anew in each simulation would have to be integrated out.
     simulator.forces, simulator.discrepancies = None, {}

@@ -23,7 +23,7 @@ import numpy as np
 from experiments.sharpness import oracle
 from experiments.sharpness.problem import Case, Problem, case_of
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import environment
+from jaxlfi.io.provenance import environment
 
 KEPT = Path("experiments/results/sharpness/references")
 """Of the problems whose references take long."""

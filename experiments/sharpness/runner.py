@@ -24,8 +24,9 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics import Choice, Edge, Fixed
 from jaxlfi.io import files as atomic
+from jaxlfi.io.provenance import environment
+from jaxlfi.io.workfolder import as_json
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import as_json, environment
 
 OURS = ("bayessim", "npe", "apt", "snle")
 OTHERS = {"sbi-npe": "sbi-npe", "sbi-npe-c": "sbi-apt", "bayesflow": "bayesflow-npe"}

@@ -24,8 +24,8 @@ from experiments.sota.cases import SETTINGS, case_of
 from experiments.sota.measures import DRAWS, FLOOR, Found, judged
 from experiments.sota.ours import NAMES, settings_of
 from jaxlfi.io import files as atomic
+from jaxlfi.io.provenance import environment
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import environment
 
 MODULES = {
     **dict.fromkeys(NAMES, "ours"),

@@ -10,7 +10,7 @@ import numpy as np
 from experiments.sbibm import tasks as benchmark
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.distributions.support import Support
-from jaxlfi.tasks import registry
+from jaxlfi.registry import TASKS
 from jaxlfi.tasks.observation import simulate_observation, simulator_shapes
 from jaxlfi.tasks.simulation import simulate_batch
 from jaxlfi.tasks.task import Task
@@ -81,7 +81,7 @@ _TASKS: dict[str, Task] = {}
 def _task(name: str) -> Task:
     """One object a task, as compiled simulators are kept by it."""
     if name not in _TASKS:
-        _TASKS[name] = benchmark.TASKS[name]() if name in benchmark.TASKS else registry.load(name)
+        _TASKS[name] = benchmark.TASKS[name]() if name in benchmark.TASKS else TASKS.load(name)
     return _TASKS[name]
 
 

@@ -19,18 +19,6 @@ import numpy as np
 
 from jaxlfi.io import files
 
-PICTURES = 240
-"""Of each data set."""
-SETS: Mapping[str, Mapping] = {
-    "ray caster": {"renderer": "raycast", "seed": 1001, "objects": ()},
-    "MuJoCo": {"renderer": "mujoco", "seed": 1001, "objects": ()},
-    "MuJoCo, FEM objects": {"renderer": "mujoco", "seed": 1002, "objects": ("dlo-0", "dlo-1", "dlo-2", "dlo-3")},
-}
-"""Data sets that methods are judged on: the ray caster's is of new scenes, the others are of another renderer, too. The
-first two are of the same scenes and looks."""
-TUNED_ON = {"renderer": "raycast", "seed": 1003, "objects": ()}
-"""What the thresholds of colours are chosen on."""
-
 
 def segmentation(arguments: argparse.Namespace) -> None:
     """Overlaps, distances and misses of the ray caster's own labels, of thresholds of colours, and of the network."""

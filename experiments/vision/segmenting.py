@@ -1,19 +1,29 @@
 """Segmentations of pictures compared: what cannot be done better, what a user would do first, and the network."""
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from experiments.vision.__main__ import PICTURES, SETS, TUNED_ON
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.vision import detectors, looks, making, pictures, scores
 from jaxlfi.envs.whip.vision.making import Asked
 from jaxlfi.envs.whip.vision.pictures import Pictures
 from jaxlfi.envs.whip.vision.renderers import RayCaster
 
+PICTURES = 240
+"""Of each data set."""
+SETS: Mapping[str, Mapping] = {
+    "ray caster": {"renderer": "raycast", "seed": 1001, "objects": ()},
+    "MuJoCo": {"renderer": "mujoco", "seed": 1001, "objects": ()},
+    "MuJoCo, FEM objects": {"renderer": "mujoco", "seed": 1002, "objects": ("dlo-0", "dlo-1", "dlo-2", "dlo-3")},
+}
+"""Data sets that methods are judged on: the ray caster's is of new scenes, the others are of another renderer, too. The
+first two are of the same scenes and looks."""
+TUNED_ON = {"renderer": "raycast", "seed": 1003, "objects": ()}
+"""What the thresholds of colours are chosen on."""
 Labels = Callable[[np.ndarray], np.ndarray]
 """From a picture to its labels."""
 

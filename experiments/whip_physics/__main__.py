@@ -24,7 +24,7 @@ from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.figures import style
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import command_line, environment
+from jaxlfi.io.provenance import command_line, environment
 
 CHAINS = {"ball joints": Chain(planar=False), "planar hinges": Chain()}
 """The chains that a scene can have, by their kind."""

@@ -5,8 +5,7 @@ from typing import Any
 
 from jaxlfi.bayessim.correction import OF_MIXTURES
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.estimators import registry
-from jaxlfi.estimators.base import Estimator
+from jaxlfi.estimators.base import Estimator, converted
 from jaxlfi.estimators.flow_estimators import SplineFlow
 from jaxlfi.estimators.likelihood_estimators import MixtureLikelihood
 from jaxlfi.estimators.mixture_network import MixtureNetwork
@@ -189,5 +188,5 @@ def with_fields(settings: Settings, given: Mapping[str, Any]) -> Settings:
     """
     own = {name: value for name, value in given.items() if name in declared(settings)}
     others = {name: value for name, value in given.items() if name not in own}
-    estimator = registry.converted(settings.estimator, type(settings.estimator), others)
+    estimator = converted(settings.estimator, type(settings.estimator), others)
     return settings.replace(estimator=estimator, **own)

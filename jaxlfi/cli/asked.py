@@ -1,7 +1,7 @@
 """What the arguments of `infer`, `compare` and `grid` ask for: settings, heuristics, supports, observations, seeds."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +9,11 @@ import numpy as np
 from jaxlfi.bayessim.presets import HYPERPARAMETERS, settings_for, with_estimator, with_fields
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.support import Support
-from jaxlfi.estimators import registry as estimators
+from jaxlfi.estimators.base import converted
+from jaxlfi.fields import declared
 from jaxlfi.heuristics import Heuristic, paired
-from jaxlfi.heuristics import registry as heuristics
-from jaxlfi.tasks import registry
+from jaxlfi.heuristics.hyperparameters import build, refuse_foreign
+from jaxlfi.registry import ESTIMATORS, HEURISTICS, TASKS
 from jaxlfi.tasks.executors import one_by_one, scheduler, workers
 from jaxlfi.tasks.observation import read_for
 from jaxlfi.tasks.task import Task
@@ -25,7 +26,7 @@ CONFIGURATION_DEFAULTS = ("ok", "misspecified", "broad")
 
 def task_of(arguments: argparse.Namespace) -> Task:
     """The task, with simulations one by one where the arguments say how they are made."""
-    return simulated_by(arguments, registry.load(arguments.task))
+    return simulated_by(arguments, TASKS.load(arguments.task))
 
 
 def simulated_again(arguments: argparse.Namespace, folder: Path, task: Task) -> Task:
@@ -83,29 +84,42 @@ def build_settings(
             -given["simulations_per_round"] * preset.simulation_budget // preset.simulations_per_round
         )
     if arguments.estimator is not None:
-        kind = estimators.load(arguments.estimator)
-        preset = with_estimator(preset, estimators.converted(preset.estimator, kind, {}))
+        preset = with_estimator(preset, converted(preset.estimator, ESTIMATORS.load(arguments.estimator), {}))
     return with_fields(preset, given).check()
 
 
-def build_heuristic(arguments: argparse.Namespace, name: str, settings: Settings, task: Task) -> Heuristic:
+def heuristics_of(arguments: argparse.Namespace, names: Iterable[str]) -> dict[str, type[Heuristic]]:
+    """The heuristics of these names.
+
+    Raises:
+        ValueError: for a name of none, and a hyperparameter that was given and that none of them has.
+    """
+    kinds = {name: HEURISTICS.load(name) for name in names}
+    refuse_foreign(arguments.hyperparameters, kinds)
+    return kinds
+
+
+def build_heuristic(
+    arguments: argparse.Namespace, name: str, kinds: Mapping[str, type[Heuristic]], settings: Settings, task: Task
+) -> Heuristic:
     """A heuristic with the hyperparameters that were given, or else those of the task, or else those of the preset.
 
     Components that it compares are matched first where networks start anew every round.
     """
+    kind = kinds[name]
     values = {
         **HYPERPARAMETERS[arguments.preset].get(name, {}),
         **task.hyperparameters.get(name, {}),
-        **heuristics.own(name, arguments.hyperparameters),
+        **{one: value for one, value in arguments.hyperparameters.items() if one in declared(kind)},
     }
-    return paired(heuristics.build(name, values, task.dim), settings.estimator.warm_start)
+    return paired(build(kind, values, task.dim), settings.estimator.warm_start)
 
 
 def configuration_parts(name: str) -> tuple[str, str]:
     """Support and heuristic of "support" or "support+heuristic"."""
     support, plus, heuristic = name.partition("+")
-    if plus and ":" not in heuristic and heuristic not in heuristics.names():
-        known = ", ".join(heuristics.names())
+    if plus and ":" not in heuristic and heuristic not in HEURISTICS.names():
+        known = ", ".join(HEURISTICS.names())
         raise ValueError(f"configurations: expected support+heuristic with one of {known}, got {name!r}")
     if ":" in heuristic:
         raise ValueError(f"configurations: expected a registered heuristic, which names a folder, got {name!r}")

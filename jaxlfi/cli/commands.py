@@ -19,17 +19,17 @@ from jaxlfi.bayessim.presets import all_rounds
 from jaxlfi.cli import asked, interrupts, summaries, tables, train
 from jaxlfi.cli.exit_status import resuming
 from jaxlfi.distributions.truncation import TRIES
-from jaxlfi.heuristics import registry as heuristics
 from jaxlfi.io import files as atomic
-from jaxlfi.io import host_devices
+from jaxlfi.io import host_devices, workfolder
+from jaxlfi.io.formats import COMPARE, GRID, RUN, RUNS, TRAINING
 from jaxlfi.io.locks import locked
-from jaxlfi.io.processes import Processes
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.io.shell import quoted
+from jaxlfi.io.workfolder import StoreError
+from jaxlfi.registry import TASKS
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import export
-from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.checkpoint import CheckpointError
 from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
@@ -37,14 +37,15 @@ from jaxlfi.studies import calibration, grid
 from jaxlfi.studies.calibration.widths import sentence
 from jaxlfi.studies.grid import Work
 from jaxlfi.tasks import priors
-from jaxlfi.tasks import registry as task_lookup
 from jaxlfi.tasks.errors import ExecutorError, SimulatorError
 from jaxlfi.tasks.observation import with_gaps_of
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.task import Task
 
 Prepared = tuple[Path, tuple[BatchPlan, Observed] | Work]
-EXPECTED = (SimulatorError, CheckpointError, run_store.StoreError, OSError)
+REPORTED = (RUN, RUNS, COMPARE, GRID)
+"""Formats of the folders that `report` draws."""
+EXPECTED = (SimulatorError, CheckpointError, StoreError, OSError)
 """Errors that the input of a run causes, and the disk; they are reported in one line."""
 LOW_MASS = 0.01
 """Mass of the posterior inside its support below which `jaxlfi sample` warns."""
@@ -55,15 +56,15 @@ DIAGNOSTICS = "diagnostics"
 def tasks(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi tasks [NAME]`."""
     if arguments.name:
-        _describe_task(task_lookup.load(arguments.name), console)
+        _describe_task(TASKS.load(arguments.name), console)
         return
     table = Table("task", "parameters", "supports", "observation")
-    for name in task_lookup.names():
+    for name in TASKS.names():
         try:
-            if wanted := task_lookup.wanted(name):
+            if wanted := TASKS.wanted(name):
                 table.add_row(escape(name), "", "", escape(f"give it as {wanted}"))
                 continue
-            task = task_lookup.load(name)
+            task = TASKS.load(name)
         except ValueError as error:  # one broken package must not hide the others
             table.add_row(escape(name), "", "", escape(str(error).splitlines()[0]))
             continue
@@ -98,11 +99,11 @@ def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
         own = arguments.support is not None or arguments.support_low is not None or arguments.support_high is not None
         support_name, support = asked.support_of(arguments, task) if own else ("own", None)
         first, support = presimulated(task, read_simulations(arguments.simulations), support)
-    rule = asked.build_heuristic(arguments, arguments.heuristic, settings, task)
-    heuristics.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
+    kinds = asked.heuristics_of(arguments, [arguments.heuristic])
+    rule = asked.build_heuristic(arguments, arguments.heuristic, kinds, settings, task)
     configuration = support_name if arguments.heuristic == "none" else f"{support_name}+{arguments.heuristic}"
     specs = tuple(RunSpec(configuration, support_name, support, rule, seed) for seed in asked.seeds_of(arguments))
-    kind = run_store.RUN if len(specs) == 1 else run_store.RUNS
+    kind = RUN if len(specs) == 1 else RUNS
     plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
     return _begun(arguments, plan, console, first)
 
@@ -115,14 +116,15 @@ def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
     if len(set(configurations)) < len(configurations):
         raise ValueError(f"configurations: expected distinct ones, got {configurations}")
     parts = [asked.configuration_parts(name) for name in configurations]
-    heuristics.refuse_foreign(arguments.hyperparameters, [heuristic for _, heuristic in parts])
+    kinds = asked.heuristics_of(arguments, [heuristic for _, heuristic in parts])
+    build = lambda heuristic: asked.build_heuristic(arguments, heuristic, kinds, settings, task)
     # Seeds are the slow index, so that every device gets all configurations, fast and slow ones.
     specs = tuple(
-        RunSpec(name, support, task.support(support), asked.build_heuristic(arguments, heuristic, settings, task), seed)
+        RunSpec(name, support, task.support(support), build(heuristic), seed)
         for seed in asked.seeds_of(arguments)
         for name, (support, heuristic) in zip(configurations, parts, strict=True)
     )
-    kind = run_store.COMPARE
+    kind = COMPARE
     plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
     return _begun(arguments, plan, console, None)
 
@@ -131,7 +133,7 @@ def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, fir
     """The folder of a plan, after everything was checked."""
     processes = arguments.joined
     if processes.writes:
-        run_store.refuse_occupied(arguments.out)
+        workfolder.refuse_occupied(arguments.out)
     observation = asked.observation_of(arguments, plan.task, lambda line: _say(console, line))
     task = with_gaps_of(plan.task, observation, plan.settings.estimator.embedding != "none")
     plan = dataclasses.replace(plan, task=task)
@@ -158,10 +160,10 @@ def _hold(arguments: argparse.Namespace, folder: Path) -> None:
 
 def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
     """Prepare `jaxlfi grid`."""
-    task = task_lookup.load(arguments.task)
+    task = TASKS.load(arguments.task)
     settings = asked.build_settings(arguments, task, all_rounds)
     axes = grid.parse_axes(arguments.vary)
-    heuristics.refuse_foreign(arguments.hyperparameters, [arguments.heuristic])
+    kinds = asked.heuristics_of(arguments, [arguments.heuristic])
     for axis in axes:
         if axis.name in arguments.hyperparameters:
             raise ValueError(f"{axis.name}: expected it on an axis or as a flag of its own, got both")
@@ -169,7 +171,7 @@ def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
     plan = grid.Grid(
         task=task,
         support=task.support(name),
-        rule=asked.build_heuristic(arguments, arguments.heuristic, settings, task),
+        rule=asked.build_heuristic(arguments, arguments.heuristic, kinds, settings, task),
         axes=axes,
         seeds=tuple(asked.seeds_of(arguments)),
         settings=settings,
@@ -179,7 +181,7 @@ def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
     )
     observation = asked.observation_of(arguments, task, lambda line: _say(console, line))
     if arguments.joined.writes:
-        run_store.refuse_occupied(arguments.out)
+        workfolder.refuse_occupied(arguments.out)
     _say(console, f"{task.name}: compiling for {plan.size} runs")
     work = grid.begin(arguments.out, plan, observation, arguments.runs_per_chunk, arguments.joined)
     _hold(arguments, arguments.out)
@@ -191,44 +193,32 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
     folder = arguments.folder
     if folder.is_dir():
         _hold(arguments, folder)
-    if grid.is_grid(folder):
-        return _resume_grid(folder, arguments.joined, console)
-    if train.is_training(folder):
+    config = workfolder.read(folder, *REPORTED, TRAINING)
+    if config["format"] == TRAINING:
         train.resume(folder, console, not arguments.no_figures, arguments.joined)
         return None
-    config = run_store.read_config(folder)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
         if arguments.joined.writes:
             executing.clean(folder)
-        _say(console, _complete(folder))
+        _say(console, f"{folder} is complete: nothing to resume. Its pictures: {quoted('jaxlfi', 'report', folder)}")
         return None
-    plan, observed = executing.reopen(folder)
-    if config.get("executor", False) and (arguments.workers, arguments.scheduler) == (None, None):
-        arguments.workers = host_devices.processors()
-        _say(console, f"simulations: in {arguments.workers} processes on this machine")
-    plan = dataclasses.replace(plan, task=asked.simulated_again(arguments, folder, plan.task))
+    if config["format"] == GRID:
+        work, what = grid.reopen(folder), "results differ by rounding"
+    else:
+        plan, observed = executing.reopen(folder)
+        if config.get("executor", False) and (arguments.workers, arguments.scheduler) == (None, None):
+            arguments.workers = host_devices.processors()
+            _say(console, f"simulations: in {arguments.workers} processes on this machine")
+        work = dataclasses.replace(plan, task=asked.simulated_again(arguments, folder, plan.task)), observed
+        what = "the result may differ in rounding from an uninterrupted one"
     if changed := executing.changed_machine(config, arguments.joined):
-        _warn(console, f"begun with {', '.join(changed)}: the result may differ in rounding from an uninterrupted one")
-    return folder, (plan, observed)
-
-
-def _complete(folder: Path) -> str:
-    return f"{folder} is complete: nothing to resume. Its pictures: {quoted('jaxlfi', 'report', folder)}"
-
-
-def _resume_grid(folder: Path, processes: Processes, console: Console) -> Prepared | None:
-    config = grid.read_config(folder)
-    if config.get("status") == "finished":
-        _say(console, _complete(folder))
-        return None
-    if changed := executing.changed_machine(config, processes):
-        _warn(console, f"begun with {', '.join(changed)}: results differ by rounding")
-    return folder, grid.reopen(folder)
+        _warn(console, f"begun with {', '.join(changed)}: {what}")
+    return folder, work
 
 
 def report(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi report`."""
-    (grid if grid.is_grid(arguments.folder) else run_store).read_config(arguments.folder)
+    workfolder.read(arguments.folder, *REPORTED)
     draw(arguments.folder, console)
 
 
@@ -263,7 +253,7 @@ def sample(arguments: argparse.Namespace, console: Console) -> None:
 
 def diagnose(arguments: argparse.Namespace, console: Console) -> None:
     """`jaxlfi diagnose DIR`."""
-    task = None if arguments.task is None else task_lookup.load(arguments.task)
+    task = None if arguments.task is None else TASKS.load(arguments.task)
     run = calibration.read_run(arguments.folder, task)
     run = run.replace(task=asked.simulated_again(arguments, arguments.folder, run.task))
     references = arguments.reference
@@ -314,12 +304,12 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     if not processes.writes:
         return
     executing.finish(folder, plan, runs)
-    if plan.kind == run_store.RUN:
+    if plan.kind == RUN:
         found = RunSummary.read(folder)
         tables.show(summaries.parameter_table(found), console)
         for sentence in found.sentences:
             _say(console, sentence)
-    if plan.kind != run_store.RUN or plan.task.truth is not None:
+    if plan.kind != RUN or plan.task.truth is not None:
         tables.show(summaries.summary_table(plan, runs), console)
     for warning in summaries.warnings(plan, runs):
         _warn(console, warning)
@@ -329,7 +319,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
         *summaries.widths_lines(plan, runs),
     ):
         _say(console, line)
-    kind = "table" if plan.kind == run_store.COMPARE else "results"
+    kind = "table" if plan.kind == COMPARE else "results"
     _say(console, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")
     if not arguments.no_figures:
         draw(folder, console)
@@ -370,7 +360,7 @@ def _figures():
     try:
         import jaxlfi.figures.checks
     except ImportError as error:
-        raise run_store.StoreError(f"pictures: expected matplotlib to be installed, got: {error}") from error
+        raise StoreError(f"pictures: expected matplotlib to be installed, got: {error}") from error
     return jaxlfi.figures
 
 

@@ -6,13 +6,12 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 import argparse
 import csv
 import io
-from collections.abc import Sequence
 from pathlib import Path
 
 from jaxlfi import flags
+from jaxlfi.cli.command import Command
 from jaxlfi.cli.domains import DOMAINS, domains_of
-from jaxlfi.cli.exit_status import exit_status
-from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.registry import ENVIRONMENTS
 
 EXAMPLES = f"""\
 {DOMAINS}
@@ -22,35 +21,20 @@ examples:
 """
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
-    top = OneLineParser(
-        prog="jaxlfi evaluate",
-        description="Evaluate saved policies, without noise, on points of domains; all meet the same episodes.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("environment", metavar="ENVIRONMENT", help="an environment's name, as of jaxlfi train")
+    parser.add_argument(
+        "policies", nargs="+", type=Path, metavar="FILE", help="policy.npz files that jaxlfi train wrote"
     )
-    top.add_argument("environment", metavar="ENVIRONMENT", help="an environment's name, as of jaxlfi train")
-    top.add_argument("policies", nargs="+", type=Path, metavar="FILE", help="policy.npz files that jaxlfi train wrote")
-    top.add_argument("--domain", nargs="+", required=True, metavar="DOMAIN", help="what to evaluate on; several: each")
-    top.add_argument("--episodes", type=int, default=128, metavar="N", help="on each domain (default: 128)")
-    top.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="of the points and episodes (default: 0)")
-    top.add_argument("--out", type=flags.output, metavar="FILE", help="a new .csv, a row for each policy and domain")
-    top.add_argument("--debug", action="store_true", help="show where an error came from")
-    return top
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: the words after `jaxlfi evaluate`; by default those of the process.
-
-    Returns:
-        0; 2 for bad input; 130 where it was interrupted.
-    """
-    arguments = parser().parse_args(argv)
-    return exit_status("jaxlfi evaluate", lambda: _run(arguments), arguments.debug)
+    parser.add_argument(
+        "--domain", nargs="+", required=True, metavar="DOMAIN", help="what to evaluate on; several: each"
+    )
+    parser.add_argument("--episodes", type=int, default=128, metavar="N", help="on each domain (default: 128)")
+    parser.add_argument(
+        "--seed", type=flags.seed, default=0, metavar="N", help="of the points and episodes (default: 0)"
+    )
+    parser.add_argument("--out", type=flags.output, metavar="FILE", help="a new .csv, a row for each policy and domain")
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -61,7 +45,6 @@ def _run(arguments: argparse.Namespace) -> None:
     from rich.table import Table
 
     from jaxlfi.cli import tables
-    from jaxlfi.rl import registry
     from jaxlfi.rl.evaluation import cross_evaluate
     from jaxlfi.rl.policy import load
 
@@ -69,7 +52,7 @@ def _run(arguments: argparse.Namespace) -> None:
         raise ValueError(f"out: expected a new .csv file, got {arguments.out}")
     if arguments.out is not None:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)  # which may fail, and then does so before the work
-    environment = registry.load(arguments.environment)
+    environment = ENVIRONMENTS.load(arguments.environment)
     policies = {str(path): load(path) for path in arguments.policies}
     draws = domains_of(environment, arguments.domain)
     rows = cross_evaluate(environment, policies, draws, arguments.episodes, arguments.seed)
@@ -83,3 +66,14 @@ def _run(arguments: argparse.Namespace) -> None:
         writer.writeheader()
         writer.writerows(rows)
         files.write_bytes(arguments.out, text.getvalue().encode())
+
+
+main = Command(
+    "evaluate",
+    "evaluate saved policies on other domains",
+    _arguments,
+    _run,
+    description="Evaluate saved policies, without noise, on points of domains; all meet the same episodes.",
+    epilog=EXAMPLES,
+)
+parser = main.parser

@@ -17,24 +17,26 @@ def one_line(error: Exception) -> str:
     return f"expected a file or folder that can be used, got {text}" if of_path and "expected" not in text else text
 
 
-def exit_status(program: str, work: Callable[[], None], debug: bool = False, advice: Callable[[], str] = str) -> int:
+def exit_status(
+    program: str, work: Callable[[], int | None], debug: bool = False, advice: Callable[[], str] = str
+) -> int:
     """Do a command's work.
 
     Args:
         program: its name, for errors.
-        work: raises ValueError, OSError or ImportError for bad input.
+        work: raises ValueError, OSError or ImportError for bad input; may return an exit status.
         debug: show where an error came from.
         advice: what to say after "interrupted", and of a failing disk; asked then.
 
     Returns:
-        0; 2 for bad input; 130 where it was interrupted.
+        0, or what the work returned; 2 for bad input; 130 where it was interrupted.
 
     Raises:
         BrokenPipeError: where nobody reads the output.
     """
     with interrupts.advising(program, advice):
         try:
-            work()
+            return work() or 0
         except (ValueError, OSError, ImportError) as error:
             if interrupts.is_unread(error):
                 raise
@@ -42,7 +44,6 @@ def exit_status(program: str, work: Callable[[], None], debug: bool = False, adv
             return refuse(program, error, debug, go_on)
         except KeyboardInterrupt:
             return interrupts.report()
-    return 0
 
 
 def refuse(program: str, error: Exception, debug: bool = False, advice: str = "") -> int:

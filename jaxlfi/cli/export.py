@@ -5,12 +5,10 @@ This module imports neither jax nor numpy before it has to, and jax for StableHL
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from jaxlfi import flags
-from jaxlfi.cli.exit_status import exit_status
-from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.cli.command import Command
 
 SUFFIXES = {"numpy": ".npz", "stablehlo": ".npz", "onnx": ".onnx"}
 """Formats, and how the names of their files end."""
@@ -27,32 +25,11 @@ examples:
 """
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
-    top = OneLineParser(
-        prog="jaxlfi export",
-        description="Write a trained policy as one file that runs elsewhere.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    top.add_argument("policy", type=Path, metavar="POLICY", help="a policy.npz, or the folder of its training")
-    top.add_argument("--format", choices=SUFFIXES, default="numpy", help="of the file (default: numpy)")
-    top.add_argument("--out", type=flags.output, required=True, metavar="FILE", help="a new file")
-    top.add_argument("--debug", action="store_true", help="show where an error came from")
-    return top
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: the words after `jaxlfi export`; by default those of the process.
-
-    Returns:
-        0; 2 for bad input; 130 where it was interrupted.
-    """
-    arguments = parser().parse_args(argv)
-    return exit_status("jaxlfi export", lambda: _export(arguments), arguments.debug)
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("policy", type=Path, metavar="POLICY", help="a policy.npz, or the folder of its training")
+    parser.add_argument("--format", choices=SUFFIXES, default="numpy", help="of the file (default: numpy)")
+    parser.add_argument("--out", type=flags.output, required=True, metavar="FILE", help="a new file")
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -85,6 +62,17 @@ def _policy_of(path: Path) -> Path:
         some = ", ".join(str(one.relative_to(path)) for one in found[:4]) + ", ..." * (len(found) > 4)
         raise ValueError(f"policy: expected a folder with one policy.npz, got {path} with {some or 'none'}: name one")
     return found[0]
+
+
+main = Command(
+    "export",
+    "write a policy as one file for a robot's computer",
+    _arguments,
+    _export,
+    description="Write a trained policy as one file that runs elsewhere.",
+    epilog=EXAMPLES,
+)
+parser = main.parser
 
 
 if __name__ == "__main__":

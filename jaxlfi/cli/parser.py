@@ -1,7 +1,7 @@
 """The command line: `jaxlfi tasks | infer | compare | grid | resume | sample | diagnose | report`, and those of tasks.
 
-A package adds commands of its own by `[project.entry-points."jaxlfi.commands"]` in pyproject.toml: a name, and a
-function that takes the words after it and returns the exit status.
+A package adds commands by `[project.entry-points."jaxlfi.commands"]` in pyproject.toml: a name, and a
+`jaxlfi.cli.command.Command`, or any function that takes the words after the name and returns the exit status.
 
 This module imports neither jax nor numpy, so that `--help` answers at once and so that what has to be set
 before jax starts can be set after the arguments are known.
@@ -10,93 +10,69 @@ before jax starts can be set after the arguments are known.
 import argparse
 import contextlib
 import dataclasses
-import itertools
-import json
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
 
 import jaxlfi
-from jaxlfi import factories, flags, plugins, source_fields
+from jaxlfi import flags, references
 from jaxlfi.cli import help_texts, interrupts, joined, warned
+from jaxlfi.cli.command import Command, OneLineParser
 from jaxlfi.cli.exit_status import refuse, resuming
-from jaxlfi.fields import Declared
+from jaxlfi.cli.own_fields import FIELDS, HELP
+from jaxlfi.fields import declared
+from jaxlfi.io.formats import PLAN, recorded
+from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, Classes, package_of
 
-Subparsers = argparse._SubParsersAction  # argparse has no public name for it
 PRESETS = ("quick", "paper")
 METHODS = ("bayessim", "apt", "npe", "snle")
-HEURISTICS, ESTIMATORS = "jaxlfi.heuristics", "jaxlfi.estimators"
-"""The entry-point groups of classes whose fields have flags."""
-COMMANDS = "jaxlfi.commands"
-"""The entry-point group of commands that packages add."""
 OWN_COMMANDS = ("tasks", "infer", "compare", "grid", "resume", "sample", "diagnose", "report")
 SETTINGS = "jaxlfi.bayessim.settings:Settings"
 """The class whose fields are the settings of a run."""
 
 
-class OneLineParser(argparse.ArgumentParser):
-    """A parser whose errors are one line, and whose flags are written out: `--seed 3` is not `--seeds 3`."""
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        """As argparse's."""
-        super().__init__(*args, allow_abbrev=False, **kwargs)
-
-    def error(self, message: str) -> NoReturn:
-        """One line on stderr, and exit status 2."""
-        self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
-
-    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
-        """The values of a flag; argparse takes the value of `--flag=--` for none, and no value for a right one."""
-        values = super()._get_values(action, arg_strings)
-        if values == [] and action.option_strings and action.nargs in (None, "+"):
-            raise argparse.ArgumentError(action, "expected at least one argument")
-        return values
-
-
 @dataclasses.dataclass(frozen=True)
 class Families:
-    """Classes whose fields have flags, by the names they are registered by or as `module:Class`.
+    """Classes whose fields have flags: by name what they declare, which is nothing of packages not imported.
 
     Attributes:
-        heuristics: their sources.
-        estimators: their sources.
+        rules: the heuristics.
+        networks: the estimators.
     """
 
-    heuristics: Mapping[str, source_fields.Source]
-    estimators: Mapping[str, source_fields.Source]
+    rules: flags.Families = dataclasses.field(default_factory=lambda: _own(HEURISTICS))
+    networks: flags.Families = dataclasses.field(default_factory=lambda: _own(ESTIMATORS))
 
-    @staticmethod
-    def of(words: Sequence[str]) -> "Families":
-        """All that are installed, and those that the words name, as their sources describe them."""
-        heuristics = [*_values(words, "--heuristic"), *(word.partition("+")[2] for word in words)]
-        return Families(
-            *(
-                source_fields.of_group(group) | {name: source_fields.of_class(name) for name in named if ":" in name}
-                for group, named in ((HEURISTICS, heuristics), (ESTIMATORS, _values(words, "--estimator")))
-            )
-        )
-
-    @property
-    def rules(self) -> flags.Families:
-        """Fields of the heuristics."""
-        return {name: source.fields for name, source in self.heuristics.items()}
-
-    @property
-    def networks(self) -> flags.Families:
-        """Fields of the estimators."""
-        return {name: source.fields for name, source in self.estimators.items()}
+    def __add__(self, others: "Families") -> "Families":
+        """Both, and where both have a class what the others say of it."""
+        return Families({**self.rules, **others.rules}, {**self.networks, **others.networks})
 
 
-def _values(words: Sequence[str], flag: str) -> list[str]:
-    """What the words give for a flag."""
-    after = [value for word, value in itertools.pairwise([*words, ""]) if word == flag]
-    return after + [word.removeprefix(f"{flag}=") for word in words if word.startswith(f"{flag}=")]
+def _own(family: Classes) -> flags.Families:
+    """All registered names, and of our own classes the fields."""
+    registered = family.points().items()
+    return {name: {} if others else FIELDS.get(point.value, {}) for name, (point, *others) in registered}
 
 
-def _run_fields() -> Mapping[str, Declared]:
-    return source_fields.of_class(SETTINGS).fields
+def _foreign(arguments: argparse.Namespace) -> dict[Classes, list[str]]:
+    """Names of classes of other packages that arguments name."""
+    configured = getattr(arguments, "configurations", None) or ()
+    rules = {getattr(arguments, "heuristic", None), *(word.partition("+")[2] for word in configured)}
+    found = {}
+    for family, names in ((HEURISTICS, rules), (ESTIMATORS, {getattr(arguments, "estimator", None)})):
+        others = {name for name, (point, *_) in family.points().items() if point.value not in FIELDS}
+        found[family] = sorted(name for name in names if name and (":" in name or name in others))
+    return found
+
+
+def _imported(foreign: Mapping[Classes, Sequence[str]]) -> Families:
+    """What these classes declare; they are imported, and jax with them.
+
+    Raises:
+        ValueError: where they cannot be.
+    """
+    return Families(*({name: declared(family.load(name)) for name in names} for family, names in foreign.items()))
 
 
 def parser(families: Families | None = None) -> argparse.ArgumentParser:
@@ -105,7 +81,7 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
     Args:
         families: classes whose fields have flags; by default all that are installed.
     """
-    families = Families.of(()) if families is None else families
+    families = families or Families()
     top = OneLineParser(
         prog="jaxlfi",
         description="Likelihood-free inference that notices when the prior's support is wrong, and moves it.",
@@ -114,38 +90,83 @@ def parser(families: Families | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"jaxlfi {jaxlfi.__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_tasks(commands)
-    _add_infer(commands, families)
-    _add_compare(commands, families)
-    _add_grid(commands, families)
-    _add_resume(commands)
-    _add_sample(commands)
-    _add_diagnose(commands)
-    _add_report(commands)
-    for name in plugins.names(COMMANDS):
+    for command in own_commands(families):
+        command.add_to(commands)
+    for name, points in COMMANDS.points().items():
         if name not in OWN_COMMANDS:
-            shown = name.replace("%", "%%")
-            commands.add_parser(name, add_help=False, help=f"commands of its own: jaxlfi {shown} --help")
+            help = HELP.get(points[0].value, f"commands of its own: jaxlfi {name} --help").replace("%", "%%")
+            commands.add_parser(name, add_help=False, help=help)
     return top
 
 
-def _add_tasks(commands: Subparsers) -> None:
-    command = commands.add_parser(
-        "tasks", help="list tasks, or describe one", description="List tasks, or describe one."
-    )
+def own_commands(families: Families) -> list[Command]:
+    """The commands of inference; those of policies, of tasks and of other packages are entry points."""
+    glossary = help_texts.GLOSSARY + flags.glossary(families.rules)
+    return [
+        Command("tasks", "list tasks, or describe one", _tasks, _work, "List tasks, or describe one."),
+        Command(
+            "infer",
+            "infer a task's parameters",
+            lambda command: _infer(command, families),
+            _work,
+            "Infer a task's parameters from one observed trajectory, adapting the support.",
+            help_texts.INFER_EXAMPLES + glossary,
+        ),
+        Command(
+            "compare",
+            "run supports and heuristics side by side",
+            lambda command: _compare(command, families),
+            _work,
+            "Run supports and heuristics side by side, over several seeds, and tabulate the errors.",
+            help_texts.COMPARE_EXAMPLES + glossary,
+        ),
+        Command(
+            "grid",
+            "run a heuristic over a grid of its hyperparameters",
+            lambda command: _grid(command, families),
+            _work,
+            "Run a heuristic over a grid of its hyperparameters, to see how sensitive it is to them.",
+            help_texts.GRID_EXAMPLES + glossary,
+        ),
+        Command(
+            "resume",
+            "go on with a run that was stopped",
+            _resume,
+            _work,
+            "Go on with a run that was stopped or killed.",
+        ),
+        Command(
+            "sample",
+            "draw from the posterior of a run",
+            _sample,
+            _work,
+            "Draw parameters from the posterior of a finished run, in natural units.",
+        ),
+        Command(
+            "diagnose",
+            "check whether the posterior of a run can be believed",
+            _diagnose,
+            _work,
+            "Check whether the posteriors of a run's method are calibrated, and whether its own fits.",
+            help_texts.DIAGNOSE_EXAMPLES,
+        ),
+        Command(
+            "report",
+            "draw the pictures of a run",
+            _report,
+            _work,
+            "Draw all pictures of a folder from its saved files.",
+        ),
+    ]
+
+
+def _tasks(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "name", nargs="?", metavar="TASK", help="describe this one: parameters, units, supports, truth"
     )
 
 
-def _add_infer(commands: Subparsers, families: Families) -> None:
-    command = commands.add_parser(
-        "infer",
-        help="infer a task's parameters",
-        description="Infer a task's parameters from one observed trajectory, adapting the support.",
-        epilog=help_texts.INFER_EXAMPLES + _glossary(families),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _infer(command: argparse.ArgumentParser, families: Families) -> None:
     command.add_argument(
         "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
     )
@@ -173,14 +194,7 @@ def _add_infer(commands: Subparsers, families: Families) -> None:
     _add_shared(command, families, seeds=1)
 
 
-def _add_compare(commands: Subparsers, families: Families) -> None:
-    command = commands.add_parser(
-        "compare",
-        help="run supports and heuristics side by side",
-        description="Run supports and heuristics side by side, over several seeds, and tabulate the errors.",
-        epilog=help_texts.COMPARE_EXAMPLES + _glossary(families),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _compare(command: argparse.ArgumentParser, families: Families) -> None:
     command.add_argument(
         "--configurations",
         nargs="+",
@@ -190,14 +204,7 @@ def _add_compare(commands: Subparsers, families: Families) -> None:
     _add_shared(command, families, seeds=4)
 
 
-def _add_grid(commands: Subparsers, families: Families) -> None:
-    command = commands.add_parser(
-        "grid",
-        help="run a heuristic over a grid of its hyperparameters",
-        description="Run a heuristic over a grid of its hyperparameters, to see how sensitive it is to them.",
-        epilog=help_texts.GRID_EXAMPLES + _glossary(families),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _grid(command: argparse.ArgumentParser, families: Families) -> None:
     command.add_argument(
         "--vary",
         nargs="+",
@@ -224,24 +231,14 @@ def _add_grid(commands: Subparsers, families: Families) -> None:
     _add_shared(command, families, seeds=4, networks=False)
 
 
-def _add_resume(commands: Subparsers) -> None:
-    command = commands.add_parser(
-        "resume",
-        help="go on with a run that was stopped",
-        description="Go on with a run that was stopped or killed.",
-    )
+def _resume(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
     _add_executor(command)
     joined.add_flags(command)
     _add_machine(command)
 
 
-def _add_sample(commands: Subparsers) -> None:
-    command = commands.add_parser(
-        "sample",
-        help="draw from the posterior of a run",
-        description="Draw parameters from the posterior of a finished run, in natural units.",
-    )
+def _sample(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
     command.add_argument("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
     command.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="seed of the draws (default: 0)")
@@ -253,14 +250,7 @@ def _add_sample(commands: Subparsers) -> None:
     )
 
 
-def _add_diagnose(commands: Subparsers) -> None:
-    command = commands.add_parser(
-        "diagnose",
-        help="check whether the posterior of a run can be believed",
-        description="Check whether the posteriors of a run's method are calibrated, and whether its own fits.",
-        epilog=help_texts.DIAGNOSE_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _diagnose(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
     command.add_argument(
         "--reference",
@@ -295,17 +285,8 @@ def _add_diagnose(commands: Subparsers) -> None:
     _add_machine(command)
 
 
-def _add_report(commands: Subparsers) -> None:
-    command = commands.add_parser(
-        "report",
-        help="draw the pictures of a run",
-        description="Draw all pictures of a folder from its saved files.",
-    )
+def _report(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="a folder that infer, compare or grid wrote")
-
-
-def _glossary(families: Families) -> str:
-    return help_texts.GLOSSARY + flags.glossary(families.rules)
 
 
 def foreign_command(name: str) -> Callable[[list[str]], int] | None:
@@ -314,53 +295,40 @@ def foreign_command(name: str) -> Callable[[list[str]], int] | None:
     Raises:
         ValueError: where several packages add it, or it cannot be imported.
     """
-    packages = [plugins.package_of(point) for point in plugins.points(COMMANDS).get(name, ())]
+    packages = [package_of(point) for point in COMMANDS.points().get(name, ())]
     if packages and name in OWN_COMMANDS:
-        plugins.refuse_clash("command", name, ["jaxlfi", *packages])
-    return plugins.find(COMMANDS, "command", name) if packages else None
+        COMMANDS.refuse_clash(name, ["jaxlfi", *packages])
+    return COMMANDS.find(name) if packages else None
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """The arguments.
 
-    Where the source of a class does not show all its fields, and there are flags that nothing else knows, the class is
-    imported, and jax with it.
+    Classes of other packages are imported where they are named and there are flags that nothing else knows.
 
     Raises:
         ValueError: if that fails.
     """
-    families = Families.of(words)
+    families = Families()
+    if {"-h", "--help"} & set(words):
+        with contextlib.suppress(ValueError):  # help has to be shown, whatever is wrong with a package
+            families += _imported(_foreign(_named_by(words)))
     arguments, unknown = parser(families).parse_known_args(words)
     if not unknown:
         return arguments
-    rules, networks = _rules_used(arguments), {getattr(arguments, "estimator", None)} - {None}
-    if any(not families.heuristics[name].complete for name in rules & set(families.heuristics)) or any(
-        not families.estimators[name].complete for name in networks & set(families.estimators)
-    ):
-        prepare_jax(arguments)
-        families = _imported(families, rules, networks)
-    return parser(families).parse_args(words)
+    if not any((foreign := _foreign(arguments)).values()):
+        return parser(families).parse_args(words)
+    prepare_jax(arguments)
+    return parser(families + _imported(foreign)).parse_args(words, argparse.Namespace(joined=arguments.joined))
 
 
-def _imported(families: Families, rules: set[str], networks: set[str]) -> Families:
-    """The families with what some classes really declare."""
-    from jaxlfi.estimators import registry as estimators
-    from jaxlfi.fields import declared
-    from jaxlfi.heuristics import registry as heuristics
-
-    real = lambda registry, names: {
-        name: source_fields.Source(declared(registry.load(name)), complete=True) for name in names
-    }
-    return Families(
-        {**families.heuristics, **real(heuristics, rules)}, {**families.estimators, **real(estimators, networks)}
-    )
-
-
-def _rules_used(arguments: argparse.Namespace) -> set[str]:
-    """Names of the heuristics that a command is going to use, right or wrong."""
-    configured = getattr(arguments, "configurations", None) or ()
-    named = [getattr(arguments, "heuristic", None), *(word.partition("+")[2] for word in configured)]
-    return {name for name in named if name}
+def _named_by(words: Sequence[str]) -> argparse.Namespace:
+    """The classes that words name, be they the arguments of a command or not."""
+    finder = OneLineParser(add_help=False)
+    finder.add_argument("--heuristic", nargs="?")
+    finder.add_argument("--estimator", nargs="?")
+    finder.add_argument("--configurations", nargs="*")
+    return finder.parse_known_args([word for word in words if word not in ("-h", "--help")])[0]
 
 
 def _registered(what: str, families: flags.Families, default: str) -> str:
@@ -413,7 +381,7 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
 
     rounds = command.add_argument_group("rounds (default: the preset's)")
-    flags.add(rounds, {"run": _run_fields()}, into="settings", defaults=False)
+    flags.add(rounds, {"run": FIELDS[SETTINGS]}, into="settings", defaults=False)
     network = command.add_argument_group("network and training (default: the preset's)")
     network.add_argument(
         "--estimator", metavar="NAME", help=_registered("the density estimator", families.networks, "the method's")
@@ -455,6 +423,8 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
     """
     from jaxlfi.io import host_devices
 
+    if hasattr(arguments, "joined"):  # it was started already, for a class of another package
+        return
     if not getattr(arguments, "no_cache", True):
         from jaxlfi.io import compile_cache
 
@@ -495,16 +465,10 @@ def _runs(arguments: argparse.Namespace) -> int:
 def _recorded(arguments: argparse.Namespace) -> dict:
     """What the work to go on with says of itself, where there is some; whether it is sound is checked later."""
     if arguments.command == "resume":
-        path = arguments.folder / "config.json"
-    elif arguments.command == "diagnose":
-        path = (arguments.out or arguments.folder / "diagnostics") / "plan.json"
-    else:
-        return {}
-    try:
-        config = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return config if isinstance(config, dict) else {}
+        return recorded(arguments.folder)
+    if arguments.command == "diagnose":
+        return recorded(arguments.out or arguments.folder / "diagnostics", PLAN)
+    return {}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -528,7 +492,7 @@ def _run(words: list[str]) -> int:
     except ValueError as error:
         return refuse("jaxlfi", error)
     if foreign:
-        with interrupts.orderly(not foreign.__module__.startswith("jaxlfi.")):
+        with interrupts.orderly(not getattr(foreign, "run", foreign).__module__.startswith("jaxlfi.")):
             return foreign(words[1:])
     if joined.asked(words):
         return joined.work(lambda: _main(words), lambda: _advice(words), "jaxlfi", "--debug" in words)
@@ -541,17 +505,18 @@ def _main(words: Sequence[str]) -> int:
     again = "; the same command goes on from here" if words[:1] == ["diagnose"] else ""
     with interrupts.advising("jaxlfi", lambda: resuming(begun[0]) if begun else again):
         try:
-            return _done(words, begun)
+            try:
+                arguments = parse(words)
+            except ValueError as error:
+                return refuse("jaxlfi", error)
+            arguments.begun = begun
+            return _work(arguments)
         except KeyboardInterrupt:
             return interrupts.report()
 
 
-def _done(words: Sequence[str], begun: list[Path]) -> int:
-    """The same, with the folder that can be resumed added to `begun`."""
-    try:
-        arguments = parse(words)
-    except ValueError as error:
-        return refuse("jaxlfi", error)
+def _work(arguments: argparse.Namespace) -> int:
+    """Do what arguments ask for, and add the folder that can be resumed to `arguments.begun`."""
     debug = getattr(arguments, "debug", False)
     try:
         if arguments.command in ("infer", "compare", "grid"):
@@ -571,7 +536,7 @@ def _done(words: Sequence[str], begun: list[Path]) -> int:
                 raise
             return refuse("jaxlfi", error, debug)
         if prepared is not None:
-            begun.append(prepared[0])
+            arguments.begun.append(prepared[0])
             try:
                 commands.run(*prepared, arguments, console)
             except commands.EXPECTED as error:
@@ -586,17 +551,17 @@ def _reference(arguments: argparse.Namespace) -> str:
     """The task's reference, with the options that other arguments ask for."""
     reference = arguments.task
     if arguments.object is not None:
-        reference = factories.with_option(reference, "object", *arguments.object)
-    options = factories.parse(reference)[1]
+        reference = references.with_option(reference, "object", *arguments.object)
+    options = references.parse(reference)[1]
     if len(arguments.observation or ()) > 1 and "trials" not in options:
-        reference = factories.with_option(reference, "trials", str(len(arguments.observation)))
+        reference = references.with_option(reference, "trials", str(len(arguments.observation)))
         if arguments.settings.get("embedding") == "trials" and "pooling" not in options:
-            reference = factories.with_option(reference, "pooling", "all")
+            reference = references.with_option(reference, "pooling", "all")
     return reference
 
 
 def _advice(words: Sequence[str]) -> str:
     """What to do where a process of several was lost."""
-    arguments, _ = parser(Families.of(words)).parse_known_args(words)
+    arguments, _ = parser().parse_known_args(words)
     folder = arguments.folder if arguments.command == "resume" else arguments.out
     return resuming(folder) if (folder / "config.json").exists() else ""

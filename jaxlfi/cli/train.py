@@ -5,17 +5,19 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 
 import argparse
 import contextlib
-import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxlfi import flags, source_fields
+from jaxlfi import flags
 from jaxlfi.cli import joined
+from jaxlfi.cli.command import Command
 from jaxlfi.cli.domains import DOMAINS, domains_of
-from jaxlfi.cli.exit_status import exit_status, resuming
-from jaxlfi.cli.parser import OneLineParser
+from jaxlfi.cli.exit_status import resuming
+from jaxlfi.cli.own_fields import FIELDS
+from jaxlfi.io.formats import TRAINING, recorded
+from jaxlfi.registry import ENVIRONMENTS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -47,53 +49,30 @@ examples:
 """
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
-    top = OneLineParser(
-        prog="jaxlfi train",
-        description="Train policies by PPO on environments whose parameters are drawn from a domain.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    top.add_argument(
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
         "environment",
         metavar="ENVIRONMENT",
         help="an environment's name, such as whip, or module:factory; NAME,key=value sets options",
     )
-    top.add_argument("--domain", nargs="+", required=True, metavar="DOMAIN", help="what to train on; several: each")
-    top.add_argument(
+    parser.add_argument("--domain", nargs="+", required=True, metavar="DOMAIN", help="what to train on; several: each")
+    parser.add_argument(
         "--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results"
     )
-    top.add_argument("--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)")
-    top.add_argument("--seeds", type=int, default=1, metavar="N", help="trainings of each domain (default: 1)")
-    top.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first one's seed (default: 0)")
-    top.add_argument(
+    parser.add_argument(
+        "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"
+    )
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="trainings of each domain (default: 1)")
+    parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first one's seed (default: 0)")
+    parser.add_argument(
         "--tensorboard", action="store_true", help="write learning curves while training: tensorboard --logdir DIR"
     )
-    top.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
-    top.add_argument("--debug", action="store_true", help="show where an error came from")
-    joined.add_flags(top)
-    group = top.add_argument_group("PPO (default: the preset's)")
-    flags.add(group, {"PPO": source_fields.of_class(SETTINGS).fields}, into="settings", defaults=False)
-    top.set_defaults(settings={})
-    return top
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: the words after `jaxlfi train`; by default those of the process.
-
-    Returns:
-        0; 2 for bad input; 130 where it was interrupted.
-    """
-    arguments = parser().parse_args(argv)
-    begun = lambda: resuming(arguments.out) if is_training(arguments.out) else ""
-    command = lambda: exit_status("jaxlfi train", lambda: _train(arguments), arguments.debug, begun)
-    if arguments.coordinator is None:
-        return command()
-    return joined.work(command, begun, "jaxlfi train", arguments.debug)
+    parser.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    joined.add_flags(parser)
+    group = parser.add_argument_group("PPO (default: the preset's)")
+    flags.add(group, {"PPO": FIELDS[SETTINGS]}, into="settings", defaults=False)
+    parser.set_defaults(settings={})
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -103,10 +82,12 @@ def _train(arguments: argparse.Namespace) -> None:
 
     compile_cache.enable()
     processes = joined.join(arguments)
-    from jaxlfi.rl import registry, training
+    from jaxlfi.rl import training
 
     if not processes.writes:
-        training.resumed(arguments.out, registry.load(arguments.environment), lambda updates, curves: None, processes)
+        training.resumed(
+            arguments.out, ENVIRONMENTS.load(arguments.environment), lambda updates, curves: None, processes
+        )
         processes.leave()
         return
     plan = _plan(arguments)
@@ -190,18 +171,9 @@ def draw(out: Path, console: "Console") -> None:
     console.print(f"learning curves: {out / 'curves.png'}", markup=False, soft_wrap=True)
 
 
-def is_training(out: Path) -> bool:
-    """Whether a folder is that of trainings; it may be damaged."""
-    try:
-        config = json.loads((out / "config.json").read_text())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(config, dict) and config.get("format") == "jaxlfi-training"
-
-
 def resume(out: Path, console: "Console", figures: bool, processes: "Processes") -> None:
     """Go on with a training that was stopped; see `run`. Every process reads the folder."""
-    from jaxlfi.rl import registry, training
+    from jaxlfi.rl import training
     from jaxlfi.runs.execute import changed_machine
 
     config = training.read_config(out)
@@ -217,7 +189,7 @@ def resume(out: Path, console: "Console", figures: bool, processes: "Processes")
     if changed := changed_machine(config, processes):
         warning = f"begun with {', '.join(changed)}: the policies may be other than without an interruption"
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True, highlight=False)
-    environment = registry.load(config["environment"])
+    environment = ENVIRONMENTS.load(config["environment"])
     if processes.writes:
         run(out, environment, console, figures, processes)
     else:
@@ -245,11 +217,10 @@ def _plan(arguments: argparse.Namespace) -> Any:
     if arguments.seeds > MAX_SEEDS:
         raise ValueError(f"seeds: expected at most {MAX_SEEDS}, got {arguments.seeds}")
     check_seeds(arguments.first_seed, arguments.seeds, "first_seed")
-    from jaxlfi.rl import registry
     from jaxlfi.rl.settings import PRESETS as SETTINGS_OF
     from jaxlfi.rl.training import Plan
 
-    environment = registry.load(arguments.environment)
+    environment = ENVIRONMENTS.load(arguments.environment)
     return Plan(
         reference=arguments.environment,
         environment=environment,
@@ -259,3 +230,15 @@ def _plan(arguments: argparse.Namespace) -> Any:
         seeds=tuple(range(arguments.first_seed, arguments.first_seed + arguments.seeds)),
         tensorboard=arguments.tensorboard,
     )
+
+
+main = Command(
+    "train",
+    "train policies by PPO on domains, such as a posterior",
+    _arguments,
+    _train,
+    description="Train policies by PPO on environments whose parameters are drawn from a domain.",
+    epilog=EXAMPLES,
+    begun=lambda arguments: resuming(arguments.out) if recorded(arguments.out).get("format") == TRAINING else "",
+)
+parser = main.parser

@@ -1,7 +1,9 @@
 """Estimators: the settings a family of density estimators has, and the network that is trained by them."""
 
 import abc
+import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import flax.linen as nn
@@ -24,7 +26,7 @@ from jaxlfi.estimators.losses import LOSSES, Rows
 from jaxlfi.estimators.normaliser import TRANSFORMS, Normaliser, fit_normaliser, standardiser
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.estimators.regression import Regression, features_size, fit_regression, unfitted
-from jaxlfi.fields import Checked, check_fields, hyperparameter, option
+from jaxlfi.fields import Checked, check_fields, declared, hyperparameter, option
 
 FIT_DRAWS = 1000
 """Number of draws of a density that its mixture of Gaussians is fitted to."""
@@ -397,6 +399,33 @@ class Network:
         """Fresh weights and the normalisers of these simulations, and what the network sees of them."""
         params = self.estimator.initialise(key, self.scale.dim, dataset.x.shape[-1])
         return self.replace(params=params).begun(dataset)
+
+
+def converted(estimator: Estimator, kind: type[Estimator], values: Mapping[str, Any]) -> Estimator:
+    """An estimator of another family, with the settings that both have, and some of them replaced.
+
+    Args:
+        estimator: whose settings are kept.
+        kind: the family.
+        values: settings to replace, by name.
+
+    Raises:
+        ValueError: for settings the family does not have or does not accept.
+
+    Example:
+        >>> from jaxlfi.estimators.flow_estimators import MaskedFlow, SplineFlow
+        >>> converted(SplineFlow(transforms=3, bins=8), MaskedFlow, {"epochs": 10}).transforms
+        3
+    """
+    known = declared(kind)
+    if foreign := sorted(set(values) - set(known)):
+        raise ValueError(
+            f"{foreign[0]}: expected a setting of {kind.__name__} ({', '.join(known)}), got one it does not have"
+        )
+    if isinstance(estimator, kind) and type(estimator) is kind:
+        return dataclasses.replace(estimator, **values)
+    shared = {name: getattr(estimator, name) for name in declared(estimator) if name in known}
+    return kind(**(shared | dict(values)))
 
 
 def untrained(

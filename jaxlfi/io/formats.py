@@ -1,9 +1,58 @@
-"""Versions of file formats: one is read, and of any other it is said which jaxlfi reads it."""
+"""Formats of work folders, and versions: one is read, and of any other it is said which jaxlfi reads it.
 
+This module imports neither jax nor numpy.
+"""
+
+import json
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
+CONFIG, PLAN = "config.json", "plan.json"
+RUN, RUNS, COMPARE, GRID = "jaxlfi-run", "jaxlfi-runs", "jaxlfi-compare", "jaxlfi-grid"
+DIAGNOSTICS, TRAINING, LOOP = "jaxlfi-diagnostics", "jaxlfi-training", "jaxlfi-r2s2r"
+
+
+class Format(NamedTuple):
+    """A kind of work folder.
+
+    Attributes:
+        what: it is, for errors.
+        version: of the format that is written; it rises whenever an older one could be misread.
+        read: older versions of which finished work is read.
+    """
+
+    what: str
+    version: int
+    read: tuple[int, ...] = ()
+
+
+VERSION = 4
+"""Of the formats of runs, grids and diagnostics.
+
+What is added to a folder without a new number, readers must do without: a new setting's default is what was done before
+there was the setting. `tests/golden/formats/` has a folder of each number, and of each state of one.
+"""
+READ = (2, 3)
+"""In 2, normalisers counted from zero (`jaxlfi.runs.load`); in 3, an unfinished run believed what it proposed by."""
+FORMATS = {
+    **dict.fromkeys((RUN, RUNS, COMPARE), Format("a run folder", VERSION, READ)),
+    GRID: Format("the folder of a grid", VERSION),
+    DIAGNOSTICS: Format("the folder of diagnostics", VERSION),
+    TRAINING: Format("the folder of a training", 1),
+    LOOP: Format("the folder of a loop", 1),
+}
+"""All work folders there are, by the "format" of their record."""
 NOTHING: Mapping[str, Any] = {}
+
+
+def recorded(folder: Path, record: str = CONFIG) -> dict[str, Any]:
+    """What a folder says of itself, be it sound or not; nothing where it says nothing."""
+    try:
+        found = json.loads((folder / record).read_text())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def require_version(where: Any, kind: str, wanted: int, got: Any, record: Mapping[str, Any] = NOTHING) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxlfi import plugins
+from jaxlfi import registry
 
 NameOf = Callable[[Any], str]
 Load = Callable[[str], type]
@@ -72,7 +72,7 @@ def dataclass_of(reference: str) -> type:
     Raises:
         ValueError: if there is none.
     """
-    kind = plugins.named("description", reference)
+    kind = registry.named("description", reference)
     if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
         raise ValueError(f"description: expected {reference!r} to be a dataclass, got {kind!r}")
     return kind

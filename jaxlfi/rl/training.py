@@ -23,20 +23,18 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxlfi.bayessim.programs import side_by_side
-from jaxlfi.io import files, serialise, trees
-from jaxlfi.io.formats import require_version
+from jaxlfi.io import files, formats, provenance, serialise, trees, workfolder
+from jaxlfi.io.formats import TRAINING
 from jaxlfi.io.processes import ALONE, Partition, Processes
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.rl import ppo
 from jaxlfi.rl.domains import POOL, Domain, Draw
 from jaxlfi.rl.environment import Environment
 from jaxlfi.rl.evaluation import evaluate
 from jaxlfi.rl.ppo import Training, Update
 from jaxlfi.rl.settings import PPO
-from jaxlfi.runs import folder as run_folders
 from jaxlfi.runs.execute import devices_of
-from jaxlfi.runs.folder import StoreError
 
-FORMAT, VERSION = "jaxlfi-training", 1
 HELD_OUT = 128
 """Points of each domain that its policies are evaluated on, other than those that they were trained on."""
 MAX_CHUNK = 16
@@ -50,7 +48,7 @@ class Plan:
     """What is to be trained.
 
     Attributes:
-        reference: by which the environment can be found (`jaxlfi.rl.registry.load`); None for one made in Python.
+        reference: by which the environment can be found (`jaxlfi.registry.ENVIRONMENTS`); None for one made in Python.
         environment: what is trained on.
         settings: of PPO.
         preset: that the settings were made from, or None.
@@ -110,8 +108,8 @@ def begin(plan: Plan, out: Path, processes: Processes = ALONE) -> None:
         "units": np.asarray(plan.environment.units),
     }
     config = {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": TRAINING,
+        "version": formats.FORMATS[TRAINING].version,
         "environment": plan.reference,
         "environment_name": plan.environment.name,
         "preset": plan.preset,
@@ -120,9 +118,9 @@ def begin(plan: Plan, out: Path, processes: Processes = ALONE) -> None:
         "tensorboard": plan.tensorboard,
         "devices": devices_of(len(names), processes),
         "processes": processes.count,
-        **run_folders.environment(),
+        **provenance.environment(),
     }
-    run_folders.create(out, config, lambda staging: files.write_sealed(staging / "domains.npz", arrays))
+    workfolder.create(out, config, lambda staging: files.write_sealed(staging / "domains.npz", arrays))
 
 
 def resumed(
@@ -203,18 +201,7 @@ def read_config(out: Path) -> dict[str, Any]:
     Raises:
         StoreError: for folders that are none.
     """
-    try:
-        config = files.read_json(out / "config.json")
-    except ValueError as error:
-        raise StoreError(
-            f"expected the folder of a training, got {str(out)!r} without a readable config.json"
-        ) from error
-    if not isinstance(config, dict) or config.get("format") != FORMAT:
-        raise StoreError(f"expected the folder of a training, got {str(out)!r}, whose config.json is not one's")
-    try:
-        require_version(out / "config.json", FORMAT, VERSION, config.get("version"), config)
-    except ValueError as error:
-        raise StoreError(str(error)) from error
+    config = workfolder.read(out, TRAINING)
     try:
         settings_of(config)
         domains, seeds = zip(*((one["domain"], one["seed"]) for one in config["trainings"]), strict=True)

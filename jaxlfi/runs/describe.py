@@ -7,11 +7,10 @@ import numpy as np
 
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.support import Support
-from jaxlfi.estimators import registry as estimators
 from jaxlfi.estimators.base import Estimator
 from jaxlfi.heuristics import Heuristic
-from jaxlfi.heuristics import registry as heuristics
 from jaxlfi.io.serialise import class_name, dataclass_of, fields_to_json, from_json, made_of, to_json
+from jaxlfi.registry import ESTIMATORS, HEURISTICS, Classes
 
 
 def settings_to_json(settings: Settings) -> dict[str, Any]:
@@ -26,7 +25,7 @@ def settings_from_json(description: Mapping[str, Any]) -> Settings:
         ValueError: for a description of anything else, of values that cannot work, or of an estimator that is not
             installed.
     """
-    return made_of(Settings, "settings", _renamed(description), _loader(estimators)).check()
+    return made_of(Settings, "settings", _renamed(description), _loader(ESTIMATORS)).check()
 
 
 def _renamed(description: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -55,7 +54,7 @@ def heuristic_from_json(description: Mapping[str, Any]) -> Heuristic:
     Raises:
         ValueError: for a description of anything else, or of a heuristic that is not installed.
     """
-    heuristic = from_json(description, _loader(heuristics))
+    heuristic = from_json(description, _loader(HEURISTICS))
     if not isinstance(heuristic, Heuristic):
         raise ValueError(f"heuristic: expected the description of one, got {description['name']!r}")
     return heuristic
@@ -72,17 +71,18 @@ def support_from_json(description: Mapping[str, list[float]]) -> Support:
 
 
 def _name(value: Any) -> str:
-    if isinstance(value, Heuristic):
-        return heuristics.name_of(value)
-    return estimators.name_of(value) if isinstance(value, Estimator) else class_name(value)
+    for family in (HEURISTICS, ESTIMATORS):
+        if isinstance(value, family.kind):
+            return family.name_of(type(value))
+    return class_name(value)
 
 
-def _loader(registry: Any):
+def _loader(family: Classes):
     """Classes by their registered names, or by module:Class what a registered class holds."""
 
     def load(name: str) -> type:
         if ":" not in name:
-            return registry.load(name)
+            return family.load(name)
         kind = dataclass_of(name)
         if not issubclass(kind, Heuristic | Estimator | Support):
             raise ValueError(f"description: expected a heuristic, an estimator or a support, got {name!r}")

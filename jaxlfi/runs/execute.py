@@ -22,13 +22,16 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
+from jaxlfi.io import provenance, workfolder
+from jaxlfi.io.formats import COMPARE, RUN, RUNS
 from jaxlfi.io.processes import ALONE, Partition, Processes
+from jaxlfi.io.workfolder import StoreError
+from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import Checkpoint
-from jaxlfi.runs.folder import COMPARE, RUN, RUNS, StoreError
 from jaxlfi.runs.run import Origin, Run
-from jaxlfi.tasks import failures, priors, registry
+from jaxlfi.tasks import failures, priors
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.failures import FailureLog, Message
 from jaxlfi.tasks.journal import Journal, OnSimulation
@@ -49,7 +52,7 @@ class BatchPlan:
     """What is going to be run.
 
     Attributes:
-        kind: the format of its folder (`jaxlfi.runs.folder.RUN`, `RUNS` or `COMPARE`).
+        kind: the format of its folder (`jaxlfi.io.formats.RUN`, `RUNS` or `COMPARE`).
         reference: by which the task was found; None for one made in Python.
         task: the task.
         preset: the settings were made from; None for others.
@@ -303,7 +306,7 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed, processes: Processe
             (staging / name).mkdir(parents=True)
             atomic.write_json(staging / name / "config.json", run)
 
-    folders.create(folder, config, fill)
+    workfolder.create(folder, config, fill)
 
 
 def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]:
@@ -325,7 +328,7 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
         plan = BatchPlan(
             kind=config["format"],
             reference=config["task"],
-            task=task or registry.load(config["task"]),
+            task=task or TASKS.load(config["task"]),
             preset=config["preset"],
             settings=describe.settings_from_json(config["settings"]),
             specs=tuple(_spec(run) for run in config["runs"]),
@@ -357,7 +360,7 @@ def devices_of(runs: int, processes: Processes) -> int:
 def changed_machine(config: Mapping[str, Any], processes: Processes = ALONE) -> list[str]:
     """In words, what is other than when a folder was begun, of what bits depend on: versions, devices, processes."""
     recorded = config.get("versions", {})
-    now = folders.versions()
+    now = provenance.versions()
     changed = [name for name in VERSIONS if recorded.get(name) not in (None, now[name])]
     words = [f"{name} {recorded[name]}, now {now[name]}" for name in changed]
     runs, devices = config.get("runs", config.get("trainings")), jax.local_device_count() * processes.count
@@ -405,7 +408,7 @@ def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
         order = list(dict.fromkeys(line["configuration"] for line in lines))
         lines.sort(key=lambda line: (order.index(line["configuration"]), line["seed"]))
         folders.write_table(folder / "table.csv", lines)
-    atomic.write_json(folder / "config.json", folders.read_config(folder) | {"status": "finished"})
+    workfolder.finish(folder)
     clean(folder)
 
 

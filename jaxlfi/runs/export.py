@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxlfi.bayessim.keys import key_of
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import StoreError, read_config
+from jaxlfi.io.workfolder import StoreError
+from jaxlfi.runs.folder import read_config
 from jaxlfi.runs.load import load
 
 

@@ -9,33 +9,23 @@ While a command runs its folder also holds `checkpoint/` (`jaxlfi.runs.checkpoin
 """
 
 import csv
-import importlib.metadata
 import io
 import json
-import os
-import platform
-import shlex
-import shutil
-import sys
-import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from datetime import UTC, datetime
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
-import jaxlfi
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.record import FINAL, ledger_line
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.io import files as atomic
-from jaxlfi.io import run_summary, trees
-from jaxlfi.io.formats import require_version
-from jaxlfi.io.serialise import json_safe
-from jaxlfi.io.shell import quoted
+from jaxlfi.io import formats, provenance, run_summary, trees, workfolder
+from jaxlfi.io.formats import COMPARE, RUN, RUNS
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.runs import describe
 from jaxlfi.tasks import failures, priors, summaries
 from jaxlfi.tasks.task import Task
@@ -43,164 +33,16 @@ from jaxlfi.tasks.task import Task
 if TYPE_CHECKING:  # runs know how to save themselves
     from jaxlfi.runs.run import Origin, Run
 
-RUN, RUNS, COMPARE = "jaxlfi-run", "jaxlfi-runs", "jaxlfi-compare"
-VERSION = 4
-"""Of the format of all folders; it rises whenever an older one could be misread.
-
-What is added to a folder without a new number, readers must do without: a new setting's default is what was done before
-there was the setting. `tests/golden/formats/` has a folder of each number, and of each state of one.
-"""
-READ = (2, 3)
-"""Older versions of which finished runs are read. In 2, normalisers counted from zero (`jaxlfi.runs.load`); in 3, an
-unfinished run believed what it proposed by."""
-PACKAGES = ("jax", "jaxlib", "flax", "optax", "distrax", "numpy")
 TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")
 
 
-class StoreError(ValueError):
-    """A folder that cannot be read, resumed or written to."""
-
-
-def environment() -> dict[str, Any]:
-    """What a run was made with: versions, platform and command line."""
-    return {
-        "versions": versions(),
-        "platform": {
-            "system": platform.platform(),
-            "processor": processor(),
-            "backend": jax.default_backend(),
-            "device": jax.devices()[0].device_kind,
-            "cores": os.cpu_count(),
-        },
-        "command_line": command_line(sys.argv),
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-
-
-def as_json(value: Any) -> Any:
-    """A value as it is read back after it was written."""
-    return json.loads(json.dumps(json_safe(value)))
-
-
-def versions() -> dict[str, str]:
-    """Of Python, jaxlfi and the packages it computes with."""
-    packages = {package: importlib.metadata.version(package) for package in PACKAGES}
-    return {"python": platform.python_version(), "jaxlfi": jaxlfi.__version__} | packages
-
-
-def command_line(argv: Sequence[str]) -> str:
-    """A command as it is recorded with its results: without the folders of the machine it ran on.
-
-    An absolute path is written relative to the working folder where it lies below it, and by its name alone elsewhere.
-
-    Example:
-        >>> command_line(["/usr/bin/jaxlfi", "report", "/elsewhere/runs/edge"])
-        'jaxlfi report edge'
-    """
-
-    def portable(argument: str) -> str:
-        flag, equals, value = argument.partition("=") if argument.startswith("-") else ("", "", argument)
-        path = Path(value)
-        if not path.is_absolute():
-            return argument
-        inside = path.is_relative_to(Path.cwd())
-        return flag + equals + (str(path.relative_to(Path.cwd())) if inside else path.name)
-
-    return shlex.join([Path(argv[0]).name, *(portable(argument) for argument in argv[1:])])
-
-
-def processor() -> str:
-    """The processor's name as the system reports it."""
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def refuse_occupied(folder: Path) -> None:
-    """Refuse to write where something is.
-
-    Raises:
-        StoreError: if the folder exists and is not empty, or is a file, a link to nothing, or the current folder, which
-            cannot be replaced.
-    """
-    if folder.is_symlink() and not folder.exists():
-        raise StoreError(
-            f"out: expected a new or empty folder, got {str(folder)!r}, a symbolic link to something that is not there"
-        )
-    if not folder.exists():
-        return
-    if folder.samefile(Path.cwd()):
-        raise StoreError(f"out: expected a new or empty folder, got {str(folder)!r}, the current one")
-    if not folder.is_dir() or any(folder.iterdir()):
-        raise StoreError(
-            f"out: expected a new or empty folder, got {str(folder)!r} which holds something: "
-            f"take another name, or continue it with {quoted('jaxlfi', 'resume', folder)}"
-        )
-
-
-def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any]) -> None:
-    """Bring a run folder into being, complete or not at all.
-
-    Args:
-        folder: where; it must not exist or be empty.
-        config: written as config.json.
-        fill: called with the folder's temporary path, to write what else belongs into it.
-    """
-    refuse_occupied(folder)
-    folder = folder.resolve()  # a link to an empty folder stands for that folder
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    except OSError as error:
-        raise StoreError(f"out: expected a folder that can be written, got {str(folder)!r}: {error}") from error
-    try:
-        staging.chmod(0o755)
-        fill(staging)
-        atomic.write_json(staging / "config.json", config)
-        staging.rename(folder)
-    except BaseException:
-        shutil.rmtree(staging, ignore_errors=True)
-        raise
-
-
 def read_config(folder: Path) -> dict[str, Any]:
-    """The config.json of a run folder of any kind.
+    """The config.json of a folder of runs of any kind.
 
     Raises:
         StoreError: for folders that are none.
     """
-    if not folder.is_dir():
-        raise StoreError(f"expected a run folder, got {str(folder)!r} which is no folder")
-    path = folder / "config.json"
-    try:
-        config = atomic.read_json(path)
-    except ValueError as error:
-        raise StoreError(f"expected a run folder, got {str(folder)!r} without a readable config.json") from error
-    kind = config.get("format") if isinstance(config, dict) else None
-    if kind not in (RUN, RUNS, COMPARE):
-        known = isinstance(kind, str) and kind.startswith("jaxlfi-")
-        found = f"is of format {kind!r}" if known else "is not of jaxlfi"
-        raise StoreError(f"expected a run folder, got {str(folder)!r} whose config.json {found}")
-    check_version(path, config)
-    return config
-
-
-def check_version(path: Path, config: Mapping[str, Any]) -> None:
-    """Refuse a folder of another version of the format, but for finished runs of some older ones.
-
-    Raises:
-        StoreError: in one line.
-    """
-    runs = config.get("format") in (RUN, RUNS, COMPARE) and config.get("status", "finished") == "finished"
-    if runs and config.get("version") in READ:
-        return
-    try:
-        require_version(path, str(config.get("format")), VERSION, config.get("version"), config)
-    except ValueError as error:
-        raise StoreError(f"{error}; or run its command again") from error
+    return workfolder.read(folder, RUN, RUNS, COMPARE)
 
 
 def append_ledger(folder: Path, index: int, row: Mapping[str, np.ndarray], reasons: Sequence[str], seconds: float):
@@ -285,7 +127,7 @@ def save(run: "Run", folder: Path) -> Path:
 
     if run.task is None:
         raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
-    create(folder, run_config(run.task, run.origin, run.spec, run.settings), fill)
+    workfolder.create(folder, run_config(run.task, run.origin, run.spec, run.settings), fill)
     return folder
 
 
@@ -304,7 +146,7 @@ def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) 
     feasible = task.inference.feasible
     return {
         "format": RUN,
-        "version": VERSION,
+        "version": formats.VERSION,
         "task": origin.reference,
         "task_name": task.name,
         "parameters": list(task.names),
@@ -326,7 +168,7 @@ def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) 
         "settings": describe.settings_to_json(settings),
         "seed": spec.seed,
         "widths": widths_note(settings, spec.heuristic),
-        **environment(),
+        **provenance.environment(),
     }
 
 

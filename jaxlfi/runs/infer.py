@@ -23,9 +23,12 @@ from jaxlfi.distributions.precision import single
 from jaxlfi.distributions.space import SpaceName
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.dataset import Dataset
-from jaxlfi.heuristics import Edge, Heuristic, paired, registry
+from jaxlfi.heuristics import Edge, Heuristic, paired
+from jaxlfi.heuristics.hyperparameters import build, check
+from jaxlfi.io import formats, workfolder
 from jaxlfi.io.locks import locked
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.registry import HEURISTICS
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.execute import BatchPlan, Observed
@@ -112,8 +115,8 @@ def infer(
     if not isinstance(settings, Settings):
         raise ValueError(f"settings: expected jaxlfi.Settings such as jaxlfi.QUICK, got {settings!r}")
     if isinstance(heuristic, str):
-        heuristic = registry.build(heuristic, task.hyperparameters.get(heuristic, {}), task.dim)
-    registry.check(heuristic, task.dim)
+        heuristic = build(HEURISTICS.load(heuristic), task.hyperparameters.get(heuristic, {}), task.dim)
+    check(heuristic, task.dim)
     heuristic = paired(heuristic, getattr(settings.estimator, "warm_start", True))  # what it is, is checked later
     embedding = getattr(settings.estimator, "embedding", "none")  # what it is, is checked later
     if executor is not None or simulation_timeout is not None:
@@ -136,7 +139,7 @@ def infer(
         box = task.support(support, space)
         name = next(iter(task.supports)) if support is None else name
     spec = RunSpec("own", name, box, heuristic, seed_of(key))
-    plan = BatchPlan(folders.RUN, None, task, None, settings, (spec,))
+    plan = BatchPlan(formats.RUN, None, task, None, settings, (spec,))
     run = _run(plan, observation, first, progress, callback, None if out is None else Path(out))
     for category, text in run.findings():
         python_warnings.warn(text, category, stacklevel=2)
@@ -153,7 +156,7 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
     with locked(out):
         config = folders.read_config(out)
         _require_same(out, config, plan)
-        if config.get("status", "finished") == "finished":
+        if workfolder.is_finished(config):
             executing.clean(out)
             run = load(out, plan.task)
             _require_observation(out, run.observed, observed.trajectory[0])
@@ -187,7 +190,7 @@ def _executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Cal
 def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
     """Refuse to go on in the folder of another run."""
     (spec,) = plan.specs
-    wanted = folders.as_json(folders.run_config(plan.task, plan.origin(spec), spec, plan.settings))
+    wanted = workfolder.as_json(folders.run_config(plan.task, plan.origin(spec), spec, plan.settings))
     compared = (
         "task_name", "names", "units", "feasible_low", "feasible_high", "prior", "support", "heuristic", "settings",
         "seed",
@@ -238,8 +241,8 @@ def _first_round(dataset: Dataset) -> np.ndarray:
     return rows[np.asarray(dataset.round)[: int(dataset.size)] == 0]
 
 
-def _of_another_run(out: Path, other: list[str]) -> folders.StoreError:
-    return folders.StoreError(
+def _of_another_run(out: Path, other: list[str]) -> workfolder.StoreError:
+    return workfolder.StoreError(
         f"out: expected a new folder or one of the same run, got {str(out)!r}, of a run with another {', '.join(other)}"
     )
 

@@ -20,14 +20,15 @@ from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.io import files as atomic
-from jaxlfi.io import trees
+from jaxlfi.io import formats, trees, workfolder
 from jaxlfi.io.formats import written_by
 from jaxlfi.io.shell import quoted
+from jaxlfi.io.workfolder import StoreError
+from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
-from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.run import Origin, Run
-from jaxlfi.tasks import failures, registry
+from jaxlfi.tasks import failures
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.observation import with_gaps_of
 from jaxlfi.tasks.task import Task
@@ -55,10 +56,10 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
     except TypeError as error:
         raise TypeError(f"folder: expected a path, got {type(folder).__name__}") from error
     config = folders.read_config(folder)
-    if config["format"] != folders.RUN:
+    if config["format"] != formats.RUN:
         one = next((run["folder"] for run in config.get("runs", ())), "seed_000")
         raise StoreError(f"{folder}: expected the folder of one run, such as {folder / one}")
-    if config.get("status", "finished") != "finished" or not (folder / "posterior.npz").exists():
+    if not workfolder.is_finished(config) or not (folder / "posterior.npz").exists():
         raise StoreError(f"{folder}: expected a finished run; go on with it by {quoted('jaxlfi', 'resume', folder)}")
     try:
         return _read(folder, config, task)
@@ -136,7 +137,7 @@ def _task(folder: Path, config: dict[str, Any], given: Task | None, space: Space
     task = given
     if task is None and config["task"] is not None:
         try:
-            task = registry.load(config["task"])
+            task = TASKS.load(config["task"])
         except ValueError:  # the posterior can be used without it
             return None
     if task is not None and (task.space != space or list(task.units) != list(config.get("units") or task.units)):

@@ -55,7 +55,7 @@ class Origin:
     """How a run is described in its config.json.
 
     Attributes:
-        reference: by which its task can be found (`jaxlfi.tasks.registry.load`); None for a task made in Python.
+        reference: by which its task can be found (`jaxlfi.registry.TASKS`); None for a task made in Python.
         configuration: what the run is called in tables.
         support_name: of Theta_0.
         preset: that the settings were made from, or None.

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxlfi.io import files as atomic
 from jaxlfi.io.processes import ALONE, Processes
-from jaxlfi.runs.folder import StoreError
+from jaxlfi.io.workfolder import StoreError
 
 LABELS = ("fingerprint", "seconds")
 """Arrays of a chunk's file that are no results."""

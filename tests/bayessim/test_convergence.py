@@ -15,9 +15,9 @@ from jaxlfi.bayessim.host import HostEngine
 from jaxlfi.diagnostics import POSTERIOR_SAMPLES
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.heuristics import Edge
+from jaxlfi.io.formats import RUN
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs.describe import settings_from_json, settings_to_json
-from jaxlfi.runs.folder import RUN
 from jaxlfi.tasks.host import HostSimulator
 from tests.small import TASK, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 from tests.tasks.test_host import Counting

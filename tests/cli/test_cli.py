@@ -16,23 +16,23 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import flags, plugins
+from jaxlfi import flags, registry
 from jaxlfi.bayessim import memory
 from jaxlfi.bayessim.presets import HYPERPARAMETERS, METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli import asked, summaries
 from jaxlfi.cli import parser as cli
 from jaxlfi.envs.gaussian_linear import MIXING, NOISE
-from jaxlfi.estimators import registry as estimators
 from jaxlfi.fields import declared
-from jaxlfi.heuristics import Edge, Mode, registry
+from jaxlfi.heuristics import Edge, Mode
+from jaxlfi.heuristics.hyperparameters import all_declared
 from jaxlfi.io import files as atomic
+from jaxlfi.io import formats
 from jaxlfi.io.host_devices import FLAG, processors
+from jaxlfi.registry import ESTIMATORS, HEURISTICS, TASKS
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import folder as run_store
-from jaxlfi.studies import grid
 from jaxlfi.tasks import observation
-from jaxlfi.tasks import registry as tasks
 from jaxlfi.tasks.trials import repeated
 from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
@@ -61,8 +61,8 @@ def test_every_setting_and_hyperparameter_has_a_documented_flag():
         documented = {action.dest for action in choices[name]._actions if action.help}
         kinds = [
             Settings,
-            *(estimators.load(name) for name in plugins.names(estimators.GROUP)),
-            *(registry.load(rule) for rule in registry.names()),
+            *(ESTIMATORS.load(name) for name in ESTIMATORS.names()),
+            *(HEURISTICS.load(rule) for rule in HEURISTICS.names()),
         ]
         fields = {field for kind in kinds for field in declared(kind)}
         assert len(kinds) >= 9 and {"rounds", "hidden", "bins", "expansion"} <= fields <= documented
@@ -190,7 +190,7 @@ def test_a_grid_has_as_many_devices_as_it_was_begun_with(tmp_path, monkeypatch):
     vary = ["--vary", "tail=0,1", "expansion=1,2,3"]
     begun = cli.parser().parse_args(["grid", TASK, *vary, "--vary", "zone_width=0", "--seeds", "4", "--out", "x"])
     assert cli._runs(begun) == 24
-    atomic.write_json(tmp_path / "config.json", {"format": grid.GRID, "axes": [{}], "devices": 7})
+    atomic.write_json(tmp_path / "config.json", {"format": formats.GRID, "axes": [{}], "devices": 7})
     monkeypatch.setenv("XLA_FLAGS", "")
     cli.prepare_jax(cli.parser().parse_args(["resume", str(tmp_path), "--no-cache"]))
     assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=7"
@@ -198,14 +198,14 @@ def test_a_grid_has_as_many_devices_as_it_was_begun_with(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("damaged", ["7", {}, -7, 0, None, 10**9, 1.5])
 def test_a_damaged_number_of_devices_is_not_asked_for(damaged, tmp_path, monkeypatch):
-    atomic.write_json(tmp_path / "config.json", {"format": grid.GRID, "axes": [{}], "devices": damaged})
+    atomic.write_json(tmp_path / "config.json", {"format": formats.GRID, "axes": [{}], "devices": damaged})
     monkeypatch.setenv("XLA_FLAGS", "")
     cli.prepare_jax(cli.parser().parse_args(["resume", str(tmp_path), "--no-cache"]))
     assert os.environ["XLA_FLAGS"] in ("", *(f"--{FLAG}={n}" for n in (1, processors())))  # of one run, or more
 
 
 def test_report_refuses_a_grid_that_is_not_finished(tmp_path, capsys):
-    atomic.write_json(tmp_path / "config.json", {"format": grid.GRID, "version": run_store.VERSION})
+    atomic.write_json(tmp_path / "config.json", {"format": formats.GRID, "version": formats.VERSION})
     assert "expected a finished grid, found no grid.npz" in error_line(capsys, "report", tmp_path)
 
 
@@ -271,7 +271,7 @@ def test_compare_warns_of_posteriors_beyond_the_bounds_of_fixed_supports(compari
     names = [run["folder"] for run in run_store.read_config(comparison)["runs"]]
     runs = [jaxlfi.load(comparison / name) for name in names]
     specs = tuple(run.spec for run in runs)
-    plan = executing.BatchPlan(run_store.COMPARE, TASK, runs[0].task, None, runs[0].settings, specs)
+    plan = executing.BatchPlan(formats.COMPARE, TASK, runs[0].task, None, runs[0].settings, specs)
     warnings = summaries.support_warnings(plan, runs)
     assert any(text.startswith("misspecified: first reaches its upper bound 0 (in 2 of 2 runs") for text in warnings)
     assert not any(text.startswith("misspecified+edge") for text in warnings)
@@ -281,7 +281,7 @@ def test_compare_warns_in_one_line_of_observations_unlike_all_simulations(compar
     names = [run["folder"] for run in run_store.read_config(comparison)["runs"]]
     runs = [jaxlfi.load(comparison / name) for name in names]
     plan = executing.BatchPlan(
-        run_store.COMPARE, TASK, runs[0].task, None, runs[0].settings, tuple(run.spec for run in runs)
+        formats.COMPARE, TASK, runs[0].task, None, runs[0].settings, tuple(run.spec for run in runs)
     )
     assert summaries.observation_warnings(plan, runs) == []
     foreign = [run.replace(x=run.x + 1e6) if run.origin.configuration == "ok" else run for run in runs]
@@ -401,10 +401,10 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, monkeypatch, capsys):
 def registered(monkeypatch):
     """One task that works and one whose package is broken."""
     points = [
-        EntryPoint("linear", "jaxlfi.envs.gaussian_linear:task", tasks.GROUP),
-        EntryPoint("broken", "no.such.module:task", tasks.GROUP),
+        EntryPoint("linear", "jaxlfi.envs.gaussian_linear:task", TASKS.group),
+        EntryPoint("broken", "no.such.module:task", TASKS.group),
     ]
-    monkeypatch.setattr(plugins, "entry_points", lambda group: points)
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
 
 
 def test_tasks_are_listed_also_beside_a_broken_package(registered, capsys):
@@ -420,7 +420,7 @@ def shouting(words):
 
 def test_packages_add_commands(monkeypatch, capsys):
     point = EntryPoint("shout", "tests.cli.test_cli:shouting", "jaxlfi.commands")
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [point])
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point])
     assert cli.main(["shout", "whip", "--help"]) == 7
     assert capsys.readouterr().out == "WHIP --HELP\n"
     assert "shout" in cli.parser().format_help()
@@ -437,21 +437,21 @@ def oven(heat: float = 1.5, rounds: int = 3):
 
 
 def test_tasks_take_options():
-    assert tasks.load("tests.cli.test_cli:oven").name == "oven at 1.5"
-    assert tasks.load("tests.cli.test_cli:oven,heat=3,rounds=4").name == "oven at 3.0"
+    assert TASKS.load("tests.cli.test_cli:oven").name == "oven at 1.5"
+    assert TASKS.load("tests.cli.test_cli:oven,heat=3,rounds=4").name == "oven at 3.0"
     with pytest.raises(ValueError, match=r"expected options among heat, rounds, got 'tests.cli.test_cli:oven,colour="):
-        tasks.load("tests.cli.test_cli:oven,colour=red")
+        TASKS.load("tests.cli.test_cli:oven,colour=red")
     with pytest.raises(ValueError, match="failed: ValueError: heat: expected a value of type float, got 'much'"):
-        tasks.load("tests.cli.test_cli:oven,heat=much")
+        TASKS.load("tests.cli.test_cli:oven,heat=much")
     with pytest.raises(ValueError, match="expected options among none"):
-        tasks.load("jaxlfi.envs.gaussian_linear:task,object=dlo-0")
+        TASKS.load("jaxlfi.envs.gaussian_linear:task,object=dlo-0")
     for wrong in (
         "tests.cli.test_cli:oven,heat",
         "tests.cli.test_cli:oven,heat=",
         "tests.cli.test_cli:oven,heat=1,heat=2",
     ):
         with pytest.raises(ValueError, match="expected options as NAME,key=value"):
-            tasks.load(wrong)
+            TASKS.load(wrong)
 
 
 def test_an_object_is_an_option_of_the_task(tmp_path, capsys):
@@ -468,19 +468,19 @@ def test_several_objects_are_an_option_of_the_task(tmp_path, capsys):
     words = "--object", "a b.npz", "c", "--object", "d", *FLAGS, "--out", tmp_path / "out"
     assert "object=a b.npz;c;d" in error_line(capsys, "infer", TASK, *words)  # which has no objects
     reference = "tests.cli.test_cli:several"
-    assert tasks.load(f"{reference},object=a b.npz;c;d").name == "('a b.npz', 'c', 'd') all"
-    assert tasks.load(f"{reference},object=a").name == "('a',) all"
+    assert TASKS.load(f"{reference},object=a b.npz;c;d").name == "('a b.npz', 'c', 'd') all"
+    assert TASKS.load(f"{reference},object=a").name == "('a',) all"
     message = error_line(capsys, "infer", TASK, "--object", "a,b", "c;d", *FLAGS, "--out", tmp_path / "out")
     assert f'got \'{TASK},object="a,b";"c;d"\'' in message
-    assert tasks.load(f'{reference},object="a,b";"c;d"').name == "('a,b', 'c;d') all"
+    assert TASKS.load(f'{reference},object="a,b";"c;d"').name == "('a,b', 'c;d') all"
 
 
 def test_a_pooling_is_the_tasks_own_unless_there_are_trials():
     reference = "tests.cli.test_cli:several,object=a"
-    assert tasks.load(f"{reference},pooling=mean").name == "('a',) mean"
-    assert tasks.load(f"{reference},pooling=mean,trials=2") == repeated(tasks.load(reference), 2, "mean")
+    assert TASKS.load(f"{reference},pooling=mean").name == "('a',) mean"
+    assert TASKS.load(f"{reference},pooling=mean,trials=2") == repeated(TASKS.load(reference), 2, "mean")
     with pytest.raises(ValueError, match=r"pooling: expected one of \['all', 'mean'\], got 'moments'"):
-        tasks.load(f"{reference},pooling=moments")
+        TASKS.load(f"{reference},pooling=moments")
 
 
 def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line(tmp_path):
@@ -492,24 +492,26 @@ def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line
     given = asked.build_settings(parse("--rounds", "7"), task)
     assert (given.rounds, given.estimator.learning_rate) == (7, 0.25)
     assert asked.build_settings(parse("--method", "npe"), task).rounds == 1  # of all simulations of the three
-    edge = asked.build_heuristic(parse("--expansion", "0.1"), "edge", settings, task)
+    kinds = {"edge": Edge, "mode": Mode}
+    edge = asked.build_heuristic(parse("--expansion", "0.1"), "edge", kinds, settings, task)
     np.testing.assert_array_equal(edge.mass_threshold, [0.125, 0.5])
     assert edge.expansion == 0.1
-    mode = asked.build_heuristic(parse(), "mode", PRESETS["paper"], task)
+    mode = asked.build_heuristic(parse(), "mode", kinds, PRESETS["paper"], task)
     assert mode == Mode()
     assert jaxlfi.settings_for(task) == settings  # the same in Python
 
 
 def test_the_paper_s_threshold_comes_with_its_preset(tmp_path):
     parse = lambda *words: cli.parser().parse_args(["infer", TASK, "--out", str(tmp_path), *words])
-    edge = lambda task, *words: asked.build_heuristic(parse(*words), "edge", PRESETS["paper"], task).mass_threshold
+    build = lambda task, *words: asked.build_heuristic(parse(*words), "edge", {"edge": Edge}, PRESETS["paper"], task)
+    edge = lambda task, *words: build(task, *words).mass_threshold
     assert edge(gaussian()) == Edge().mass_threshold == 0.12  # more than a uniform posterior has along a bound
     assert edge(gaussian(), "--preset", "paper") == 0.005
     assert edge(gaussian(), "--preset", "paper", "--mass-threshold", "0.3") == 0.3
     np.testing.assert_array_equal(edge(oven(), "--preset", "paper"), [0.125, 0.5])  # the task's own
     for given in HYPERPARAMETERS.values():
         for name, values in given.items():
-            assert set(values) <= set(registry.hyperparameters(registry.load(name)))
+            assert set(values) <= set(all_declared(HEURISTICS.load(name)))
 
 
 def test_a_setting_that_a_task_asks_for_and_nothing_has_is_refused():

@@ -12,16 +12,15 @@ import pytest
 from flax import struct
 from scipy import stats
 
-from jaxlfi import plugins
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import dataset as datasets
-from jaxlfi.estimators import registry
-from jaxlfi.estimators.base import Estimator, Network, untrained
+from jaxlfi.estimators.base import Estimator, Network, converted, untrained
 from jaxlfi.estimators.posterior import MAP_DRAWS, Posterior
 from jaxlfi.estimators.training import fit
 from jaxlfi.fields import declared, option
 from jaxlfi.io.serialise import from_json, to_json
+from jaxlfi.registry import ESTIMATORS
 
 # --------------------------------------------------------------------------------- an estimator of another package
 
@@ -79,7 +78,7 @@ COMMON = {
     "learning_rate": 1e-2,
 }
 """Small settings; a family takes those that it has."""
-KINDS = {name: registry.load(name) for name in plugins.names(registry.GROUP)} | {"third party": OneFile}
+KINDS = {name: ESTIMATORS.load(name) for name in ESTIMATORS.names()} | {"third party": OneFile}
 SPACE = Space(("rate", "shift"), (True, False))
 PHI = Support([np.log(0.1), -4.0], [np.log(20.0), 4.0])
 BOX = Support([np.log(0.4), -1.5], [np.log(6.0), 1.0])
@@ -164,12 +163,13 @@ def test_ours_are_registered():
 
 
 def test_families_are_found_by_their_names_and_written_to_json(case):
-    name = registry.name_of(case.estimator)
+    name = ESTIMATORS.name_of(type(case.estimator))
     if isinstance(case.estimator, OneFile):
         assert name.endswith("test_estimators:OneFile")
         return
-    assert registry.load(name) is type(case.estimator)
-    assert from_json(to_json(case.estimator, registry.name_of), registry.load) == case.estimator
+    assert ESTIMATORS.load(name) is type(case.estimator)
+    described = to_json(case.estimator, lambda value: ESTIMATORS.name_of(type(value)))
+    assert from_json(described, ESTIMATORS.load) == case.estimator
 
 
 def test_conditioning_is_the_same_compiled_and_not(case):
@@ -286,16 +286,16 @@ def test_what_is_no_estimator_is_refused():
         ("no_such_module:Thing", "cannot load"),
     ):
         with pytest.raises(ValueError, match=f"^estimator: .*{message}") as error:
-            registry.load(wrong)
+            ESTIMATORS.load(wrong)
         assert "\n" not in str(error.value)
 
 
 def test_settings_that_families_share_are_kept_from_one_to_another():
     mdn, nsf = KINDS["mdn"](hidden=(9, 9), ensemble_size=3, prune=0.1), KINDS["nsf"]
-    other = registry.converted(mdn, nsf, {"bins": 7})
+    other = converted(mdn, nsf, {"bins": 7})
     assert type(other) is nsf and (other.hidden, other.ensemble_size, other.bins) == ((9, 9), 3, 7)
-    assert registry.converted(mdn, KINDS["mdn"], {"prune": 0.2}) == mdn.replace(prune=0.2)
+    assert converted(mdn, KINDS["mdn"], {"prune": 0.2}) == mdn.replace(prune=0.2)
     with pytest.raises(ValueError, match=r"^bins: expected a setting of MixtureNetwork"):
-        registry.converted(mdn, KINDS["mdn"], {"bins": 7})
+        converted(mdn, KINDS["mdn"], {"bins": 7})
     with pytest.raises(ValueError, match=r"^bins: expected a whole number in \[1, 999\], got 0"):
-        registry.converted(mdn, nsf, {"bins": 0})
+        converted(mdn, nsf, {"bins": 0})

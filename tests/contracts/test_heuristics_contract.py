@@ -15,13 +15,15 @@ from jaxlfi.distributions.belief import Belief, uninformed
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
 from jaxlfi.fields import declared
-from jaxlfi.heuristics import Adaptation, Choice, Heuristic, Matched, registry
+from jaxlfi.heuristics import Adaptation, Choice, Heuristic, Matched
+from jaxlfi.heuristics.hyperparameters import check
+from jaxlfi.registry import HEURISTICS
 from jaxlfi.runs import describe
 
 RULES = {
-    **{name: registry.load(name)() for name in registry.names()},
-    **{f"matched {name}": Matched(registry.load(name)()) for name in registry.names()},
-    "choice": Choice(1, tuple(registry.load(name)() for name in registry.names())),
+    **{name: HEURISTICS.load(name)() for name in HEURISTICS.names()},
+    **{f"matched {name}": Matched(HEURISTICS.load(name)()) for name in HEURISTICS.names()},
+    "choice": Choice(1, tuple(HEURISTICS.load(name)() for name in HEURISTICS.names())),
 }
 DIM, COMPONENTS, PROBLEMS = 3, 4, 3
 every_rule = pytest.mark.parametrize("name", RULES)
@@ -146,7 +148,7 @@ def test_another_value_is_the_same_program(name):
 def test_its_leaves_can_be_one_value_for_each_parameter(name):
     vector = lambda leaf: jnp.full(DIM, leaf, jnp.float32) if isinstance(leaf, float) else leaf
     rule = jax.tree.map(vector, RULES[name])
-    registry.check(rule, DIM)
+    check(rule, DIM)
     close(applied(rule, PROBLEM), applied(RULES[name], PROBLEM))
 
 
@@ -159,13 +161,13 @@ def test_it_is_written_and_read_back(name):
     close(applied(again, PROBLEM), applied(rule, PROBLEM))
 
 
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", HEURISTICS.names())
 def test_what_it_declares_is_documented_and_its_defaults_are_accepted(name):
-    kind = registry.load(name)
+    kind = HEURISTICS.load(name)
     assert issubclass(kind, Heuristic) and kind.__doc__
     for field in declared(kind).values():
         assert field.info.help and not field.info.help.endswith("."), field.name
         if isinstance(field.default, float):
             assert field.info.contains(field.default)
-    registry.check(kind(), DIM)
-    assert registry.name_of(kind()) == name
+    check(kind(), DIM)
+    assert HEURISTICS.name_of(kind) == name

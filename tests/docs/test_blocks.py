@@ -153,7 +153,7 @@ def test_every_command_is_understood(page):
 def parse(words: list[str]) -> None:
     """By the parser that the command itself uses."""
     if command := cli.foreign_command(words[0]):
-        sys.modules[command.__module__].parser().parse_args(words[1:])
+        command.parser().parse_args(words[1:])
     else:
         cli.parse(words)
 

@@ -108,11 +108,11 @@ def test_flags_of_the_settings_before():
     from experiments.ablation import CLIPPED
     from jaxlfi.cli.asked import build_settings
     from jaxlfi.cli.parser import parser
-    from jaxlfi.tasks import registry
+    from jaxlfi.registry import TASKS
 
     (flags,) = re.findall(r"CLIPPED`, on the command line `([^`]+)`", page("index"))
     arguments = parser().parse_args(["compare", "lotka_volterra", "--out", "x", *flags.split()])
-    found, expected = build_settings(arguments, registry.load("lotka_volterra")), CLIPPED.check()
+    found, expected = build_settings(arguments, TASKS.load("lotka_volterra")), CLIPPED.check()
     assert settings_to_json(found) == settings_to_json(expected)
     kept = json.loads((RESULTS / "ablation/clipped.json").read_text())["settings"]["estimator"]["hyperparameters"]
     now = settings_to_json(CLIPPED)["estimator"]["hyperparameters"]

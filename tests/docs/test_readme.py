@@ -2,7 +2,6 @@
 
 import re
 import shlex
-import sys
 import tomllib
 from pathlib import Path
 
@@ -33,7 +32,7 @@ def starting(*words: str) -> list[list[str]]:
 def parse(words: list[str]) -> None:
     """By the parser that the command itself uses."""
     if command := cli.foreign_command(words[0]):
-        sys.modules[command.__module__].parser().parse_args(words[1:])
+        command.parser().parse_args(words[1:])
     else:
         cli.parse(words)
 

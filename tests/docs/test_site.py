@@ -13,6 +13,7 @@ import jaxlfi
 from jaxlfi.bayessim.record import ledger_line, record
 from jaxlfi.fields import declared
 from jaxlfi.heuristics import Edge, Mode, Truncate
+from jaxlfi.io import provenance
 from jaxlfi.runs import folder
 
 ROOT = Path(__file__).parents[2]
@@ -129,7 +130,7 @@ def test_every_array_of_a_round_is_described():
 
 
 def test_every_key_of_a_configuration_is_described():
-    assert keys_of_return(folder.run_config) | keys_of_return(folder.environment) <= described("config.json")
+    assert keys_of_return(folder.run_config) | keys_of_return(provenance.environment) <= described("config.json")
 
 
 def test_every_array_of_a_written_run_is_described():

@@ -6,11 +6,11 @@ import numpy as np
 from experiments.embedding import candidate, table
 from experiments.widths import DRAWS, judged
 from jaxlfi.io import files as atomic
-from jaxlfi.tasks import registry
+from jaxlfi.registry import TASKS
 
 
 def test_candidates_see_the_summaries_or_the_trajectory():
-    task = registry.load("lotka_volterra")
+    task = TASKS.load("lotka_volterra")
     for name, size, embedding in (("summaries", 9, "none"), ("raw", 302, "none"), ("series", 302, "series")):
         observed, settings = candidate(name, task)
         assert jax.eval_shape(observed.summary, jax.ShapeDtypeStruct((151, 2), np.float32)).shape == (size,)

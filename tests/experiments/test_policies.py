@@ -23,7 +23,7 @@ from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
 from jaxlfi.envs.whip.vision.camera import project, side_camera
 from jaxlfi.envs.whip.vision.keypoints import along
-from jaxlfi.io import files, serialise
+from jaxlfi.io import files, formats, serialise
 from jaxlfi.rl import training
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.evaluation import evaluate
@@ -138,7 +138,7 @@ def test_domains_are_named_as_the_command_line_does(tmp_path):
 
 
 CONFIG = {
-    "format": training.FORMAT, "version": training.VERSION, "environment_name": "whip", "environment": {},
+    "format": formats.TRAINING, "version": 1, "environment_name": "whip", "environment": {},
     "versions": {},
 }  # fmt: skip
 """Of a training, but for its settings and trainings."""

@@ -91,7 +91,7 @@ def _recording(path: Path) -> None:
 def _weights(path: Path) -> None:
     from jaxlfi.envs.whip.vision import weights
     from jaxlfi.envs.whip.vision.segmenter import Segmenter
-    from jaxlfi.runs.folder import environment
+    from jaxlfi.io.provenance import environment
 
     network = Segmenter((8, 8, 8))
     weights.save(path, weights.Weights(network, weights.initial(network, jax.random.key(0)), environment()))

@@ -7,7 +7,7 @@ import pytest
 
 from jaxlfi.cli.exit_status import one_line, resuming
 from jaxlfi.io.shell import quoted
-from jaxlfi.runs.folder import StoreError, refuse_occupied
+from jaxlfi.io.workfolder import StoreError, refuse_occupied
 
 NAMES = ["plain", "my rope", "a,b;c=d", "größe", "don't", "$(touch x)", "two  spaces", "-n", "a*", "new\nline"]
 

@@ -23,10 +23,10 @@ from jaxlfi.cli import evaluate as evaluating
 from jaxlfi.cli import train as command
 from jaxlfi.distributions.support import Support
 from jaxlfi.io import files
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.rl import domains, training
 from jaxlfi.rl.evaluation import cross_evaluate
 from jaxlfi.rl.policy import Policy, load
-from jaxlfi.runs.folder import StoreError
 from jaxlfi.tasks.task import Task
 
 LINE = Line()

@@ -8,7 +8,8 @@ import pytest
 import jaxlfi
 from jaxlfi.cli import commands
 from jaxlfi.envs.gaussian_linear import posterior
-from jaxlfi.tasks import registry, summaries
+from jaxlfi.registry import TASKS
+from jaxlfi.tasks import summaries
 from jaxlfi.tasks.trials import repeated
 from tests.small import command, gaussian, settings, whole_runs  # noqa: F401
 
@@ -112,7 +113,7 @@ def test_all_trials_summaries_lie_one_after_another(key):
     np.testing.assert_array_equal(both.summary(jnp.asarray(trials.reshape(27, 2))), trials[:, -1].ravel())
     assert both.named_summaries(6)[1:3] == ("b of trial 1", "a of trial 2")
     assert both.settings == {"embedding": "trials"} and both == repeated(task, 3, "all") != repeated(task, 3)
-    assert registry.load("gaussian_linear,trials=3,pooling=all") == repeated(registry.load("gaussian_linear"), 3, "all")
+    assert TASKS.load("gaussian_linear,trials=3,pooling=all") == repeated(TASKS.load("gaussian_linear"), 3, "all")
 
 
 @pytest.mark.slow

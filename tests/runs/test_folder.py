@@ -12,6 +12,7 @@ from jaxlfi.bayessim.presets import PRESETS
 from jaxlfi.envs import lotka_volterra, lynx_hare, mg1
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Matched, Mode
 from jaxlfi.io import files as atomic
+from jaxlfi.io import provenance, workfolder
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.describe import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json
 from jaxlfi.tasks.observation import observe
@@ -220,22 +221,22 @@ def test_python_objects_are_never_written(tmp_path):
 def test_foreign_folders_are_refused(tmp_path, content):
     if content is not None:
         (tmp_path / "config.json").write_text(content)
-    with pytest.raises(folders.StoreError, match="expected"):
+    with pytest.raises(workfolder.StoreError, match="expected"):
         folders.read_config(tmp_path)
 
 
 def test_a_grid_is_named_where_a_run_is_expected(tmp_path):
     (tmp_path / "config.json").write_text('{"format": "jaxlfi-grid", "version": 2}')
-    with pytest.raises(folders.StoreError, match=r"expected a run folder, got .* is of format 'jaxlfi-grid'"):
+    with pytest.raises(workfolder.StoreError, match=r"expected a run folder, got .* is of format 'jaxlfi-grid'"):
         folders.read_config(tmp_path)
 
 
 def test_occupied_folders_are_refused_and_empty_ones_taken(tmp_path):
-    folders.create(tmp_path / "new", {"a": 1}, lambda folder: None)
+    workfolder.create(tmp_path / "new", {"a": 1}, lambda folder: None)
     (tmp_path / "empty").mkdir()
-    folders.create(tmp_path / "empty", {"a": 1}, lambda folder: None)
-    with pytest.raises(folders.StoreError, match="resume"):
-        folders.create(tmp_path / "new", {"a": 2}, lambda folder: None)
+    workfolder.create(tmp_path / "empty", {"a": 1}, lambda folder: None)
+    with pytest.raises(workfolder.StoreError, match="resume"):
+        workfolder.create(tmp_path / "new", {"a": 2}, lambda folder: None)
     assert json.loads((tmp_path / "new" / "config.json").read_text()) == {"a": 1}
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "new"]
 
@@ -243,12 +244,12 @@ def test_occupied_folders_are_refused_and_empty_ones_taken(tmp_path):
 def test_a_link_to_an_empty_folder_is_that_folder_and_the_current_one_is_refused(tmp_path, monkeypatch):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
-    folders.create(tmp_path / "link", {"a": 1}, lambda folder: None)
+    workfolder.create(tmp_path / "link", {"a": 1}, lambda folder: None)
     assert (tmp_path / "link").is_symlink() and json.loads((tmp_path / "real" / "config.json").read_text()) == {"a": 1}
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    with pytest.raises(folders.StoreError, match=r"expected a new or empty folder, got '\.', the current one"):
-        folders.create(Path("."), {"a": 1}, lambda folder: None)
+    with pytest.raises(workfolder.StoreError, match=r"expected a new or empty folder, got '\.', the current one"):
+        workfolder.create(Path("."), {"a": 1}, lambda folder: None)
 
 
 # ---------------------------------------------------------------------------------------------------- provenance
@@ -258,8 +259,8 @@ def test_a_command_is_recorded_without_the_machines_folders(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     below, elsewhere = tmp_path / "runs" / "a b", tmp_path.parent / "other" / "table.csv"
     argv = ["/usr/bin/jaxlfi", "infer", "task", "--out", str(below), f"--observation={elsewhere}", "--vary", "tau=0.1"]
-    assert folders.command_line(argv) == "jaxlfi infer task --out 'runs/a b' --observation=table.csv --vary tau=0.1"
-    assert folders.command_line(["jaxlfi", "grid", "runs/x", "--tail", "-1"]) == "jaxlfi grid runs/x --tail -1"
+    assert provenance.command_line(argv) == "jaxlfi infer task --out 'runs/a b' --observation=table.csv --vary tau=0.1"
+    assert provenance.command_line(["jaxlfi", "grid", "runs/x", "--tail", "-1"]) == "jaxlfi grid runs/x --tail -1"
 
 
 def test_kept_results_name_no_folder_of_a_machine():

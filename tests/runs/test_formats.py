@@ -10,11 +10,9 @@ import pytest
 import jaxlfi
 from jaxlfi import figures
 from jaxlfi.figures import checks, style
-from jaxlfi.io import files
+from jaxlfi.io import files, formats, workfolder
 from jaxlfi.io.formats import require_version, written_by
 from jaxlfi.rl import policy
-from jaxlfi.runs import folder as run_store
-from jaxlfi.studies import grid
 from jaxlfi.studies.calibration.folder import read_plan
 from tests.small import command, whole_runs  # noqa: F401 - a fixture
 
@@ -26,12 +24,12 @@ name_of = lambda path: str(path.relative_to(FORMATS[0].parent))
 
 def read_now(path: Path) -> bool:
     """Whether a folder is of the version that is written."""
-    return files.read_json(path / "config.json")["version"] == run_store.VERSION
+    return files.read_json(path / "config.json")["version"] == formats.VERSION
 
 
 def loads(path: Path) -> bool:
     """Whether a finished run is of a version that is read."""
-    return read_now(path) or files.read_json(path / "config.json")["version"] in run_store.READ
+    return read_now(path) or files.read_json(path / "config.json")["version"] in formats.READ
 
 
 @pytest.fixture(autouse=True)
@@ -78,7 +76,7 @@ def test_studies_are_read(folder, tmp_path):
             shutil.copytree(folder / name, tmp_path / name)
             assert command("report", tmp_path / name) == 0 and command("resume", tmp_path / name) == 0
     if read_now(folder / "grid"):
-        assert grid.read_config(folder / "grid")["status"] == "finished"
+        assert workfolder.read(folder / "grid", formats.GRID)["status"] == "finished"
         assert read_plan(folder / "flow" / "diagnostics" / "plan.json")["draws"] == 20
         shutil.copytree(folder / "flow" / "diagnostics", tmp_path / "diagnostics")
         assert len(checks.report(tmp_path / "diagnostics")) == 6

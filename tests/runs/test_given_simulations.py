@@ -12,7 +12,8 @@ import jaxlfi
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.gaussian_linear import MIXING, NOISE, posterior
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import StoreError, read_ledger
+from jaxlfi.io.workfolder import StoreError
+from jaxlfi.runs.folder import read_ledger
 from jaxlfi.runs.load import load
 from jaxlfi.studies.calibration import read_run
 from jaxlfi.tasks.host import HostSimulator

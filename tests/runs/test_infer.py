@@ -15,7 +15,8 @@ from jaxlfi.bayessim import programs
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Choice, Edge, Fixed, Truncate
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import StoreError, as_json, read_ledger, run_config
+from jaxlfi.io.workfolder import StoreError, as_json
+from jaxlfi.runs.folder import read_ledger, run_config
 from jaxlfi.runs.load import load
 from jaxlfi.tasks.host import SimulatorError
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture

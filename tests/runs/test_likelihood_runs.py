@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi.runs.folder import StoreError
+from jaxlfi.io.workfolder import StoreError
 from tests.small import gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 pytestmark = pytest.mark.slow

@@ -14,8 +14,8 @@ import pytest
 import jaxlfi
 from jaxlfi.heuristics import Choice, Edge, Fixed, Matched, Mode
 from jaxlfi.io import files as atomic
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.load import load
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 

@@ -26,11 +26,10 @@ from jaxlfi.figures.collection import Collection
 from jaxlfi.figures.history import History
 from jaxlfi.heuristics import Edge, Fixed
 from jaxlfi.io import files as atomic
-from jaxlfi.io import trees
+from jaxlfi.io import formats, trees, workfolder
 from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.run import Origin
 from jaxlfi.studies import calibration as study
-from jaxlfi.studies import grid
 from jaxlfi.studies.calibration import CalibrationPlan, plan
 from jaxlfi.tasks.host import SimulatorError
 from tests.small import SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
@@ -65,7 +64,7 @@ def make(out, support: str, heuristic, rounds: int, scale: float = 1.0, shift: f
         wrong = identity(2, network.normaliser.name).replace(**moments)
         atomic.write_arrays(beside / "network.npz", trees.to_arrays(network.replace(normaliser=wrong)))
 
-    run_store.create(out, config, fill)
+    workfolder.create(out, config, fill)
     return out
 
 
@@ -367,9 +366,9 @@ def test_folders_that_cannot_be_diagnosed(kind, folder, tmp_path, capsys):
     changes, expected = {
         "foreign": ({"format": "other"}, "not of jaxlfi"),
         "unfinished": ({"status": "running"}, "expected a finished run"),
-        "runs": ({"format": run_store.RUNS, "runs": [{"folder": "seed_003"}]}, "one/seed_003"),
-        "compare": ({"format": run_store.COMPARE, "runs": [{"folder": "ok/seed_000"}]}, "one/ok/seed_000"),
-        "grid": ({"format": grid.GRID}, "got a grid's"),
+        "runs": ({"format": formats.RUNS, "runs": [{"folder": "seed_003"}]}, "one/seed_003"),
+        "compare": ({"format": formats.COMPARE, "runs": [{"folder": "ok/seed_000"}]}, "one/ok/seed_000"),
+        "grid": ({"format": formats.GRID}, "got a grid's"),
         "changed": ({"parameters": ["other", "second"]}, "expected the task as it was when the run was made"),
         "older": ({"version": 1}, "expected jaxlfi-run of version 4, got version 1, which jaxlfi"),
         "made in Python": ({"task": None}, "--task module:factory names it"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import StoreError
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.studies.chunk_store import ChunkStore
 
 NAMES = ("place", "square")

@@ -23,7 +23,7 @@ from jaxlfi.diagnostics import POSTERIOR_SAMPLES, discrepancy
 from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Centre, Edge, Matched, Mode
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import StoreError
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.studies import grid as study
 from jaxlfi.studies.grid import Axis, Grid, chunks
 from jaxlfi.studies.grid import folder as store

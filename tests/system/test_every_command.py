@@ -24,10 +24,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxlfi import plugins
 from jaxlfi.cli import parser as cli
 from jaxlfi.figures import style
 from jaxlfi.io import files
+from jaxlfi.registry import COMMANDS
 from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401 - a fixture
 
 SMALL = " ".join(flag for flag in FLAGS if flag != "--no-figures")
@@ -252,7 +252,7 @@ def commands() -> set[str]:
         return [name for action in subparsers for name in action.choices]
 
     found = set(names(cli.parser()))
-    for name, (point,) in plugins.points(cli.COMMANDS).items():
+    for name, (point,) in COMMANDS.points().items():
         if below := names(importlib.import_module(point.module).parser()):
             found = found - {name} | {f"{name} {one}" for one in below}
     return found

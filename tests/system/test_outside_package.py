@@ -1,4 +1,4 @@
-"""A package of three files adds a heuristic, an estimator and a task, and every command takes them; none of ours knows.
+"""A package of four files adds a heuristic, an estimator, a task and a command; ours take them, and none knows them.
 
 It is installed into an environment of its own, as pip would install a wheel of it: the files, and a dist-info folder
 with the entry points of its pyproject.toml. (The environment borrows the packages of the running one by a .pth file, so
@@ -42,6 +42,9 @@ PYPROJECT = """
 
     [project.entry-points."jaxlfi.tasks"]
     line = "outside.problem:task"
+
+    [project.entry-points."jaxlfi.commands"]
+    slope = "outside.tool:slope"
 """
 RULE = '''
     """A support that widens wherever the posterior's mean is near a bound."""
@@ -138,6 +141,28 @@ PROBLEM = '''
             log=("slope",),
         )
 '''
+TOOL = '''
+    """What a run says of the line's slope."""
+
+    from pathlib import Path
+
+    from jaxlfi.cli.command import Command
+
+
+    def arguments(parser):
+        """Its only argument."""
+        parser.add_argument("folder", type=Path, metavar="DIR", help="the folder of a run")
+
+
+    def run(arguments):
+        """Print the mean."""
+        import jaxlfi
+
+        print("slope", float(jaxlfi.load(arguments.folder).draws()[:, 1].mean()))
+
+
+    slope = Command("slope", "say how steep a line is", arguments, run, epilog="It reads a folder.")
+'''
 SESSION = """
     import contextlib, io, json, sys
 
@@ -160,10 +185,10 @@ TINY = (
 
 
 def write_package(folder: Path) -> None:
-    """The three files and pyproject.toml, as its author has them."""
+    """The four files and pyproject.toml, as its author has them."""
     (folder / "outside").mkdir(parents=True)
     (folder / "pyproject.toml").write_text(textwrap.dedent(PYPROJECT))
-    for name, text in {"rule": RULE, "network": NETWORK, "problem": PROBLEM}.items():
+    for name, text in {"rule": RULE, "network": NETWORK, "problem": PROBLEM, "tool": TOOL}.items():
         (folder / "outside" / f"{name}.py").write_text(textwrap.dedent(text).lstrip())
 
 
@@ -293,14 +318,16 @@ def test_the_package_is_found_in_its_environment_only(environment):
     assert subprocess.run([sys.executable, "-c", "import outside"], capture_output=True, check=False).returncode != 0
 
 
-def test_help_lists_its_flags_without_importing_it(environment):
+def test_help_lists_its_flags_where_it_is_named_and_does_not_import_it_before(environment):
     script = (
         "import atexit, sys; import jaxlfi.cli.parser as cli; "
         "atexit.register(lambda: print([name for name in ('jax', 'numpy', 'outside') if name in sys.modules])); "
         "cli.main(['infer', '--help'])"
     )
     output = " ".join(environment.run("-c", script).split())
-    assert output.endswith("[]")
+    assert output.endswith("[]") and "truncate, widen, or your own" in output
+    named = environment.run("-m", "jaxlfi", "infer", "--heuristic", "widen", "--estimator", "independent", "--help")
+    output = " ".join(named.split())
     assert "--gain X [X ...] widen: how far a bound moves (kappa; [0, 2]; default: 0.5)" in output
     assert "--units N units of the hidden layer" in output
     assert "line" in environment.jaxlfi("tasks", "line,points=7")
@@ -330,6 +357,17 @@ def test_load_gives_the_run_back(environment, inferred):
     *described, mean = json.loads(environment.script(script))
     assert described == ["Widen", "IndependentNetwork", 4, "line seen at 3 places", 3, True]
     np.testing.assert_allclose(mean, [0.5, 0.7], atol=0.6)
+
+
+def test_its_command_is_one_of_ours(environment, inferred):
+    name, slope = environment.jaxlfi("slope", inferred).split()
+    assert name == "slope" and 0.1 < float(slope) < 10
+    assert "slope     commands of its own: jaxlfi slope --help" in environment.run("-m", "jaxlfi", "--help")
+    assert "the folder of a run" in environment.run("-m", "jaxlfi", "slope", "--help")
+    process = environment.start("-m", "jaxlfi", "slope", "nowhere")
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 2
+    assert errors == "jaxlfi slope: error: expected a run folder, got 'nowhere' which is no folder\n"
 
 
 def test_compare_runs_it_beside_ours(environment, compared):

@@ -13,7 +13,7 @@ import jaxlfi
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.space import Space
 from jaxlfi.estimators.posterior import truncated
-from jaxlfi.heuristics import registry as heuristics
+from jaxlfi.heuristics import hyperparameters as heuristics
 from jaxlfi.runs import infer as inferring
 from tests.small import SETTINGS, gaussian
 

@@ -8,9 +8,8 @@ from typing import Literal
 import pytest
 
 from jaxlfi.envs import gaussian_linear
-from jaxlfi.factories import convert, parse
-from jaxlfi.tasks import registry
-from jaxlfi.tasks.registry import load
+from jaxlfi.references import convert, parse
+from jaxlfi.registry import TASKS
 
 
 @pytest.fixture
@@ -44,12 +43,12 @@ def here(monkeypatch):
 
 
 def test_registered_tasks_are_found():
-    assert {"gaussian_linear", "lotka_volterra", "lotka_volterra_ode", "mg1"} <= set(registry.names())
-    assert load("gaussian_linear") == gaussian_linear.task()
+    assert {"gaussian_linear", "lotka_volterra", "lotka_volterra_ode", "mg1"} <= set(TASKS.names())
+    assert TASKS.load("gaussian_linear") == gaussian_linear.task()
 
 
 def test_options_have_the_types_of_the_signature(here):
-    load("made_up_tasks:factory,steps=5,duration=20,clean=yes,kind=stiff,path=a/b,label=7,anything=8")
+    TASKS.load("made_up_tasks:factory,steps=5,duration=20,clean=yes,kind=stiff,path=a/b,label=7,anything=8")
     assert here.seen == {
         "steps": 5, "duration": 20.0, "clean": True, "kind": "stiff", "path": Path("a/b"), "label": "7",
         "anything": "8",
@@ -58,17 +57,17 @@ def test_options_have_the_types_of_the_signature(here):
 
 
 def test_annotations_that_are_text_are_understood(here):
-    load("made_up_tasks:late,size=4,ratio=2")
+    TASKS.load("made_up_tasks:late,size=4,ratio=2")
     assert here.seen == {"size": 4, "ratio": 2.0}
 
 
 def test_factories_of_any_keywords_get_text(here):
-    load("made_up_tasks:keywords,colour=red,n=3")
+    TASKS.load("made_up_tasks:keywords,colour=red,n=3")
     assert here.seen == {"colour": "red", "n": "3"}
 
 
 def test_a_task_of_ours_takes_its_options():
-    task = load("lotka_volterra_ode,duration=20")
+    task = TASKS.load("lotka_volterra_ode,duration=20")
     assert task.name == "lotka_volterra_ode" and float(task.times[-1]) == pytest.approx(20.0)
 
 
@@ -98,12 +97,12 @@ def test_a_task_of_ours_takes_its_options():
 )
 def test_wrong_references_are_reported_in_one_line(here, reference, message):
     with pytest.raises(ValueError, match=f"^task: .*{message}") as error:
-        load(reference)
+        TASKS.load(reference)
     assert "\n" not in str(error.value)
 
 
 def test_a_task_itself_can_be_named(here):
-    assert load("made_up_tasks:ready") is here.ready
+    assert TASKS.load("made_up_tasks:ready") is here.ready
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 import jaxlfi
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.gaussian_linear import posterior
-from jaxlfi.tasks import registry
+from jaxlfi.registry import TASKS
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.observation import read_for, simulator_shapes, trials_of
 from jaxlfi.tasks.simulation import simulate_batch, trajectory_and_outcome
@@ -96,8 +96,11 @@ def test_a_host_simulator_makes_all_trials_in_one_call():
             lambda: repeated(gaussian(), 2, "median"),
             r"pooling: expected one of \['all', 'mean', 'moments'\], got 'median'",
         ),
-        (lambda: registry.load(f"{TASK},trials=two"), "trials: expected a value of type int, got 'two'"),
-        (lambda: together([np.zeros((3, 2)), np.zeros((3, 1))]), r"observation: expected trials of one shape .*\[3, 1\], \[3, 2\]"),
+        (lambda: TASKS.load(f"{TASK},trials=two"), "trials: expected a value of type int, got 'two'"),
+        (
+            lambda: together([np.zeros((3, 2)), np.zeros((3, 1))]),
+            r"observation: expected trials of one shape .*\[3, 1\], \[3, 2\]",
+        ),
     ],
 )
 def test_what_is_refused(call, said):
@@ -147,5 +150,5 @@ def test_the_command_line_takes_several_files_and_the_run_is_loaded_again(tmp_pa
     assert command("infer", "gaussian_linear", "--observation", *files, *flags, "--out", out) == 0
     run = jaxlfi.load(out)
     np.testing.assert_allclose(run.observed, [0.5, -0.5, 1.5, -0.5])
-    assert run.task == repeated(registry.load("gaussian_linear"), 2)
+    assert run.task == repeated(TASKS.load("gaussian_linear"), 2)
     assert command("infer", f"{TASK},trials=3", "--observation", *files, *flags, "--out", tmp_path / "other") == 2

@@ -27,7 +27,7 @@ from jaxlfi.envs.whip.vision.options import FORMATS
 from jaxlfi.envs.whip.vision.photographer import Photographer
 from jaxlfi.envs.whip.vision.renderers import RENDERERS
 from jaxlfi.io import files
-from jaxlfi.runs.folder import environment
+from jaxlfi.io.provenance import environment
 
 HELD_OUT_PICTURES, HELD_OUT_ROLLOUTS = 200, 100
 """What trained networks are judged by: pictures and rollouts of other seeds."""

@@ -14,9 +14,11 @@ from rich.console import Console
 
 from jaxlfi import diagnostics
 from jaxlfi.io import files as atomic
+from jaxlfi.io import formats, provenance, workfolder
+from jaxlfi.io.formats import DIAGNOSTICS, PLAN
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as run_store
-from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.run import Run
 from jaxlfi.studies.calibration.checks import Check, against, calibration, predictive
 from jaxlfi.studies.calibration.plan import CalibrationPlan
@@ -24,8 +26,6 @@ from jaxlfi.studies.calibration.repeat import chunk_length, posteriors, read_arr
 from jaxlfi.studies.calibration.truths import draw_truths
 from jaxlfi.studies.calibration.widths import Widths, arrays_of, measured
 from jaxlfi.tasks.host import SimulatorError
-
-FORMAT, VERSION = "jaxlfi-diagnostics", run_store.VERSION
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,9 +50,9 @@ def begin(out: Path, run: Run, plans: Sequence[CalibrationPlan]) -> dict[str, An
     Raises:
         StoreError: where the folder holds something else, or diagnostics that were asked for differently.
     """
-    wanted = run_store.as_json(description(run, plans))
-    path = out / "plan.json"
-    if path.exists():
+    wanted = workfolder.as_json(description(run, plans))
+    path = out / PLAN
+    if workfolder.begun(out, PLAN):
         found = read_plan(path)
         changed = [name for name in wanted if found.get(name) != wanted[name]]
         if changed:
@@ -61,10 +61,6 @@ def begin(out: Path, run: Run, plans: Sequence[CalibrationPlan]) -> dict[str, An
                 f"{', '.join(changed)}: take another folder by --out, or remove that one"
             )
         return found
-    # A kill while plan.json is written leaves plan.json.part.
-    if out.exists() and (not out.is_dir() or any(path.suffix != ".part" for path in out.iterdir())):
-        raise StoreError(f"out: expected a new or empty folder, got {str(out)!r} which holds something")
-    out.mkdir(parents=True, exist_ok=True)
     found = wanted | {"chunk_length": chunk_length(run, plans[0]), "devices": jax.local_device_count()}
     atomic.write_json(path, found)
     return found
@@ -80,9 +76,9 @@ def read_plan(path: Path) -> dict[str, Any]:
         found = atomic.read_json(path)
     except ValueError as error:
         raise StoreError(f"{path}: expected a plan, got a damaged one: {error}") from error
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise StoreError(f"{path}: expected format {FORMAT!r}, got another")
-    run_store.check_version(path, found)
+    if not isinstance(found, dict) or found.get("format") != DIAGNOSTICS:
+        raise StoreError(f"{path}: expected format {DIAGNOSTICS!r}, got another")
+    workfolder.require_format(path, found)
     return found
 
 
@@ -94,8 +90,8 @@ def description(run: Run, plans: Sequence[CalibrationPlan]) -> dict[str, Any]:
     shared = ("task", "names", "units", "configuration", "support", "heuristic", "settings", "seed")
     plan = plans[0]
     return {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": DIAGNOSTICS,
+        "version": formats.VERSION,
         "run": {name: config[name] for name in shared} | {"arrays": hashlib.sha256(content).hexdigest()[:32]},
         "references": [_reference(run, plan) for plan in plans],
         "truths": plan.truths,
@@ -130,7 +126,7 @@ def diagnose(
         StoreError: for a folder that holds something else.
         SimulatorError: for a simulator that breaks its contract or fails always; a folder that is new is removed again.
     """
-    new = not (out / "plan.json").exists()
+    new = not (out / PLAN).exists()
     found = begin(out, run, plans)
     try:
         truths = [_truths(out / plan.folder / "truths.npz", run, plan) for plan in plans]
@@ -172,7 +168,7 @@ def diagnose(
             "significance": diagnostics.SIGNIFICANCE,
             "checks": [dataclasses.asdict(check) for check in lines],
         }
-        | run_store.environment(),
+        | provenance.environment(),
     )
     return Diagnosis(tuple(widths), tuple(lines))
 

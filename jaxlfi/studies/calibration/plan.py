@@ -5,12 +5,12 @@ from pathlib import Path
 
 import jax
 
-from jaxlfi.heuristics import registry
-from jaxlfi.runs.folder import StoreError
+from jaxlfi.heuristics.hyperparameters import check
+from jaxlfi.io import formats
+from jaxlfi.io.workfolder import StoreError
+from jaxlfi.registry import TASKS
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Run
-from jaxlfi.studies import grid
-from jaxlfi.tasks import registry as registry_of_tasks
 from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.task import Task
 
@@ -112,12 +112,12 @@ def read_run(folder: Path, task: Task | None = None) -> Run:
         ValueError: for a folder that holds no finished run of one seed, a run of several rounds that began with given
             simulations, a task that cannot be found or has changed, or a heuristic that is not installed.
     """
-    if grid.is_grid(folder):
+    if formats.recorded(folder).get("format") == formats.GRID:
         raise StoreError(f"{folder}: expected the folder of one run, got a grid's, which keeps no posteriors")
     run = load(folder, task)
     if run.task is None and run.origin.reference is not None:
         try:
-            registry_of_tasks.load(run.origin.reference)
+            TASKS.load(run.origin.reference)
         except ValueError as error:
             raise StoreError(
                 f"{folder}: expected its task {run.origin.reference!r}, which cannot be loaded from here (--task names "
@@ -139,5 +139,5 @@ def read_run(folder: Path, task: Task | None = None) -> Run:
             f"{folder}: expected the task as it was when the run was made, with {run.x.shape[0]} summaries, "
             f"got {simulator_shapes(run.task).summary}"
         )
-    registry.check(run.heuristic, run.task.dim)
+    check(run.heuristic, run.task.dim)
     return run

@@ -19,7 +19,7 @@ from jaxlfi.distributions.precision import single
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.io import files as atomic
 from jaxlfi.io.progress import RoundProgress
-from jaxlfi.runs.folder import StoreError
+from jaxlfi.io.workfolder import StoreError
 from jaxlfi.runs.run import Run
 from jaxlfi.studies.calibration.plan import DRAWS, RUNS, CalibrationPlan
 from jaxlfi.studies.chunk_store import ChunkStore

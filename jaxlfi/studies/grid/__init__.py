@@ -6,11 +6,10 @@ serves them all.
 """
 
 from jaxlfi.studies.grid.chunks import MEASURES, Work, arranged, measure, prepare, run_chunk
-from jaxlfi.studies.grid.folder import GRID, advance, begin, create, is_grid, read_config, reopen
+from jaxlfi.studies.grid.folder import advance, begin, create, reopen
 from jaxlfi.studies.grid.grid import Axis, Grid, combinations, grid_runs, heuristics, parse_axes
 
 __all__ = [
-    "GRID",
     "MEASURES",
     "Axis",
     "Grid",
@@ -22,11 +21,9 @@ __all__ = [
     "create",
     "grid_runs",
     "heuristics",
-    "is_grid",
     "measure",
     "parse_axes",
     "prepare",
-    "read_config",
     "reopen",
     "run_chunk",
 ]

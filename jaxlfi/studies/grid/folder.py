@@ -25,20 +25,18 @@ from rich.console import Console
 
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.io import files as atomic
-from jaxlfi.io import serialise
+from jaxlfi.io import provenance, serialise, workfolder
+from jaxlfi.io.formats import GRID
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.io.progress import RoundProgress
+from jaxlfi.io.workfolder import StoreError
+from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as run_store
-from jaxlfi.runs.folder import StoreError
 from jaxlfi.runs.run import Origin
 from jaxlfi.studies.chunk_store import ChunkStore
 from jaxlfi.studies.grid.chunks import MEASURES, Work, arranged, prepare, run_chunk
 from jaxlfi.studies.grid.grid import Axis, Grid, combinations, hyperparameters, observations
-from jaxlfi.tasks import registry as tasks
-
-GRID = "jaxlfi-grid"
-"""The format of a grid's folder."""
 
 
 def description(work: Work) -> dict[str, Any]:
@@ -76,7 +74,7 @@ def description(work: Work) -> dict[str, Any]:
 
 def fingerprint(work: Work) -> str:
     """A hash of the description: chunks that bear another belong to another grid."""
-    return _digest(json.dumps(run_store.as_json(description(work)), sort_keys=True).encode())
+    return _digest(json.dumps(workfolder.as_json(description(work)), sort_keys=True).encode())
 
 
 def _digest(*parts) -> str:
@@ -106,7 +104,7 @@ def begin(
         ValueError: for anything that does not fit.
     """
     if processes.writes:
-        run_store.refuse_occupied(folder)
+        workfolder.refuse_occupied(folder)
         work = prepare(grid, observation, runs_per_chunk, processes)
         create(folder, work, processes)
     else:
@@ -121,10 +119,10 @@ def create(folder: Path, work: Work, processes: Processes = ALONE) -> None:
     def fill(staging: Path) -> None:
         atomic.write_arrays(staging / "observation.npz", {"trajectory": work.observed, "x": work.x}, durable=True)
 
-    run_store.create(
+    workfolder.create(
         folder,
         description(work)
-        | run_store.environment()
+        | provenance.environment()
         | {
             "status": "running",
             "devices": jax.local_device_count() * processes.count,
@@ -136,38 +134,16 @@ def create(folder: Path, work: Work, processes: Processes = ALONE) -> None:
     )
 
 
-def is_grid(folder: Path) -> bool:
-    """Whether a folder says that it is a grid's; whether it is sound is checked later."""
-    try:
-        config = atomic.read_json(folder / "config.json")
-    except ValueError:
-        return False
-    return isinstance(config, dict) and config.get("format") == GRID
-
-
-def read_config(folder: Path) -> dict[str, Any]:
-    """The config.json of a grid.
-
-    Raises:
-        StoreError: if it is missing, damaged or of another version.
-    """
-    if not is_grid(folder):
-        raise StoreError(f"expected the folder of a grid, got {str(folder)!r} whose config.json is not one's")
-    config = atomic.read_json(folder / "config.json")
-    run_store.check_version(folder / "config.json", config)
-    return config
-
-
 def reopen(folder: Path) -> Work:
     """The work of a folder, finished or not; not compiled.
 
     Raises:
         StoreError: for a folder that is damaged or whose configuration or task has changed since it was begun.
     """
-    config = read_config(folder)
+    config = workfolder.read(folder, GRID)
     try:
         grid = Grid(
-            task=tasks.load(config["task"]),
+            task=TASKS.load(config["task"]),
             support=describe.support_from_json(config["support"]),
             rule=describe.heuristic_from_json(config["heuristic"]),
             axes=tuple(Axis(axis["name"], tuple(axis["values"])) for axis in config["axes"]),
@@ -179,7 +155,7 @@ def reopen(folder: Path) -> Work:
         )
         start = atomic.read_arrays(folder / "observation.npz")
         work = Work(grid, start["trajectory"], start["x"], config["runs_per_chunk"])
-        now = run_store.as_json(description(work))
+        now = workfolder.as_json(description(work))
         same = fingerprint(work) == config["fingerprint"] and all(config.get(name) == now[name] for name in now)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise StoreError(f"{folder}: expected a complete description of a grid, got: {error}") from error
@@ -230,8 +206,7 @@ def finish(folder: Path, grid: Grid, arrays: Mapping[str, np.ndarray], seconds: 
     """Write the results, and then that the grid is complete."""
     atomic.write_arrays(folder / "grid.npz", arrays, durable=True)
     atomic.write_bytes(folder / "table.csv", table(grid, arrays).encode(), durable=True)
-    config = read_config(folder)
-    atomic.write_json(folder / "config.json", config | {"status": "finished", "seconds": round(seconds, 3)})
+    workfolder.finish(folder, seconds=round(seconds, 3))
 
 
 def table(grid: Grid, arrays: Mapping[str, np.ndarray]) -> str:

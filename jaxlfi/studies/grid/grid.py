@@ -13,7 +13,8 @@ from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.support import Support
-from jaxlfi.heuristics import Heuristic, registry
+from jaxlfi.heuristics import Heuristic
+from jaxlfi.heuristics.hyperparameters import all_declared, check, replaced
 from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.task import Task
 
@@ -37,7 +38,7 @@ class Grid:
         axes: hyperparameters and their values.
         seeds: of the runs; each has one observation in all combinations.
         settings: the same for all runs.
-        reference: by which the task was found (`jaxlfi.tasks.registry.load`).
+        reference: by which the task was found (`jaxlfi.registry.TASKS`).
         preset: the settings were made from.
         support_name: the support's name, or "own".
 
@@ -62,7 +63,7 @@ class Grid:
 
     def __post_init__(self):
         check_axes(self.rule, self.axes)
-        registry.check(self.rule, self.task.dim)
+        check(self.rule, self.task.dim)
         self.settings.check()
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds: expected at least one, all different, got {self.seeds}")
@@ -98,7 +99,7 @@ def _parse_axis(text: str) -> Axis:
 
 def hyperparameters(rule: Heuristic) -> dict[str, Any]:
     """A heuristic's hyperparameters and their default values, which are the paper's."""
-    return {name: field.default for name, field in registry.hyperparameters(rule).items() if not field.static}
+    return {name: field.default for name, field in all_declared(rule).items() if not field.static}
 
 
 def check_axes(rule: Heuristic, axes: Sequence[Axis]) -> None:
@@ -120,7 +121,7 @@ def check_axes(rule: Heuristic, axes: Sequence[Axis]) -> None:
         shown = ",".join(f"{value:g}" for value in axis.values)
         if len(set(np.float32(axis.values).tolist())) < max(len(axis.values), 1):  # runs hold single precision
             raise ValueError(f"{axis.name}: expected at least one value, each once, got {shown or 'none'}")
-        info = registry.hyperparameters(rule)[axis.name].info
+        info = all_declared(rule)[axis.name].info
         if not np.isfinite(axis.values).all() or not info.contains(axis.values):
             raise ValueError(f"{axis.name}: expected finite numbers in {info.interval}, got {shown}")
 
@@ -144,7 +145,7 @@ def heuristics(rule: Heuristic, axes: Sequence[Axis]) -> list[Heuristic]:
         >>> [edge.tail for edge in heuristics(Edge(), [Axis("tail", (0.0, 1.0))])]
         [0.0, 1.0]
     """
-    return [registry.replaced(rule, values) for values in combinations(axes)]
+    return [replaced(rule, values) for values in combinations(axes)]
 
 
 def grid_runs(grid: Grid) -> list[RunSpec]:

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from jaxlfi.envs.lotka_volterra.jump_process import lotka_volterra_nine
 from jaxlfi.envs.lotka_volterra.ode import NOISES, gaussian_noise, lognormal_noise, populations, task
-from jaxlfi.tasks import registry as tasks
+from jaxlfi.registry import TASKS
 from jaxlfi.tasks.simulation import simulate
 
 RATES = [(0.01, 0.1, 0.1, 0.02), (0.03, 0.15, 0.12, 0.011), (0.004, 0.31, 0.22, 0.006)]
@@ -129,7 +129,7 @@ def test_the_task_is_appendix_a():
 
 def test_the_appendix_to_the_letter_is_its_first_tenth(key):
     """200 steps of 0.1; everything else is the same."""
-    problem, whole = tasks.load("jaxlfi.envs.lotka_volterra.ode:short"), task()
+    problem, whole = TASKS.load("jaxlfi.envs.lotka_volterra.ode:short"), task()
     np.testing.assert_allclose(problem.times, whole.times[:201], atol=1e-6)
     assert problem.times[-1] == 20.0 and problem.name == "lotka_volterra_ode_short"
     again = jax.random.clone(key)
@@ -141,7 +141,7 @@ def test_the_appendix_to_the_letter_is_its_first_tenth(key):
         np.testing.assert_array_equal(problem.support(name).low, box.low)
         np.testing.assert_array_equal(problem.support(name).high, box.high)
     np.testing.assert_array_equal(problem.truth, whole.truth)
-    positive = np.asarray(tasks.load("jaxlfi.envs.lotka_volterra.ode:short").simulate(again, problem.truth))
+    positive = np.asarray(TASKS.load("jaxlfi.envs.lotka_volterra.ode:short").simulate(again, problem.truth))
     np.testing.assert_array_equal(positive, trajectory)
 
 

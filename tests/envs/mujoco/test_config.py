@@ -12,7 +12,7 @@ from envs_mujoco import ARM, recorded
 
 from jaxlfi.cli import parser as cli
 from jaxlfi.envs.mujoco.config import read
-from jaxlfi.tasks import registry
+from jaxlfi.registry import TASKS
 
 CONFIG = """
 model = "arm.xml"
@@ -51,7 +51,7 @@ def folder(tmp_path):
 
 
 def test_a_file_says_all_of_it(folder):
-    task = registry.load(f"mujoco,config={folder / 'arm.toml'}")
+    task = TASKS.load(f"mujoco,config={folder / 'arm.toml'}")
     assert task.name == "arm" and task.names == ("joint/elbow/damping", "control/delay")
     assert task.units == ("N m s/rad", "") and task.log == ("joint/elbow/damping",)
     assert task.channels == ("angle [rad]",) and task.record_label == "time [s]"
@@ -66,9 +66,9 @@ def test_a_file_says_all_of_it(folder):
 
 def test_another_recording_in_its_place(folder):
     (folder / "other.csv").write_text("time [s],motor,angle [rad]\n0,0,0.5\n1,0,0.25\n")
-    task = registry.load(f"mujoco,config={folder / 'arm.toml'},log={folder / 'other.csv'}")
+    task = TASKS.load(f"mujoco,config={folder / 'arm.toml'},log={folder / 'other.csv'}")
     assert task.observation[:, 0].tolist() == [0.5, 0.25]
-    both = registry.load(f"mujoco,config={folder / 'arm.toml'},log={folder / 'other.csv'};{folder / 'swing.csv'}")
+    both = TASKS.load(f"mujoco,config={folder / 'arm.toml'},log={folder / 'other.csv'};{folder / 'swing.csv'}")
     assert both.observation.shape == (103, 1)
 
 
@@ -78,8 +78,8 @@ def test_a_summary_by_its_name(folder):
     path.write_text('summary = "spectrum"\n' + CONFIG)
     shape = lambda task: task.summary(jnp.asarray(task.observation)).shape
     assert shape(read(path)) == (12,)
-    assert shape(registry.load(f"mujoco,config={path},summary=samples")) == (30,)
-    learnt = registry.load(f"mujoco,config={path},summary=learnt")
+    assert shape(TASKS.load(f"mujoco,config={path},summary=samples")) == (30,)
+    learnt = TASKS.load(f"mujoco,config={path},summary=learnt")
     assert shape(learnt) == (101,) and learnt.settings["embedding"] == "series"
 
 
@@ -132,7 +132,7 @@ def test_other_first_guesses_and_what_the_model_gets_wrong(folder):
         + '[supports.wide]\n"joint/elbow/damping" = [0.001, 0.9]\n'
         + "[discrepancy]\nangle = { deviation = 0.5, time = 0.2 }\n"
     )
-    task = registry.load(f"mujoco,config={folder / 'arm.toml'}")
+    task = TASKS.load(f"mujoco,config={folder / 'arm.toml'}")
     assert task.simulate.function.forces is None
     np.testing.assert_allclose(task.supports["wide"].low, [0.001, 0])
     np.testing.assert_allclose(task.supports["wide"].high, [0.9, 0.1])
@@ -148,7 +148,7 @@ def test_other_first_guesses_and_what_the_model_gets_wrong(folder):
 def test_forces_that_the_model_lacks(folder):
     """A fraction of what acts on each joint at the centre of the box."""
     (folder / "arm.toml").write_text("unmodelled_force = 1\n" + CONFIG)
-    task = registry.load(f"mujoco,config={folder / 'arm.toml'}")
+    task = TASKS.load(f"mujoco,config={folder / 'arm.toml'}")
     expected = task.simulate.function.typical_forces(np.array([np.sqrt(0.01 * 0.2), 0.05]))
     np.testing.assert_allclose(task.simulate.function.forces.deviations, expected.deviations)
 

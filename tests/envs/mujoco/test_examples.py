@@ -13,7 +13,7 @@ import jax
 import jaxlfi
 from jaxlfi.envs.mujoco.least_squares import best_fits
 from jaxlfi.envs.mujoco.logs import read
-from jaxlfi.tasks import registry
+from jaxlfi.registry import TASKS
 
 FOLDER = Path(__file__).parents[3] / "examples/mujoco"
 NAMES = ("furuta", "arm", "puck", "finger")
@@ -28,7 +28,7 @@ SETTINGS = jaxlfi.QUICK.replace(
 
 
 def example(name):
-    return registry.load(f"mujoco,config={FOLDER / name}.toml")
+    return TASKS.load(f"mujoco,config={FOLDER / name}.toml")
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -23,7 +23,7 @@ from jaxlfi.envs.mujoco.mjx_effects import Held
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
 from jaxlfi.envs.mujoco.simulator import REFUSED, UNSTABLE, Simulator, simulator_of
-from jaxlfi.tasks import registry
+from jaxlfi.registry import TASKS
 
 FOLDER = Path(__file__).parents[3] / "examples/mujoco"
 
@@ -245,8 +245,8 @@ def test_engines_are_chosen_by_name(tmp_path, capsys):
         '[parameters."joint/rail/damping"]\nsupport = [0.1, 2.0]\n'
     )
     reference = f"mujoco,config={tmp_path / 'slide.toml'}"
-    assert not registry.load(f"{reference},engine=mjx").on_host
-    assert registry.load(reference).on_host and registry.load(f"{reference},engine=native").on_host
+    assert not TASKS.load(f"{reference},engine=mjx").on_host
+    assert TASKS.load(reference).on_host and TASKS.load(f"{reference},engine=native").on_host
     assert small.command("tasks", f"{reference},engine=mjx") == 0
     assert "joint/rail/damping" in capsys.readouterr().out
     assert small.command("infer", f"{reference},engine=warp", "--out", tmp_path / "run") == 2

@@ -13,7 +13,7 @@ from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.environment import make
 from jaxlfi.envs.whip.parameters import HIGHEST, LOWEST
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
-from jaxlfi.rl import registry
+from jaxlfi.registry import ENVIRONMENTS
 from jaxlfi.rl.environment import Environment
 
 THETA = jnp.array([[200.0, 1e5], [300.0, 2e3]])
@@ -31,9 +31,9 @@ def started(whip):
 
 
 def test_it_is_found_by_name(whip):
-    found = registry.load("whip,detector=clean,engine=native")
+    found = ENVIRONMENTS.load("whip,detector=clean,engine=native")
     assert found == whip and isinstance(found, Environment)
-    assert "whip" in registry.names()
+    assert "whip" in ENVIRONMENTS.names()
     for reference, expected in (
         ("whip,detector=eye", "detector: expected one of clean"),
         ("whip,colour=red", "environment: expected options among detector, engine"),
@@ -41,7 +41,7 @@ def test_it_is_found_by_name(whip):
         ("math:pi", "environment: expected 'math:pi' to give a jaxlfi.rl.environment.Environment, got float"),
     ):
         with pytest.raises(ValueError, match=expected):
-            registry.load(reference)
+            ENVIRONMENTS.load(reference)
 
 
 def test_boxes_are_the_papers_in_mm_and_pa(whip):

@@ -23,7 +23,7 @@ from jaxlfi.envs.whip.real2sim import CHANNELS, DATA, NUISANCES, recorded, task,
 from jaxlfi.envs.whip.trajectory import trajectory
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
-from jaxlfi.tasks import registry as tasks
+from jaxlfi.registry import TASKS
 from jaxlfi.tasks.simulation import trajectory_and_outcome
 from tests.small import SETTINGS, command
 
@@ -146,14 +146,14 @@ def test_a_run_from_the_command_line(tmp_path, capsys):
     assert command(*words) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["task"] == "whip,engine=native,object=dlo-0"
-    assert tasks.load(config["task"]).observation is not None
+    assert TASKS.load(config["task"]).observation is not None
     assert (tmp_path / "run" / "report.html").exists()
 
 
 def test_without_mujoco_the_task_says_what_to_install():
     script = (
         "import sys; sys.modules['mujoco'] = None; import jaxlfi, jaxlfi.envs.lotka_volterra, jaxlfi.envs.whip; "
-        "from jaxlfi.tasks import registry as tasks; tasks.load('lotka_volterra'); tasks.load('jaxlfi.envs.whip:task')"
+        "from jaxlfi.registry import TASKS; TASKS.load('lotka_volterra'); TASKS.load('jaxlfi.envs.whip:task')"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode != 0 and "pip install 'jaxlfi[whip]'" in done.stderr.splitlines()[-1]

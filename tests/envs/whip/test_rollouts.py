@@ -20,7 +20,7 @@ from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.real2sim import CHANNELS, DATA, NUISANCES, recorded, task, whip_task
 from jaxlfi.envs.whip.trajectory import trajectory
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
-from jaxlfi.tasks import registry
+from jaxlfi.registry import TASKS
 from jaxlfi.tasks.observation import simulator_shapes
 from tests.small import command
 
@@ -196,7 +196,7 @@ def test_a_run_of_two_recordings_is_loaded_again_by_its_reference(folder, tmp_pa
     assert reference == f"whip,engine=native,object=dlo-2;{a}"
     run = jaxlfi.load(out)
     assert run.task.name == "whip x 2" and run.observed.shape == (32, 30) and run.x.shape == (112,)
-    np.testing.assert_array_equal(run.task.observation, registry.load(reference).observation)
+    np.testing.assert_array_equal(run.task.observation, TASKS.load(reference).observation)
     assert (out / "report.html").exists() and list((out / "figures").glob("*.png"))
     assert command("resume", out) == 0
     capsys.readouterr()

@@ -1,10 +1,9 @@
-"""Objects made by name: by factories that `jaxlfi.plugins` finds, with options given as text.
+"""References as text: a name, and options for what makes the thing of that name, as in "whip,object=dlo-0".
 
-A reference is a name, and options for its factory, as in "whip,object=dlo-0,detector=clean". Options are converted to
-the types that the factory's signature declares: int, float, bool, str, Path, Literal, unions of them, and tuples of any
-number of one of them, whose items ";" separates. A value may be put in quotation marks, within which separators are
-part of it and "" is a quotation mark; a path with separators needs none where it exists, or where what follows a comma
-in it does not begin as an option does.
+Options are converted to the types that a signature declares: int, float, bool, str, Path, Literal, unions of them, and
+tuples of any number of one of them, whose items ";" separates. A value may be put in quotation marks, within which
+separators are part of it and "" is a quotation mark; a path with separators needs none where it exists, or where what
+follows a comma in it does not begin as an option does.
 """
 
 import inspect
@@ -13,9 +12,7 @@ import os
 import re
 import types
 import typing
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 SEPARATOR = ";"
@@ -103,67 +100,8 @@ def _items(text: str) -> list[str]:
     return items
 
 
-def _signature(factory) -> inspect.Signature | None:
-    """The signature of a factory, where it has one."""
-    try:
-        return inspect.signature(factory, eval_str=True)
-    except (TypeError, ValueError, NameError):  # not every callable has one
-        return None
-
-
-def parameters(factory: Any) -> tuple[str, ...]:
-    """Names of a factory's options; empty for an object that is not callable."""
-    signature = _signature(factory)
-    return () if signature is None else tuple(signature.parameters)
-
-
-def wanted(name: str, factory: Any, options: Mapping[str, str] = MappingProxyType({})) -> str:
-    """The reference with the options besides those given that a factory cannot do without; empty where there are none.
-
-    Example:
-        >>> def arm(config: Path, mass: float, gain: float = 1.0): ...
-        >>> wanted("arm", arm)
-        'arm,config=FILE,mass=FLOAT'
-    """
-    signature = _signature(factory) if callable(factory) else None
-    if signature is None:
-        return ""
-    several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    missing = [
-        f"{each.name}={'FILE' if each.annotation is Path else getattr(each.annotation, '__name__', 'VALUE').upper()}"
-        for each in signature.parameters.values()
-        if each.default is each.empty and each.kind not in several and each.name not in options
-    ]
-    return ",".join([name, *missing]) if missing else ""
-
-
-def made(word: str, reference: str, factory: Any, options: dict[str, str], kind: type) -> Any:
-    """The object that a factory makes with these options; or the object itself, if it was given ready-made.
-
-    Raises:
-        ValueError: for options that the factory does not have or of another type, and for whatever it raises.
-    """
-    if (isinstance(factory, kind) and not isinstance(factory, type)) or not callable(factory):
-        if options:
-            raise ValueError(f"{word}: expected no options of {reference!r}, which is not made by a function")
-        return factory
-    signature = _signature(factory)
-    if signature is not None:
-        try:
-            signature.bind_partial(**options)
-        except TypeError as error:
-            known = ", ".join(signature.parameters) or "none"
-            raise ValueError(f"{word}: expected options among {known}, got {reference!r}: {error}") from error
-        if whole := wanted(reference, factory, options):
-            raise ValueError(f"{word}: expected {whole}, got {reference!r}")
-    try:
-        return factory(**_converted(signature, options))
-    except Exception as error:
-        raise ValueError(f"{word}: {reference!r} failed: {type(error).__name__}: {error}") from error
-
-
-def _converted(signature: inspect.Signature | None, options: dict[str, str]) -> dict[str, Any]:
-    """Options in the types of the factory's parameters."""
+def converted(signature: inspect.Signature | None, options: dict[str, str]) -> dict[str, Any]:
+    """Options in the types of a signature's parameters; the text itself where there is no signature."""
     if signature is None:
         return {name: _unquoted(value) for name, value in options.items()}
     kinds = {name: parameter.annotation for name, parameter in signature.parameters.items()}

@@ -1,4 +1,4 @@
-"""Heuristics by name, from installed packages or `module:Class`, made of their hyperparameters and checked."""
+"""Hyperparameters of heuristics, those they wrap included: set by name, listed, replaced and checked."""
 
 import dataclasses
 import inspect
@@ -8,42 +8,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxlfi import plugins
 from jaxlfi.fields import Declared, check_fields, declared
 from jaxlfi.heuristics.base import Heuristic
-
-GROUP = "jaxlfi.heuristics"
-"""The entry-point group; ours are registered in pyproject.toml as a third party's would be."""
+from jaxlfi.registry import HEURISTICS
 
 
-def names() -> list[str]:
-    """Names of all registered heuristics."""
-    return plugins.names(GROUP)
-
-
-def load(reference: str) -> type[Heuristic]:
-    """The class of a registered name, or of "module:Class".
-
-    Raises:
-        ValueError: for unknown names, modules that cannot be imported and classes that are no heuristics.
-
-    Example:
-        >>> load("jaxlfi.heuristics:Edge").__name__
-        'Edge'
-    """
-    return plugins.load(GROUP, "heuristic", reference, Heuristic)
-
-
-def name_of(rule: Heuristic) -> str:
-    """The registered name of a heuristic, or else "module:Class"."""
-    return plugins.name_of(GROUP, type(rule))
-
-
-def build(reference: str, values: Mapping[str, Any], dim: int) -> Heuristic:
+def build(kind: type[Heuristic], values: Mapping[str, Any], dim: int) -> Heuristic:
     """A heuristic with these hyperparameters, and its defaults for the others.
 
     Args:
-        reference: a registered name, or "module:Class".
+        kind: its class.
         values: by name; of a hyperparameter one number, or one per dimension.
         dim: number of parameters D.
 
@@ -51,17 +25,17 @@ def build(reference: str, values: Mapping[str, Any], dim: int) -> Heuristic:
         ValueError: for values it does not have or does not accept.
 
     Example:
-        >>> build("jaxlfi.heuristics:Edge", {"expansion": [0.1, 0.3], "tail": [0.5]}, dim=2).tail
+        >>> from jaxlfi.heuristics import Edge
+        >>> build(Edge, {"expansion": [0.1, 0.3], "tail": [0.5]}, dim=2).tail
         0.5
     """
-    kind = load(reference)
-    known = declared(kind)
-    refuse_foreign(values, [reference])
-    made = {name: value if known[name].static else _leaf(name, value, dim) for name, value in values.items()}
+    name, known = HEURISTICS.name_of(kind), declared(kind)
+    refuse_foreign(values, {name: kind})
+    made = {one: value if known[one].static else _leaf(one, value, dim) for one, value in values.items()}
     try:
         rule = kind(**made)
     except TypeError as error:
-        raise ValueError(f"heuristic: {reference!r} cannot be made of its hyperparameters: {error}") from error
+        raise ValueError(f"heuristic: {name!r} cannot be made of its hyperparameters: {error}") from error
     check(rule, dim)
     return rule
 
@@ -73,17 +47,17 @@ def _leaf(name: str, value: Any, dim: int) -> Any:
     return numbers[0] if len(numbers) == 1 else np.asarray(numbers, np.float32)
 
 
-def hyperparameters(rule: Heuristic | type[Heuristic]) -> dict[str, Declared]:
+def all_declared(rule: Heuristic | type[Heuristic]) -> dict[str, Declared]:
     """What a heuristic declares, by name: its own and those of the rules it wraps.
 
     Example:
         >>> from jaxlfi.heuristics import Matched, Mode
-        >>> hyperparameters(Matched(Mode()))["proximity"].default
+        >>> all_declared(Matched(Mode()))["proximity"].default
         0.4
     """
     found = declared(rule)
     for inner in [] if isinstance(rule, type) else _wrapped(rule):
-        found = found | {name: field for name, field in hyperparameters(inner).items() if name not in found}
+        found = found | {name: field for name, field in all_declared(inner).items() if name not in found}
     return found
 
 
@@ -98,8 +72,10 @@ def replaced(rule: Heuristic, values: Mapping[str, Any]) -> Heuristic:
         >>> replaced(Matched(Mode()), {"proximity": 0.3}).rule.proximity
         0.3
     """
-    if foreign := set(values) - set(hyperparameters(rule)):
-        raise ValueError(f"{min(foreign)}: expected a hyperparameter of {name_of(rule)}, got one it does not have")
+    if foreign := set(values) - set(all_declared(rule)):
+        raise ValueError(
+            f"{min(foreign)}: expected a hyperparameter of {HEURISTICS.name_of(type(rule))}, got one it does not have"
+        )
     return _replaced(rule, values)
 
 
@@ -126,30 +102,23 @@ def check(rule: Any, dim: int) -> None:
     _check_ranges(rule)
 
 
-def refuse_foreign(given: Iterable[str], used: Iterable[str]) -> None:
+def refuse_foreign(given: Iterable[str], used: Mapping[str, type[Heuristic]]) -> None:
     """Refuse a hyperparameter that none of the heuristics in use has: it would silently do nothing.
 
     Args:
         given: names of hyperparameters.
-        used: names of heuristics.
+        used: heuristics by name.
 
     Raises:
         ValueError: naming the hyperparameter, and those that there are.
     """
-    used = sorted(set(used))
-    known = sorted({name for reference in used for name in declared(load(reference))})
+    known = sorted({name for kind in used.values() for name in declared(kind)})
     for name in given:
         if name not in known:
             raise ValueError(
-                f"{name}: expected a hyperparameter of {' or '.join(used)} ({', '.join(known) or 'none'}), "
+                f"{name}: expected a hyperparameter of {' or '.join(sorted(used))} ({', '.join(known) or 'none'}), "
                 "got one they do not have"
             )
-
-
-def own(reference: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the values given that this heuristic has."""
-    known = declared(load(reference))
-    return {name: value for name, value in given.items() if name in known}
 
 
 def _check_ranges(rule: Heuristic) -> None:

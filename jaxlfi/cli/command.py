@@ -1,0 +1,94 @@
+"""A command of the program: its name, what it is for, its arguments and what it does, ours or another package's.
+
+This module imports neither jax nor numpy, and a module with commands should not either, before one of them runs: so
+`--help` answers at once.
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+from jaxlfi.cli import joined
+from jaxlfi.cli.exit_status import exit_status
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """A parser whose errors are one line, and whose flags are written out: `--seed 3` is not `--seeds 3`."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        """As argparse's."""
+        super().__init__(*args, allow_abbrev=False, **kwargs)
+
+    def error(self, message: str) -> NoReturn:
+        """One line on stderr, and exit status 2."""
+        self.exit(2, f"{self.prog}: error: {' '.join(message.split())} (see {self.prog} --help)\n")
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        """The values of a flag; argparse takes the value of `--flag=--` for none, and no value for a right one."""
+        values = super()._get_values(action, arg_strings)
+        if values == [] and action.option_strings and action.nargs in (None, "+"):
+            raise argparse.ArgumentError(action, "expected at least one argument")
+        return values
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """A command; called with the words after its name, it does its work and returns the exit status.
+
+    Attributes:
+        name: that it is called by.
+        help: what it does, in a line of a list.
+        arguments: adds them to a parser; one called `debug` shows where an error came from.
+        run: what it does. Errors of bad input are ValueError, OSError and ImportError; it may return an exit status.
+        description: what it does, at the beginning of its own help.
+        epilog: examples, at the end of it.
+        begun: how to go on with what was interrupted, for the end of a line.
+
+    Example:
+        >>> def arguments(parser):
+        ...     parser.add_argument("name")
+        >>> greet = Command("greet", "say hello", arguments, lambda arguments: print(f"hello, {arguments.name}"))
+        >>> greet(["there"])
+        hello, there
+        0
+    """
+
+    name: str
+    help: str
+    arguments: Callable[[argparse.ArgumentParser], Any]
+    run: Callable[[argparse.Namespace], int | None]
+    description: str = ""
+    epilog: str = ""
+    begun: Callable[[argparse.Namespace], str] = lambda arguments: ""
+
+    def parser(self) -> argparse.ArgumentParser:
+        """Its own command line."""
+        top = OneLineParser(prog=f"jaxlfi {self.name}", **self._texts())
+        self.arguments(top)
+        return top
+
+    def add_to(self, commands: "argparse._SubParsersAction") -> None:
+        """Add it to a program of several commands."""
+        self.arguments(commands.add_parser(self.name, help=self.help, **self._texts()))
+
+    def _texts(self) -> dict[str, Any]:
+        formatter = argparse.RawDescriptionHelpFormatter if self.epilog else argparse.HelpFormatter
+        return {"description": self.description, "epilog": self.epilog or None, "formatter_class": formatter}
+
+    def __call__(self, words: Sequence[str] | None = None) -> int:
+        """Do its work.
+
+        Args:
+            words: those after its name; by default those of the process.
+
+        Returns:
+            0, or what its work returned; 2 for bad input; 130 where it was interrupted.
+        """
+        parser = self.parser()
+        arguments = parser.parse_args(words)
+        debug, begun = getattr(arguments, "debug", False), lambda: self.begun(arguments)
+        work = lambda: exit_status(parser.prog, lambda: self.run(arguments), debug, begun)
+        if getattr(arguments, "coordinator", None) is None:
+            return work()
+        return joined.work(work, begun, parser.prog, debug)

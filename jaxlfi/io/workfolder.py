@@ -1,0 +1,148 @@
+"""The life of a work folder: begun complete or not at all, known again, read, and finished.
+
+Every folder that a command works in holds a record of itself, config.json (that of diagnostics plan.json): its format
+and version, what was asked for, what it is made with, and whether it is finished. What else it holds is up to the work.
+"""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxlfi.io import files
+from jaxlfi.io.formats import CONFIG, FORMATS, require_version
+from jaxlfi.io.serialise import json_safe
+from jaxlfi.io.shell import quoted
+
+
+class StoreError(ValueError):
+    """A folder that cannot be read, resumed or written to."""
+
+
+def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any]) -> None:
+    """Bring a work folder into being, complete or not at all.
+
+    Args:
+        folder: where; it must not exist or be empty.
+        config: written as config.json.
+        fill: called with the folder's temporary path, to write what else belongs into it.
+
+    Raises:
+        StoreError: where something is there, or nothing can be written.
+    """
+    refuse_occupied(folder)
+    folder = folder.resolve()  # a link to an empty folder stands for that folder
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    except OSError as error:
+        raise StoreError(f"out: expected a folder that can be written, got {str(folder)!r}: {error}") from error
+    try:
+        staging.chmod(0o755)
+        fill(staging)
+        files.write_json(staging / CONFIG, config)
+        staging.rename(folder)
+    except BaseException:
+        shutil.rmtree(staging, ignore_errors=True)
+        raise
+
+
+def begun(folder: Path, record: str, expected: str = "a new or empty folder") -> bool:
+    """Whether a folder holds work already; one that does not is made, for a command that goes on when given again.
+
+    Args:
+        folder: of the work.
+        record: the name of its record. A kill while it is written leaves NAME.part.
+        expected: what the folder should be, for errors.
+
+    Raises:
+        StoreError: where the folder holds something else.
+    """
+    if (folder / record).exists():
+        return True
+    if folder.exists() and (not folder.is_dir() or any(path.suffix != ".part" for path in folder.iterdir())):
+        raise StoreError(f"out: expected {expected}, got {str(folder)!r} which holds something")
+    folder.mkdir(parents=True, exist_ok=True)
+    return False
+
+
+def refuse_occupied(folder: Path) -> None:
+    """Refuse to write where something is.
+
+    Raises:
+        StoreError: if the folder exists and is not empty, or is a file, a link to nothing, or the current folder, which
+            cannot be replaced.
+    """
+    if folder.is_symlink() and not folder.exists():
+        raise StoreError(
+            f"out: expected a new or empty folder, got {str(folder)!r}, a symbolic link to something that is not there"
+        )
+    if not folder.exists():
+        return
+    if folder.samefile(Path.cwd()):
+        raise StoreError(f"out: expected a new or empty folder, got {str(folder)!r}, the current one")
+    if not folder.is_dir() or any(folder.iterdir()):
+        raise StoreError(
+            f"out: expected a new or empty folder, got {str(folder)!r} which holds something: "
+            f"take another name, or continue it with {quoted('jaxlfi', 'resume', folder)}"
+        )
+
+
+def read(folder: Path, *formats: str) -> dict[str, Any]:
+    """The config.json of a folder.
+
+    Args:
+        folder: of the work.
+        formats: that it may have.
+
+    Raises:
+        StoreError: for folders of others, or of another version.
+    """
+    what = FORMATS[formats[0]].what
+    if not folder.is_dir():
+        raise StoreError(f"expected {what}, got {str(folder)!r} which is no folder")
+    path = folder / CONFIG
+    try:
+        config = files.read_json(path)
+    except ValueError as error:
+        raise StoreError(f"expected {what}, got {str(folder)!r} without a readable {CONFIG}") from error
+    kind = config.get("format") if isinstance(config, dict) else None
+    if kind not in formats:
+        known = isinstance(kind, str) and kind.startswith("jaxlfi-")
+        found = f"is of format {kind!r}" if known else "is not of jaxlfi"
+        raise StoreError(f"expected {what}, got {str(folder)!r} whose {CONFIG} {found}")
+    require_format(path, config)
+    return config
+
+
+def require_format(path: Path, config: Mapping[str, Any]) -> None:
+    """Refuse the record of another version of its format, but for finished work of some older ones.
+
+    Raises:
+        StoreError: in one line.
+    """
+    _, version, older = FORMATS[config["format"]]
+    if config.get("version") in older and is_finished(config):
+        return
+    try:
+        require_version(path, config["format"], version, config.get("version"), config)
+    except ValueError as error:
+        raise StoreError(f"{error}; or run its command again") from error
+
+
+def is_finished(config: Mapping[str, Any]) -> bool:
+    """Whether work has come to its end; one run of several, whose record has no status, is written at its end."""
+    return config.get("status", "finished") == "finished"
+
+
+def finish(folder: Path, **found: Any) -> None:
+    """Say in its record that the work is finished, and what was found."""
+    config = files.read_json(folder / CONFIG)
+    files.write_json(folder / CONFIG, config | {"status": "finished"} | found)
+
+
+def as_json(value: Any) -> Any:
+    """A value as it is read back after it was written."""
+    return json.loads(json.dumps(json_safe(value)))

@@ -1,0 +1,85 @@
+"""Writes jaxlfi/cli/own_fields.py: `python -m tests.own_fields`, after a field or a command of ours was changed."""
+
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jaxlfi
+from jaxlfi import fields, registry
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.estimators.base import Estimator
+from jaxlfi.rl.settings import PPO
+
+PLACE = Path(jaxlfi.__file__).parent / "cli" / "own_fields.py"
+HEAD = '''"""What `--help` says of our classes and commands, none of which it imports; by tests/own_fields.py."""
+
+from math import inf
+
+from jaxlfi.fields import Declared, described, hyperparameter, option
+
+'''
+FOOT = """
+FIELDS: dict[str, dict[str, Declared]] = {{
+{entries}
+}}
+\"\"\"Fields by the class that declares them, as "module:Class", and by their own name.\"\"\"
+HELP = {{
+{commands}
+}}
+\"\"\"What our commands do, by what their entry points lead to.\"\"\"
+"""
+
+
+def kinds() -> list[type]:
+    """Our classes whose fields have flags, bases first."""
+    families = (registry.HEURISTICS, registry.ESTIMATORS)
+    points = [point for family in families for several in family.points().values() for point in several]
+    ours = [registry.named("class", point.value) for point in points if registry.package_of(point) == "jaxlfi"]
+    return [Estimator, *sorted(ours, key=lambda kind: (kind.__module__, kind.__name__)), PPO, Settings]
+
+
+def commands() -> dict[str, str]:
+    """What our commands do, by their entry points."""
+    points = [point for several in registry.COMMANDS.points().values() for point in several]
+    ours = [point.value for point in points if registry.package_of(point) == "jaxlfi"]
+    return {place: registry.named("command", place).help for place in ours}
+
+
+def call(field: fields.Declared) -> str:
+    """The call that declares a field."""
+    given = {"help": field.info.help} | {
+        name: value
+        for name, value in vars(field.info).items()
+        if name != "help" and value != getattr(fields.FieldInfo(""), name)
+    }
+    arguments = [shown(field.default), *(f"{name}={shown(value)}" for name, value in given.items())]
+    return f"{'option' if field.static else 'hyperparameter'}({', '.join(arguments)})"
+
+
+def shown(value: Any) -> str:
+    """A value in the source."""
+    text = str(value) if isinstance(value, float) and math.isinf(value) else repr(value)
+    return text if not text.startswith("'") or '"' in text else f'"{text[1:-1]}"'
+
+
+def source() -> str:
+    """The table."""
+    text, entries, names = HEAD, [], {}
+    for kind in kinds():
+        base = next((one for one in kind.__mro__[1:] if one in names), None)
+        inherited = fields.declared(base) if base else {}
+        new = {name: one for name, one in fields.declared(kind).items() if inherited.get(name) != one}
+        names[kind] = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", kind.__name__).upper()
+        text += f"{names[kind]} = {f'{names[base]} | ' if base else ''}{{\n"
+        text += "".join(f'    "{name}": {call(one)},\n' for name, one in new.items()) + "}\n"
+        entries.append(f'    "{kind.__module__}:{kind.__qualname__}": described({names[kind]}),')
+    helps = "\n".join(f"    {shown(place)}: {shown(text)}," for place, text in commands().items())
+    return text + FOOT.format(entries="\n".join(entries), commands=helps)
+
+
+if __name__ == "__main__":
+    PLACE.write_text(source())
+    subprocess.run([sys.executable, "-m", "ruff", "format", "--quiet", PLACE], check=True)
