@@ -20,8 +20,7 @@ INTEGRATORS = {
 }
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
     """What a step goes on from; all else that MJX holds is derived from it.
 
     Attributes:

@@ -20,8 +20,7 @@ SAME_CORRELATION = 0.5
 """Change of a correlation below which a posterior has settled; by chance, 0.2 is reached in one round of ten."""
 
 
-@struct.dataclass
-class Progress:
+class Progress(struct.PyTreeNode):
     """How far a run has come. Its posteriors are compared with those `LAG` rounds before, by their moments.
 
     Attributes:

@@ -35,23 +35,30 @@ class Settings(Checked):
     """
 
     estimator: Estimator = dataclasses.field(default=MixtureNetwork())
-    rounds: int = option(10, low=1, high=100_000, help="inference rounds, N_LFI, at most")
+    rounds: int = option(default=10, low=1, high=100_000, help="inference rounds, N_LFI, at most")
     min_rounds: int = option(
-        0, low=0, high=100_000, help="rounds after which a run ends once its posterior has settled; 0: it makes all"
+        default=0,
+        low=0,
+        high=100_000,
+        help="rounds after which a run ends once its posterior has settled; 0: it makes all",
     )
-    simulations_per_round: int = option(100, low=1, high=100_000_000, help="simulations added each round, at most")
+    simulations_per_round: int = option(
+        default=100, low=1, high=100_000_000, help="simulations added each round, at most"
+    )
     simulation_budget: int = option(
-        125, low=1, high=100_000_000, help="simulations attempted each round, at most, failures included"
+        default=125, low=1, high=100_000_000, help="simulations attempted each round, at most, failures included"
     )
-    correction: str = option("none", choices=tuple(CORRECTIONS), help="from the network to the posterior")
-    restriction: str = option("clip", choices=tuple(RESTRICTIONS), help="how proposals are kept in the support")
+    correction: str = option(default="none", choices=tuple(CORRECTIONS), help="from the network to the posterior")
+    restriction: str = option(default="clip", choices=tuple(RESTRICTIONS), help="how proposals are kept in the support")
     defensive: Float[Array, "*batch"] | float = hyperparameter(
-        0.0, low=0.0, high=1.0, help="fraction of proposals drawn from the prior over the support"
+        default=0.0, low=0.0, high=1.0, help="fraction of proposals drawn from the prior over the support"
     )
     inflation: Float[Array, "*batch"] | float = hyperparameter(
-        1.0, low=1.0, high=100.0, help="how many times as wide as the posterior proposals are drawn"
+        default=1.0, low=1.0, high=100.0, help="how many times as wide as the posterior proposals are drawn"
     )
-    predictive: bool = option(True, help="simulate 20 draws of each round's posterior, to compare with the observation")
+    predictive: bool = option(
+        default=True, help="simulate 20 draws of each round's posterior, to compare with the observation"
+    )
 
     @property
     def accounts_for_prior(self) -> bool:

@@ -8,8 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 
-@struct.dataclass
-class Contrasts:
+class Contrasts(struct.PyTreeNode):
     """Which other rows of a minibatch each row is compared with.
 
     Attributes:

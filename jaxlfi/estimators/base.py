@@ -84,39 +84,43 @@ class Estimator(Checked, abc.ABC):
         ValueError: from `check` for settings that contradict each other.
     """
 
-    learning_rate: Float[Array, "*batch"] | float = hyperparameter(1e-5, above=0.0, help="Adam's step size")
-    weight_decay: Float[Array, "*batch"] | float = hyperparameter(0.0, low=0.0, help="decoupled weight decay")
+    learning_rate: Float[Array, "*batch"] | float = hyperparameter(default=1e-5, above=0.0, help="Adam's step size")
+    weight_decay: Float[Array, "*batch"] | float = hyperparameter(default=0.0, low=0.0, help="decoupled weight decay")
     clip_norm: Float[Array, "*batch"] | float = hyperparameter(
-        math.inf, above=0.0, high=math.inf, help="norm the gradients are clipped to; inf: not clipped"
+        default=math.inf, above=0.0, high=math.inf, help="norm the gradients are clipped to; inf: not clipped"
     )
-    components: int = option(4, low=1, high=1_000_000, help="Gaussians K in each network's mixture")
-    ensemble_size: int = option(1, low=1, high=1_000_000, help="networks in the ensemble")
-    epochs: int = option(1000, low=0, help="full passes over the data each round")
-    steps: int = option(0, low=0, help="gradient steps each round, in place of epochs")
-    batch_size: int = option(100, low=1, help="simulations in a minibatch")
-    schedule: str = option("constant", choices=tuple(SCHEDULES), help="of the learning rate within a round")
-    validation: float = option(0.0, low=0.0, high=0.9, help="fraction held out to choose the best weights by")
-    patience: int = option(0, low=0, help="epochs without a better validation loss before training stops; 0: no limit")
-    warm_start: bool = option(True, help="train on from the last round's weights, or start anew")
+    components: int = option(default=4, low=1, high=1_000_000, help="Gaussians K in each network's mixture")
+    ensemble_size: int = option(default=1, low=1, high=1_000_000, help="networks in the ensemble")
+    epochs: int = option(default=1000, low=0, help="full passes over the data each round")
+    steps: int = option(default=0, low=0, help="gradient steps each round, in place of epochs")
+    batch_size: int = option(default=100, low=1, help="simulations in a minibatch")
+    schedule: str = option(default="constant", choices=tuple(SCHEDULES), help="of the learning rate within a round")
+    validation: float = option(default=0.0, low=0.0, high=0.9, help="fraction held out to choose the best weights by")
+    patience: int = option(
+        default=0, low=0, help="epochs without a better validation loss before training stops; 0: no limit"
+    )
+    warm_start: bool = option(default=True, help="train on from the last round's weights, or start anew")
     loss: str = option(
-        "likelihood",
+        default="likelihood",
         choices=tuple(LOSSES),
         help="likelihood; atomic, combined: no correction for the proposals needed",
     )
-    normaliser: str = option("zscore", choices=tuple(TRANSFORMS), help="how summaries are normalised")
+    normaliser: str = option(default="zscore", choices=tuple(TRANSFORMS), help="how summaries are normalised")
     embedding: str = option(
-        "none",
+        default="none",
         choices=("none", *EMBEDDINGS),
         help="network that makes features of long summaries, trained with the other",
     )
-    features: int = option(16, low=1, help="numbers that the embedding makes of a summary")
+    features: int = option(default=16, low=1, help="numbers that the embedding makes of a summary")
     reduction: str = option(
-        "none",
+        default="none",
         choices=("none", "regression", "half"),
         help="the networks see what regressions predict; or half of them",
     )
     record_size: int = option(
-        0, low=0, help="numbers of a record (channels of a series, length of a trial) in the summary; 0: the task's"
+        default=0,
+        low=0,
+        help="numbers of a record (channels of a series, length of a trial) in the summary; 0: the task's",
     )
 
     closed_form: ClassVar[bool] = False
@@ -230,7 +234,8 @@ class Estimator(Checked, abc.ABC):
 
     def initialise(self, key: jax.Array, dim: int, obs: int) -> dict:
         """Fresh weights for every network of the ensemble."""
-        module, inputs = self.embedded(dim), self.inputs(dim, obs)
+        module: Any = self.embedded(dim)
+        inputs = self.inputs(dim, obs)
         return jax.vmap(lambda k: module.init(k, jnp.zeros(inputs)))(jax.random.split(key, self.ensemble_size))
 
     def begin(
@@ -289,8 +294,7 @@ def viewed(given: Float[Array, "*n given"], view: Float[Array | np.ndarray, " gi
     return given if view is None else given * view
 
 
-@struct.dataclass
-class Network:
+class Network(struct.PyTreeNode):
     """A density estimator: its settings, the weights of the ensemble, and what they were normalised by.
 
     Attributes:

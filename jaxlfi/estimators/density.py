@@ -21,8 +21,7 @@ class Density(Protocol):
         ...
 
 
-@struct.dataclass
-class EnsembleDensity:
+class EnsembleDensity(struct.PyTreeNode):
     """The equally weighted mixture of an ensemble's conditional densities.
 
     Attributes:

@@ -20,9 +20,9 @@ class FlowEstimator(Estimator):
         transforms: maps from theta to the base, one after another.
     """
 
-    hidden: tuple[int, ...] = option((50, 50), low=1, help="units of each hidden layer")
-    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="relu, tanh or silu")
-    transforms: int = option(5, low=1, help="transforms of a flow")
+    hidden: tuple[int, ...] = option(default=(50, 50), low=1, help="units of each hidden layer")
+    activation: str = option(default="tanh", choices=tuple(ACTIVATIONS), help="relu, tanh or silu")
+    transforms: int = option(default=5, low=1, help="transforms of a flow")
 
     def check(self) -> "FlowEstimator":
         """Refuse settings that cannot work, by name; returns the settings."""
@@ -66,9 +66,9 @@ class SplineFlow(FlowEstimator):
         8
     """
 
-    bins: int = option(10, low=1, high=999, help="pieces of each spline")
-    tail_bound: float = option(5.0, low=0.1, help="half the splines' range, in standard deviations")
-    regression: int = option(0, low=0, help="networks that start from a ridge regression on the summaries")
+    bins: int = option(default=10, low=1, high=999, help="pieces of each spline")
+    tail_bound: float = option(default=5.0, low=0.1, help="half the splines' range, in standard deviations")
+    regression: int = option(default=0, low=0, help="networks that start from a ridge regression on the summaries")
 
     def begin(
         self, params: dict, theta: Float[Array, "n dim"], x: Float[Array, "n obs"], valid: Bool[Array, " n"]
