@@ -29,9 +29,10 @@ test: $(VENV)/.installed  ## all tests but slow ones
 test-all: $(VENV)/.installed  ## all tests
 	$(PYTEST)
 
-lint: $(VENV)/.installed  ## style
+lint: $(VENV)/.installed  ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check --quiet .
+	$(BIN)/mypy
 
 docs: $(VENV)/.installed  ## the documentation site, in site/
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

@@ -129,11 +129,11 @@ READABLE = """
     EXTRA = ("c",)
 
     class Base(Heuristic, abc.ABC):
-        first: float = number(HALF, help="one " "text", low=-1, high=LIMIT)
-        second: float = fields.hyperparameter(1, help="b", high=math.inf)
+        first: float = number(default=HALF, help="one " "text", low=-1, high=LIMIT)
+        second: float = fields.hyperparameter(default=1, help="b", high=math.inf)
 
     class Rule(Base):
-        second: float = number(endless, help="c", symbol="s", low=-jnp.inf, high=float("inf"))
+        second: float = number(default=endless, help="c", symbol="s", low=-jnp.inf, high=float("inf"))
         kind: str = option(default="b", help="d", choices=(*KINDS, *EXTRA))
         layers: tuple = option(default=(1, 2), help="e", low=1)
         note: int = 3
