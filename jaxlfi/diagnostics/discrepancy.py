@@ -92,7 +92,8 @@ def not_simulated(
 
 
 def _theta_error(task: Task, theta: Float[Array, "samples dim"]) -> Float[Array, "samples dim"]:
-    return jnp.abs(theta - (jnp.nan if task.truth is None else task.inference.truth))
+    truth = task.inference.truth
+    return jnp.abs(theta - (jnp.nan if truth is None else truth))
 
 
 def trajectory_distance(trajectory: Array, observed: Array) -> Float[Array, ""]:
