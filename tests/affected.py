@@ -4,7 +4,7 @@ A test is as far from a change as it takes imports to lead there: a test that im
 one that imports what imports it. What is no Python module is next to the tests that name it. The examples in the
 docstrings of changed modules are run first.
 
-    python -m tests.affected --since main --seconds 60
+    python -m tests.affected --since main --seconds 45
 """
 
 import argparse
@@ -14,7 +14,6 @@ import pathlib
 import re
 import subprocess
 import sys
-import time
 from collections.abc import Iterable, Mapping
 
 import jaxlfi
@@ -102,10 +101,9 @@ def main() -> int:
     """Run them; pytest's exit status, or 0 where nothing is affected."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--since", default="main", help="the branch to compare with")
-    parser.add_argument("--seconds", type=float, default=60, help="tests begin for so long")
+    parser.add_argument("--seconds", type=float, default=45, help="tests begin for so long")
     parser.add_argument("--list", action="store_true", help="only print the files of tests, with their distance")
     arguments = parser.parse_args()
-    until = time.time() + arguments.seconds
     changes = changed(arguments.since)
     tests = nearest(changes, users())
     if arguments.list:
@@ -120,7 +118,9 @@ def main() -> int:
     options = ["-q", "-m", "not slow", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", "-p", "tests.until"]
     sys.stdout.flush()
     return subprocess.run(
-        [sys.executable, "-m", "pytest", *options, *words], cwd=ROOT, env=os.environ | {"TESTS_UNTIL": str(until)}
+        [sys.executable, "-m", "pytest", *options, *words],
+        cwd=ROOT,
+        env=os.environ | {"TESTS_SECONDS": str(arguments.seconds)},
     ).returncode
 
 

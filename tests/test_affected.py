@@ -1,6 +1,7 @@
 """What `make check` runs: the tests nearest to a change."""
 
-import time
+import contextlib
+from types import SimpleNamespace
 
 import pytest
 
@@ -23,7 +24,7 @@ def test_tests_of_a_module_come_before_those_of_what_imports_it(graph):
     found = nearest({ROOT / "jaxlfi/diagnostics/c2st.py"}, graph)
     assert names(found)[0] == "diagnostics/test_c2st.py" and found[ROOT / "tests/diagnostics/test_c2st.py"] == 1
     assert list(found.values()) == sorted(found.values()) and max(found.values()) > 1
-    assert OURS not in found  # nor is any other test that does not lead there
+    assert not {"io/test_shell.py", "io/test_locks.py"} & set(names(found))  # they do not lead there
 
 
 @pytest.mark.parametrize(
@@ -46,8 +47,18 @@ def test_a_changed_test_is_the_nearest_of_all_and_what_nothing_names_affects_non
 
 
 def test_no_test_begins_once_the_time_is_up(monkeypatch):
-    monkeypatch.setenv("TESTS_UNTIL", str(time.time() + 60))
-    until.pytest_runtest_setup(None)
-    monkeypatch.setenv("TESTS_UNTIL", str(time.time() - 1))
-    with pytest.raises(pytest.skip.Exception, match="make test"):
-        until.pytest_runtest_setup(None)
+    config = SimpleNamespace(rootpath=ROOT, args=[str(OURS)], stash={})
+    item = SimpleNamespace(config=config, path=OURS)
+    for seconds, over in (("60", False), ("-1", True)):
+        monkeypatch.setenv("TESTS_SECONDS", seconds)
+        until.pytest_collection_modifyitems(config, [item])
+        with pytest.raises(pytest.skip.Exception, match="make test") if over else contextlib.nullcontext():
+            until.pytest_runtest_setup(item)
+
+
+def test_files_keep_the_order_of_the_command_line(monkeypatch):
+    monkeypatch.setenv("TESTS_SECONDS", "1")
+    config = SimpleNamespace(rootpath=ROOT, args=["tests/b.py::test_it", "tests/a.py"], stash={})
+    items = [SimpleNamespace(path=ROOT / "tests" / name) for name in ("a.py", "b.py", "a.py")]
+    until.pytest_collection_modifyitems(config, items)
+    assert [item.path.name for item in items] == ["b.py", "a.py", "a.py"]
