@@ -4,7 +4,7 @@ A test is as far from a change as it takes imports to lead there: a test that im
 one that imports what imports it. What is no Python module is next to the tests that name it. The examples in the
 docstrings of changed modules are run first.
 
-    python -m tests.affected --since main --seconds 45
+    python -m tests.affected --since main --seconds 35
 """
 
 import argparse
@@ -101,7 +101,7 @@ def main() -> int:
     """Run them; pytest's exit status, or 0 where nothing is affected."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--since", default="main", help="the branch to compare with")
-    parser.add_argument("--seconds", type=float, default=45, help="tests begin for so long")
+    parser.add_argument("--seconds", type=float, default=35, help="tests begin for so long")
     parser.add_argument("--list", action="store_true", help="only print the files of tests, with their distance")
     arguments = parser.parse_args()
     changes = changed(arguments.since)
