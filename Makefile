@@ -6,13 +6,13 @@ OUT ?= runs/demo
 # Worker processes of the tests: one more than two cores, as some tests wait for processes that they start.
 WORKERS ?= 3
 
-.PHONY: demo test test-all lint docs bench clean help
+.PHONY: demo test test-all lint check docs bench clean help
 
 help:  ## what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
 # Python compiles what it imports; all that is installed would take longer than the installation.
-$(VENV)/.installed: pyproject.toml setup.py constraints.txt
+$(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[test,dev,whip,policy]'
 	@touch $@
@@ -29,9 +29,13 @@ test: $(VENV)/.installed  ## all tests but slow ones
 test-all: $(VENV)/.installed  ## all tests
 	$(PYTEST)
 
-lint: $(VENV)/.installed  ## style
+lint: $(VENV)/.installed  ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check --quiet .
+	$(BIN)/mypy
+
+check: lint  ## before a commit, a minute and a half: style, types, and the tests nearest to what differs from main
+	$(BIN)/python -m tests.affected
 
 docs: $(VENV)/.installed  ## the documentation site, in site/
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
@@ -42,4 +46,4 @@ bench: $(VENV)/.installed  ## benchmarks against NumPy, numba and PyTorch
 	$(BIN)/python -m experiments.benchmarks
 
 clean:  ## remove the environment and caches
-	rm -rf $(VENV) site .pytest_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) site build .pytest_cache .ruff_cache .mypy_cache *.egg-info

@@ -133,8 +133,7 @@ ORDERS: dict[str, Callable[[Array], Array]] = {"sorted": jnp.sort, "departure": 
 # ------------------------------------------------------------------------------------------------------ whitening
 
 
-@struct.dataclass
-class Whitening:
+class Whitening(struct.PyTreeNode):
     """An affine map of summaries to ones of mean 0 and standard deviation 1 over pilot simulations.
 
     Attributes:

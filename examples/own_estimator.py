@@ -57,7 +57,7 @@ class LaplaceModule(nn.Module):
 class Laplace(Estimator):
     """Settings of the family; those of training are inherited."""
 
-    units: int = option(32, low=1, help="units of the hidden layer")
+    units: int = option(default=32, low=1, help="units of the hidden layer")
 
     def module(self, dim):
         """The Flax network of one ensemble member."""

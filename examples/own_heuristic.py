@@ -27,8 +27,8 @@ class Surround(Heuristic):
     Fields made by `hyperparameter` are checked, can be mapped over by `vmap`, and become flags of the command line.
     """
 
-    outside: float = hyperparameter(0.01, help="posterior mass left beyond each bound", low=0.001, below=0.5)
-    margin: float = hyperparameter(0.5, help="width added on either side, as a fraction of the interval", low=0)
+    outside: float = hyperparameter(default=0.01, help="posterior mass left beyond each bound", low=0.001, below=0.5)
+    margin: float = hyperparameter(default=0.5, help="width added on either side, as a fraction of the interval", low=0)
 
     def __call__(self, previous, posterior, feasible):
         """Everything at once over the D dimensions: no Python branches on values."""

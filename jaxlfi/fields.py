@@ -7,8 +7,8 @@ imports neither jax nor numpy before they are needed, so that the command line c
 import dataclasses
 import math
 import sys
-from collections.abc import Mapping
-from typing import Any, Self, dataclass_transform
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, Self, cast, dataclass_transform
 
 KEY = "jaxlfi"
 """The key of a field's metadata that holds its `FieldInfo`."""
@@ -82,8 +82,8 @@ class Declared:
 
 
 def hyperparameter(
-    default: Any,
     *,
+    default: Any,
     help: str,
     symbol: str = "",
     low: float | None = None,
@@ -104,7 +104,7 @@ def hyperparameter(
 
     Example:
         >>> class Step(Checked):
-        ...     size: float = hyperparameter(0.2, help="how far to go", symbol="eta", low=0)
+        ...     size: float = hyperparameter(default=0.2, help="how far to go", symbol="eta", low=0)
         >>> Step(size=-1)
         Traceback (most recent call last):
         ValueError: size: expected a number in [0, inf), got -1
@@ -113,8 +113,8 @@ def hyperparameter(
 
 
 def option(
-    default: Any,
     *,
+    default: Any,
     help: str,
     symbol: str = "",
     choices: tuple | None = None,
@@ -239,7 +239,7 @@ def _is_known(value: Any) -> bool:
     return seen and jax.numpy.issubdtype(value.dtype, jax.numpy.number)
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(hyperparameter, option))
+@dataclass_transform(frozen_default=True, field_specifiers=(hyperparameter, option, dataclasses.field))
 class Checked:
     """Base of frozen dataclasses that are pytrees and refuse wrong fields. A class that derives from it is one.
 
@@ -251,14 +251,16 @@ class Checked:
     Example:
         >>> import jax
         >>> class Step(Checked):
-        ...     size: float = hyperparameter(0.2, help="how far to go", low=0, high=1)
-        ...     kind: str = option("up", help="where to go", choices=("up", "down"))
+        ...     size: float = hyperparameter(default=0.2, help="how far to go", low=0, high=1)
+        ...     kind: str = option(default="up", help="where to go", choices=("up", "down"))
         >>> jax.tree.map(lambda size: -size, Step())
         Step(size=-0.2, kind='up')
         >>> Step(kind="left")
         Traceback (most recent call last):
         ValueError: kind: expected one of up, down, got 'left'
     """
+
+    _flax_dataclass: ClassVar[bool]
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
@@ -271,7 +273,7 @@ class Checked:
 
     def replace(self, **changes: Any) -> Self:
         """The same value with some fields replaced, which are checked."""
-        return dataclasses.replace(self, **changes)
+        return dataclasses.replace(cast(Any, self), **changes)
 
 
 def _register(kind: type) -> None:
@@ -289,8 +291,8 @@ def _register(kind: type) -> None:
         parts, fixed = flatten(value)
         return tuple(zip(map(jax.tree_util.GetAttrKey, leaves), parts, strict=True)), fixed
 
-    def unflatten(fixed: tuple, parts: tuple) -> Any:
-        value = object.__new__(kind)
+    def unflatten(fixed: tuple, parts: Iterable[Any]) -> Any:
+        value: Any = object.__new__(kind)
         for name, part in (*zip(leaves, parts, strict=True), *zip(static, fixed, strict=True)):
             object.__setattr__(value, name, part)
         return value

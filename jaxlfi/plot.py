@@ -73,7 +73,8 @@ def pairs(
     to_drawn = lambda what, values: _with_logarithms(what, values, is_log, names_)
     sets = {label: to_drawn(_called(label), draws) for label, draws in sets.items()}
     marked = np.full(dim, np.nan) if truth is None else to_drawn("truth", _vector("truth", truth, dim, unknown=True))
-    box = None if support is None else tuple(to_drawn("support", bound) for bound in _bounds(support, dim))
+    low, high = (None, None) if support is None else _bounds(support, dim)
+    box = None if low is None else (to_drawn("support", low), to_drawn("support", high))
     estimates = {
         label: [to_drawn(f"points[{label!r}]", part) for part in parts] for label, parts in _points(points, dim).items()
     }
@@ -190,9 +191,10 @@ def _mask(log: Sequence[bool] | Sequence[str], names: Sequence[str] | None, dim:
     """Which parameters are drawn as logarithms, shape [D]."""
     given = [log] if isinstance(log, str) else list(log)
     if all(isinstance(name, str) for name in given) and (names is not None or not given):
-        if unknown := [name for name in given if name not in names]:
-            raise ValueError(f"log: expected some of {', '.join(names)}, got {', '.join(unknown)}")
-        return np.array([name in given for name in names or [None] * dim])
+        known = [None] * dim if names is None else list(names)
+        if unknown := [name for name in given if name not in known]:
+            raise ValueError(f"log: expected some of {', '.join(map(str, known))}, got {', '.join(map(str, unknown))}")
+        return np.array([name in given for name in known])
     mask = np.asarray(given)
     if mask.shape != (dim,) or mask.dtype != bool:
         raise ValueError(f"log: expected names of parameters or {dim} booleans, got {log!r}")

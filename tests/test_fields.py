@@ -34,15 +34,15 @@ OWN = {"centre": Centre, "edge": Edge, "mode": Mode, "none": Fixed, "truncate": 
 class Everything(Checked):
     """A field of every kind."""
 
-    rate: float = hyperparameter(0.1, help="a rate", above=0, below=1)
-    norm: float = hyperparameter(math.inf, help="a norm", above=0, high=math.inf)
-    plain: float = hyperparameter(0.0, help="any number")
-    count: int = option(3, help="how many", low=1)
-    fraction: float = option(0.0, help="how much", low=0, below=1)
-    layers: tuple[int, ...] = option((8,), help="units", low=1)
-    kind: str = option("a", help="which", choices=("a", "b"))
-    word: str = option("a", help="anything")
-    switch: bool = option(True, help="whether")
+    rate: float = hyperparameter(default=0.1, help="a rate", above=0, below=1)
+    norm: float = hyperparameter(default=math.inf, help="a norm", above=0, high=math.inf)
+    plain: float = hyperparameter(default=0.0, help="any number")
+    count: int = option(default=3, help="how many", low=1)
+    fraction: float = option(default=0.0, help="how much", low=0, below=1)
+    layers: tuple[int, ...] = option(default=(8,), help="units", low=1)
+    kind: str = option(default="a", help="which", choices=("a", "b"))
+    word: str = option(default="a", help="anything")
+    switch: bool = option(default=True, help="whether")
 
 
 REFUSED = {
@@ -157,10 +157,10 @@ RULE = '''
     class Swell(Heuristic):
         """Both bounds of every parameter move out."""
 
-        gain: float = hyperparameter(0.5, help="how far bounds move", symbol="kappa", low=0, high=2)
-        expansion: float = hyperparameter(0.3, help="another step", symbol="eta", low=0)
-        seeds: float = hyperparameter(1.0, help="as a flag of the command is called", low=0)
-        side: str = option("both", help="which bounds", choices=("both", "low"))
+        gain: float = hyperparameter(default=0.5, help="how far bounds move", symbol="kappa", low=0, high=2)
+        expansion: float = hyperparameter(default=0.3, help="another step", symbol="eta", low=0)
+        seeds: float = hyperparameter(default=1.0, help="as a flag of the command is called", low=0)
+        side: str = option(default="both", help="which bounds", choices=("both", "low"))
 
         def __call__(self, previous, posterior, feasible):
             left = jnp.ones_like(previous.support.low, bool)
@@ -337,12 +337,12 @@ class Nested(Heuristic):
 
     inner: dict[str, Heuristic]
     box: Support
-    level: float = hyperparameter(math.inf, help="level", high=math.inf)
-    weights: np.ndarray = hyperparameter(1.0, help="weights")
-    counts: np.ndarray = hyperparameter(1, help="counts")
-    words: tuple = option(("nan", "inf"), help="words")
-    switch: bool = option(False, help="switch")
-    number: int = option(1, help="number")
+    level: float = hyperparameter(default=math.inf, help="level", high=math.inf)
+    weights: np.ndarray = hyperparameter(default=1.0, help="weights")
+    counts: np.ndarray = hyperparameter(default=1, help="counts")
+    words: tuple = option(default=("nan", "inf"), help="words")
+    switch: bool = option(default=False, help="switch")
+    number: int = option(default=1, help="number")
 
     def __call__(self, previous, posterior, feasible):
         """Never called: only the fields are read."""

@@ -30,8 +30,7 @@ from jaxlfi.envs.mujoco.parameters import Parameter
 from jaxlfi.rl.environment import EnvState
 
 
-@struct.dataclass
-class Inner:
+class Inner(struct.PyTreeNode):
     """A model's state, and what lasts for an episode.
 
     Attributes:

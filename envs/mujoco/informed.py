@@ -127,7 +127,8 @@ def _complement(rows: np.ndarray) -> np.ndarray:
 
 def _reduced(rows: np.ndarray) -> np.ndarray:
     """Rows of the same span, each with a 1 where all others are 0, and as many zeros as that gives."""
-    rows, taken = np.array(rows, float), []
+    taken: list[int] = []
+    rows = np.array(rows, float)
     scale = np.abs(rows).max(axis=0, initial=1e-300)
     for row in range(len(rows)):
         free = np.abs(rows[row]) / np.where(scale > 0, scale, 1.0)

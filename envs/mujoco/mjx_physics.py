@@ -20,8 +20,7 @@ INTEGRATORS = {
 }
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
     """The state that a step continues from; everything else that MJX holds is derived from it.
 
     Attributes:

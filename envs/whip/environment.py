@@ -53,8 +53,7 @@ LIMITS = Limits(
 """Of the set-point: the actions' own limits, the speed that these come to, and the workspace."""
 
 
-@struct.dataclass
-class Scene:
+class Scene(struct.PyTreeNode):
     """An episode, the scene it is in, and the key of what comes.
 
     Attributes:

@@ -20,8 +20,7 @@ OBSERVATION = 28
 """Length of an observation."""
 
 
-@struct.dataclass
-class Episode:
+class Episode(struct.PyTreeNode):
     """State of an episode between two steps.
 
     Attributes:
@@ -39,8 +38,7 @@ class Episode:
     steps: Int[Array, "*batch"]
 
 
-@struct.dataclass
-class Step:
+class Step(struct.PyTreeNode):
     """The values that a step returns to a learner.
 
     Attributes:

@@ -4,8 +4,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 
-@struct.dataclass
-class Frames:
+class Frames(struct.PyTreeNode):
     """One or more frames of a scene, in m, in the world frame: x away from the robot, z up, the camera at negative y.
 
     Attributes:

@@ -9,8 +9,7 @@ from jaxtyping import Array, Float
 from jaxlfi.distributions.support import Support
 
 
-@struct.dataclass
-class WhipParameters:
+class WhipParameters(struct.PyTreeNode):
     """One whipping scene, in SI units; leaves may carry leading axes, one scene per entry (section VI-B).
 
     Attributes:

@@ -52,8 +52,7 @@ class CrossEntropy:
     target_return: float = 1.98
 
 
-@struct.dataclass
-class Search:
+class Search(struct.PyTreeNode):
     """State of the search between two iterations.
 
     Attributes:
@@ -69,8 +68,7 @@ class Search:
     value: Float[Array, ""]
 
 
-@struct.dataclass
-class Plan:
+class Plan(struct.PyTreeNode):
     """The result of a search.
 
     Attributes:
@@ -85,8 +83,7 @@ class Plan:
     history: Float[Array, "iterations population"]
 
 
-@struct.dataclass
-class Outcome:
+class Outcome(struct.PyTreeNode):
     """The outcome of an episode.
 
     Attributes:

@@ -33,8 +33,7 @@ SLOWNESS = 2.0
 """How many times slower than real time an animation is."""
 
 
-@struct.dataclass
-class Rollout:
+class Rollout(struct.PyTreeNode):
     """One rollout of given actions, which continues after the end of the episode.
 
     Attributes:

@@ -55,8 +55,7 @@ def reward(hit: Bool[Array, "*batch 6"], out: Bool[Array, "*batch"]) -> Float[Ar
     return jnp.where(out, -1.0, 2.0 * hit[..., TOP] - hit[..., :TOP] @ jnp.asarray(PENALTIES))
 
 
-@struct.dataclass
-class Verdict:
+class Verdict(struct.PyTreeNode):
     """The rules applied to one step.
 
     Attributes:

@@ -27,8 +27,7 @@ from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
 from jaxlfi.tasks.task import Task
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
     """What the next round needs.
 
     Attributes:
@@ -56,8 +55,7 @@ class State:
         return self.network.scale
 
 
-@struct.dataclass
-class Round:
+class Round(struct.PyTreeNode):
     """The outcome of one round; `run` stacks these.
 
     Attributes:
@@ -179,7 +177,8 @@ def update(
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     reported, effective_share = belief, jnp.ones(())
     if correction.report is not None:
-        q = network.estimator.weighted(network, observed)
+        estimator: Any = network.estimator  # one with a closed form: `Settings.check` sees to it
+        q = estimator.weighted(network, observed)
         divided, effective_share = correction.report(
             task, q, proposals, round, settings.defensive, state.belief.support
         )

@@ -57,26 +57,25 @@ class RunSpec:
     seed: int
 
 
-@struct.dataclass
-class RunInputs:
+class RunInputs(struct.PyTreeNode):
     """The inputs of a run to the compiled program, stacked along a leading axis for a batch.
 
     Attributes:
         key: the run's key.
         support: Theta_0.
         heuristic: the rule, or a `Choice` among the rules of all runs.
-        observed: the observed trajectory, shape [T, C] or [T].
-        x: its summary x^r, shape [S].
+        observed: the observed trajectory, shape [T, C] or [T]; NumPy's array until it is on its device.
+        x: its summary x^r, shape [S]; likewise.
     """
 
     key: jax.Array
     support: Support
     heuristic: Heuristic
-    observed: Float[Array | np.ndarray, "*shape"]
-    x: Float[Array | np.ndarray, "*batch obs"]
+    observed: Float[Any, "*shape"]
+    x: Float[Any, "*batch obs"]
 
 
-def stack_heuristics(rules: Sequence[Heuristic]) -> tuple[Heuristic, list[int | None]]:
+def stack_heuristics(rules: Sequence[Heuristic]) -> tuple[Heuristic, Sequence[int | None]]:
     """The rules of several runs as one stacked pytree.
 
     Rules of the same structure differ in leaves only. Where there are more structures than one, each run gets a
@@ -98,7 +97,9 @@ def stack_heuristics(rules: Sequence[Heuristic]) -> tuple[Heuristic, list[int | 
     return stack(choices), places
 
 
-def stack_inputs(specs: Sequence[RunSpec], observed: np.ndarray, x: np.ndarray) -> tuple[RunInputs, list[int | None]]:
+def stack_inputs(
+    specs: Sequence[RunSpec], observed: np.ndarray, x: np.ndarray
+) -> tuple[RunInputs, Sequence[int | None]]:
     """Inputs of a batch, and each run's place in the choice of heuristics.
 
     Args:

@@ -20,8 +20,7 @@ SAME_CORRELATION = 0.5
 """Change of a correlation below which a posterior has settled; by chance, 0.2 is reached in one round of ten."""
 
 
-@struct.dataclass
-class Progress:
+class Progress(struct.PyTreeNode):
     """The progress of a run: the moments of its posterior, compared with those of `LAG` rounds before.
 
     Attributes:

@@ -17,8 +17,7 @@ from jaxlfi.tasks.priors import InferencePrior
 from jaxlfi.tasks.task import Task
 
 
-@struct.dataclass
-class CorrectionInfo:
+class CorrectionInfo(struct.PyTreeNode):
     """What a correction did in a round.
 
     Attributes:
@@ -47,7 +46,7 @@ class Correction:
         accounts_for_prior: whether it does all that is done for a task's own prior; else proposals do.
     """
 
-    row_weights: Callable[[Task, Dataset, Belief, Array, Array], Array]
+    row_weights: Callable[[Task, Dataset, Belief, Array | int, Array | float], Array]
     change: Callable[[Task, GaussianMixture, Belief], tuple[GaussianMixture, Array]]
     report: Callable[..., tuple[GaussianMixture, Array]] | None = None
     accounts_for_prior: bool = False

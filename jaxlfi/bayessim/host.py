@@ -62,6 +62,8 @@ def engine_for(
 class HostEngine(BatchEngine):
     """Steps the runs of a batch by one round each, simulating them one after another on the host."""
 
+    references: np.ndarray
+
     def __init__(
         self,
         task: Task,

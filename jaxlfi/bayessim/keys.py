@@ -7,13 +7,13 @@ JAX's checker of keys that are used twice.
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Int
 
 
-@struct.dataclass
-class RunKeys:
+class RunKeys(struct.PyTreeNode):
     """Independent keys derived from one.
 
     Attributes:
@@ -74,4 +74,4 @@ def seed_of(key: jax.Array) -> int:
 def key_of(seed: int) -> jax.Array:
     """The key of a seed: `jax.random.key(seed)`, also for seeds of more than 32 bits."""
     words = np.frombuffer(int(seed).to_bytes(8, "big"), ">u4").astype(np.uint32)
-    return jax.random.wrap_key_data(words, impl="threefry2x32")
+    return jax.random.wrap_key_data(jnp.asarray(words), impl="threefry2x32")

@@ -15,7 +15,7 @@ from jaxlfi.tasks.task import Task
 PAPER = Settings()
 """The paper's numbers to the letter (section III-C); they are the defaults of `Settings` and `MixtureNetwork`."""
 
-ENSEMBLE = {
+ENSEMBLE: dict[str, Any] = {
     "activation": "tanh",
     "ensemble_size": 4,
     "validation": 0.1,

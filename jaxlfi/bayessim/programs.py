@@ -77,7 +77,7 @@ def compiled(many: Any, arguments: tuple) -> Any:
     leaves, structure = jax.tree.flatten(arguments)
     signature = (
         many,
-        jax.config.jax_enable_x64,
+        jax.config.jax_enable_x64,  # type: ignore[attr-defined]  # jax makes it at run time
         structure,
         tuple((np.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves),
     )

@@ -35,28 +35,28 @@ class Settings(Checked):
     """
 
     estimator: Estimator = dataclasses.field(default=MixtureNetwork())
-    rounds: int = option(10, low=1, high=100_000, help="largest number of inference rounds, N_LFI")
+    rounds: int = option(default=10, low=1, high=100_000, help="largest number of inference rounds, N_LFI")
     min_rounds: int = option(
-        0, low=0, high=100_000, help="rounds after which a run may end, once its posterior has settled; 0: it makes all"
+        default=0, low=0, high=100_000, help="rounds after which a run may end, once its posterior has settled; 0: it makes all"
     )
     simulations_per_round: int = option(
-        100, low=1, high=100_000_000, help="largest number of valid simulations added per round"
+        default=100, low=1, high=100_000_000, help="largest number of valid simulations added per round"
     )
     simulation_budget: int = option(
-        125, low=1, high=100_000_000, help="largest number of simulations attempted per round, failures included"
+        default=125, low=1, high=100_000_000, help="largest number of simulations attempted per round, failures included"
     )
     correction: str = option(
-        "none", choices=tuple(CORRECTIONS), help="how to correct for proposals that are not the prior"
+        default="none", choices=tuple(CORRECTIONS), help="how to correct for proposals that are not the prior"
     )
-    restriction: str = option("clip", choices=tuple(RESTRICTIONS), help="how proposals are kept in the support")
+    restriction: str = option(default="clip", choices=tuple(RESTRICTIONS), help="how proposals are kept in the support")
     defensive: Float[Array, "*batch"] | float = hyperparameter(
-        0.0, low=0.0, high=1.0, help="fraction of proposals drawn from the prior over the support"
+        default=0.0, low=0.0, high=1.0, help="fraction of proposals drawn from the prior over the support"
     )
     inflation: Float[Array, "*batch"] | float = hyperparameter(
-        1.0, low=1.0, high=100.0, help="width of the proposals, in widths of the posterior"
+        default=1.0, low=1.0, high=100.0, help="width of the proposals, in widths of the posterior"
     )
     predictive: bool = option(
-        True, help="simulate 20 draws of each round's posterior and compare them with the observation"
+        default=True, help="simulate 20 draws of each round's posterior and compare them with the observation"
     )
 
     @property

@@ -22,7 +22,8 @@ class SharedEngine:
     A device steps the same runs by the same program as one of as many devices in a single process.
     """
 
-    known_failures, references = BatchEngine.known_failures, BatchEngine.references
+    known_failures: str = ""
+    references: np.ndarray | None = None
 
     def __init__(
         self,

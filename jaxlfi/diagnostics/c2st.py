@@ -25,8 +25,7 @@ PATIENCE = 10
 MIN_EPOCHS, MAX_EPOCHS = 50, 10_000
 
 
-@struct.dataclass
-class _Training:
+class _Training(struct.PyTreeNode):
     params: list
     moments: optax.OptState
     epochs: Int[Array, ""]

@@ -7,6 +7,7 @@ same distribution, and each rank from 0 to L is equally likely.
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -161,7 +162,7 @@ def distance_ranks(
     if is_concrete((low, high)) and not (low < high).all():
         raise ValueError(f"low, high: expected low < high, got {low.tolist()} and {high.tolist()}")
     key_point, key_ties = jax.random.split(key)
-    place = jax.random.uniform(key_point, truths.shape)
+    place: Any = jax.random.uniform(key_point, truths.shape)
     place = np.asarray(place, np.float64) if is_concrete((place, truths, draws, low, high)) else place
     point = low + (high - low) * place
     distance = lambda theta, point: ((((theta - point) / (high - low)) ** 2).sum(axis=-1)) ** 0.5

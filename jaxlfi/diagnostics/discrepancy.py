@@ -16,8 +16,7 @@ POSTERIOR_SAMPLES = 20
 """Number of posterior draws that a discrepancy is averaged over (section V)."""
 
 
-@struct.dataclass
-class Discrepancy:
+class Discrepancy(struct.PyTreeNode):
     """How far draws of a posterior, and their simulations, are from the truth and the observation.
 
     Attributes:
@@ -81,7 +80,9 @@ def compared(
     return Discrepancy(theta, _theta_error(task, theta), error, jnp.asarray(trajectory), x, jnp.asarray(len(theta)))
 
 
-def not_simulated(task: Task, theta: Float[Array, "samples dim"], observed: Array, obs: int) -> Discrepancy:
+def not_simulated(
+    task: Task, theta: Float[Array, "samples dim"], observed: Array | np.ndarray, obs: int
+) -> Discrepancy:
     """A discrepancy from the truth alone: nothing is simulated, and what simulations would tell is NaN.
 
     Args:
@@ -97,7 +98,8 @@ def not_simulated(task: Task, theta: Float[Array, "samples dim"], observed: Arra
 
 
 def _theta_error(task: Task, theta: Float[Array, "samples dim"]) -> Float[Array, "samples dim"]:
-    return jnp.abs(theta - (jnp.nan if task.truth is None else task.inference.truth))
+    truth = task.inference.truth
+    return jnp.abs(theta - (jnp.nan if truth is None else truth))
 
 
 def trajectory_distance(trajectory: Array, observed: Array) -> Float[Array, ""]:

@@ -6,6 +6,7 @@ problem, and needs no further simulation.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -105,7 +106,7 @@ def _comparable(x: np.ndarray, observed: np.ndarray) -> np.ndarray:
     return np.all(away <= EXPLODED * np.where(usual > 0, usual, np.inf), axis=1)
 
 
-def _standardised(x: np.ndarray, observed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _standardised(x: Any, observed: Any) -> tuple[np.ndarray, np.ndarray]:
     """Summaries by their spread, without those that never vary; principal components where there are very many."""
     varies = np.ptp(x, axis=0) > 0
     x, observed = x[:, varies], observed[varies]

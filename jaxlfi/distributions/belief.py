@@ -13,8 +13,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import TRIES, rejection_sample, weighted_sample
 
 
-@struct.dataclass
-class Belief:
+class Belief(struct.PyTreeNode):
     """What is believed of the parameters after a round: p_(Theta) in the paper.
 
     Attributes:

@@ -10,4 +10,5 @@ def svd(x: Float[Array, "rows columns"]) -> tuple[Float[Array, "rows rank"], Arr
     By QR iteration. Divide and conquer, `jnp.linalg.svd`'s way on CPUs, hands the matrices of a batch to the threads it
     runs on itself, and waits for them: where two such batches run at once on two cores, both can wait for ever.
     """
-    return jax.lax.linalg.svd(x, full_matrices=False, algorithm=jax.lax.linalg.SvdAlgorithm.QR)
+    left, values, right = jax.lax.linalg.svd(x, full_matrices=False, algorithm=jax.lax.linalg.SvdAlgorithm.QR)
+    return left, values, right

@@ -88,7 +88,7 @@ def rare_draws(density: Any, mixture: GaussianMixture, region: Support | Region)
         theta, log_weight = candidates(key_mixture, mixture, box, (n, CANDIDATES))
         log_weight = log_weight + density.log_prob(theta) - mixture.log_prob(theta)
         near, found = _picked(key_pick, theta, jnp.where(region.contains(theta), log_weight, -jnp.inf))
-        if region is box:
+        if isinstance(region, Support):
             return near
         theta = region.sample(key_anywhere, n * CANDIDATES).reshape(theta.shape)
         log_weight = density.log_prob(theta) - region.log_prior(theta)

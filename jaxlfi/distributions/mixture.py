@@ -17,8 +17,7 @@ HALVINGS = 40
 """Bisections that find a quantile: 2^-40 of the interval it is known to lie in is below the spacing of float32."""
 
 
-@struct.dataclass
-class GaussianMixture:
+class GaussianMixture(struct.PyTreeNode):
     """K Gaussians in D dimensions, sum_k w_k N(mu_k, L_k L_k^T).
 
     Attributes:

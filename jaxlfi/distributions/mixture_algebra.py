@@ -19,8 +19,7 @@ RESOLUTION = 1e-5
 """Relative difference of two whitened precisions below which float32 cannot decide its sign."""
 
 
-@struct.dataclass
-class Pairing:
+class Pairing(struct.PyTreeNode):
     """What happened to the pairs of components of a product or a quotient; only to be looked at.
 
     Pair i * K_b + j is component i of `a` with component j of `b`.
@@ -196,8 +195,7 @@ def reduce(mixture: GaussianMixture, components: int) -> GaussianMixture:
     return GaussianMixture(jnp.log(parts.weights[kept]), parts.means[kept], parts.scale_tril[kept])
 
 
-@struct.dataclass
-class _Pairs:
+class _Pairs(struct.PyTreeNode):
     """All pairs in the whitened variables y = L_1^-1 (theta - m_1), turned to b's principal axes."""
 
     log_weight: Float[Array, " pairs"]  # log w_i v_j
@@ -249,8 +247,7 @@ def _triangular(factor: Float[Array, "*batch dim n"]) -> Float[Array, "*batch di
     return jnp.tril(jnp.swapaxes(upper, -1, -2) * signs[..., None, :])
 
 
-@struct.dataclass
-class _Components:
+class _Components(struct.PyTreeNode):
     """Components with plain weights, [K, ...], or one of them."""
 
     weights: Float[Array, "*comp"]

@@ -9,8 +9,7 @@ from jaxtyping import Array, Float
 from jaxlfi.distributions.mixture import GaussianMixture
 
 
-@struct.dataclass
-class _Components:
+class _Components(struct.PyTreeNode):
     """A mixture by its covariances' eigendecompositions, of standardised samples; fields [K], [K, D], [K, D, D]."""
 
     log_weights: Array

@@ -32,7 +32,7 @@ def single(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def traced(*arguments: Any, **named: Any) -> Any:
-        if not jax.config.jax_enable_x64:
+        if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]  # jax makes it at run time
             return function(*arguments, **named)
         token = _DOUBLE.set(True)
         try:

@@ -11,8 +11,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import TRIES, rejection_sample
 
 
-@struct.dataclass
-class Region:
+class Region(struct.PyTreeNode):
     """A box without the places where a prior is zero. It takes the place of a `Support` where draws are kept inside.
 
     Attributes:

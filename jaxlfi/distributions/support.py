@@ -1,14 +1,23 @@
 """Support: the box Theta = [theta_min, theta_max] the parameters are drawn from."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+if TYPE_CHECKING:
+    AnyArray = Array
+else:
+    AnyArray = Array | np.ndarray
+"""An array of JAX, or of NumPy in its place. Type checkers take it for one of JAX: what is asked of it, both have."""
 
-@struct.dataclass
-class Support:
+
+class Support(struct.PyTreeNode):
     """An axis-aligned box of parameters, Theta in the paper.
 
     Bounds given as Python sequences are checked at once (equal lengths, finite, low < high). Arrays, JAX's or NumPy's,
@@ -29,8 +38,12 @@ class Support:
         [9.0, 0.8999999761581421]
     """
 
-    low: Float[Array | np.ndarray, "*batch dim"]
-    high: Float[Array | np.ndarray, "*batch dim"]
+    low: Float[AnyArray, "*batch dim"]
+    high: Float[AnyArray, "*batch dim"]
+
+    if TYPE_CHECKING:  # it is made of more than it holds
+
+        def __init__(self, low: ArrayLike | Sequence[float], high: ArrayLike | Sequence[float]) -> None: ...
 
     def __post_init__(self):
         if isinstance(self.low, list | tuple) or isinstance(self.high, list | tuple):
@@ -42,12 +55,12 @@ class Support:
                 object.__setattr__(self, name, bound.copy())
 
     @property
-    def width(self) -> Float[Array | np.ndarray, "*batch dim"]:
+    def width(self) -> Float[AnyArray, "*batch dim"]:
         """theta_max - theta_min, the range size r of Algorithms 2-4."""
         return self.high - self.low
 
     @property
-    def centre(self) -> Float[Array | np.ndarray, "*batch dim"]:
+    def centre(self) -> Float[AnyArray, "*batch dim"]:
         """The middle of the box."""
         return 0.5 * (self.low + self.high)
 
@@ -73,7 +86,7 @@ class Support:
         """The smallest box around both."""
         return Support(jnp.minimum(self.low, other.low), jnp.maximum(self.high, other.high))
 
-    def to_unit(self, theta: Float[Array | np.ndarray, "*n dim"]) -> Float[Array, "*n dim"]:
+    def to_unit(self, theta: Float[AnyArray, "*n dim"]) -> Float[Array, "*n dim"]:
         """Scale the box to [-1, 1]^D."""
         return (theta - self.centre) / (0.5 * self.width)
 

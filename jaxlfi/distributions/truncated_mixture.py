@@ -61,8 +61,8 @@ def candidates(
     ordered = _ordered(mixture, support)
 
     def one(component: Array, uniform: Array) -> tuple[Array, Array]:
-        own = jax.tree.map(lambda leaf: leaf[component], ordered)
-        theta, log_weight, _ = _by_conditionals(*own, support, uniform)
+        order, mean, factor = jax.tree.map(lambda leaf: leaf[component], ordered)
+        theta, log_weight, _ = _by_conditionals(order, mean, factor, support, uniform)
         return theta, log_weight - log_masses[component]
 
     for _ in shape:

@@ -22,7 +22,10 @@ MASS_DRAWS = 10_000
 class Place(Protocol):
     """Where draws are kept: a box, or the part of one where a prior is not zero (`jaxlfi.distributions.region`)."""
 
-    dim: int
+    @property
+    def dim(self) -> int:
+        """Number of parameters D."""
+        ...
 
     def contains(self, theta: Float[Array, "*n dim"]) -> Bool[Array, "*n"]:
         """Whether each parameter vector lies inside."""
@@ -86,7 +89,7 @@ def weighted_sample(
         fallback: draws that take the place of those missing where fewer than n candidates have any weight; without one,
             candidates of no weight do.
     """
-    key_noise, key_fallback = (key, None) if fallback is None else jax.random.split(key)
+    key_noise, key_fallback = (key, key) if fallback is None else jax.random.split(key)
     odds = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight) + jax.random.gumbel(key_noise, log_weight.shape)
     best, rows = jax.lax.top_k(odds, n)
     if fallback is None:

@@ -8,8 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 
-@struct.dataclass
-class Contrasts:
+class Contrasts(struct.PyTreeNode):
     """The other rows of a minibatch that each row is compared with.
 
     Attributes:

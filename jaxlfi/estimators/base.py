@@ -86,46 +86,48 @@ class Estimator(Checked, abc.ABC):
         ValueError: from `check` for settings that contradict each other.
     """
 
-    learning_rate: Float[Array, "*batch"] | float = hyperparameter(1e-5, above=0.0, help="learning rate of Adam")
-    weight_decay: Float[Array, "*batch"] | float = hyperparameter(0.0, low=0.0, help="decoupled weight decay")
+    learning_rate: Float[Array, "*batch"] | float = hyperparameter(default=1e-5, above=0.0, help="learning rate of Adam")
+    weight_decay: Float[Array, "*batch"] | float = hyperparameter(default=0.0, low=0.0, help="decoupled weight decay")
     clip_norm: Float[Array, "*batch"] | float = hyperparameter(
-        math.inf,
+        default=math.inf,
         above=0.0,
         high=math.inf,
         help="largest norm of a gradient, to which longer ones are clipped; inf: no clipping",
     )
-    components: int = option(4, low=1, high=1_000_000, help="number K of Gaussians in each network's mixture")
-    ensemble_size: int = option(1, low=1, high=1_000_000, help="number of networks in the ensemble")
-    epochs: int = option(1000, low=0, help="passes over the data per round")
-    steps: int = option(0, low=0, help="gradient steps per round, instead of epochs")
-    batch_size: int = option(100, low=1, help="simulations per minibatch")
-    schedule: str = option("constant", choices=tuple(SCHEDULES), help="learning-rate schedule within a round")
+    components: int = option(default=4, low=1, high=1_000_000, help="number K of Gaussians in each network's mixture")
+    ensemble_size: int = option(default=1, low=1, high=1_000_000, help="number of networks in the ensemble")
+    epochs: int = option(default=1000, low=0, help="passes over the data per round")
+    steps: int = option(default=0, low=0, help="gradient steps per round, instead of epochs")
+    batch_size: int = option(default=100, low=1, help="simulations per minibatch")
+    schedule: str = option(default="constant", choices=tuple(SCHEDULES), help="learning-rate schedule within a round")
     validation: float = option(
-        0.0, low=0.0, high=0.9, help="fraction of the data held out for validation, which selects the weights"
+        default=0.0, low=0.0, high=0.9, help="fraction of the data held out for validation, which selects the weights"
     )
     patience: int = option(
-        0, low=0, help="epochs without a better validation loss before training stops; 0: it never stops early"
+        default=0, low=0, help="epochs without a better validation loss before training stops; 0: it never stops early"
     )
-    warm_start: bool = option(True, help="start each round from the last round's weights, or from new ones")
+    warm_start: bool = option(default=True, help="start each round from the last round's weights, or from new ones")
     loss: str = option(
-        "likelihood",
+        default="likelihood",
         choices=tuple(LOSSES),
         help="training loss; atomic and combined need no correction for the proposals",
     )
-    normaliser: str = option("zscore", choices=tuple(TRANSFORMS), help="how summaries are normalised")
+    normaliser: str = option(default="zscore", choices=tuple(TRANSFORMS), help="how summaries are normalised")
     embedding: str = option(
-        "none",
+        default="none",
         choices=("none", *EMBEDDINGS),
         help="network that extracts features from long summaries, trained together with the density",
     )
-    features: int = option(16, low=1, help="number of features that the embedding extracts")
+    features: int = option(default=16, low=1, help="number of features that the embedding extracts")
     reduction: str = option(
-        "none",
+        default="none",
         choices=("none", "regression", "half"),
         help="whether networks see what regressions predict: none, all of them, or half",
     )
     record_size: int = option(
-        0, low=0, help="numbers per record of the summary (channels of a series, length of a trial); 0: the task's"
+        default=0,
+        low=0,
+        help="numbers per record of the summary (channels of a series, length of a trial); 0: the task's",
     )
 
     closed_form: ClassVar[bool] = False
@@ -244,7 +246,8 @@ class Estimator(Checked, abc.ABC):
 
     def initialise(self, key: jax.Array, dim: int, obs: int) -> dict:
         """Fresh weights for every network of the ensemble."""
-        module, inputs = self.embedded(dim), self.inputs(dim, obs)
+        module: Any = self.embedded(dim)
+        inputs = self.inputs(dim, obs)
         return jax.vmap(lambda k: module.init(k, jnp.zeros(inputs)))(jax.random.split(key, self.ensemble_size))
 
     def begin(
@@ -309,8 +312,7 @@ def viewed(given: Float[Array, "*n given"], view: Float[Array | np.ndarray, " gi
     return given if view is None else given * view
 
 
-@struct.dataclass
-class Network:
+class Network(struct.PyTreeNode):
     """A density estimator: its settings, the weights of the ensemble, and what they were normalised by.
 
     Attributes:

@@ -7,8 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlfi.tasks.simulation import Simulations
 
 
-@struct.dataclass
-class Dataset:
+class Dataset(struct.PyTreeNode):
     """The accumulated pairs (theta, x) of Algorithm 1, line 9. The first `size` rows are filled, the rest are zero.
 
     Attributes:

@@ -21,8 +21,7 @@ class Density(Protocol):
         ...
 
 
-@struct.dataclass
-class EnsembleDensity:
+class EnsembleDensity(struct.PyTreeNode):
     """The mixture of an ensemble's conditional densities.
 
     Attributes:

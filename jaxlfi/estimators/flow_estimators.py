@@ -22,9 +22,9 @@ class FlowEstimator(Estimator):
         transforms: maps from theta to the base, one after another.
     """
 
-    hidden: tuple[int, ...] = option((50, 50), low=1, help="units per hidden layer")
-    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="activation function")
-    transforms: int = option(5, low=1, help="number of transforms per flow")
+    hidden: tuple[int, ...] = option(default=(50, 50), low=1, help="units per hidden layer")
+    activation: str = option(default="tanh", choices=tuple(ACTIVATIONS), help="activation function")
+    transforms: int = option(default=5, low=1, help="number of transforms per flow")
 
     def check(self) -> "FlowEstimator":
         """Refuse settings that cannot work, by name; returns the settings."""
@@ -68,9 +68,9 @@ class SplineFlow(FlowEstimator):
         8
     """
 
-    bins: int = option(10, low=1, high=999, help="number of pieces per spline")
-    tail_bound: float = option(5.0, low=0.1, help="half of the range of the splines, in standard deviations")
-    regression: int = option(0, low=0, help="number of networks that start from a ridge regression on the summaries")
+    bins: int = option(default=10, low=1, high=999, help="number of pieces per spline")
+    tail_bound: float = option(default=5.0, low=0.1, help="half of the range of the splines, in standard deviations")
+    regression: int = option(default=0, low=0, help="number of networks that start from a ridge regression on the summaries")
 
     def begin(
         self,

@@ -28,8 +28,7 @@ _UNIT_SLOPE = float(np.log(np.expm1(1 - MIN_SLOPE)))
 """Raw value of a slope for which softplus and the minimum slope add up to 1."""
 
 
-@struct.dataclass
-class Conditioner:
+class Conditioner(struct.PyTreeNode):
     """A small multilayer perceptron of theta, with the context already in its first layer and its masks applied.
 
     Attributes:
@@ -62,8 +61,7 @@ class Conditioner:
         return out + self.biases[-1].reshape(-1, *[1] * (out.ndim - 1))
 
 
-@struct.dataclass
-class Affine:
+class Affine(struct.PyTreeNode):
     """Shift and scale by x alone: u = (theta - shift) exp(-log_scale).
 
     Attributes:
@@ -84,8 +82,7 @@ class Affine:
         return u * jnp.exp(self.log_scale) + self.shift
 
 
-@struct.dataclass
-class Autoregressive:
+class Autoregressive(struct.PyTreeNode):
     """Shift and scale of each dimension by x and the dimensions before it (Papamakarios et al. 2017).
 
     Attributes:
@@ -110,8 +107,7 @@ class Autoregressive:
         return theta
 
 
-@struct.dataclass
-class SplineCoupling:
+class SplineCoupling(struct.PyTreeNode):
     """Monotonic splines of some dimensions by x and the others, which stay (Durkan et al. 2019).
 
     The splines are rational-quadratic inside [-tail, tail] and the identity outside.
@@ -145,8 +141,7 @@ class SplineCoupling:
         return self._moved(u, inverse=True)[0]
 
 
-@struct.dataclass
-class Flow:
+class Flow(struct.PyTreeNode):
     """q(theta | x) for one x or a batch of them, as a flow network puts it out.
 
     Attributes:
@@ -264,7 +259,7 @@ class NSF(nn.Module):
     def __call__(self, x: Float[Array, "*batch obs"]) -> Flow:
         """The flow for each summary vector."""
         _check(self)
-        transforms = [_affine(self, "affine", x)]
+        transforms: list[Affine | SplineCoupling] = [_affine(self, "affine", x)]
         for t in range(self.transforms):
             changed = coupling(self.dim, t)
             first = np.broadcast_to(~changed, (self.hidden, self.dim))

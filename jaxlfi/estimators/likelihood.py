@@ -4,7 +4,7 @@ Sequential neural likelihood (Papamakarios, Sterratt and Murray 2019). What para
 density of the summary given them, so that the simulations of all rounds can be pooled as they are.
 """
 
-from typing import ClassVar
+from typing import Any, ClassVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -51,9 +51,9 @@ class Likelihood(Estimator):
     """
 
     noise_floor: Float[Array, "*batch"] | float = hyperparameter(
-        0.03, low=0.0, high=1.0, help="noise added to the summaries before training a likelihood"
+        default=0.03, low=0.0, high=1.0, help="noise added to the summaries before training a likelihood"
     )
-    particles: int = option(1000, low=10, help="SMC particles (likelihood methods)")
+    particles: int = option(default=1000, low=10, help="SMC particles (likelihood methods)")
 
     of_summaries: ClassVar[bool] = True
 
@@ -95,7 +95,8 @@ class Likelihood(Estimator):
         self, network: Network, x: Float[Array, " obs"], theta: Float[Array, "*n dim"]
     ) -> Float[Array, "*n"]:
         """Log-density of success with the normalised summary of x, given theta [..., D] in inference space."""
-        module, given = self.module(x.shape[-1]), network.to_network(theta)
+        module: Any = self.module(x.shape[-1])
+        given = network.to_network(theta)
         value = jnp.broadcast_to(network.normaliser(x), (*theta.shape[:-1], x.shape[-1]))
         each = jax.vmap(lambda params: module.apply(params, given).log_prob(value))(network.params)
         of_valid = jax.nn.logsumexp(each, axis=0) - jnp.log(self.ensemble_size)
@@ -132,8 +133,7 @@ def _log_prior(network: Network, theta: Float[Array, "*n dim"]) -> Float[Array, 
     return jnp.zeros(theta.shape[:-1]) if network.prior is None else network.prior.log_prob(theta)
 
 
-@struct.dataclass
-class LikelihoodDensity:
+class LikelihoodDensity(struct.PyTreeNode):
     """Likelihood times prior on a box, divided by the evidence: a posterior that has been truncated already.
 
     Attributes:
@@ -153,7 +153,7 @@ class LikelihoodDensity:
 
     def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
         """Log-density at theta; -inf outside of the box."""
-        log_likelihood = self.network.estimator.log_likelihood(self.network, self.x, theta)
+        log_likelihood = cast(Likelihood, self.network.estimator).log_likelihood(self.network, self.x, theta)
         joint = jnp.maximum(jnp.nan_to_num(log_likelihood, nan=LEAST), LEAST) + _log_prior(self.network, theta)
         inside = region(self.support, self.network.prior).contains(theta)
         return jnp.where(inside, joint - self.log_evidence, -jnp.inf)
@@ -190,9 +190,10 @@ class LikelihoodDensity:
         return jnp.where(jnp.any(log_weight > -jnp.inf, axis=1, keepdims=True), theta, instead)
 
 
-@struct.dataclass
 class LikelihoodPosterior(Posterior):
     """The posterior by a likelihood: nothing of it is outside of its support, and on another one it is found anew."""
+
+    density: LikelihoodDensity
 
     def inner_draws(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` draws in inference space."""

@@ -12,8 +12,7 @@ from jaxlfi.estimators.mdn import ACTIVATIONS, Dense
 from jaxlfi.fields import option
 
 
-@struct.dataclass
-class SummaryMixture:
+class SummaryMixture(struct.PyTreeNode):
     """A mixture of Gaussians over summaries, by the Cholesky factors of its precisions.
 
     As `jaxlfi.estimators.mdn.MixtureHead`, but with the factors' entries below the diagonal as a vector: there are many
@@ -87,8 +86,8 @@ class MixtureLikelihood(Likelihood):
         True
     """
 
-    hidden: tuple[int, ...] = option((50, 50), low=1, help="units per hidden layer")
-    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="activation function")
+    hidden: tuple[int, ...] = option(default=(50, 50), low=1, help="units per hidden layer")
+    activation: str = option(default="tanh", choices=tuple(ACTIVATIONS), help="activation function")
 
     def check(self) -> "MixtureLikelihood":
         """Refuse settings that cannot work, by name; returns the settings."""

@@ -15,8 +15,7 @@ ATOMS = 10
 """Parameter vectors M that the atomic loss compares for each simulation, at most (the paper's appendix A)."""
 
 
-@struct.dataclass
-class Rows:
+class Rows(struct.PyTreeNode):
     """Simulations as the network sees them.
 
     A posterior network gives a density of parameters for a summary, a likelihood network one of summaries for

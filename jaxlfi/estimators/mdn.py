@@ -16,8 +16,7 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "tanh": nn.
 """Activations by name."""
 
 
-@struct.dataclass
-class MixtureHead:
+class MixtureHead(struct.PyTreeNode):
     """A mixture as the network puts it out, by the Cholesky factors of its *precisions*.
 
     With precision U^T U, the log-density of a component needs a product with U and the logarithms of its diagonal: no

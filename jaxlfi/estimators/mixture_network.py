@@ -1,7 +1,7 @@
 """The mixture density network as an estimator: the paper's family."""
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import flax.linen as nn
 import jax
@@ -40,13 +40,13 @@ class MixtureNetwork(Estimator):
         8
     """
 
-    hidden: tuple[int, ...] = option((1024, 1024, 1024), low=1, help="units per hidden layer")
-    activation: str = option("tanh", choices=tuple(ACTIVATIONS), help="activation function")
+    hidden: tuple[int, ...] = option(default=(1024, 1024, 1024), low=1, help="units per hidden layer")
+    activation: str = option(default="tanh", choices=tuple(ACTIVATIONS), help="activation function")
     parameters: str = option(
-        "feasible", choices=("feasible", "zscore"), help="how parameters are scaled: by Phi, or to unit variance"
+        default="feasible", choices=("feasible", "zscore"), help="how parameters are scaled: by Phi, or to unit variance"
     )
     prune: Float[Array, "*batch"] | float = hyperparameter(
-        0.0, low=0.0, high=0.5, help="smallest weight of a component; lighter ones are dropped"
+        default=0.0, low=0.0, high=0.5, help="smallest weight of a component; lighter ones are dropped"
     )
 
     closed_form: ClassVar[bool] = True
@@ -97,7 +97,7 @@ class MixtureNetwork(Estimator):
         return self._pooled(network, x, network.log_weights)
 
     def _pooled(self, network: Network, x: Array, log_weights: Array | None) -> GaussianMixture:
-        module = self.embedded(network.scale.dim)
+        module: Any = self.embedded(network.scale.dim)
         x = network.given(x)
         one = lambda params, view: module.apply(params, viewed(x, view)).mixture().prune(self.prune)
         each = jax.vmap(one)(network.params, network.views)
@@ -113,6 +113,6 @@ class MixtureNetwork(Estimator):
         """The mixture, which is the density itself, truncated."""
         return truncated(mixture, mixture, support, network.space, network.prior)
 
-    def mixture(self, key: jax.Array | None, density: GaussianMixture, support: Place) -> GaussianMixture:
+    def mixture(self, key: jax.Array | None, density: Any, support: Place) -> GaussianMixture:
         """The density itself."""
         return density

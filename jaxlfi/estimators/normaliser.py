@@ -23,8 +23,7 @@ The number is odd so that the median is one of the values, and changes only its 
 """
 
 
-@struct.dataclass
-class Normaliser:
+class Normaliser(struct.PyTreeNode):
     """A fixed elementwise transform between two changes of origin and unit.
 
     Attributes:

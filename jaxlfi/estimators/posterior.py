@@ -36,8 +36,7 @@ ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
 """How far a bound in natural units can be off, relative to its size."""
 
 
-@struct.dataclass
-class Posterior:
+class Posterior(struct.PyTreeNode):
     """The posterior of an observation: a density on a box, as a pytree.
 
     It is always the density truncated to the support, and zero where a prior that the task brings is zero. Draws are

@@ -15,8 +15,7 @@ from jaxlfi.estimators.ridge import ridge
 from jaxlfi.estimators.statistics import statistics, statistics_size
 
 
-@struct.dataclass
-class Regression:
+class Regression(struct.PyTreeNode):
     """The features of a summary: P = D of its numbers, and D more of its statistics where it is a series.
 
     Attributes:
@@ -81,12 +80,12 @@ def fit_regression(
     z = jnp.where(valid[:, None], predictors(every), 0.0)
     obs = x.shape[-1]
     parts = [slice(0, obs), slice(obs, None)] if every.shape[-1] > obs else [slice(None)]
-    coefficients, features = [], []
+    coefficients, by_part = [], []
     for part in parts:
         found, _, left_out = ridge(z[:, part], theta, near)
         coefficients.append(jnp.zeros((theta.shape[-1], z.shape[-1])).at[:, part].set(found))
-        features.append(jnp.where(near[:, None], left_out, z[:, part] @ found.T))
-    features = jnp.concatenate(features, axis=-1)
+        by_part.append(jnp.where(near[:, None], left_out, z[:, part] @ found.T))
+    features = jnp.concatenate(by_part, axis=-1)
     output = standardiser(features, valid)
     return before.replace(predictors=predictors, coefficients=jnp.concatenate(coefficients), output=output), output(
         features

@@ -23,8 +23,7 @@ LEAST = -1e10
 LogDensity = Callable[[Float[Array, " dim"]], Float[Array, ""]]
 
 
-@struct.dataclass
-class Tempered:
+class Tempered(struct.PyTreeNode):
     """The final particles.
 
     Attributes:

@@ -1,5 +1,7 @@
 """Fitting q_phi to a masked dataset by Adam, as one loop over epochs."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -16,8 +18,7 @@ STEPS_PER_EPOCH = 50
 """Maximum gradient steps in an epoch, where steps are counted; the validation loss is computed after each epoch."""
 
 
-@struct.dataclass
-class FitInfo:
+class FitInfo(struct.PyTreeNode):
     """A record of the fit; P epochs, E networks in the ensemble.
 
     Attributes:
@@ -34,15 +35,13 @@ class FitInfo:
     nonfinite: Int[Array, "*batch"]
 
 
-@struct.dataclass
-class _Training:
+class _Training(struct.PyTreeNode):
     params: dict
     moments: optax.OptState
     nonfinite: Int[Array, ""]
 
 
-@struct.dataclass
-class _Best:
+class _Best(struct.PyTreeNode):
     params: dict
     loss: Float[Array, ""]
     at: Int[Array, ""]
@@ -110,7 +109,8 @@ def _weights(network: Network, dataset: Dataset, data: Rows, rows: Array) -> Flo
     count = jnp.floor(estimator.validation * dataset.size).astype(jnp.int32)
     places = jnp.arange(max(2, int(estimator.validation * dataset.capacity)))
     held_out = jnp.take(rows, jnp.maximum(dataset.size - count, 1) + places, mode="clip")
-    own, module = data.take(held_out), estimator.embedded(dataset.theta.shape[-1])
+    own = data.take(held_out)
+    module: Any = estimator.embedded(dataset.theta.shape[-1])
     score = lambda params, view: module.apply(params, viewed(own.given, view)).log_prob(own.value)
     return stacked(jax.vmap(score)(network.params, network.views), (places < count) * dataset.late[held_out] * 1.0)
 

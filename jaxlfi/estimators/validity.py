@@ -6,6 +6,8 @@ none of the selection either. The posterior given that the observation is a vali
 they have learnt times P(valid | theta).
 """
 
+from typing import cast
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -22,8 +24,7 @@ from jaxlfi.estimators.training import fit
 from jaxlfi.fields import option
 
 
-@struct.dataclass
-class Success:
+class Success(struct.PyTreeNode):
     """Whether a simulation succeeds: 1 with the probability of a logit, else 0."""
 
     logit: Float[Array, "*batch"]
@@ -50,7 +51,7 @@ class SuccessNetwork(nn.Module):
 class SuccessLikelihood(Likelihood):
     """The likelihood of an outcome, as if it were a summary."""
 
-    hidden: tuple[int, ...] = option((32, 32), low=1, help="units per hidden layer")
+    hidden: tuple[int, ...] = option(default=(32, 32), low=1, help="units per hidden layer")
 
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one ensemble member."""
@@ -72,8 +73,7 @@ ESTIMATOR = SuccessLikelihood(
 """Four small networks, each with the weights of the epoch that was best on its held-out fifth of the attempts."""
 
 
-@struct.dataclass
-class Validity:
+class Validity(struct.PyTreeNode):
     """The probability of success of a simulation, by its parameters.
 
     Attributes:
@@ -86,7 +86,7 @@ class Validity:
 
     def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
         """Logarithm of the probability, at parameters in inference space."""
-        learnt = self.network.estimator.log_likelihood(self.network, jnp.ones(1), theta)
+        learnt = cast(Likelihood, self.network.estimator).log_likelihood(self.network, jnp.ones(1), theta)
         return jnp.where(self.failures > 0, learnt, 0.0)
 
     def learnt(self, key: jax.Array, attempts: Dataset) -> "Validity":

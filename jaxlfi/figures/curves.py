@@ -15,8 +15,8 @@ def trajectory_curve(runs: Runs, configuration: str, alpha: float = 1.0) -> np.n
     errors = [h.trajectory_error for h in runs[configuration] if h.trajectory_error is not None]
     if not errors:
         return None
-    errors = np.stack(errors)
-    return np.exp(-alpha * np.where(np.isnan(errors), np.inf, errors))
+    stacked = np.stack(errors)
+    return np.exp(-alpha * np.where(np.isnan(stacked), np.inf, stacked))
 
 
 def theta_curve(runs: Runs, configuration: str, alpha: float = 1.0) -> np.ndarray | None:

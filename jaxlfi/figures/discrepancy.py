@@ -1,6 +1,6 @@
 """Distance of the last posterior from the true parameters, and of its trajectories from the observed one."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -70,7 +70,8 @@ class Panel(NamedTuple):
 def panels(runs: Runs) -> list[Panel]:
     """One panel per parameter, if the truth is known, and one for the trajectory."""
     first = next(iter(runs.values()))[0]
-    thetas, trajectories = {}, {}
+    thetas: dict[str, Any] = {}
+    trajectories: dict[str, Any] = {}
     for name in runs:
         theta, trajectory = final_errors(runs, name)
         thetas |= {} if theta is None else {name: theta}

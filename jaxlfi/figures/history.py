@@ -320,7 +320,7 @@ def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
             f"least one round, got {arrays['theta'].shape} and {arrays['logits'].shape}"
         )
     (rounds, simulations, dim), components = arrays["theta"].shape, arrays["logits"].shape[1]
-    expected = dict.fromkeys(("counted", "kept", "failure"), (rounds, simulations))
+    expected: dict[str, tuple[int, ...]] = dict.fromkeys(("counted", "kept", "failure"), (rounds, simulations))
     expected |= {name: (rounds, dim) for name in REQUIRED if name.endswith(("_low", "_high"))}
     expected |= {
         "logits": (rounds, components),

@@ -16,8 +16,7 @@ Value = Float[Array, ""] | Float[Array, " dim"] | float | int
 """Of a hyperparameter: a scalar, or one value a dimension."""
 
 
-@struct.dataclass
-class Adaptation:
+class Adaptation(struct.PyTreeNode):
     """What a heuristic saw and what it did in one round; only to be looked at.
 
     Attributes:
@@ -50,7 +49,7 @@ class Heuristic(Checked, abc.ABC):
         >>> from jaxlfi.fields import hyperparameter
         >>> from jaxlfi.heuristics import adapted
         >>> class Widen(Heuristic):
-        ...     expansion: float = hyperparameter(0.1, help="how far both bounds move", symbol="eta", low=0)
+        ...     expansion: float = hyperparameter(default=0.1, help="how far both bounds move", symbol="eta", low=0)
         ...
         ...     def __call__(self, previous, posterior, feasible):
         ...         everywhere = jnp.ones_like(previous.support.low, bool)

@@ -25,17 +25,17 @@ class Choice(Heuristic):
     rules: tuple[Heuristic, ...]
 
     @property
-    def grows(self) -> bool:
+    def grows(self) -> bool:  # type: ignore[override]  # its rules say, and only an instance has them
         """Whether any rule can let the support grow."""
         return any(rule.grows for rule in self.rules)
 
     @property
-    def proposes_from_prior(self) -> bool:
+    def proposes_from_prior(self) -> bool:  # type: ignore[override]  # its rules say, and only an instance has them
         """Whether all rules always propose from the prior."""
         return all(rule.proposes_from_prior for rule in self.rules)
 
     @property
-    def compares_components(self) -> bool:
+    def compares_components(self) -> bool:  # type: ignore[override]  # its rules say, and only an instance has them
         """Whether any rule compares components."""
         return any(rule.compares_components for rule in self.rules)
 

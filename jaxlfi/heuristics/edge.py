@@ -35,22 +35,22 @@ class Edge(Heuristic):
     """
 
     zone_fraction: Value = hyperparameter(
-        0.1, help="width of the zone along a bound, as a fraction of the support's width", symbol="delta", low=0, high=1
+        default=0.1, help="width of the zone along a bound, as a fraction of the support's width", symbol="delta", low=0, high=1
     )
     mass_threshold: Value = hyperparameter(
-        0.12, help="posterior mass in the zone above which the bound moves", symbol="tau", low=0, high=1
+        default=0.12, help="posterior mass in the zone above which the bound moves", symbol="tau", low=0, high=1
     )
     expansion: Value = hyperparameter(
-        0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
+        default=0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
     )
     zone_width: Value = hyperparameter(
-        0.0,
+        default=0.0,
         help="width of the zone along a bound, in the parameter's units, added to the fraction",
         symbol="delta",
         low=0,
     )
     tail: Value = hyperparameter(
-        1.0, help="fraction of the mass beyond the bound that counts as in the zone", low=0, high=1
+        default=1.0, help="fraction of the mass beyond the bound that counts as in the zone", low=0, high=1
     )
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:

@@ -130,8 +130,13 @@ def _check_ranges(rule: Heuristic) -> None:
 def _wrapped(rule: Heuristic) -> list[Heuristic]:
     """The rules that a heuristic's fields hold."""
     found: list[Heuristic] = []
+
+    def note(inner: Heuristic) -> Heuristic:
+        found.append(inner)
+        return inner
+
     for field in dataclasses.fields(rule):
-        _map_rules(lambda inner: found.append(inner) or inner, getattr(rule, field.name))
+        _map_rules(note, getattr(rule, field.name))
     return found
 
 
@@ -154,6 +159,6 @@ def _map_rules(function: Callable[[Heuristic], Heuristic], value: Any) -> Any:
         unchanged = all(new is old for new, old in zip(parts, value, strict=True))
         return value if unchanged else type(value)(parts)
     if isinstance(value, dict):
-        parts = {name: _map_rules(function, part) for name, part in value.items()}
-        return value if all(parts[name] is value[name] for name in value) else parts
+        named = {name: _map_rules(function, part) for name, part in value.items()}
+        return value if all(named[name] is value[name] for name in value) else named
     return value

@@ -32,12 +32,12 @@ class Matched(Heuristic):
     rule: Heuristic
 
     @property
-    def grows(self) -> bool:
+    def grows(self) -> bool:  # type: ignore[override]  # its rules say, and only an instance has them
         """Whether the rule can let the support grow."""
         return self.rule.grows
 
     @property
-    def proposes_from_prior(self) -> bool:
+    def proposes_from_prior(self) -> bool:  # type: ignore[override]  # its rules say, and only an instance has them
         """Whether the rule always proposes from the prior."""
         return self.rule.proposes_from_prior
 

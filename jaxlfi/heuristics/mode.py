@@ -31,20 +31,24 @@ class Mode(Heuristic):
     compares_components = True
 
     shift_threshold: Value = hyperparameter(
-        0.01, help="how far a mode must have moved since the last round", symbol="nu_TH", low=0
+        default=0.01, help="how far a mode must have moved since the last round", symbol="nu_TH", low=0
     )
     proximity: Value = hyperparameter(
-        0.4, help="how near a bound a mode must be, as a fraction of the support's width", symbol="rho", low=0, high=1
+        default=0.4,
+        help="how near a bound a mode must be, as a fraction of the support's width",
+        symbol="rho",
+        low=0,
+        high=1,
     )
     mass_threshold: Value = hyperparameter(
-        0.05,
+        default=0.05,
         help="weight of the modes that move towards a bound, above which the bound moves",
         symbol="tau",
         low=0,
         high=1,
     )
     expansion: Value = hyperparameter(
-        0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
+        default=0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
     )
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:

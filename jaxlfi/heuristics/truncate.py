@@ -38,7 +38,7 @@ class Truncate(Heuristic):
     grows = False
     proposes_from_prior = True
 
-    quantile: Value = hyperparameter(1e-3, help="posterior mass left beyond each bound", low=0, below=0.5)
+    quantile: Value = hyperparameter(default=1e-3, help="posterior mass left beyond each bound", low=0, below=0.5)
 
     def __call__(self, previous: Belief, posterior: GaussianMixture, feasible: Support) -> tuple[Belief, Adaptation]:
         """Intersect the support with the posterior's interval; the evidence is the interval's two ends, shape [D]."""

@@ -104,7 +104,8 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], compress: bool = True, d
     if objects := [name for name, value in plain.items() if value.dtype.hasobject]:
         raise TypeError(f"expected arrays of numbers or strings, got Python objects in {objects}")
     buffer = io.BytesIO()
-    (np.savez_compressed if compress else np.savez)(buffer, **plain)
+    write: Any = np.savez_compressed if compress else np.savez
+    write(buffer, **plain)
     write_bytes(path, buffer.getvalue(), durable)
 
 

@@ -2,6 +2,7 @@
 
 import time
 from types import TracebackType
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -53,7 +54,7 @@ class RoundProgress:
             TextColumn("left"),
         )
         self._bar = Progress(*columns, console=console) if console.is_terminal else None
-        self._task = self._bar.add_task(label, total=rounds, completed=done) if self._bar else None
+        self._task: Any = self._bar.add_task(label, total=rounds, completed=done) if self._bar else None
 
     def __enter__(self) -> "RoundProgress":
         """Show the bar, or say what begins."""

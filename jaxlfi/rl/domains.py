@@ -23,8 +23,7 @@ ROUNDING = 1e-5
 """How far apart bounds are the same, as a fraction: exp(ln x) in single precision errs by some 1e-7 ln x."""
 
 
-@struct.dataclass
-class Domain:
+class Domain(struct.PyTreeNode):
     """Points theta in natural units, one for each environment of a training or evaluation.
 
     Attributes:

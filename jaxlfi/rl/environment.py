@@ -57,8 +57,7 @@ class Signals:
         return values * np.float32(self.scale) + np.float32(self.centre)
 
 
-@struct.dataclass
-class EnvState:
+class EnvState(struct.PyTreeNode):
     """An episode between two steps.
 
     Attributes:

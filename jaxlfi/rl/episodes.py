@@ -11,8 +11,7 @@ from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.environment import Environment, EnvState
 
 
-@struct.dataclass
-class Episodes:
+class Episodes(struct.PyTreeNode):
     """N environments between two steps; its fields `obs`, `reward`, `done` and `info` are those of Brax's states.
 
     Attributes:
@@ -38,8 +37,7 @@ class Episodes:
     info: dict[str, Any]
 
 
-@struct.dataclass
-class Ended:
+class Ended(struct.PyTreeNode):
     """Episodes that ended in a step.
 
     Attributes:

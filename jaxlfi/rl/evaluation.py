@@ -14,8 +14,7 @@ from jaxlfi.rl.environment import Environment
 from jaxlfi.rl.policy import Policy
 
 
-@struct.dataclass
-class Outcomes:
+class Outcomes(struct.PyTreeNode):
     """One episode at each point of a domain.
 
     Attributes:

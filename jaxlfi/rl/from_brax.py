@@ -19,8 +19,7 @@ MODELS = ("sys", "_mjx_model")
 """Attributes that hold an environment's model: of Brax's environments, and of MuJoCo Playground's."""
 
 
-@struct.dataclass
-class Inner:
+class Inner(struct.PyTreeNode):
     """A state of the environment, and the parameters of its episode.
 
     Attributes:

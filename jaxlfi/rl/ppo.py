@@ -33,8 +33,7 @@ except ImportError as error:
     raise ImportError("jaxlfi.rl needs Brax: pip install 'jaxlfi[policy]'") from error
 
 
-@struct.dataclass
-class Training:
+class Training(struct.PyTreeNode):
     """What the next update needs.
 
     Attributes:
@@ -52,8 +51,7 @@ class Training:
     updates: Int[Array, ""]
 
 
-@struct.dataclass
-class Update:
+class Update(struct.PyTreeNode):
     """What an update did.
 
     Attributes:

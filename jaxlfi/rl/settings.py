@@ -17,35 +17,40 @@ class PPO(Checked):
         ValueError: for values out of range, and segments that cannot be divided among the environments.
     """
 
-    learning_rate: Number = hyperparameter(3e-4, help="learning rate of Adam", low=0)
+    learning_rate: Number = hyperparameter(default=3e-4, help="learning rate of Adam", low=0)
     annealing: Number = hyperparameter(
-        0.0, help="fraction by which the learning rate falls, linearly, until the last update", low=0, high=1
+        default=0.0,
+        help="fraction by which the learning rate falls, linearly, until the last update",
+        low=0,
+        high=1,
     )
-    discount: Number = hyperparameter(0.99, help="discount factor", symbol="gamma", low=0, high=1)
+    discount: Number = hyperparameter(default=0.99, help="discount factor", symbol="gamma", low=0, high=1)
     gae_lambda: Number = hyperparameter(
-        0.95, help="decay of the generalised advantage estimate", symbol="lambda", low=0, high=1
+        default=0.95, help="decay of the generalised advantage estimate", symbol="lambda", low=0, high=1
     )
-    entropy: Number = hyperparameter(0.0, help="entropy bonus: weight of the policy's entropy in the loss", low=0)
+    entropy: Number = hyperparameter(default=0.0, help="entropy bonus: weight of the policy's entropy in the loss", low=0)
     clipping: Number = hyperparameter(
-        0.2, help="PPO clipping range of the probability ratio", symbol="epsilon", above=0
+        default=0.2, help="PPO clipping range of the probability ratio", symbol="epsilon", above=0
     )
-    value_weight: Number = hyperparameter(0.5, help="weight of the value function's loss", low=0)
+    value_weight: Number = hyperparameter(default=0.5, help="weight of the value function's loss", low=0)
     max_gradient_norm: Number = hyperparameter(
-        0.5, help="largest norm of a gradient, to which longer ones are clipped", above=0
+        default=0.5, help="largest norm of a gradient, to which longer ones are clipped", above=0
     )
-    adam_epsilon: Number = hyperparameter(1e-5, help="epsilon of Adam", above=0)
+    adam_epsilon: Number = hyperparameter(default=1e-5, help="epsilon of Adam", above=0)
     initial_deviation: Number = hyperparameter(
-        1.0, help="standard deviation of the first policy's actions, as a fraction of their limit", above=0
+        default=1.0, help="standard deviation of the first policy's actions, as a fraction of their limit", above=0
     )
-    environments: int = option(12, help="number of environments stepped in parallel, each with its own theta", low=1)
-    unroll: int = option(16, help="steps per trajectory segment", low=1)
-    segments: int = option(1, help="trajectory segments per minibatch", low=1)
-    minibatches: int = option(1536, help="minibatches per update", low=1)
-    epochs: int = option(10, help="epochs per update", low=1)
-    total_steps: int = option(60_000, help="total environment steps, rounded up to whole updates", low=1)
-    hidden: tuple[int, ...] = option((64, 64), help="widths of the hidden layers of both networks", low=1)
+    environments: int = option(default=12, help="number of environments stepped in parallel, each with its own theta", low=1)
+    unroll: int = option(default=16, help="steps per trajectory segment", low=1)
+    segments: int = option(default=1, help="trajectory segments per minibatch", low=1)
+    minibatches: int = option(default=1536, help="minibatches per update", low=1)
+    epochs: int = option(default=10, help="epochs per update", low=1)
+    total_steps: int = option(
+        default=60_000, help="total environment steps, rounded up to whole updates", low=1
+    )
+    hidden: tuple[int, ...] = option(default=(64, 64), help="widths of the hidden layers of both networks", low=1)
     redrawn: bool = option(
-        False, help="draw a new theta for every episode; otherwise each environment keeps its own, as in the paper"
+        default=False, help="draw a new theta for every episode; otherwise each environment keeps its own, as in the paper"
     )
 
     def __post_init__(self):

@@ -48,7 +48,9 @@ class Checkpoint:
     def read_start(self) -> tuple[np.ndarray, np.ndarray, Simulations | None]:
         """The runs' observations and summaries, and the simulations that were given for the first round."""
         start = self._read("start.npz")
-        given = {name.removeprefix(GIVEN): leaf for name, leaf in start.items() if name.startswith(GIVEN)}
+        given: dict[str, Any] = {
+            name.removeprefix(GIVEN): leaf for name, leaf in start.items() if name.startswith(GIVEN)
+        }
         given |= {name: jnp.asarray(leaf) for name, leaf in given.items() if name != "x"}  # which may be more precise
         observed, x = (self._named(start, "start.npz", name) for name in ("observed", "x"))
         try:

@@ -32,9 +32,10 @@ def _renamed(description: Mapping[str, Any]) -> Mapping[str, Any]:
     """The settings of the second format, in which a normaliser that finds its units had a name of its own."""
     estimator = description.get("estimator") if isinstance(description, Mapping) else None
     fields = estimator.get("hyperparameters") if isinstance(estimator, Mapping) else None
-    if not isinstance(fields, Mapping) or fields.get("normaliser") != "fitted-asinh":
+    if estimator is None or not isinstance(fields, Mapping) or fields.get("normaliser") != "fitted-asinh":
         return description
-    return description | {"estimator": estimator | {"hyperparameters": fields | {"normaliser": "asinh"}}}
+    fields = {**fields, "normaliser": "asinh"}
+    return {**description, "estimator": {**estimator, "hyperparameters": fields}}
 
 
 def heuristic_to_json(heuristic: Heuristic) -> dict[str, Any]:

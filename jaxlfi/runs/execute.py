@@ -186,7 +186,7 @@ def execute(
     done = 0 if checkpoint is None else checkpoint.rounds_done()
     rows, seconds, final = ([], [], {}) if checkpoint is None else checkpoint.read_rounds(done)
     messages: list[list[Message]] = [[] for _ in plan.specs]
-    if checkpoint is not None:
+    if folder is not None and checkpoint is not None:
         _complete_ledgers(folder, plan, rows, seconds, places)
         messages = [failures.cut(folder / name, done) for name in plan.folders()]
 

@@ -46,7 +46,7 @@ def to_inference_data(folder: Path | str, n: int = 1000, seed: int = 0) -> Any:
     dims = ["time", "channel"][: observed.ndim]
     labels = channels if len(channels) == observed.shape[-1] else np.arange(observed.shape[-1])
     coords = {"time": times, "channel": labels}
-    groups = {"observed_data": {"trajectory": observed}}
+    groups: dict[str, dict[str, Any]] = {"observed_data": {"trajectory": observed}}
     valid = np.isfinite(run.history["sample_trajectory_error"][-1])
     if valid.any():
         groups["posterior_predictive"] = {"trajectory": run.history["final_trajectory"][valid][None]}

@@ -51,6 +51,12 @@ def append_ledger(folder: Path, index: int, row: Mapping[str, np.ndarray], reaso
     atomic.append_line(folder / "ledger.jsonl", line)
 
 
+def _task_of(run: "Run") -> Task:
+    if run.task is None:
+        raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
+    return run.task
+
+
 def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
     """Write the arrays of one finished run into its folder, which exists and has its ledger.
 
@@ -59,7 +65,7 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
         run: one run, with the task.
         keep_network: save the network also where the posterior can do without.
     """
-    task, history = run.task, jax.device_get(run.history)
+    task, history = _task_of(run), jax.device_get(run.history)
     belief, labels = jax.device_get(run.belief), np.asarray(run.space.labels)
     draws = run.draws()
     atomic.write_arrays(
@@ -111,12 +117,13 @@ def save(run: "Run", folder: Path) -> Path:
     Raises:
         StoreError: for a run without its task, or one of an earlier version that lacks what is recorded now.
     """
+    task = _task_of(run)
 
     def fill(staging: Path) -> None:
         for index, seconds in enumerate(np.asarray(run.history["seconds"])):
             row = {name: value[index] for name, value in run.history.items() if not name.startswith(FINAL)}
             try:
-                append_ledger(staging, index, jax.device_get(row), run.task.reasons, seconds)
+                append_ledger(staging, index, jax.device_get(row), task.reasons, seconds)
             except KeyError as missing:  # of a folder from before there was such a record
                 raise StoreError(
                     f"save: expected a run whose history has {missing}, got one without, as earlier versions made it: "
@@ -125,9 +132,7 @@ def save(run: "Run", folder: Path) -> Path:
         failures.append(staging, run.failure_log.messages)
         write_run(staging, run)
 
-    if run.task is None:
-        raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
-    workfolder.create(folder, run_config(run.task, run.origin, run.spec, run.settings), fill)
+    workfolder.create(folder, run_config(task, run.origin, run.spec, run.settings), fill)
     return folder
 
 

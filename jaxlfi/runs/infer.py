@@ -200,7 +200,11 @@ def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
     added = {"one_by_one": False, "simulation_timeout": None}
     other += [name for name, before in added.items() if config.get(name, before) != wanted[name]]
     priors = [np.asarray(described.get(PRIOR), float) for described in (config, wanted)]
-    if PRIOR in config and "prior" not in other and not np.allclose(*priors, rtol=1e-3, atol=1e-3, equal_nan=True):
+    if (
+        PRIOR in config
+        and "prior" not in other
+        and not np.allclose(priors[0], priors[1], rtol=1e-3, atol=1e-3, equal_nan=True)
+    ):
         other.append("prior")
     if other:
         raise _of_another_run(out, other)

@@ -122,7 +122,7 @@ def _read(folder: Path, config: dict[str, Any], task: Task | None) -> Run:
 
 def _failure_log(folder: Path, history: dict[str, np.ndarray]) -> failures.FailureLog:
     try:
-        return failures.FailureLog(map(str, history.get("reasons", ())), failures.read(folder))
+        return failures.FailureLog([*map(str, history.get("reasons", ()))], failures.read(folder))
     except ValueError as error:
         raise StoreError(str(error)) from error
 

@@ -69,8 +69,7 @@ class Origin:
     given_simulations: int | None = 0
 
 
-@struct.dataclass
-class Run:
+class Run(struct.PyTreeNode):
     """What an inference run found. A pytree: under `vmap`, every array has a leading axis.
 
     Attributes:
@@ -96,7 +95,7 @@ class Run:
     """
 
     belief: Belief
-    history: dict[str, Array]
+    history: dict[str, Any]
     dataset: Dataset
     network: Network | None
     observed: Float[Array | np.ndarray, "*shape"]

@@ -58,7 +58,7 @@ def summarised(
         text
         for d, one in enumerate(parameters)
         for text in (
-            _of_the_guess(one, draws[:, d], *(_bounds(box, d) for box in (guess, last)), heuristic),
+            _of_the_guess(one, draws[:, d], _bounds(guess, d), _bounds(last, d), heuristic),
             _of_its_bounds(one, *(_bounds(box, d) for box in (last, feasible))),
             _unconstrained(one),
         )

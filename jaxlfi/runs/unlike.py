@@ -20,7 +20,8 @@ def observation_findings(run: "Run") -> list[Finding]:
         run: one run, concrete.
     """
     rows = slice(int(run.dataset.size))
-    names, channels = None, ()
+    names: tuple[str, ...] | None = None
+    channels: tuple[str, ...] = ()
     if run.task is not None:
         names, channels = names_of(run.task, np.shape(run.observed), len(run.x))
     return unlike(np.asarray(run.x), np.asarray(run.dataset.x)[rows], names, channels)
@@ -45,7 +46,7 @@ def names_of(task: Task, trajectory: Sequence[int], size: int) -> tuple[tuple[st
     Returns:
         S names; and C names, or none where it is no series.
     """
-    names, channels = task.named_summaries(size), task.channels
+    names, channels = task.named_summaries(size), tuple(task.channels)
     if task.summary is not summaries.identity or task.summary_names or len(trajectory) > 2:
         return names, ()
     # A vector may be a series or single numbers, each in a unit of its own.

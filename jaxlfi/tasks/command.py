@@ -49,6 +49,7 @@ class Command:
 
     template: str
     names: Sequence[str]
+    _words: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
         object.__setattr__(self, "names", tuple(self.names))

@@ -1,5 +1,6 @@
 """Simulations one by one: here or through an executor, to the same bits in any order of arrival."""
 
+import functools
 import queue
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
@@ -49,6 +50,7 @@ def simulate_each(
     arrived: queue.SimpleQueue[tuple[int, Future]] = queue.SimpleQueue()
     pending: dict[int, Future] = {}
     begun, successes = 0, 0
+    arrive = lambda place, future: arrived.put((place, future))
     missing = lambda: len(requests) if wanted is None else wanted - successes
     journal.expect(len(requests) if wanted is None else min(wanted, len(requests)))
     try:
@@ -57,7 +59,7 @@ def simulate_each(
                 known = journal.find(requests[begun])
                 if known is None:
                     pending[begun] = _submitted(submit, requests[begun])
-                    pending[begun].add_done_callback(lambda future, place=begun: arrived.put((place, future)))
+                    pending[begun].add_done_callback(functools.partial(arrive, begun))
                 else:
                     answers[begun] = known
                     successes += known.succeeded

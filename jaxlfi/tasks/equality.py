@@ -33,6 +33,7 @@ def same(a: Any, b: Any) -> bool:
         return len(a) == len(b) and all(map(same, a, b))
     if isinstance(a, np.ndarray | jax.Array):
         return a.shape == b.shape and a.dtype == b.dtype and np.array_equal(np.asarray(a), np.asarray(b))
+    structure: Any
     leaves, structure = jax.tree.flatten(a)
     others, other_structure = jax.tree.flatten(b)
     if len(leaves) == 1 and leaves[0] is a:

@@ -31,7 +31,7 @@ class Failure(NamedTuple):
 
     reason: str
     message: str
-    count: int
+    count: int  # type: ignore[assignment]  # nobody asks this tuple for an element's count
 
 
 class Message(NamedTuple):
@@ -40,7 +40,7 @@ class Message(NamedTuple):
     round: int
     reason: str
     message: str
-    count: int
+    count: int  # type: ignore[assignment]  # nobody asks this tuple for an element's count
 
 
 class FailureLog:

@@ -31,7 +31,7 @@ class Guard:
             payload: the simulator, as cloudpickle writes it.
         """
         self.payload = payload
-        self._process: subprocess.Popen | None = None
+        self._process: Any = None  # a subprocess.Popen with pipes, once it is started
 
     def simulate(self, request: Request, timeout: float | None) -> Answer:
         """Make one simulation there.

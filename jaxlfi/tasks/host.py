@@ -87,7 +87,7 @@ class HostSimulator:
 
     def some(
         self,
-        key: jax.Array,
+        key: Any,
         theta: np.ndarray,
         shape: Sequence[int] | None = None,
         rows: Sequence[int] | None = None,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, BinaryIO
 
 from jaxlfi.io import records
 from jaxlfi.tasks.failures import KEPT, Failure, Tally
@@ -31,7 +32,8 @@ class Journal:
         self._failures: dict[int, Tally] = {}
         self._path, self._on_simulation = path, on_simulation
         self._known: dict[tuple, Answer] = {}
-        self._done, self._wanted, self._file = 0, 0, None
+        self._done, self._wanted = 0, 0
+        self._file: BinaryIO | None = None
         if path is None or not path.exists():
             return
         for fields, trajectory in records.whole(path):
@@ -59,7 +61,7 @@ class Journal:
     def add(self, request: Request, answer: Answer) -> None:
         """Keep what came of a simulation."""
         if self._path is not None:
-            fields = {name: list(getattr(request, name)) for name in ("words", "theta")}
+            fields: dict[str, Any] = {name: list(getattr(request, name)) for name in ("words", "theta")}
             fields |= {"index": request.index, "outcome": answer.outcome, "message": answer.message}
             self._file = self._file or self._path.open("ab")
             self._file.write(records.encoded(fields, answer.trajectory))

@@ -160,13 +160,13 @@ def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
 
 def trace_observation(key: jax.Array, task: Task) -> jax.Array:
     """As `simulate_observation`, inside a traced function: the first try, which may have failed."""
-    if task.truth is None:
+    if task.inference.truth is None:
         raise ValueError("observation: expected one, as the task has neither an observation nor a known truth")
     return trajectory_and_outcome(task, jax.random.fold_in(key, 0), task.inference.truth)[0]
 
 
 def _at_truth(key: jax.Array, task: Task, journal: Journal):
-    truth = task.inference.truth
+    truth: Any = task.inference.truth
     if not task.on_host:
         return _simulate_jit(task, key, truth)
     trajectory, outcome = task.simulate(key, np.asarray(task.space.to_natural(truth)), journal)
@@ -195,6 +195,7 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
     if observation is None:
         simulate = simulate_observation if concrete else trace_observation
         observation = simulate(key, task)
+    observed: Any
     if task.on_host:
         observed = np.array(checked(observation, observed_shapes(task, np.asarray(observation)), gaps_of(task)), float)
         x = summaries_in_double(task, observed[None])[0]
@@ -297,10 +298,10 @@ class Columns:
     def of(task: Task) -> "Columns":
         """Those of a task."""
         if task.on_host:
-            return Columns(task.channels, len(task.channels) or None)
+            return Columns(tuple(task.channels), len(task.channels) or None)
         shape = simulator_shapes(task).trajectory
         count = shape[-1] if len(shape) > 1 else 1
-        return Columns(task.channels if len(task.channels) == count else (), count)
+        return Columns(tuple(task.channels) if len(task.channels) == count else (), count)
 
 
 def read(path: str | Path, columns: Columns = Columns(), say: Say = lambda line: None) -> np.ndarray:

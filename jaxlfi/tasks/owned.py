@@ -137,7 +137,7 @@ def _holds_masked(value: Sequence[Any]) -> bool:
     )
 
 
-def _unmasked(value: np.ma.MaskedArray) -> np.ndarray:
+def _unmasked(value: Any) -> np.ndarray:
     if not np.ma.is_masked(value):
         return np.array(value.data)
     if value.dtype.kind not in "biufc":

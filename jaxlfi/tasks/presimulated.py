@@ -98,7 +98,7 @@ def _summaries(task: Task, arrays: Mapping[str, Any], rows: int) -> tuple[np.nda
             )
         return summarised_batch(task, trajectory, np.zeros(rows, np.int32))
     x = _array(arrays, "x", (rows, None))
-    finite = np.isfinite(x.astype(np.float32)).all(axis=1)
+    finite = np.asarray(np.isfinite(x.astype(np.float32)).all(axis=1))
     return np.where(finite[:, None], x, 0.0), np.where(finite, 0, len(task.reasons)).astype(np.int32)
 
 

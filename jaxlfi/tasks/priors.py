@@ -41,6 +41,7 @@ class InferencePrior:
 
     distribution: Any
     space: Space | None = None
+    _values: Any = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
         object.__setattr__(self, "_values", _values_of(self.distribution))

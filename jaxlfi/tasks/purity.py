@@ -89,12 +89,13 @@ def _unwrapped(function: Any) -> Any:
     return function.__wrapped__ if isinstance(function, _JITTED) else function
 
 
-_JITTED = type(jax.jit(lambda: None))
+_JITTED: Any = type(jax.jit(lambda: None))
 
 
 def _state() -> tuple[tuple, tuple]:
     """Of the generators that NumPy and Python have for all: a simulator may draw from them."""
-    kind, words, *rest = np.random.get_state()  # noqa: NPY002
+    state: Any = np.random.get_state()  # noqa: NPY002
+    kind, words, *rest = state
     return (kind, words.tobytes(), *rest), random.getstate()
 
 

@@ -19,8 +19,7 @@ from jaxlfi.tasks.reference import counted_from, summaries_in_double
 from jaxlfi.tasks.task import Task
 
 
-@struct.dataclass
-class Simulations:
+class Simulations(struct.PyTreeNode):
     """The simulations of one round, in the order of their attempt.
 
     Attributes:

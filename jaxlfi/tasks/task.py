@@ -94,12 +94,12 @@ class Task:
         ('force', 'ln stiffness')
     """
 
-    simulate: Simulate
+    simulate: Any
     names: Sequence[str]
     supports: Mapping[str, Support]
     feasible: Support
-    units: Sequence[str] | None = None
-    summary: str | Callable[[jax.Array], jax.Array] = "identity"
+    units: Any = None
+    summary: Any = "identity"
     truth: Any = None
     observation: Any = None
     log: Sequence[str] = ()
@@ -206,7 +206,7 @@ class Task:
     @functools.cached_property
     def space(self) -> Space:
         """The map between natural units and inference space."""
-        return Space(self.names, tuple(name in self.log for name in self.names))
+        return Space(tuple(self.names), tuple(name in self.log for name in self.names))
 
     @functools.cached_property
     def inference(self) -> InferenceView:
@@ -241,7 +241,7 @@ class Task:
             raise ValueError(
                 f"summary_names: expected one for each of the summary's {count} numbers, got {len(self.summary_names)}"
             )
-        return self.summary_names or tuple(f"x_{i + 1}" for i in range(count))
+        return tuple(self.summary_names) or tuple(f"x_{i + 1}" for i in range(count))
 
     def support(self, choice: str | Support | None = None, space: SpaceName = "natural") -> Support:
         """A box Theta_0 in inference space, checked.

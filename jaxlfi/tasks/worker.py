@@ -59,7 +59,7 @@ class Request(NamedTuple):
     """
 
     words: Sequence[int]
-    index: int
+    index: int  # type: ignore[assignment]  # nobody asks this tuple for an element's index
     theta: Sequence[float]
     shape: Sequence[int] | None
 

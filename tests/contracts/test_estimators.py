@@ -58,7 +58,7 @@ class LogisticNetwork(nn.Module):
 class OneFile(Estimator):
     """All that a third party writes."""
 
-    width: int = option(8, low=1, help="units of the hidden layer")
+    width: int = option(default=8, low=1, help="units of the hidden layer")
 
     def module(self, dim: int) -> nn.Module:
         """The network."""

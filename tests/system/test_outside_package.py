@@ -56,8 +56,8 @@ RULE = '''
     class Widen(Heuristic):
         """Both bounds move away from the posterior's mean where it is near."""
 
-        gain: float = hyperparameter(0.5, help="how far a bound moves", symbol="kappa", low=0, high=2)
-        margin: float = hyperparameter(0.4, help="how near the mean has to be", low=0, high=1)
+        gain: float = hyperparameter(default=0.5, help="how far a bound moves", symbol="kappa", low=0, high=2)
+        margin: float = hyperparameter(default=0.4, help="how near the mean has to be", low=0, high=1)
 
         def __call__(self, previous, posterior, feasible):
             box = previous.support
@@ -109,7 +109,7 @@ NETWORK = '''
     class IndependentNetwork(Estimator):
         """Settings: those that all estimators have, and one."""
 
-        units: int = option(16, low=1, help="units of the hidden layer")
+        units: int = option(default=16, low=1, help="units of the hidden layer")
 
         def module(self, dim):
             """The network."""

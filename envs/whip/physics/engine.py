@@ -16,8 +16,7 @@ from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.rig import START
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
     """State of the physics of one scene.
 
     Attributes:

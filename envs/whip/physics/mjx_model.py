@@ -94,8 +94,7 @@ def _of_cubes(scene: Scene, parameters: WhipParameters, total):
         yield "body_invweight0", (cubes, column), 1 / value
 
 
-@struct.dataclass
-class Response:
+class Response(struct.PyTreeNode):
     """Accelerations in one plane by unit forces and torques, of a straight chain that hangs from a mass.
 
     Attributes:

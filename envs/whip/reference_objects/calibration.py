@@ -1,6 +1,7 @@
 """The beam that a soft body is equivalent to: its effective Young's modulus and its stretch, measured at rest."""
 
 import dataclasses
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -81,7 +82,8 @@ def at_rest(dlo: ReferenceObject, gravity: tuple[float, float, float]) -> np.nda
     beat = np.sqrt(dlo.length / np.linalg.norm(gravity))  # time scale of a pendulum
     damped = dataclasses.replace(dlo, damping=beat / 2)
     model = cantilever_model(damped, gravity, timestep=beat / 20)
-    data, before = mujoco.MjData(model), np.inf
+    before: Any = np.inf
+    data = mujoco.MjData(model)
     for _ in range(200):
         mujoco.mj_step(model, data, nstep=10)
         line = centreline(dlo, data)

@@ -8,8 +8,7 @@ from jaxlfi.envs.whip.parameters import WhipParameters
 from jaxlfi.envs.whip.quaternions import rotation
 
 
-@struct.dataclass
-class Camera:
+class Camera(struct.PyTreeNode):
     """A pinhole camera with a square image; written for one, vmap for many.
 
     Attributes:

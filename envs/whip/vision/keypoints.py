@@ -17,8 +17,7 @@ KEYPOINTS = ON_DLO + 6
 """Number of all keypoints."""
 
 
-@struct.dataclass
-class Detector:
+class Detector(struct.PyTreeNode):
     """The error model of a learnt detector of keypoints; its numbers can be vmapped over.
 
     It tracks four points of the DLO. Their positions are drawn once per trajectory, uniformly among all that lie
@@ -86,8 +85,7 @@ DETECTORS: Mapping[str, Detector] = types.MappingProxyType(
 """Detectors by name."""
 
 
-@struct.dataclass
-class Tracking:
+class Tracking(struct.PyTreeNode):
     """State of a detector in a trajectory.
 
     Attributes:

@@ -52,8 +52,7 @@ class Training:
         return optax.chain(optax.clip_by_global_norm(self.clip), optax.adam(rate))
 
 
-@struct.dataclass
-class Trained:
+class Trained(struct.PyTreeNode):
     """State of a training.
 
     Attributes:

@@ -22,8 +22,7 @@ PALETTE = np.array([RGBA[name][:3] for name in (*COLOURS, "dlo")])
 """Colours of the labels 1 to 7, shape [7, 3]."""
 
 
-@struct.dataclass
-class Surface:
+class Surface(struct.PyTreeNode):
     """The pattern of a table or a wall.
 
     Attributes:
@@ -41,8 +40,7 @@ class Surface:
     phase: Float[Array, "3"]
 
 
-@struct.dataclass
-class Boxes:
+class Boxes(struct.PyTreeNode):
     """Boxes in a scene that have no label: background objects, and a hand.
 
     Attributes:
@@ -60,8 +58,7 @@ class Boxes:
     there: Bool[Array, " n"]
 
 
-@struct.dataclass
-class Look:
+class Look(struct.PyTreeNode):
     """How one scene looks; all colours are linear, from 0 to 1.
 
     Attributes:

@@ -9,8 +9,7 @@ TAPS = 7
 """Pixels along each axis that blur mixes, and that motion spreads over."""
 
 
-@struct.dataclass
-class Shot:
+class Shot(struct.PyTreeNode):
     """The camera settings of one picture.
 
     Attributes:

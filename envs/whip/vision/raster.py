@@ -14,8 +14,7 @@ DLO = len(COLOURS) + 1
 """The DLO's label. The cubes are 1 to 6, bottom-up; 0 is the background, including the gripper."""
 
 
-@struct.dataclass
-class Bodies:
+class Bodies(struct.PyTreeNode):
     """Convex bodies of six faces: all x with normal @ x <= offset for each face.
 
     Attributes:
@@ -27,8 +26,7 @@ class Bodies:
     offsets: Float[Array, "bodies 6"]
 
 
-@struct.dataclass
-class Hits:
+class Hits(struct.PyTreeNode):
     """What the ray through each pixel hits first.
 
     Attributes:

@@ -24,8 +24,7 @@ STREWN = (0.25, -0.08, 0.02), (0.74, 0.08, 0.4)
 """Between which cubes are strewn, in m."""
 
 
-@struct.dataclass
-class Rollouts:
+class Rollouts(struct.PyTreeNode):
     """Rollouts of N scenes, each of 17 frames.
 
     Attributes:

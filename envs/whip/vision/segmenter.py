@@ -67,8 +67,7 @@ def _enlarged(x: Array) -> Array:
     return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)
 
 
-@struct.dataclass
-class Batches:
+class Batches(struct.PyTreeNode):
     """Pictures to learn from, as bytes.
 
     Attributes:

@@ -120,8 +120,7 @@ def _normalised(x: Array) -> Array:
     return nn.GroupNorm(num_groups=8)(x)
 
 
-@struct.dataclass
-class Pairs:
+class Pairs(struct.PyTreeNode):
     """Rollouts to learn from, as bytes.
 
     Attributes:
