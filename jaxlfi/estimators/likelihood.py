@@ -190,7 +190,7 @@ class LikelihoodDensity:
         return jnp.where(jnp.any(log_weight > -jnp.inf, axis=1, keepdims=True), theta, instead)
 
 
-@struct.dataclass
+@struct.dataclass(repr=False)
 class LikelihoodPosterior(Posterior):
     """The posterior by a likelihood: nothing of it is outside of its support, and on another one it is found anew."""
 
