@@ -95,7 +95,8 @@ def _together(names, values: np.ndarray, places: np.ndarray, write, within: floa
         left = np.var(z[:, group] @ (known * scale[group]).T, axis=0) / np.sum((known * scale[group]) ** 2, axis=1)
         if len(group) > MOST or (left >= 1 - TOGETHER).any():  # not so once it is put into words
             continue
-        other = _reduced(_complement(known * scale[group]) / scale[group], within)
+        units = 1.0 if write is _product else scale[group]  # logarithms have none
+        other = _reduced(_complement(known * units) / units, within)
         pair = len(group) == 2
         found.append(
             TradeOff(

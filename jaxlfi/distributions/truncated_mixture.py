@@ -19,8 +19,8 @@ CANDIDATES = 64
 """Number of weighted candidates that each draw is resampled from."""
 POINTS = 1024
 """Points of each component that its mass inside is the mean weight of."""
-STATISTICS_POINTS = 1024
-"""Points of each component that moments and quantiles are averaged over."""
+MOMENT_POINTS = 4096
+"""Points of each component that moments are averaged over."""
 HALVINGS = 34
 """Bisections that find a quantile: 2^-34 of the box is below the spacing of float32, also of a narrow posterior."""
 TAIL = 4.0
@@ -104,7 +104,7 @@ def weighted_points(
 ) -> tuple[Float[Array, "points dim"], Float[Array, " points"]]:
     """Points inside a box, and the logarithms of the weights that make them those of the truncated mixture.
 
-    They are the same each time, `STATISTICS_POINTS` of each component on a lattice: weighted means over them are
+    They are the same each time, `MOMENT_POINTS` of each component on a lattice: weighted means over them are
     moments of the truncated mixture to a few thousandths of a standard deviation.
 
     Args:
@@ -117,7 +117,7 @@ def weighted_points(
         >>> f"{float(jnp.average(points[:, 0], weights=jnp.exp(log_weight))):.3f}"  # sqrt(2 / pi) = 0.798
         '0.798'
     """
-    lattice = jnp.asarray(_even_lattice(STATISTICS_POINTS, support.dim))
+    lattice = jnp.asarray(_even_lattice(MOMENT_POINTS, support.dim))
 
     def of_component(order: Array, mean: Array, factor: Array) -> tuple[Array, Array]:
         return jax.vmap(lambda uniform: _by_conditionals(order, mean, factor, support, uniform)[:2])(lattice)
@@ -170,7 +170,7 @@ def truncated_quantiles(
 def _conditional_normals(mixture: GaussianMixture, support: Support, d: Array) -> tuple[Array, Array, Array]:
     """One dimension as normals truncated to the box: means, scales and the logarithms of their weights, shape [M]."""
     dim = support.dim
-    points = _even_lattice(STATISTICS_POINTS if dim > 1 else 1, dim - 1)
+    points = _even_lattice(POINTS if dim > 1 else 1, dim - 1)
     lattice = jnp.asarray(np.concatenate([points, np.full((len(points), 1), 0.5, np.float32)], axis=1))
 
     def of_component(order: Array, mean: Array, factor: Array) -> tuple[Array, Array, Array]:

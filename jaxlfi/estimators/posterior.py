@@ -249,9 +249,10 @@ class Posterior:
 
     def _plain(self) -> "Posterior":
         """The same, without a prior that is zero nowhere in the support and so says nothing."""
-        if self.prior is None or not is_concrete(self.support) or priors.is_bounded(self.prior, self.support):
+        mixture = isinstance(self.density, GaussianMixture) and is_concrete(self)
+        if not mixture or self.prior is None or priors.is_bounded(self.prior, self.support):
             return self
-        return self.replace(prior=None)
+        return _without_prior(self)
 
     def _places(self, names: Names) -> tuple[int, ...]:
         """Places of some parameters, from 0."""
@@ -457,6 +458,12 @@ def _sample(key: jax.Array, posterior: Posterior, n: int) -> Array:
 def _conditional(posterior: Posterior, given: tuple[int, ...], others: tuple[int, ...], values: Array) -> Posterior:
     mixture, box, rows = posterior.density.conditional(given, values), posterior.support, np.array(others)
     return truncated(mixture, mixture, Support(box.low[rows], box.high[rows]), _sub_space(posterior.space, others))
+
+
+@jax.jit
+@single
+def _without_prior(posterior: Posterior) -> Posterior:
+    return posterior.replace(prior=None).on(posterior.support)
 
 
 @functools.partial(jax.jit, static_argnums=1)

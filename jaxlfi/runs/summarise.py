@@ -18,8 +18,8 @@ from jaxlfi.io.run_summary import ParameterSummary, RunSummary
 INNER, OUTER = (0.25, 0.75), (0.05, 0.95)
 """Levels between which half and 90 % of the draws lie."""
 IDENTIFIED, WEAKLY = 0.5, 0.85
-"""Standard deviation, relative to a uniform distribution's over the last box, below which a parameter is identified,
-and below which it is so weakly."""
+"""Standard deviation below which a parameter is identified, and below which it is so weakly: relative to that of a
+uniform distribution over the first guess or the last box, whichever is wider."""
 ALONG, LEANING = 0.05, 0.15
 """Draws lean on a bound where more than the second share of them lies within the first fraction of the width of it."""
 MOVED = 0.05
@@ -51,8 +51,9 @@ def summarised(
     """
     draws = np.asarray(draws, np.float64)
     inner = np.asarray(space.to_inference(draws), np.float64)
+    spans = [_span(space, box) for box in (boxes[0], boxes[2])]
     parameters = tuple(
-        _parameter(space, d, draws[:, d], inner[:, d], (units or [""] * space.dim)[d], boxes, truth)
+        _parameter(space, d, draws[:, d], inner[:, d], (units or [""] * space.dim)[d], boxes, spans, truth)
         for d in range(space.dim)
     )
     together = trade_offs(space.names, draws)
@@ -95,16 +96,18 @@ def _at_phi(side: str, last, feasible) -> bool:
     return math.isclose(last[place], feasible[place], rel_tol=1e-5)
 
 
-def _parameter(space: Space, d: int, draws, inner, unit: str, boxes, truth) -> ParameterSummary:
+def _span(space: Space, box: Support) -> np.ndarray:
+    """Widths of the central 90 % of a uniform distribution over a box of inference space, in natural units."""
+    low, high = (np.asarray(space.to_natural(box.low + level * box.width), np.float64) for level in OUTER)
+    return high - low
+
+
+def _parameter(space: Space, d: int, draws, inner, unit: str, boxes, spans, truth) -> ParameterSummary:
     levels = (*INNER, *OUTER)
     first, third, low, high = map(float, np.quantile(draws, levels))
-    last = np.float64(boxes[1].width[d])
-    ratio = inner.std() / (last / math.sqrt(12))
-    # A box stands for a uniform distribution over it, in inference space.
-    ends = [
-        np.asarray(space.to_natural(box.low + level * box.width), np.float64)[d] for box in boxes for level in OUTER
-    ]
-    narrower = (np.array(ends[1::2]) - ends[::2]) / max(high - low, 1e-30)
+    guess, last = (np.float64(box.width[d]) for box in boxes[:2])
+    ratio = inner.std() / (max(guess, last) / math.sqrt(12))  # a box that shrank to the posterior is no measure of it
+    narrower = [span[d] / max(high - low, 1e-30) for span in spans]
     verdict = "identified" if ratio < IDENTIFIED else "weakly" if ratio < WEAKLY else "not at all"
     place = (inner - np.float64(boxes[1].low[d])) / last
     share = {"lower": np.mean(place < ALONG), "upper": np.mean(place > 1 - ALONG)}
@@ -115,7 +118,7 @@ def _parameter(space: Space, d: int, draws, inner, unit: str, boxes, truth) -> P
         central_50=(first, third),
         central_90=(low, high),
         narrower=float(narrower[0]),
-        narrower_than_phi=float(narrower[2]),
+        narrower_than_phi=float(narrower[1]),
         verdict=verdict,
         leans=tuple(side for side in share if share[side] > LEANING),
         truth=None if truth is None else float(truth[d]),

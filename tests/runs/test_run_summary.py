@@ -111,6 +111,8 @@ def test_what_is_not_constrained_is_said():
     assert [one.verdict for one in found.parameters] == ["identified", "not at all"]
     half = np.stack([NARROW[:, 0], np.exp(RNG.normal(1.0, 0.4, 4000).clip(0, 2))], axis=1)
     assert [one.verdict for one in of(half).parameters] == ["identified", "weakly"] and not said(of(half), "constrain")
+    shrunk = jaxlfi.Support([1.8, 0.8], [2.2, 1.2])  # as `Truncate` leaves it: as wide as the posterior
+    assert [one.verdict for one in of(last=shrunk).parameters] == ["identified"] * 2
 
 
 def test_a_box_that_widens_for_want_of_information_is_no_evidence():
