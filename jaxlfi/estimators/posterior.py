@@ -222,7 +222,7 @@ class Posterior:
         """
         plain, known = self._plain(), {**(values or {}), **named}
         given = plain._places(list(known))
-        inner = plain.space.to_inference(jnp.zeros(plain.space.dim).at[np.array(given)].set(_numbers(known)))
+        inner = plain.space.to_inference(jnp.ones(plain.space.dim).at[np.array(given)].set(_numbers(known)))
         box = plain.support
         for d, name in zip(given, known, strict=True):
             inside = (inner[d] >= box.low[d]) & (inner[d] <= box.high[d])

@@ -59,10 +59,10 @@ def _observation(run: "Run") -> str:
 
 def _fit(run: "Run") -> tuple[str, bool]:
     """Whether simulations of the posterior look like the observation: in words, and as far as is known."""
-    names, simulated, observed = channels(run)
     count = int(np.asarray(run.history.get("predictive_simulations", [0]))[-1])
     if not count:
         return "", True
+    names, simulated, observed = channels(run)
     valid = simulated[np.isfinite(simulated).all(axis=(1, 2))]
     if len(valid) < MIN_RESIDUALS:
         return (
@@ -84,17 +84,16 @@ def channels(run: "Run") -> tuple[list[str], np.ndarray, np.ndarray]:
         count = observed.shape[1]
         known = () if run.task is None else run.task.channels
         series = known if len(known) == count else [f"channel {c + 1}" for c in range(count)]
-    nothing = np.zeros((0, len(x)))
     if series:
         observed = observed.reshape(len(observed), -1)
-        simulated = np.asarray(run.history.get("final_trajectory", nothing))
-        return list(series), simulated.reshape(-1, *observed.shape), observed
-    simulated = np.asarray(run.history.get("final_x", nothing))
+        return list(series), np.asarray(run.history["final_trajectory"]).reshape(-1, *observed.shape), observed
+    simulated = np.asarray(run.history["final_x"])
     named = run.task is not None and run.task.summary_names
     if named or len(x) < RECORDS:
         return list(names), simulated[:, None], x[None]
     # Many numbers without a name, each in a unit of its own: all together, in units of their scatter.
-    scale = np.nan_to_num(np.nanstd(simulated, axis=0)) if len(simulated) else np.zeros(len(x))
+    finite = simulated[np.isfinite(simulated).all(axis=1)]
+    scale = finite.std(axis=0) if len(finite) else np.ones(len(x))
     scale = np.where(scale > 0, scale, np.inf)[:, None]
     return ["all of its numbers"], simulated[..., None] / scale, x[:, None] / scale
 
