@@ -95,9 +95,8 @@ def test_residuals_are_those_of_the_channels():
     assert one.usual == two.usual == pytest.approx(1.0, abs=0.2) and not one.far and not two.far
     constant = np.concatenate([simulated, np.zeros((20, 400, 1))], axis=2)
     assert np.isnan(residuals(constant, np.concatenate([observed, observed[:, :1]], axis=1))[2].ratio)
-    for wrong in (simulated[:7], simulated[:, :3], simulated[0]):
-        with pytest.raises(ValueError, match=r"^simulated, observed: expected shapes \[N, T, C\] with N of at least 8"):
-            residuals(wrong, observed)
+    with pytest.raises(ValueError, match=r"^simulated, observed: expected shapes \[N, T, C\] with N of at least 8"):
+        residuals(simulated[:7], observed)
 
 
 @pytest.mark.parametrize("shape", [(1, 40), (50, 2), (1, 3)], ids=["summaries", "series", "few"])
