@@ -55,7 +55,7 @@ def call(field: fields.Declared) -> str:
         for name, value in vars(field.info).items()
         if name != "help" and value != getattr(fields.FieldInfo(""), name)
     }
-    arguments = [shown(field.default), *(f"{name}={shown(value)}" for name, value in given.items())]
+    arguments = [f"default={shown(field.default)}", *(f"{name}={shown(value)}" for name, value in given.items())]
     return f"{'option' if field.static else 'hyperparameter'}({', '.join(arguments)})"
 
 

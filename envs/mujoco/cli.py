@@ -55,8 +55,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="find points of least squares from a posterior's draws",
         description="Follow the best of some draws to points of least squares, by Gauss-Newton steps, and take the "
         "integrator's own error off. Prints each point with 90 % intervals, which points explain the recording as "
-        "well as the best, which parameters are hardly told apart or on a bound of Phi, and what the model gets "
-        "wrong, as unmodelled_force and a table [discrepancy] for the task's file.",
+        "well as the best, which parameters trade off against each other or are on a bound of Phi, and what the model "
+        "gets wrong, as unmodelled_force and a table [discrepancy] for the task's file.",
     )
     fit.add_argument(
         "source",

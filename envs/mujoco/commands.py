@@ -12,7 +12,8 @@ from rich.table import Table
 import jaxlfi
 from jaxlfi import plot
 from jaxlfi.cli import tables
-from jaxlfi.envs.mujoco import config, informed, least_squares, sysid_point
+from jaxlfi.diagnostics import identifiability
+from jaxlfi.envs.mujoco import config, least_squares, sysid_point
 from jaxlfi.envs.mujoco.least_squares import Fit
 from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.envs.mujoco.sysid_point import SysidPoint
@@ -23,8 +24,6 @@ from jaxlfi.registry import TASKS
 from jaxlfi.runs.run import Run
 from jaxlfi.tasks.task import Task
 
-ALIKE = 0.95
-"""Correlation from which on two parameters are said not to be told apart."""
 AS_GOOD = 1.1
 """Points whose misfit is within this factor of the best one's explain the recording as well."""
 DRAWS = 1000
@@ -139,12 +138,12 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
         if bound:
             lines.append(f"{name} ended on a bound of Phi: widen Phi if it can be.")
     lines += _not_informed(task, best)
-    deviation = np.sqrt(np.maximum(np.diagonal(best.covariance), 1e-300))
-    correlation = best.covariance / np.outer(deviation, deviation)
-    for d, other in zip(*np.triu_indices(len(deviation), 1), strict=True):
-        if abs(correlation[d, other]) > ALIKE and best.informed[[d, other]].all():
-            both = f"{task.names[d]} and {task.names[other]}"
-            lines.append(f"{both} are hardly told apart: correlation {correlation[d, other]:.3f}.")
+    rows, names = (
+        np.flatnonzero(best.informed),
+        [name for name, one in zip(task.names, best.informed, strict=True) if one],
+    )
+    found = identifiability.trade_offs(names, np.asarray(task.space.to_natural(_normal_draws(task, best)))[:, rows])
+    lines += [identifiability.trade_off_sentence(names, one) for one in found]
     lines.append(
         f"Residuals are {best.misfit:.2f} times the noise; of a model without error they would be 1. "
         f"The integrator's own error is {best.defect:.2f} times the noise, and is taken off."
@@ -157,16 +156,16 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
 
 
 def _not_informed(task: Task, best: Fit) -> list[str]:
-    """Parameters without an interval, and what the recording informs of them together."""
+    """Parameters without an interval, and what the recording determines of them together."""
     box = task.inference.feasible
     widths = np.asarray(box.high, float) - np.asarray(box.low, float)
     noises = _noises(task)
     others = np.where(np.isin(task.names, noises)[:, None], 0.0, best.uninformed) / widths[:, None]
     others = scipy.linalg.orth(others) * widths[:, None]
-    lines = informed.sentences(task.names, task.space.log, best.theta, others, widths)
-    named = informed.untouched(best.uninformed.T / widths)
+    lines = identifiability.sentences(task.names, task.space.log, best.theta, others, widths)
+    named = identifiability.untouched(best.uninformed.T / widths)
     lines += [
-        f"{name} is not informed by this recording: its interval is as wide as Phi."
+        identifiability.unconstrained(name, ": its interval is as wide as Phi")
         for name, known, along in zip(task.names, best.informed, named, strict=True)
         if along and not known
     ]
@@ -188,11 +187,15 @@ def _over_feasible(task: Task, count: int) -> np.ndarray:
     return np.asarray(task.space.to_natural(np.random.default_rng(0).uniform(low, high, (count, len(low)))))
 
 
-def _drawn(task: Task, one: Fit) -> np.ndarray:
-    """Draws of the normal distribution that a point's covariance stands for, within Phi; in natural units."""
+def _normal_draws(task: Task, one: Fit) -> np.ndarray:
+    """Draws of the normal distribution that a point's covariance stands for, in inference space."""
     centre = np.asarray(task.space.to_inference(one.theta), float)
-    draws = np.random.default_rng(0).multivariate_normal(centre, one.covariance, DRAWS, method="eigh")
-    feasible = task.inference.feasible
+    return np.random.default_rng(0).multivariate_normal(centre, one.covariance, DRAWS, method="eigh")
+
+
+def _drawn(task: Task, one: Fit) -> np.ndarray:
+    """The same within Phi, in natural units."""
+    draws, feasible = _normal_draws(task, one), task.inference.feasible
     inside = np.asarray(feasible.contains(draws))
     if inside.sum() < plot.MIN_DRAWS:  # as where the recording informs a parameter hardly better than the box does
         return np.asarray(task.space.to_natural(np.clip(draws, feasible.low, feasible.high)))
@@ -214,7 +217,7 @@ def _table(task: Task, one: Fit | SysidPoint, title: str) -> Table:
     for name, unit, value, (low, high), bound in zip(
         task.names, units, one.theta, one.interval, one.at_bound, strict=True
     ):
-        none = "not estimated by least squares" if name in _noises(task) else "not informed by this recording"
+        none = "not estimated by least squares" if name in _noises(task) else "not constrained by this recording"
         interval = f"{low:.4g} to {high:.4g}" if np.isfinite([low, high]).all() else none
         table.add_row(name, unit, f"{value:.4g}", interval, "on a bound" if bound else "")
     return table

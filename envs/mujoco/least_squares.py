@@ -7,7 +7,7 @@ that `discrepancy.estimated` reads off the residuals). What residuals cannot sho
 up for, as a pendulum's damping does for an integrator that damps. The integrator's own error is known, however: the
 point is found again with the difference that a finer one makes there (defect correction; Stetter, 1978). And forces
 that the model lacks (`forces`) are taken to be as large in the directions that parameters make up for as in those that
-residuals show. What a recording does not inform has no interval (`informed`).
+residuals show. What a recording does not inform has no interval (`jaxlfi.diagnostics.identifiability`).
 
 Time and memory grow with the length of the recording, and not with its square: of covariances of all that was measured
 only their products with the parameters' few directions are made.
@@ -20,8 +20,9 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Bool, Float
 
+from jaxlfi.diagnostics import identifiability
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import forces, informed, noise
+from jaxlfi.envs.mujoco import forces, noise
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy, estimated
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.simulator import simulator_of
@@ -186,7 +187,7 @@ def fit(task: Task, start: Sequence[float], box: Support | None = None, observat
     discrepancies = _discrepancies(residuals, found.fun - defect)
     interval = intervals(residuals, found.x, np.sqrt(np.diagonal(covariance)), uninformed, low, high)
     margin = 10 * STEP * (high - low)
-    moved = informed.untouched(uninformed_directions(found.jac, high - low).T / (high - low))
+    moved = identifiability.untouched(uninformed_directions(found.jac, high - low).T / (high - low))
     at_bound = moved & ((found.x - low < margin) | (high - found.x < margin))
     misfit = float(np.sqrt(np.mean(found.fun**2)))
     added = float(np.sqrt(np.mean(defect**2)))
@@ -222,10 +223,10 @@ def intervals(
         low: of the box, in inference space.
         high: of the box.
     """
-    reach = informed.NORMAL * deviations
+    reach = identifiability.NORMAL * deviations
     ends = np.clip(np.stack([point - reach, point + reach]), low, high)
-    known = informed.untouched(uninformed.T / (high - low)) & (
-        np.ptp(ends, axis=0) < informed.LIKE_THE_BOX * (high - low)
+    known = identifiability.untouched(uninformed.T / (high - low)) & (
+        np.ptp(ends, axis=0) < identifiability.LIKE_THE_BOX * (high - low)
     )
     return np.where(known, residuals.natural(ends), np.nan).T
 
@@ -239,7 +240,7 @@ def uninformed_directions(
         jacobian: of residuals in standard deviations of the noise.
         width: of the box, in inference space.
     """
-    sizes, rows = informed.directions(jacobian * width)
+    sizes, rows = identifiability.directions(jacobian * width)
     return (width * rows[~_seen(sizes, rows)]).T
 
 
@@ -298,7 +299,7 @@ def _uncertainty(
     That size is one of the model by its own integrator; the covariance is that of the point that was corrected.
     """
     jacobian, processes = found.jac * width, _discrepancies(residuals, found.fun)
-    sizes, rows = informed.directions(jacobian)
+    sizes, rows = identifiability.directions(jacobian)
     seen = _seen(sizes, rows)
     while True:
         along = jacobian @ rows[seen].T / sizes[seen]  # orthonormal
@@ -306,7 +307,7 @@ def _uncertainty(
         weights = along / sizes[seen]
         by_parameters = weights.T @ by_forces
         spread = _form(residuals, processes, weights) + (size * widened) ** 2 * by_parameters @ by_parameters.T
-        narrow = informed.says_more(np.sqrt(np.diagonal(spread)), rows[seen])
+        narrow = identifiability.says_more(np.sqrt(np.diagonal(spread)), rows[seen])
         if narrow.all():
             break
         seen[np.flatnonzero(seen)[~narrow]] = False
@@ -318,7 +319,7 @@ def _uncertainty(
 def _seen(sizes: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Directions along which white noise leaves less than the box."""
     deviations = np.divide(1.0, sizes, out=np.full(len(sizes), np.inf), where=sizes > 0)
-    return informed.says_more(deviations, rows)
+    return identifiability.says_more(deviations, rows)
 
 
 def _solved(

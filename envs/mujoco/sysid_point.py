@@ -6,7 +6,7 @@ import io
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxlfi.envs.mujoco.informed import NORMAL, untouched
+from jaxlfi.diagnostics.identifiability import NORMAL, untouched
 from jaxlfi.envs.mujoco.least_squares import Residuals, intervals, uninformed_directions
 from jaxlfi.tasks.task import Task
 

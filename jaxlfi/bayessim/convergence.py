@@ -86,6 +86,18 @@ def advanced(progress: Progress, posterior: GaussianMixture, min_rounds: int) ->
     )
 
 
+def changes(moved: float, rescaled: float, turned: float) -> list[str]:
+    """In words, how a posterior still changed over the last rounds; nothing for one that has settled.
+
+    Example:
+        >>> changes(1.26, 1.1, 0.2)
+        ['means by up to 1.3 standard deviations']
+    """
+    found = [f"means by up to {moved:.1f} standard deviations"] * (moved >= STILL)
+    found += [f"standard deviations by factors of up to {rescaled:.1f}"] * (rescaled >= SAME_WIDTH)
+    return found + [f"correlations by up to {turned:.1f}"] * (turned >= SAME_CORRELATION)
+
+
 def _split(covariance: Float[Array, "dim dim"]) -> tuple[Float[Array, " dim"], Float[Array, "dim dim"]]:
     """Standard deviations and correlations."""
     scale = jnp.sqrt(jnp.diagonal(covariance))

@@ -307,17 +307,16 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     if plan.kind == RUN:
         found = RunSummary.read(folder)
         tables.show(summaries.parameter_table(found), console)
-        for sentence in found.sentences:
-            _say(console, sentence)
+        for line in (*found.sentences, *found.steps()):
+            _say(console, line)
     if plan.kind != RUN or plan.task.truth is not None:
         tables.show(summaries.summary_table(plan, runs), console)
     for warning in summaries.warnings(plan, runs):
         _warn(console, warning)
-    for line in (
-        *summaries.failure_lines(runs),
-        *summaries.rounds_lines(plan, runs),
-        *summaries.widths_lines(plan, runs),
-    ):
+    several = (
+        () if plan.kind == run_store.RUN else (*summaries.failure_lines(runs), *summaries.rounds_lines(plan, runs))
+    )
+    for line in (*several, *summaries.widths_lines(plan, runs)):  # of a single run, its summary says so
         _say(console, line)
     kind = "table" if plan.kind == COMPARE else "results"
     _say(console, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")

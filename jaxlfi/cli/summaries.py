@@ -7,7 +7,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from jaxlfi import diagnostics
-from jaxlfi.bayessim.convergence import LAG, SAME_CORRELATION, SAME_WIDTH, STILL
+from jaxlfi.bayessim.convergence import LAG, changes
 from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.diagnostics.bounds import bound_warnings
@@ -101,10 +101,8 @@ def _changes(histories: Sequence[Mapping[str, np.ndarray]]) -> str:
     )
     if not np.isfinite(moved):
         return f"made too few rounds to have settled: they are compared over {LAG}"
-    changes = [f"means by up to {moved:.1f} standard deviations"] * (moved >= STILL)
-    changes += [f"standard deviations by factors of up to {rescaled:.1f}"] * (rescaled >= SAME_WIDTH)
-    changes += [f"correlations by up to {turned:.1f}"] * (turned >= SAME_CORRELATION)
-    return f"still changed over the last {LAG} rounds: {', '.join(changes)} (--rounds allows for more)"
+    listed = ", ".join(changes(moved, rescaled, turned))
+    return f"still changed over the last {LAG} rounds: {listed} (--rounds allows for more)"
 
 
 def widths_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:

@@ -24,9 +24,10 @@ from jaxlfi.diagnostics.discrepancy import (
     not_simulated,
     trajectory_distance,
 )
+from jaxlfi.diagnostics.identifiability import TradeOff, trade_offs
 from jaxlfi.diagnostics.intervals import Estimate, Intervals, check_intervals, check_regions
 from jaxlfi.diagnostics.misspecification import Finding, unlike
-from jaxlfi.diagnostics.predictive import PredictiveCheck, predictive_check
+from jaxlfi.diagnostics.predictive import PredictiveCheck, Residual, predictive_check, residuals
 
 __all__ = [
     "OK",
@@ -39,6 +40,8 @@ __all__ = [
     "Histogram",
     "Intervals",
     "PredictiveCheck",
+    "Residual",
+    "TradeOff",
     "Uniformity",
     "bound_evidence",
     "bound_warnings",
@@ -58,6 +61,8 @@ __all__ = [
     "predictive_check",
     "ranks",
     "ranks_verdict",
+    "residuals",
+    "trade_offs",
     "trajectory_distance",
     "uniformity",
     "unlike",

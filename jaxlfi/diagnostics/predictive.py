@@ -7,6 +7,12 @@ from jaxtyping import Array, Float
 
 MIN_SIMULATIONS = 20
 """Minimum number of finite simulations that a posterior predictive check needs."""
+MIN_RESIDUALS = 8
+"""Minimum number of simulations whose scatter residuals are compared with."""
+FAR = 3.0
+"""Residual, in units of the simulations' scatter, from which on a model is said to lack something."""
+FURTHER = 1.5
+"""How many times as far as the farthest of the simulations it must be, besides: smooth series have few free numbers."""
 REACH = 2.0
 """Robust standard deviations at which values are clipped before means and correlations are taken."""
 
@@ -28,6 +34,65 @@ class PredictiveCheck:
     distance: float
     distances: Float[np.ndarray, " n"]
     failed: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Residual:
+    """How far an observation is from simulations of the posterior, in one channel.
+
+    Attributes:
+        ratio: root mean square of observation less the simulations' mean, in units of their scatter; about 1 for an
+            observation that is one of them. NaN where they do not scatter.
+        usual: the greatest ratio among the simulations, each against the others, in any channel.
+    """
+
+    ratio: float
+    usual: float
+
+    @property
+    def far(self) -> bool:
+        """Whether the model lacks something: the ratio is at least `FAR`, and `FURTHER` than any simulation's."""
+        return self.ratio >= FAR and self.ratio > FURTHER * self.usual
+
+
+def residuals(
+    simulated: Float[Array | np.ndarray, "n time channels"], observed: Float[Array | np.ndarray, "time channels"]
+) -> list[Residual]:
+    """Compare an observed series with simulations of posterior draws, channel by channel.
+
+    The scatter is the standard deviation of the simulations, over all records of a channel: of the noise, and of what
+    the parameters leave open. A model that is right has ratios of about 1, of many records or of few.
+
+    Args:
+        simulated: N finite simulations, at least `MIN_RESIDUALS`.
+        observed: in the same shape.
+
+    Raises:
+        ValueError: for other shapes, and too few simulations.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> simulated = rng.normal(size=(20, 50, 2))
+        >>> [one.far for one in residuals(simulated, rng.normal(size=(50, 2)) + [0.0, 9.0])]
+        [False, True]
+    """
+    simulated, observed = np.asarray(simulated, np.float64), np.asarray(observed, np.float64)
+    if simulated.ndim != 3 or simulated.shape[1:] != observed.shape or len(simulated) < MIN_RESIDUALS:
+        raise ValueError(
+            f"simulated, observed: expected shapes [N, T, C] with N of at least {MIN_RESIDUALS} and [T, C], got "
+            f"{list(simulated.shape)} and {list(observed.shape)}"
+        )
+    each = [_ratio(simulated[j], np.delete(simulated, j, axis=0)) for j in range(len(simulated))]
+    usual = float(np.max(np.nan_to_num(each)))
+    return [Residual(float(ratio), usual) for ratio in _ratio(observed, simulated)]
+
+
+def _ratio(one: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Root mean square distance from the others' mean, relative to what it is expected to be, by channel."""
+    expected = (1 + 1 / len(others)) * others.var(axis=0, ddof=1).mean(axis=0)
+    away = np.mean((one - others.mean(axis=0)) ** 2, axis=0)
+    known = expected > 1e-12 * np.mean(others**2, axis=(0, 1))
+    return np.sqrt(np.where(known, away / np.where(known, expected, 1.0), np.nan))
 
 
 def predictive_check(

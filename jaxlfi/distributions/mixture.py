@@ -1,10 +1,12 @@
 """A mixture of Gaussians with full covariances: what a posterior is in this library."""
 
 import functools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax.scipy.linalg import solve_triangular
 from jax.scipy.stats import norm
@@ -138,6 +140,45 @@ class GaussianMixture(struct.PyTreeNode):
 
         return jax.lax.custom_root(lambda theta: self.marginal_cdf(theta) - level, least, bisect, divide)
 
+    def marginal(self, kept: Sequence[int]) -> "GaussianMixture":
+        """The mixture of some dimensions, in the order given, whatever the others are: closed form.
+
+        Example:
+            >>> both = GaussianMixture(jnp.zeros(1), jnp.array([[3.0, 4.0]]), jnp.array([[[1.0, 0.0], [3.0, 4.0]]]))
+            >>> float(both.marginal((1,)).scale_tril[0, 0, 0])
+            5.0
+        """
+        kept = np.asarray(kept)
+        return GaussianMixture(self.logits, self.means[:, kept], lower_factor(self.scale_tril[:, kept]))
+
+    def conditional(self, given: Sequence[int], values: Float[Array, " given"]) -> "GaussianMixture":
+        """The mixture of the other dimensions, where some have the values given: closed form.
+
+        Its logits are the logarithms of w_k N(values; ...) and are not normalised: the logarithm of their sum is the
+        log-density of the values, up to that of the weights' own sum.
+
+        Args:
+            given: dimensions, not all.
+            values: of these.
+
+        Example:
+            >>> both = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.array([[[1.0, 0.0], [0.8, 0.6]]]))
+            >>> other = both.conditional((0,), jnp.array([2.0]))
+            >>> [round(float(value[0].squeeze()), 3) for value in (other.means, other.scale_tril)]
+            [1.6, 0.6]
+        """
+        given = np.asarray(given)
+        order = np.concatenate([given, np.setdiff1d(np.arange(self.means.shape[-1]), given)])
+        first, means = len(given), self.means[:, order]
+        factor = lower_factor(self.scale_tril[:, order])
+        known = GaussianMixture(self.logits, means[:, :first], factor[:, :first, :first])
+        z = jax.vmap(functools.partial(solve_triangular, lower=True))(known.scale_tril, values - known.means)
+        return GaussianMixture(
+            logits=jax.nn.log_softmax(self.logits) + component_log_prob(known, values),
+            means=means[:, first:] + jnp.einsum("kij,kj->ki", factor[:, first:, :first], z),
+            scale_tril=factor[:, first:, first:],
+        )
+
     def mirror(self) -> "GaussianMixture":
         """The mixture of -theta."""
         return GaussianMixture(self.logits, -self.means, self.scale_tril)
@@ -168,6 +209,13 @@ class GaussianMixture(struct.PyTreeNode):
     def permute(self, order: Int[Array, " comp"]) -> "GaussianMixture":
         """The same mixture with its components in another order."""
         return GaussianMixture(self.logits[order], self.means[order], self.scale_tril[order])
+
+
+def lower_factor(rows: Float[Array, "*batch rows columns"]) -> Float[Array, "*batch rows rows"]:
+    """The lower Cholesky factor of rows times their transpose, without squaring them."""
+    upper = jnp.linalg.qr(jnp.swapaxes(rows, -1, -2), mode="r")
+    signs = jnp.where(jnp.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    return jnp.swapaxes(signs[..., None] * upper, -1, -2)
 
 
 def systematic(key: jax.Array, weights: Float[Array, " comp"], n: int) -> Int[Array, " n"]:

@@ -190,7 +190,7 @@ class LikelihoodDensity(struct.PyTreeNode):
         return jnp.where(jnp.any(log_weight > -jnp.inf, axis=1, keepdims=True), theta, instead)
 
 
-class LikelihoodPosterior(Posterior):
+class LikelihoodPosterior(Posterior, repr=False):
     """The posterior by a likelihood: nothing of it is outside of its support, and on another one it is found anew."""
 
     density: LikelihoodDensity

@@ -5,9 +5,12 @@ import html
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from jaxlfi.io import files
+from jaxlfi.io import files, text_table
+
+if TYPE_CHECKING:
+    import pandas
 
 NAME = "summary.json"
 
@@ -22,7 +25,9 @@ class ParameterSummary:
         median: of the draws.
         central_50: the interval between the quarters.
         central_90: between the first and the last twentieth.
-        narrower: how many times narrower the central 90 % are than those of the first guess, in inference space.
+        narrower: how many times narrower the central 90 % are than those of the first guess, in natural units; less
+            than 1 for wider ones.
+        narrower_than_phi: the same of Phi.
         verdict: "identified", "weakly" or "not at all".
         leans: on which bounds of the last box the draws lean: "lower", "upper", both or none.
         truth: where it is known, else None.
@@ -35,6 +40,7 @@ class ParameterSummary:
     central_50: tuple[float, float]
     central_90: tuple[float, float]
     narrower: float
+    narrower_than_phi: float
     verdict: str
     leans: tuple[str, ...]
     truth: float | None
@@ -56,26 +62,51 @@ class RunSummary:
 
     Attributes:
         parameters: of the task, in its order.
-        sentences: what follows from them.
+        sentences: what follows from them and from the run.
+        next_steps: what to do about it, each with its command or argument.
     """
 
     parameters: tuple[ParameterSummary, ...]
     sentences: tuple[str, ...]
+    next_steps: tuple[str, ...] = ()
 
     def table(self) -> tuple[list[str], list[list[str]]]:
         """The headings, and a row of texts for each parameter."""
-        headings = ["parameter", "median", "50 %", "90 %", "narrower than the guess", "identified"]
-        known = any(one.truth is not None for one in self.parameters)
-        return headings + ["truth"] * known, [_row(one, known) for one in self.parameters]
+        headings = ["parameter", "median", "50 %", "90 %", "narrower than the guess", "than Phi", "identified"]
+        optional = {
+            "leans on": lambda one: " and ".join(one.leans),
+            "truth": lambda one: "" if one.truth is None else f"{one.truth:.6g}",
+        }
+        cells = {name: [cell(one) for one in self.parameters] for name, cell in optional.items()}
+        shown = {name: column for name, column in cells.items() if any(column)}
+        rows = [
+            [*_row(one), *(column[place] for column in shown.values())] for place, one in enumerate(self.parameters)
+        ]
+        return [*headings, *shown], rows
 
     def to_dict(self) -> dict[str, Any]:
         """The same as numbers and texts, as summary.json has it."""
-        return {"parameters": [dataclasses.asdict(one) for one in self.parameters], "sentences": list(self.sentences)}
+        return {
+            "parameters": [dataclasses.asdict(one) for one in self.parameters],
+            "sentences": list(self.sentences),
+            "next_steps": list(self.next_steps),
+        }
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """The parameters' numbers as a data frame, indexed by name.
+
+        Raises:
+            ImportError: without pandas.
+        """
+        import pandas
+
+        return pandas.DataFrame([dataclasses.asdict(one) for one in self.parameters]).set_index("name")
 
     @classmethod
     def from_dict(cls, described: Mapping[str, Any]) -> "RunSummary":
         """The summary that `to_dict` described."""
-        return cls(tuple(map(_parameter_of, described["parameters"])), tuple(described["sentences"]))
+        parameters = tuple(map(_parameter_of, described["parameters"]))
+        return cls(parameters, tuple(described["sentences"]), tuple(described["next_steps"]))
 
     @classmethod
     def read(cls, folder: Path) -> "RunSummary | None":
@@ -93,18 +124,17 @@ class RunSummary:
             raise ValueError(f"{path}: expected the summary of a run, got something else ({error})") from error
 
     def __str__(self) -> str:
-        headings, rows = self.table()
-        widths = [max(map(len, column)) for column in zip(headings, *rows, strict=True)]
-        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in (headings, *rows)]
-        return "\n".join([*lines, *self.sentences])
+        return "\n".join([text_table.as_text(*self.table()), *self.sentences, *self.steps()])
+
+    def steps(self) -> list[str]:
+        """What to do next, in lines of text."""
+        return ["Next:", *(f"- {step}" for step in self.next_steps)] if self.next_steps else []
 
     def to_html(self) -> str:
         """The table and the sentences, as a page or a notebook shows them."""
-        headings, rows = self.table()
-        cells = lambda row, tag: "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row)
-        body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
-        said = "".join(f"<li>{html.escape(one)}</li>" for one in self.sentences)
-        return f"<table><thead><tr>{cells(headings, 'th')}</tr></thead><tbody>{body}</tbody></table><ul>{said}</ul>"
+        items = lambda texts: "<ul>" + "".join(f"<li>{html.escape(one)}</li>" for one in texts) + "</ul>"
+        steps = f"<p>Next:</p>{items(self.next_steps)}" if self.next_steps else ""
+        return text_table.as_html(*self.table()) + items(self.sentences) + steps
 
     _repr_html_ = to_html
 
@@ -113,19 +143,28 @@ def _parameter_of(described: Mapping[str, Any]) -> ParameterSummary:
     """From its description, in which null stands for what is no number."""
     number = lambda value: math.nan if value is None else value
     pairs = {name: tuple(map(number, described[name])) for name in ("central_50", "central_90")}
-    numbers = {name: number(described[name]) for name in ("median", "narrower")}
+    numbers = {name: number(described[name]) for name in ("median", "narrower", "narrower_than_phi")}
     return ParameterSummary(**{**described, **pairs, **numbers, "leans": tuple(described["leans"])})
 
 
-def _row(one: ParameterSummary, known: bool) -> list[str]:
+def _row(one: ParameterSummary) -> list[str]:
     interval = lambda ends: f"[{one.shown(ends[0])}, {one.shown(ends[1])}]"
     unit = f" {one.unit}" if one.unit else ""
-    cells = [
+    return [
         one.name,
         one.shown(one.median) + unit,
         interval(one.central_50),
         interval(one.central_90),
-        f"{one.narrower:.1f} times" if one.narrower < 10 else f"{one.narrower:.0f} times",
+        _times(one.narrower),
+        _times(one.narrower_than_phi),
         one.verdict,
     ]
-    return cells + ["" if one.truth is None else f"{one.truth:.6g}"] * known
+
+
+def _times(factor: float) -> str:
+    """How many times narrower, in words where it is no narrower."""
+    if 0.95 < factor < 1.05:
+        return "as wide"
+    if factor < 1:
+        return f"{_times(1 / factor)} wider"
+    return f"{factor:.1f} times" if factor < 10 else f"{factor:.0f} times"

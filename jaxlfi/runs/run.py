@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import html
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Heuristic
 from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.runs import folder as folders
+from jaxlfi.runs.account import account
 from jaxlfi.runs.summarise import summarised
 from jaxlfi.runs.unlike import observation_findings
 from jaxlfi.tasks import failures, owned
@@ -230,17 +232,20 @@ class Run(struct.PyTreeNode):
     def summary(self, draws: Float[Array, "n dim"] | None = None) -> RunSummary:
         """The answer, stated: each parameter's median and intervals, and in sentences what follows from them.
 
+        Whether the first guess was wrong, what the observation does not determine, whether simulations of the posterior
+        fit it, what failed, whether the run had settled, and what to do next.
+
         Args:
             draws: of the posterior, in natural units, where they were made already.
 
         Example:
             >>> print(run.summary())  # doctest: +SKIP
-            parameter  median   50 %          90 %          narrower than the guess  identified
-            stiffness  3.1 N/m  [2.9, 3.3]    [2.6, 3.6]    12 times                 identified
+            parameter  median   50 %          90 %          narrower than the guess  than Phi  identified
+            stiffness  3.1 N/m  [2.9, 3.3]    [2.6, 3.6]    2.7 times                17 times  identified
         """
         _require_one(self, "summary")
         rule = getattr(self.heuristic, "rule", self.heuristic)
-        return summarised(
+        found = summarised(
             np.asarray(self.draws() if draws is None else draws),
             self.space,
             self.units,
@@ -248,6 +253,7 @@ class Run(struct.PyTreeNode):
             None if self.task is None else self.task.truth,
             type(rule).__name__.upper(),
         )
+        return account(self, found)
 
     def draws(self, n: int = DRAWS) -> Float[Array, "n dim"]:
         """The posterior draws that are saved with the run, in natural units; the same each time."""
@@ -267,6 +273,21 @@ class Run(struct.PyTreeNode):
         """
         _require_one(self, "save")
         return folders.save(self, Path(path))
+
+    def __repr__(self) -> str:
+        if not is_concrete(self) or self.x.ndim != 1:
+            return f"{self._headline()}; arrays have leading axes"
+        return f"{self._headline()}\n{self.posterior!r}\nprint(run.summary()) says what follows from it."
+
+    def _repr_html_(self) -> str | None:
+        if not is_concrete(self) or self.x.ndim != 1:
+            return None
+        return f"<p>{html.escape(self._headline())}</p>{self.summary().to_html()}"
+
+    def _headline(self) -> str:
+        name = self.origin.configuration if self.task is None else self.task.name
+        rule, rounds = getattr(self.heuristic, "rule", self.heuristic), self.history["attempted"].shape[-1]
+        return f"Run of {name}: {rounds} {'round' if rounds == 1 else 'rounds'}, {type(rule).__name__.upper()}"
 
     def _summary(self, observation: Any) -> jax.Array:
         on_host = self.task is not None and self.task.on_host

@@ -1,15 +1,16 @@
-"""What a run found, stated: each parameter with its intervals, and in sentences what a user wants to know next.
+"""What a posterior's draws say of each parameter: intervals, and in sentences what a user wants to know of them.
 
 Everything is counted from the run's own draws, in natural units; nothing is said that was not measured on this run.
+What else a run has to say, of its fit and its failures: `jaxlfi.runs.account`.
 """
 
-import itertools
 import math
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxlfi.diagnostics.identifiability import TradeOff, listed, trade_off_sentence, trade_offs, unconstrained
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.io.run_summary import ParameterSummary, RunSummary
@@ -17,16 +18,17 @@ from jaxlfi.io.run_summary import ParameterSummary, RunSummary
 INNER, OUTER = (0.25, 0.75), (0.05, 0.95)
 """Levels between which half and 90 % of the draws lie."""
 IDENTIFIED, WEAKLY = 0.5, 0.85
-"""Standard deviation, relative to a uniform distribution's over the last box, below which a parameter is identified,
-and below which it is so weakly."""
+"""Standard deviation below which a parameter is identified, and below which it is so weakly: relative to that of a
+uniform distribution over the first guess or the last box, whichever is wider."""
 ALONG, LEANING = 0.05, 0.15
 """Draws lean on a bound where more than the second share of them lies within the first fraction of the width of it."""
 MOVED = 0.05
 """Fraction of the width by which a bound has moved to be spoken of."""
 OUTSIDE = 0.5
 """Share of the draws outside the first guess above which it was wrong."""
-TOGETHER = 0.9
-"""Correlation above which two parameters are not separately identifiable."""
+ANOTHER = (
+    "Another experiment, one that {}: let the simulator return its measurements as well, beside those of this one."
+)
 
 
 def summarised(
@@ -49,32 +51,63 @@ def summarised(
     """
     draws = np.asarray(draws, np.float64)
     inner = np.asarray(space.to_inference(draws), np.float64)
+    spans = [_span(space, box) for box in (boxes[0], boxes[2])]
     parameters = tuple(
-        _parameter(space, d, draws[:, d], inner[:, d], (units or [""] * space.dim)[d], boxes, truth)
+        _parameter(space, d, draws[:, d], inner[:, d], (units or [""] * space.dim)[d], boxes, spans, truth)
         for d in range(space.dim)
     )
+    together = trade_offs(space.names, draws)
+    shared = {d for one in together for d in one.places}
     guess, last, feasible = (space.box_to_natural(box) for box in boxes)
-    sentences = [
-        text
-        for d, one in enumerate(parameters)
-        for text in (
-            _of_the_guess(one, draws[:, d], _bounds(guess, d), _bounds(last, d), heuristic),
-            _of_its_bounds(one, *(_bounds(box, d) for box in (last, feasible))),
-            _unconstrained(one),
-        )
-        if text
-    ]
-    pairs = itertools.combinations(range(space.dim), 2)
-    sentences += filter(None, (_not_separate(space, parameters, inner, *pair) for pair in pairs))
-    return RunSummary(parameters, tuple(sentences))
+    sentences, steps = [], []
+    for d, one in enumerate(parameters):
+        first, now, limits = (_bounds(box, d) for box in (guess, last, feasible))
+        sentences += [
+            _of_the_guess(one, draws[:, d], first, now, heuristic),
+            _of_its_bounds(one, now, limits),
+            _unconstrained(one, first, now, limits, heuristic, d in shared),
+        ]
+        steps += _wider(one, now, limits)
+    known = [one.verdict == "identified" for one in parameters]
+    for one in together:
+        sentences.append(trade_off_sentence(space.names, one, all(known[d] for d in one.places)))
+    unclear = [one.name for d, one in enumerate(parameters) if one.verdict == "not at all" and d not in shared]
+    steps += [ANOTHER.format(f"{listed(unclear)} {'changes' if len(unclear) == 1 else 'change'}")] * bool(unclear)
+    steps += [_apart(space, one) for one in together if not all(known[d] for d in one.places)]
+    return RunSummary(parameters, tuple(filter(None, sentences)), tuple(steps))
 
 
-def _parameter(space: Space, d: int, draws, inner, unit: str, boxes, truth) -> ParameterSummary:
+def _apart(space: Space, one: TradeOff) -> str:
+    return ANOTHER.format(f"{listed([space.names[d] for d in one.places])} change in different ways")
+
+
+def _wider(one: ParameterSummary, last, feasible) -> list[str]:
+    """What to do about a bound of Phi that the posterior leans on."""
+    if one.verdict == "not at all":
+        return []
+    sides = [side for side in one.leans if _at_phi(side, last, feasible)]
+    word = {"lower": "below", "upper": "above"}
+    places = [f"{word[side]} {_value(feasible[side == 'upper'], one)}" for side in sides]
+    return [f"A wider Phi, if {one.name} can be {' or '.join(places)}: the task's `feasible`."] if sides else []
+
+
+def _at_phi(side: str, last, feasible) -> bool:
+    place = int(side == "upper")
+    return math.isclose(last[place], feasible[place], rel_tol=1e-5)
+
+
+def _span(space: Space, box: Support) -> np.ndarray:
+    """Widths of the central 90 % of a uniform distribution over a box of inference space, in natural units."""
+    low, high = (np.asarray(space.to_natural(box.low + level * box.width), np.float64) for level in OUTER)
+    return high - low
+
+
+def _parameter(space: Space, d: int, draws, inner, unit: str, boxes, spans, truth) -> ParameterSummary:
     levels = (*INNER, *OUTER)
     first, third, low, high = map(float, np.quantile(draws, levels))
-    known = np.quantile(inner, OUTER)
-    guess, last = (np.asarray(box.width, np.float64)[d] for box in boxes[:2])
-    ratio = inner.std() / (last / math.sqrt(12))
+    guess, last = (np.float64(box.width[d]) for box in boxes[:2])
+    ratio = inner.std() / (max(guess, last) / math.sqrt(12))  # a box that shrank to the posterior is no measure of it
+    narrower = [span[d] / max(high - low, 1e-30) for span in spans]
     verdict = "identified" if ratio < IDENTIFIED else "weakly" if ratio < WEAKLY else "not at all"
     place = (inner - np.float64(boxes[1].low[d])) / last
     share = {"lower": np.mean(place < ALONG), "upper": np.mean(place > 1 - ALONG)}
@@ -84,7 +117,8 @@ def _parameter(space: Space, d: int, draws, inner, unit: str, boxes, truth) -> P
         median=float(np.median(draws)),
         central_50=(first, third),
         central_90=(low, high),
-        narrower=float((OUTER[1] - OUTER[0]) * guess / max(known[1] - known[0], 1e-30)),
+        narrower=float(narrower[0]),
+        narrower_than_phi=float(narrower[1]),
         verdict=verdict,
         leans=tuple(side for side in share if share[side] > LEANING),
         truth=None if truth is None else float(truth[d]),
@@ -110,7 +144,7 @@ def _of_the_guess(one: ParameterSummary, draws: np.ndarray, guess, last, heurist
     """Whether the first guess was wrong, where the box has been moved."""
     ends = zip(("lower", "upper"), guess, last, strict=True)
     shifted = [(side, now) for side, was, now in ends if abs(now - was) > MOVED * (guess[1] - guess[0])]
-    if not shifted:
+    if not shifted or one.verdict == "not at all":  # a box that widens for want of information is no evidence
         return ""
     outside = np.mean((draws < guess[0]) | (draws > guess[1]))
     if outside > OUTSIDE:
@@ -134,36 +168,23 @@ def _of_its_bounds(one: ParameterSummary, last, feasible) -> str:
     texts = []
     for side in one.leans:
         place = int(side == "upper")
-        at_phi = math.isclose(last[place], feasible[place], rel_tol=1e-5)
-        of = "the feasible domain's" if at_phi else "the box's"
+        of = "the feasible domain's" if _at_phi(side, last, feasible) else "the box's"
         texts.append(f"{of} {side} bound, {_value(last[place], one)}")
     advice = "values beyond it were never tried"
     return f"The posterior of {one.name} leans on {' and '.join(texts)}: {advice}."
 
 
-def _unconstrained(one: ParameterSummary) -> str:
+def _unconstrained(one: ParameterSummary, guess, last, feasible, heuristic: str, shared: bool) -> str:
+    """Where nothing is known of a parameter, and what the heuristic made of that."""
     if one.verdict != "not at all":
         return ""
-    return f"The observation does not constrain {one.name}: its posterior is about as wide as its box."
-
-
-def _not_separate(space: Space, parameters, inner: np.ndarray, i: int, j: int) -> str:
-    """Two parameters of which only one combination is well determined."""
-    scale = inner[:, [i, j]].std(axis=0)
-    if not np.all(scale > 0):
-        return ""
-    correlation = float(np.corrcoef(inner[:, i], inner[:, j])[0, 1])
-    if abs(correlation) < TOGETHER or "not at all" in (parameters[i].verdict, parameters[j].verdict):
-        return ""
-    # The combination of least spread: theta_i - slope theta_j, along the long axis of the two.
-    slope = math.copysign(scale[0] / scale[1], correlation)
-    first, second = parameters[i].name, parameters[j].name
-    if space.log[i] and space.log[j]:
-        power = "" if abs(abs(slope) - 1) < 0.1 else f"^{abs(slope):.2g}"
-        combination = f"{first} {'/' if slope > 0 else '*'} {second}{power}"
-    else:
-        combination = f"{space.labels[i]} {'-' if slope > 0 else '+'} {abs(slope):.2g} * {space.labels[j]}"
-    return (
-        f"{first} and {second} are not separately identifiable (correlation {correlation:.2f}): "
-        f"only {combination} is well determined."
+    if last[0] >= guess[0] and last[1] <= guess[1]:
+        # Of what is known together with others, that is said.
+        return "" if shared else unconstrained(one.name, ": its posterior is about as wide as its box")
+    all_of_it = ", all of the feasible domain" * all(_at_phi(side, last, feasible) for side in ("lower", "upper"))
+    was, now = (f"{box[0]:.3g} to {_value(box[1], one)}" for box in (guess, last))
+    return unconstrained(
+        one.name,
+        f"{' by itself' * shared}: {heuristic} moved its box from {was} out to {now}{all_of_it}, which says nothing "
+        "against the first guess",
     )

@@ -37,9 +37,19 @@ def test_intervals_are_those_of_the_draws_in_natural_units():
     np.testing.assert_allclose(mass.central_50, normal.ppf([0.25, 0.75]), atol=0.01)
     np.testing.assert_allclose(mass.central_90, normal.ppf([0.05, 0.95]), atol=0.015)
     np.testing.assert_allclose(stiffness.central_90, log_normal.ppf([0.05, 0.95]), rtol=0.02)
-    # 0.9 of a guess 2 wide, against 3.29 standard deviations, in inference space for both.
-    np.testing.assert_allclose([mass.narrower, stiffness.narrower], 0.9 * 2 / (3.29 * 0.1), rtol=0.05)
-    assert mass.leans == stiffness.leans == () and of().sentences == ()
+    # In natural units for both: 0.9 of a guess 2 wide, and what 0.9 of one of two logarithms is.
+    np.testing.assert_allclose(mass.narrower, 0.9 * 2 / (3.29 * 0.1), rtol=0.05)
+    width = np.diff(log_normal.ppf([0.05, 0.95]))
+    np.testing.assert_allclose(stiffness.narrower, np.diff(np.exp([0.1, 1.9])) / width, rtol=0.05)
+    np.testing.assert_allclose(mass.narrower_than_phi, 0.9 * 6 / (3.29 * 0.1), rtol=0.05)
+    np.testing.assert_allclose(stiffness.narrower_than_phi, np.diff(np.exp([-1.7, 3.7])) / width, rtol=0.05)
+    assert mass.leans == stiffness.leans == () and of().sentences == of().next_steps == ()
+
+
+def test_an_interval_that_is_no_narrower_is_called_wider():
+    wide = np.stack([RNG.uniform(0.0, 6.0, 4000), NARROW[:, 1]], axis=1)
+    (row, _), known = of(wide, last=PHI).table()[1], of(wide, last=PHI).parameters[0]
+    assert known.narrower == pytest.approx(1 / 3, rel=0.05) and row[4] == "3.0 times wider" and row[5] == "as wide"
 
 
 def test_digits_are_as_many_as_another_set_of_draws_would_give():
@@ -96,9 +106,26 @@ def test_what_is_not_constrained_is_said():
     assert found.sentences == (
         "The observation does not constrain stiffness: its posterior is about as wide as its box.",
     )
+    (step,) = found.next_steps
+    assert step.startswith("Another experiment, one that stiffness changes: let the simulator return")
     assert [one.verdict for one in found.parameters] == ["identified", "not at all"]
     half = np.stack([NARROW[:, 0], np.exp(RNG.normal(1.0, 0.4, 4000).clip(0, 2))], axis=1)
     assert [one.verdict for one in of(half).parameters] == ["identified", "weakly"] and not said(of(half), "constrain")
+    shrunk = jaxlfi.Support([1.8, 0.8], [2.2, 1.2])  # as `Truncate` leaves it: as wide as the posterior
+    assert [one.verdict for one in of(last=shrunk).parameters] == ["identified"] * 2
+
+
+def test_a_box_that_widens_for_want_of_information_is_no_evidence():
+    """EDGE moves bounds to Phi where a posterior is as wide as its box: most of it is then outside of the guess."""
+    flat = np.stack([RNG.uniform(0.0, 6.0, 4000), NARROW[:, 1]], axis=1)
+    (sentence,) = of(flat, last=jaxlfi.Support([0.0, 0.0], [6.0, 2.0])).sentences
+    assert sentence == (
+        "The observation does not constrain mass: EDGE moved its box from 1 to 3 kg out to 0 to 6 kg, all of the "
+        "feasible domain, which says nothing against the first guess."
+    )
+    assert not said(of(flat, last=jaxlfi.Support([0.0, 0.0], [5.0, 2.0])), "feasible domain")
+    known = np.stack([RNG.normal(4.0, 0.1, 4000), NARROW[:, 1]], axis=1)
+    assert not said(of(known, last=jaxlfi.Support([0.0, 0.0], [6.0, 2.0])), "says nothing against")
 
 
 def test_a_posterior_that_leans_on_a_bound_is_said():
@@ -110,29 +137,71 @@ def test_a_posterior_that_leans_on_a_bound_is_said():
     )
     at_phi = summarised(leaning, SPACE, None, (GUESS, GUESS, GUESS), None, "EDGE")
     assert said(at_phi, "leans on the feasible domain's upper bound, 3:")
+    assert at_phi.next_steps == ("A wider Phi, if mass can be above 3: the task's `feasible`.",)
+    assert found.next_steps == () and found.table()[0][-1] == "leans on" and found.table()[1][0][-1] == "upper"
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_parameters_not_separately_identifiable_are_named_with_their_combination(sign):
-    shared, own = RNG.normal(0.0, 0.15, (2, 4000)) * np.array([[1.0], [0.1]])
-    both = Space(("mass", "stiffness"), (True, True))
-    logs = np.stack([1.0 + shared, 1.0 + sign * shared + own], axis=1)
-    (sentence,) = of(np.exp(logs), space=both, guess=PHI, last=PHI).sentences
-    assert "mass and stiffness are not separately identifiable (correlation" in sentence
-    assert sentence.endswith(f"only mass {'/' if sign > 0 else '*'} stiffness is well determined.")
-    (sentence,) = of(
-        np.stack([1.0 + 2 * shared, np.exp(1.0 + sign * shared + own)], axis=1), last=PHI, guess=PHI
-    ).sentences
-    assert sentence.split("): only ")[1].startswith(f"mass {'-' if sign > 0 else '+'} 2 * ln stiffness")
-    assert not said(of(np.exp(np.stack([1 + shared, 1 + own], axis=1)), space=both, guess=PHI, last=PHI), "separately")
+    shared, own = RNG.uniform(-1.0, 1.0, 4000), RNG.normal(0.0, 0.03, 4000)
+    both, box = Space(("mass", "stiffness"), (True, True)), jaxlfi.Support([-1.0, -1.0], [1.0, 1.0])
+    logs = np.stack([shared, (sign * shared + own).clip(-1, 1)], axis=1)
+    found = summarised(np.exp(logs), both, None, (box, box, box), None, "EDGE")
+    assert [one.verdict for one in found.parameters] == ["not at all"] * 2
+    known, unknown = ("mass / stiffness", "mass * stiffness")[::sign]
+    correlation = f"{sign}.00" if sign < 0 else "1.00"
+    assert found.sentences == (
+        f"mass and stiffness are not separately identifiable (correlation {correlation}): only {known} is well "
+        f"determined; {unknown} is not.",
+    )
+    (step,) = found.next_steps
+    assert step.startswith("Another experiment, one that mass and stiffness change in different ways: let")
+    free = np.exp(RNG.uniform(-1.0, 1.0, (4000, 2)))
+    assert not said(summarised(free, both, None, (box, box, box), None, "EDGE"), "separately")
+
+
+def test_a_combination_of_three_is_found_where_no_two_are_correlated_much():
+    names, box = ("a", "b", "c"), jaxlfi.Support([-2.0] * 3, [2.0] * 3)
+    space, logs = Space(names, (True,) * 3), RNG.uniform(-1.0, 1.0, (4000, 3))
+    logs[:, 2] = -logs[:, 0] - logs[:, 1] + RNG.normal(0.0, 0.03, 4000)
+    assert np.abs(np.corrcoef(logs.T)[np.triu_indices(3, 1)]).max() < 0.8
+    found = summarised(np.exp(logs), space, None, (box, box, box), None, "EDGE")
+    assert said(found, "a, b and c are not separately identifiable: only a * b * c is well determined; ")
+    assert sum("separately" in sentence for sentence in found.sentences) == 1
+    logs[:, 2] = RNG.normal(0.0, 0.03, 4000)
+    assert not said(summarised(np.exp(logs), space, None, (box, box, box), None, "EDGE"), "separately")
+
+
+def test_parameters_that_are_known_but_trade_off_are_said_to_do_so():
+    shared, own = RNG.normal(0.0, 0.15, 4000), RNG.normal(0.0, 0.01, 4000)
+    linear = Space(("mass", "stiffness"), (False, False))
+    draws = np.stack([1.0 + 2 * shared, 0.1 + shared + own], axis=1)  # some negative: no product
+    found = of(draws, guess=PHI, last=jaxlfi.Support([-9.0, -9.0], [9.0, 9.0]), space=linear)
+    assert [one.verdict for one in found.parameters] == ["identified"] * 2
+    sentence = next(one for one in found.sentences if "trade off" in one)
+    assert sentence.startswith("mass and stiffness trade off against each other (correlation 1.00): mass - ")
+    assert " * stiffness varies " in sentence and not said(found, "separately")
+    assert not any("different ways" in step for step in found.next_steps)
+    apart = np.stack([1.0 + 2 * shared, 0.1 + RNG.normal(0.0, 0.15, 4000)], axis=1)
+    assert not said(of(apart, guess=PHI, last=PHI, space=linear), "trade off")
+
+
+def test_a_data_frame_has_the_numbers():
+    pandas = pytest.importorskip("pandas")
+    frame = of().to_pandas()
+    assert isinstance(frame, pandas.DataFrame) and list(frame.index) == ["mass", "stiffness"]
+    assert frame.loc["mass", "median"] == of().parameters[0].median
 
 
 def test_forms_agree_and_come_back_from_a_file(tmp_path):
     found = of(truth=np.array([2.05, 2.6]), last=jaxlfi.Support([1.0, 0.0], [5.5, 2.0]))
+    found = dataclasses.replace(found, next_steps=("Do this.", "Then that."))
     (tmp_path / NAME).write_text(json.dumps(found.to_dict()))
     assert RunSummary.read(tmp_path) == found and RunSummary.read(tmp_path / "none") is None
     lines = str(found).splitlines()
-    assert lines[0].split()[0] == "parameter" and lines[0].endswith("truth") and lines[-1] == found.sentences[-1]
+    assert lines[0].split()[0] == "parameter" and lines[0].endswith("truth")
+    assert lines[-3:] == ["Next:", "- Do this.", "- Then that."]
+    assert lines[-4] == found.sentences[-1] and "<li>Then that.</li>" in found.to_html()
     assert lines[1].startswith("mass") and "kg" in lines[1] and lines[1].endswith("2.05")
     assert found.to_html().count("<tr>") == 3 and found.sentences[0] in found.to_html()
     assert "&lt;b&gt;" in of(units=("<b>", "")).to_html()

@@ -99,8 +99,8 @@ def test_a_run_tells_why_its_simulations_failed(tmp_path):
 def test_commands_print_the_commonest(tmp_path, capsys):
     assert command("infer", f"{__name__}:moody_task", *FLAGS, "--out", tmp_path / "run") == 0
     said = capsys.readouterr().out.splitlines()
-    begin = next(place for place, line in enumerate(said) if line.startswith("failed: "))
+    (line,) = [line for line in said if " simulations failed: " in line]
     found = jaxlfi.load(tmp_path / "run").failures
-    assert said[begin].endswith("simulations:") and len(found) == 3
-    for line, one in zip(said[begin + 1 : begin + 4], found, strict=True):
-        assert line.split(":")[0] == f"  {one.count} {one.reason}" and one.message in line
+    assert len(found) == 3 and all(f"{one.count} {one.reason}" in line and one.message in line for one in found)
+    assert command("compare", f"{__name__}:moody_task", *FLAGS, "--seeds", 2, "--out", tmp_path / "runs") == 0
+    assert any(line.startswith("failed: ") for line in capsys.readouterr().out.splitlines())

@@ -10,8 +10,9 @@ pytest.importorskip("mujoco")
 import mujoco
 import small
 
-from jaxlfi.envs.mujoco import commands, informed, sysid_point
-from jaxlfi.envs.mujoco.informed import sentences, untouched
+from jaxlfi.diagnostics import identifiability
+from jaxlfi.diagnostics.identifiability import sentences, untouched
+from jaxlfi.envs.mujoco import commands, sysid_point
 from jaxlfi.envs.mujoco.least_squares import best_fits, fit
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.model_task import mujoco_task
@@ -57,7 +58,7 @@ def cart(*parameters, damping=0.5, back=-0.2, noise=1e-3):
 
 
 def said(task, point):
-    return [line for line in commands.said(task, [point]) if "not informed" in line]
+    return [line for line in commands.said(task, [point]) if "constrain" in line or "separately" in line]
 
 
 # ------------------------------------------------------------------------------------------------------------- names
@@ -73,24 +74,35 @@ def test_single_parameters_and_combinations_are_named():
         orthonormal = np.linalg.qr(rows.T)[0]
         return sentences(names, log, theta, orthonormal, ones)
 
-    together = "are not informed by this recording one by one, only"
-    assert of([0, 1, 0, 0]) == ["b is not informed by this recording."]
-    assert of([0, 1, 0, 0], [0, 0, 0, 1]) == [f"{name} is not informed by this recording." for name in "bd"]
-    assert of([1, -1, 0, 0]) == [f"a and b {together} a * b."]
-    assert of([1, 0, 1, 0]) == [f"a and c {together} a / c."]
-    assert of([1, -2, 0, 0]) == [f"a and b {together} a^2 * b."]
-    assert of([1, -1, 0, 0], [0, 1, 0, -1]) == [f"a, b and d {together} a * b * d."]
-    assert of([1, -1, 0, 0], [0, 0, 1, 0]) == [f"a and b {together} a * b.", "c is not informed by this recording."]
-    assert of([1, -1, 0, 0], [0, 0, 1, 1]) == [f"a and b {together} a * b.", f"c and d {together} c / d."]
+    together, alone = "are not separately identifiable: only", "The observation does not constrain"
+    assert of([0, 1, 0, 0]) == [f"{alone} b."]
+    assert of([0, 1, 0, 0], [0, 0, 0, 1]) == [f"{alone} {name}." for name in "bd"]
+    assert of([1, -1, 0, 0]) == [f"a and b {together} a * b is well determined."]
+    assert of([1, 0, 1, 0]) == [f"a and c {together} a / c is well determined."]
+    assert of([1, -2, 0, 0]) == [f"a and b {together} a^2 * b is well determined."]
+    assert of([1, -1, 0, 0], [0, 1, 0, -1]) == [f"a, b and d {together} a * b * d is well determined."]
+    assert of([1, -1, 0, 0], [0, 0, 1, 0]) == [f"a and b {together} a * b is well determined.", f"{alone} c."]
+    assert of([1, -1, 0, 0], [0, 0, 1, 1]) == [
+        f"a and b {together} a * b is well determined.",
+        f"c and d {together} c / d is well determined.",
+    ]
     (three,) = of([1, -1, 1, 0])
     assert three.startswith(f"a, b and c {together} ") and " and " in three.partition("only ")[2]
     # Of numbers that are no logarithms: steps of the same size leave a sum, and relative ones a product.
-    assert of([1, -1, 0, 0], log=linear, theta=np.array([2.0, 5, 1, 1])) == [f"a and b {together} a + b."]
-    assert of([1, 1, 0, 0], log=linear, theta=np.array([2.0, 5, 1, 1])) == [f"a and b {together} a - b."]
-    assert of([2, -5, 0, 0], log=linear, theta=np.array([2.0, 5, 1, 1])) == [f"a and b {together} a * b."]
-    assert of([1, -0.37, 0, 0], log=linear, theta=np.array([0.0, 5, 1, 1])) == [f"a and b {together} a + 2.7 * b."]
+    assert of([1, -1, 0, 0], log=linear, theta=np.array([2.0, 5, 1, 1])) == [
+        f"a and b {together} a + b is well determined."
+    ]
+    assert of([1, 1, 0, 0], log=linear, theta=np.array([2.0, 5, 1, 1])) == [
+        f"a and b {together} a - b is well determined."
+    ]
+    assert of([2, -5, 0, 0], log=linear, theta=np.array([2.0, 5, 1, 1])) == [
+        f"a and b {together} a * b is well determined."
+    ]
+    assert of([1, -0.37, 0, 0], log=linear, theta=np.array([0.0, 5, 1, 1])) == [
+        f"a and b {together} a + 2.7 * b is well determined."
+    ]
     assert of([1, -5, 0, 0], log=[True, False, True, True], theta=np.array([2.0, 5, 1, 1])) == [
-        f"a and b {together} a * b."
+        f"a and b {together} a * b is well determined."
     ]
 
 
@@ -98,7 +110,7 @@ def test_a_small_part_of_a_direction_is_none():
     rows = np.array([[1.0, 0.03, 0.0]]) / np.hypot(1, 0.03)
     assert untouched(rows).tolist() == [False, True, True]
     assert sentences(["a", "b", "c"], [False] * 3, np.ones(3), rows.T, np.ones(3)) == [
-        "a is not informed by this recording."
+        "The observation does not constrain a."
     ]
     assert untouched(np.zeros((0, 2))).all()
 
@@ -108,7 +120,7 @@ def test_directions_are_those_of_the_whole_decomposition():
     rng = np.random.default_rng(0)
     for rows in (2, 3, 40):
         jacobian = rng.standard_normal((rows, 3)) @ np.diag([1.0, 10.0, 1e-9])
-        sizes, found = informed.directions(jacobian)
+        sizes, found = identifiability.directions(jacobian)
         expected = np.zeros(3)
         expected[: min(rows, 3)] = np.linalg.svd(jacobian, compute_uv=False)
         np.testing.assert_allclose(sizes, expected, atol=1e-12)
@@ -124,7 +136,7 @@ def test_directions_are_those_of_the_whole_decomposition():
 @pytest.mark.parametrize(
     ("parameters", "start", "damping", "back", "known", "lines"),
     [
-        ([DAMPING, IDLE], [1, 0.1], 0.5, 0, [True, False], ["joint/other/damping is not informed by this recording."]),
+        ([DAMPING, IDLE], [1, 0.1], 0.5, 0, [True, False], ["The observation does not constrain joint/other/damping."]),
         ([GAIN, GEAR, DAMPING], [1, 3, 1], 0.5, 0, [False, False, True], ["/gainprm[0] * actuator/motor/gear[0]."]),
         ([GAIN, MASS], [1, 1], 0, -0.2, [True, True], []),  # which the known damping of the motor tells apart
         ([GAIN, MASS], [1, 1], 0, 0, [False, False], ["only actuator/motor/gainprm[0] / body/cart/mass."]),
@@ -177,7 +189,7 @@ def test_friction_that_never_slips():
     friction = Parameter("geom/box/friction[0]", (1.0, 3.0))
     task = mujoco_task(xml, [friction], Log(times, signals), noises=dict.fromkeys(signals, 1e-3))
     point = fit(task, [2.0])
-    assert said(task, point) == ["geom/box/friction[0] is not informed by this recording."]
+    assert said(task, point) == ["The observation does not constrain geom/box/friction[0]."]
     assert np.isnan(point.interval).all()
 
 
@@ -226,7 +238,7 @@ def test_all_that_is_printed_and_kept_does_without_an_interval(tmp_path, capsys)
     words = ("fit", tmp_path / "cart.toml", "--starts", 4, "--keep", 2, "--out", tmp_path / "fit")
     assert small.command("mujoco", *words) == 0
     printed = capsys.readouterr().out
-    assert "point 1 of 1" in printed and printed.count("not informed by this recording") == 2
+    assert "point 1 of 1" in printed and printed.count("not constrained by this recording") == 2
     assert "sensor/idle/noise is not estimated by least squares: inference does." in printed
     (point,) = json.loads((tmp_path / "fit/fit.json").read_text())["points"]
     assert point["interval"][1:] == [[None, None]] * 2 and np.isfinite(point["interval"][0]).all()

@@ -1,0 +1,296 @@
+"""Which parameters, and which combinations of them, an observation determines: from draws, or from derivatives.
+
+Of a posterior's draws, `trade_offs` finds the parameters that vary together, and the combination that hardly varies.
+Where derivatives of what is measured are known, directions in which nothing changes, or so little that the box of the
+parameters says more, are unknown exactly (`sentences`): an interval along them would be made up. They are compared in
+widths of the box, where all parameters have the same scale. Both say what they find in the same words.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+LIKE_THE_BOX = 0.9
+"""Width of a 90 % interval, as a fraction of the box's, from which on it says no more than the box does."""
+PART = 0.1
+"""How far a parameter may change in an uninformed direction, as a fraction of what changes most, and be informed."""
+EXACT = 0.02
+"""Exponents and weights this near to simple numbers are written as those."""
+NORMAL = 1.6449
+"""Half of a 90 % interval of a normal distribution, in standard deviations."""
+NEARLY = 0.1
+"""The same of exponents that are read off draws."""
+TOGETHER = 0.9
+"""Correlation above which two parameters are not told apart; for several, what is left of the variance is as little."""
+MOST = 4
+"""Parameters of a combination, at most: one of more says nothing to a reader."""
+_SIMPLE = (0.0, 0.5, 1.0, 2.0, 3.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class TradeOff:
+    """Parameters of which a combination is known much better than they are.
+
+    Attributes:
+        places: of the parameters, from 0.
+        known: combinations that hardly vary, in words.
+        unknown: the combinations that vary instead.
+        correlation: of two parameters, or of their logarithms where the combination is a product; else NaN.
+        factor: how many times less the known combinations vary than the parameters would let them independently.
+    """
+
+    places: tuple[int, ...]
+    known: tuple[str, ...]
+    unknown: tuple[str, ...]
+    correlation: float
+    factor: float
+
+
+def trade_offs(names: Sequence[str], draws: Float[np.ndarray, "n dim"]) -> list[TradeOff]:
+    """Groups of parameters that draws of a posterior do not tell apart, with what is known of them together.
+
+    A combination is known where its variance is less than 1 - `TOGETHER` of what it would be were the parameters
+    independent: for two, where their correlation exceeds `TOGETHER`. Products of powers are looked for among parameters
+    that are positive, and weighted sums among all; of the same parameters, what varies less is reported.
+
+    Args:
+        names: of the parameters.
+        draws: in natural units, shape [n, D].
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> mass, ratio = np.exp(rng.normal(0.0, 0.5, 1000)), np.exp(rng.normal(0.0, 0.02, 1000))
+        >>> [found] = trade_offs(["stiffness", "mass"], np.stack([mass * ratio, mass], axis=1))
+        >>> found.known, found.unknown, f"{found.correlation:.2f}"
+        (('stiffness / mass',), ('stiffness * mass',), '1.00')
+    """
+    draws = np.asarray(draws, np.float64)
+    positive = np.flatnonzero((draws > 0).all(axis=0))
+    products = _together(names, np.log(draws[:, positive]), positive, _product, NEARLY)
+    sums = _together(names, draws, np.arange(draws.shape[1]), _sum, EXACT)
+    better = {one.places: one for one in sums}
+    found = [max(one, better.get(one.places, one), key=lambda either: either.factor) for one in products]
+    taken = {d for one in found for d in one.places}
+    return [*found, *(one for one in sums if not taken & set(one.places))]
+
+
+def _together(names, values: np.ndarray, places: np.ndarray, write, within: float) -> list[TradeOff]:
+    """Groups of columns with combinations that hardly vary."""
+    scale = values.std(axis=0)
+    usable = np.flatnonzero(scale > 1e-12 * np.abs(values).max(axis=0, initial=0.0))
+    if len(usable) < 2:
+        return []
+    values, places, scale = values[:, usable], places[usable], scale[usable]
+    z = (values - values.mean(axis=0)) / scale
+    variance, axes = np.linalg.eigh(z.T @ z / len(z))
+    rows = _reduced(axes.T[variance < 1 - TOGETHER], EXACT)
+    rows = np.where(np.abs(rows) < PART * np.abs(rows).max(axis=1, keepdims=True, initial=0.0), 0.0, rows)
+    found = []
+    for group in _groups(rows):
+        own = rows[np.ix_([row for row in range(len(rows)) if rows[row, group].any()], group)]
+        several, known = [names[places[d]] for d in group], _reduced(own / scale[group], within)
+        left = np.var(z[:, group] @ (known * scale[group]).T, axis=0) / np.sum((known * scale[group]) ** 2, axis=1)
+        if len(group) > MOST or (left >= 1 - TOGETHER).any():  # not so once it is put into words
+            continue
+        units = 1.0 if write is _product else scale[group]  # logarithms have none
+        other = _reduced(_complement(known * units) / units, within)
+        pair = len(group) == 2
+        found.append(
+            TradeOff(
+                places=tuple(int(d) for d in places[group]),
+                known=tuple(write(several, row) for row in known),
+                unknown=tuple(write(several, row) for row in other),
+                correlation=float(np.mean(z[:, group[0]] * z[:, group[1]])) if pair else np.nan,
+                factor=float(1 / np.sqrt(max(left.max(), 1e-12))),
+            )
+        )
+    return found
+
+
+def unconstrained(name: str, more: str = "") -> str:
+    """That nothing is known of a parameter, in words."""
+    return f"The observation does not constrain {name}{more}."
+
+
+def not_separate(names: Sequence[str], known: Sequence[str], unknown: Sequence[str] = (), note: str = "") -> str:
+    """That some parameters are known together only, in words.
+
+    Example:
+        >>> not_separate(["stiffness", "mass"], ["stiffness / mass"])
+        'stiffness and mass are not separately identifiable: only stiffness / mass is well determined.'
+    """
+    verb = lambda texts: "is" if len(texts) == 1 else "are"
+    but = f"; {listed(unknown)} {verb(unknown)} not" if unknown else ""
+    return (
+        f"{listed(names)} are not separately identifiable{note}: only {listed(known)} {verb(known)} well "
+        f"determined{but}."
+    )
+
+
+def trade_off_sentence(names: Sequence[str], one: TradeOff, each_known: bool = True) -> str:
+    """What a trade-off means, in words.
+
+    Args:
+        names: of all parameters.
+        one: the trade-off.
+        each_known: whether each of its parameters is known by itself as well.
+    """
+    several = [names[d] for d in one.places]
+    note = "" if np.isnan(one.correlation) else f" (correlation {one.correlation:.2f})"
+    if not each_known:
+        return not_separate(several, one.known, one.unknown, note)
+    verb = "varies" if len(one.known) == 1 else "vary"
+    return (
+        f"{listed(several)} trade off against each other{note}: {listed(one.known)} {verb} {one.factor:.2g} times less "
+        "than it would if they were independent."
+    )
+
+
+def listed(texts: Sequence[str]) -> str:
+    """Texts as "a", "a and b" or "a, b and c"."""
+    return " and ".join(filter(None, (", ".join(texts[:-1]), *texts[-1:])))
+
+
+def directions(
+    jacobian: Float[np.ndarray, "rows dim"],
+) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, "dim dim"]]:
+    """Orthogonal directions of the parameters, as rows, and by how much the residuals change along each.
+
+    Args:
+        jacobian: by parameters in widths of the box.
+    """
+    upper = np.linalg.qr(jacobian, mode="r")
+    square = np.zeros((jacobian.shape[1], jacobian.shape[1]))
+    square[: len(upper)] = upper
+    _, sizes, rows = np.linalg.svd(square)
+    return sizes, rows
+
+
+def says_more(
+    deviations: Float[np.ndarray, " directions"], rows: Float[np.ndarray, "directions dim"]
+) -> Bool[np.ndarray, " directions"]:
+    """Whether an interval along a direction is narrower than the box, of the parameter that changes most along it.
+
+    Args:
+        deviations: standard deviations along the directions, in widths of the box.
+        rows: the directions.
+    """
+    return 2 * NORMAL * deviations * np.abs(rows).max(axis=1) < LIKE_THE_BOX
+
+
+def untouched(uninformed: Float[np.ndarray, "directions dim"]) -> Bool[np.ndarray, " dim"]:
+    """Which parameters next to nothing changes along any combination of some orthogonal directions."""
+    onto = np.abs(uninformed.T @ uninformed)
+    return np.diagonal(onto) < PART * np.maximum(onto.max(axis=1), 1e-12)
+
+
+def sentences(
+    names: Sequence[str],
+    log: Sequence[bool],
+    theta: Float[np.ndarray, " dim"],
+    uninformed: Float[np.ndarray, "dim directions"],
+    widths: Float[np.ndarray, " dim"],
+) -> list[str]:
+    """What an observation does not determine: single parameters, and several but for a combination of them.
+
+    Args:
+        names: of the parameters.
+        log: which are inferred as logarithms.
+        theta: the point, in natural units.
+        uninformed: directions in inference space along which nothing changes.
+        widths: of the box, in inference space.
+
+    Example:
+        >>> along = np.array([[1.0], [-1.0]])
+        >>> sentences(["mass", "length"], [True, True], np.ones(2), along, np.ones(2))
+        ['mass and length are not separately identifiable: only mass * length is well determined.']
+    """
+    rows = uninformed.T / widths
+    rows = _reduced(np.where(untouched(rows), 0.0, rows))
+    found = []
+    for group in _groups(rows):
+        own = rows[np.ix_([row for row in range(len(rows)) if rows[row, group].any()], group)]
+        several = [names[d] for d in group]
+        if len(own) == len(group):
+            found += [unconstrained(name) for name in several]
+            continue
+        logs = np.array([log[d] for d in group])
+        combined = _combinations(several, logs, theta[group], own * widths[group])
+        found.append(not_separate(several, combined))
+    return found
+
+
+def _groups(rows: np.ndarray) -> list[list[int]]:
+    """Parameters that change together in some direction."""
+    groups: list[set[int]] = []
+    for row in rows:
+        own = set(np.flatnonzero(row).tolist())
+        apart = [group for group in groups if not group & own]
+        groups = [*apart, own.union(*(group for group in groups if group & own))]
+    return sorted(sorted(group) for group in groups)
+
+
+def _combinations(names: Sequence[str], log: np.ndarray, theta: np.ndarray, uninformed: np.ndarray) -> list[str]:
+    """What does not change along any of some directions: products of powers, or sums, whichever is the simpler one.
+
+    A single point does not tell a product from a sum of parameters that are equal there: a product is written then.
+    """
+    relative = uninformed / np.where(log, 1.0, np.where(theta != 0, theta, np.nan))
+    powers = _complement(relative) if np.isfinite(relative).all() else None
+    weights = _complement(uninformed * np.where(log, theta, 1.0))
+    if powers is not None and (_simple(powers) or (log.any() and not _simple(weights))):
+        return [_product(names, row) for row in powers]
+    return [_sum(names, row) for row in weights]
+
+
+def _simple(rows: np.ndarray) -> bool:
+    return bool(np.isin(np.abs(rows), _SIMPLE).all())
+
+
+def _complement(rows: np.ndarray) -> np.ndarray:
+    """Simple vectors that are orthogonal to all rows, and span all that are."""
+    scale = np.abs(rows).max(axis=0)
+    _, sizes, right = np.linalg.svd(rows / scale)
+    return _reduced(right[len(sizes) :] / scale)
+
+
+def _reduced(rows: np.ndarray, within: float = EXACT) -> np.ndarray:
+    """Rows of the same span, each with a 1 where all others are 0, and as many zeros as that gives."""
+    rows, taken = np.array(rows, float), []
+    scale = np.abs(rows).max(axis=0, initial=1e-300)
+    for row in range(len(rows)):
+        free = np.abs(rows[row]) / np.where(scale > 0, scale, 1.0)
+        free[taken] = 0.0
+        column = int(np.argmax(free))
+        taken.append(column)
+        rows[row] /= rows[row, column]
+        for other in range(len(rows)):
+            if other != row:
+                rows[other] -= rows[other, column] * rows[row]
+    for value, sign in itertools.product(_SIMPLE, (1.0, -1.0)):
+        rows[np.abs(rows - sign * value) < within] = sign * value
+    return rows
+
+
+def _product(names: Sequence[str], powers: np.ndarray) -> str:
+    """As "a * b^2 / c"."""
+    powers = 2 * powers if 0.5 in np.abs(powers) else powers
+    powers = powers * (1.0 if powers[np.flatnonzero(powers)[0]] > 0 else -1.0)
+    power = lambda name, value: name if value == 1 else f"{name}^{value:.2g}"
+    above = " * ".join(power(name, value) for name, value in zip(names, powers, strict=True) if value > 0)
+    below = "".join(f" / {power(name, -value)}" for name, value in zip(names, powers, strict=True) if value < 0)
+    return above + below
+
+
+def _sum(names: Sequence[str], weights: np.ndarray) -> str:
+    """As "a + 2 * b - c"."""
+    weights = weights * (1.0 if weights[np.flatnonzero(weights)[0]] > 0 else -1.0)
+    text = ""
+    for name, value in zip(names, weights, strict=True):
+        if value:
+            term = name if abs(value) == 1 else f"{abs(value):.3g} * {name}"
+            text += f"{' + ' if value > 0 else ' - '}{term}" if text else term
+    return text

@@ -1,0 +1,172 @@
+"""What a run says of itself, in sentences: whether the model fits, what failed, whether it had settled, what is next.
+
+As in `jaxlfi.runs.summarise`, nothing is said that was not measured on this run.
+"""
+
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from jaxlfi.bayessim.convergence import LAG, changes
+from jaxlfi.diagnostics.identifiability import listed
+from jaxlfi.diagnostics.misspecification import RECORDS
+from jaxlfi.diagnostics.predictive import MIN_RESIDUALS, Residual, residuals
+from jaxlfi.io.run_summary import RunSummary
+from jaxlfi.runs.unlike import names_of, observation_findings
+
+if TYPE_CHECKING:  # runs know their account
+    from jaxlfi.runs.run import Run
+
+COMMONEST = 3
+"""Reasons of failed simulations that are named, at most."""
+CHANNELS = 4
+"""Channels that are named, at most: those with the greatest residuals."""
+EDGE = "A support that can grow: `--heuristic edge`, or `heuristic=jaxlfi.Edge()`."
+LOOK = "Look at the misfit: `jaxlfi report FOLDER` draws simulations of the posterior beside the observation."
+DIAGNOSE = "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER`."
+
+
+def account(run: "Run", found: RunSummary) -> RunSummary:
+    """The summary of a run's parameters with sentences on the run as a whole, and all that there is to do next.
+
+    Args:
+        run: one run, concrete.
+        found: of its parameters.
+    """
+    strange, (fit, fits) = _observation(run), _fit(run)
+    settled, more = _settled(run)
+    steps = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more + list(found.next_steps)
+    sentences = (*found.sentences, strange, fit, _failures(run), settled)
+    return RunSummary(found.parameters, tuple(filter(None, sentences)), tuple(steps) or (DIAGNOSE,))
+
+
+def _held_back(run: "Run", found: RunSummary) -> bool:
+    """Whether a posterior leans on a bound that its heuristic cannot move, and that is not Phi's."""
+    box, phi = jax.device_get((run.belief.support, run.feasible))
+    inside = {"lower": box.low > phi.low + 1e-5 * phi.width, "upper": box.high < phi.high - 1e-5 * phi.width}
+    leans = [inside[side][d] for d, one in enumerate(found.parameters) for side in one.leans]
+    return not run.heuristic.grows and any(leans)
+
+
+def _observation(run: "Run") -> str:
+    """In what the observation is unlike everything that was simulated."""
+    found = [one.name for one in observation_findings(run)]
+    if not found:
+        return ""
+    return f"The observation is unlike all simulations in {listed(found)}: its posterior cannot be relied on."
+
+
+def _fit(run: "Run") -> tuple[str, bool]:
+    """Whether simulations of the posterior look like the observation: in words, and as far as is known."""
+    count = int(np.asarray(run.history.get("predictive_simulations", [0]))[-1])
+    if not count:
+        return "", True
+    names, simulated, observed = channels(run)
+    valid = simulated[np.isfinite(simulated).all(axis=(1, 2))]
+    if len(valid) < MIN_RESIDUALS:
+        return (
+            f"Only {len(valid)} of {count} simulations of the posterior succeeded: too few to see whether it fits.",
+            True,
+        )
+    return fit_sentence(names, residuals(valid, observed))
+
+
+def channels(run: "Run") -> tuple[list[str], np.ndarray, np.ndarray]:
+    """What simulations of the posterior are compared by: channels of a series, or numbers of the summary.
+
+    Returns:
+        Names [C], simulations [N, T, C] and the observation [T, C].
+    """
+    observed, x = np.asarray(run.observed), np.asarray(run.x)
+    names, series = (run.summary_names, ()) if run.task is None else names_of(run.task, observed.shape, len(x))
+    if observed.ndim == 2 and len(observed) > 1:
+        count = observed.shape[1]
+        known = () if run.task is None else run.task.channels
+        series = known if len(known) == count else [f"channel {c + 1}" for c in range(count)]
+    if series:
+        observed = observed.reshape(len(observed), -1)
+        return list(series), np.asarray(run.history["final_trajectory"]).reshape(-1, *observed.shape), observed
+    simulated = np.asarray(run.history["final_x"])
+    named = run.task is not None and run.task.summary_names
+    if named or len(x) < RECORDS:
+        return list(names), simulated[:, None], x[None]
+    # Many numbers without a name, each in a unit of its own: all together, in units of their scatter.
+    finite = simulated[np.isfinite(simulated).all(axis=1)]
+    scale = finite.std(axis=0) if len(finite) else np.ones(len(x))
+    scale = np.where(scale > 0, scale, np.inf)[:, None]
+    return ["all of its numbers"], simulated[..., None] / scale, x[:, None] / scale
+
+
+def fit_sentence(names: list[str], found: list[Residual]) -> tuple[str, bool]:
+    """Whether a model fits, in words.
+
+    Args:
+        names: of the channels.
+        found: their residuals.
+
+    Returns:
+        The sentence, "" where nothing scatters, and whether it does.
+
+    Example:
+        >>> fit_sentence(["arm", "pendulum"], [Residual(1.1, 1.4), Residual(9.0, 1.3)])[0]
+        'Simulations of the posterior miss the observation: its residual is 9.0 times their scatter in pendulum \
+(1.1 in arm): the model lacks something there.'
+    """
+    known = [(one, name) for one, name in zip(found, names, strict=True) if np.isfinite(one.ratio)]
+    known = sorted(known, key=lambda pair: -pair[0].ratio)
+    if not known:
+        return "", True
+    far, near = ([pair for pair in known if pair[0].far == wanted] for wanted in (True, False))
+    if not far:
+        rest = f", and no more in {len(known) - CHANNELS} others" if len(known) > CHANNELS else ""
+        return f"Simulations of the posterior fit the observation: its residual is {_listed(near)}{rest}.", True
+    rest = f" ({_listed(near, '')})" if near else ""
+    return (
+        f"Simulations of the posterior miss the observation: its residual is {_listed(far)}{rest}: the model lacks "
+        "something there."
+    ), False
+
+
+def _listed(pairs: list[tuple[Residual, str]], unit: str = " times their scatter") -> str:
+    """The greatest residuals, with their channels."""
+    first, *others = pairs[:CHANNELS]
+    texts = [f"{first[0].ratio:.1f}{unit} in {first[1]}", *(f"{one.ratio:.1f} in {name}" for one, name in others)]
+    return listed(texts)
+
+
+def _failures(run: "Run") -> str:
+    """How many simulations failed, and the commonest reasons."""
+    found = run.failures
+    if not found:
+        return ""
+    attempted = int(np.sum(run.history["attempted"]))
+    reasons = [f"{one.count:,} {one.reason}{f' ({one.message})' if one.message else ''}" for one in found[:COMMONEST]]
+    head = f"{sum(one.count for one in found):,} of {attempted:,} simulations failed"
+    return (
+        f"{head}, the commonest reasons: {'; '.join(reasons)}."
+        if len(found) > COMMONEST
+        else f"{head}: {'; '.join(reasons)}."
+    )
+
+
+def _settled(run: "Run") -> tuple[str, list[str]]:
+    """Whether the posterior still changed from round to round, and that more rounds are wanted."""
+    history = {
+        name: np.asarray(run.history[name])
+        for name in ("moved", "rescaled", "turned", "settled")
+        if name in run.history
+    }
+    made = 1 if "settled" not in history else np.count_nonzero(~history["settled"][:-1]) + 1
+    if made == 1 or len(history) < 4:
+        return "", []
+    more = [f"More rounds: `--rounds {2 * made}`, or `settings=run.settings.replace(rounds={2 * made})`."]
+    last = [float(history[name][-1]) for name in ("moved", "rescaled", "turned")]
+    if not np.isfinite(last).all():
+        return f"{made} rounds are too few to tell whether the posterior has settled: it is compared over {LAG}.", more
+    if still := changes(*last):
+        return (
+            f"The posterior had not settled after {made} rounds: over the last {LAG}, it changed its {listed(still)}.",
+            more,
+        )
+    return f"The posterior settled: over the last {LAG} of {made} rounds it hardly changed.", []
