@@ -8,12 +8,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.reliability.comparing import content, files
-from experiments.reliability.injection import Blow
-from experiments.reliability.process import Ended, Running, run
+from tests.reliability.comparing import content, files
+from tests.reliability.injection import Blow
+from tests.reliability.process import Ended, Running, run
 
 if TYPE_CHECKING:
-    from experiments.reliability.__main__ import Undisturbed
+    from tests.reliability.__main__ import Undisturbed
 
 COLUMNS = ("command", "adversity", "status", "lines", "said", "then")
 DAY = 86400.0
