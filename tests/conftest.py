@@ -59,16 +59,18 @@ MAX_MEMORY = 1700 * 2**20
 
 
 LONG = (
-    "test_examples", "test_cli", "test_outside_package", "test_draws", "test_infer", "test_grid", "test_apt",
-    "test_resume", "test_readme", "test_calibration_study", "test_lynx_hare", "test_load", "test_real2sim",
-    "test_algorithm", "test_engines", "test_estimators", "test_training", "test_from_brax", "test_fuzzing",
+    "test_default_widths", "test_examples", "test_cli", "test_outside_package", "test_draws", "test_infer",
+    "test_grid", "test_apt", "test_resume", "test_readme", "test_calibration_study", "test_lynx_hare", "test_load",
+    "test_real2sim", "test_algorithm", "test_engines", "test_estimators", "test_training", "test_from_brax",
+    "test_fuzzing",
 )  # fmt: skip
-"""Files of half a minute and more."""
+"""Files of half a minute and more, in the order in which they begin: the longest first."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with long files, so that no worker is left alone with one at the end."""
-    items.sort(key=lambda item: item.path.stem not in LONG)
+    place = {name: number for number, name in enumerate(LONG)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
 
 
 @pytest.fixture

@@ -37,13 +37,19 @@ class Settings(Checked):
     estimator: Estimator = dataclasses.field(default=MixtureNetwork())
     rounds: int = option(default=10, low=1, high=100_000, help="largest number of inference rounds, N_LFI")
     min_rounds: int = option(
-        default=0, low=0, high=100_000, help="rounds after which a run may end, once its posterior has settled; 0: it makes all"
+        default=0,
+        low=0,
+        high=100_000,
+        help="rounds after which a run may end, once its posterior has settled; 0: it makes all",
     )
     simulations_per_round: int = option(
         default=100, low=1, high=100_000_000, help="largest number of valid simulations added per round"
     )
     simulation_budget: int = option(
-        default=125, low=1, high=100_000_000, help="largest number of simulations attempted per round, failures included"
+        default=125,
+        low=1,
+        high=100_000_000,
+        help="largest number of simulations attempted per round, failures included",
     )
     correction: str = option(
         default="none", choices=tuple(CORRECTIONS), help="how to correct for proposals that are not the prior"

@@ -86,7 +86,9 @@ class Estimator(Checked, abc.ABC):
         ValueError: from `check` for settings that contradict each other.
     """
 
-    learning_rate: Float[Array, "*batch"] | float = hyperparameter(default=1e-5, above=0.0, help="learning rate of Adam")
+    learning_rate: Float[Array, "*batch"] | float = hyperparameter(
+        default=1e-5, above=0.0, help="learning rate of Adam"
+    )
     weight_decay: Float[Array, "*batch"] | float = hyperparameter(default=0.0, low=0.0, help="decoupled weight decay")
     clip_norm: Float[Array, "*batch"] | float = hyperparameter(
         default=math.inf,

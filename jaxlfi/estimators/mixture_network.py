@@ -43,7 +43,9 @@ class MixtureNetwork(Estimator):
     hidden: tuple[int, ...] = option(default=(1024, 1024, 1024), low=1, help="units per hidden layer")
     activation: str = option(default="tanh", choices=tuple(ACTIVATIONS), help="activation function")
     parameters: str = option(
-        default="feasible", choices=("feasible", "zscore"), help="how parameters are scaled: by Phi, or to unit variance"
+        default="feasible",
+        choices=("feasible", "zscore"),
+        help="how parameters are scaled: by Phi, or to unit variance",
     )
     prune: Float[Array, "*batch"] | float = hyperparameter(
         default=0.0, low=0.0, high=0.5, help="smallest weight of a component; lighter ones are dropped"

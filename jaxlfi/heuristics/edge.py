@@ -35,7 +35,11 @@ class Edge(Heuristic):
     """
 
     zone_fraction: Value = hyperparameter(
-        default=0.1, help="width of the zone along a bound, as a fraction of the support's width", symbol="delta", low=0, high=1
+        default=0.1,
+        help="width of the zone along a bound, as a fraction of the support's width",
+        symbol="delta",
+        low=0,
+        high=1,
     )
     mass_threshold: Value = hyperparameter(
         default=0.12, help="posterior mass in the zone above which the bound moves", symbol="tau", low=0, high=1

@@ -28,7 +28,9 @@ class PPO(Checked):
     gae_lambda: Number = hyperparameter(
         default=0.95, help="decay of the generalised advantage estimate", symbol="lambda", low=0, high=1
     )
-    entropy: Number = hyperparameter(default=0.0, help="entropy bonus: weight of the policy's entropy in the loss", low=0)
+    entropy: Number = hyperparameter(
+        default=0.0, help="entropy bonus: weight of the policy's entropy in the loss", low=0
+    )
     clipping: Number = hyperparameter(
         default=0.2, help="PPO clipping range of the probability ratio", symbol="epsilon", above=0
     )
@@ -40,17 +42,18 @@ class PPO(Checked):
     initial_deviation: Number = hyperparameter(
         default=1.0, help="standard deviation of the first policy's actions, as a fraction of their limit", above=0
     )
-    environments: int = option(default=12, help="number of environments stepped in parallel, each with its own theta", low=1)
+    environments: int = option(
+        default=12, help="number of environments stepped in parallel, each with its own theta", low=1
+    )
     unroll: int = option(default=16, help="steps per trajectory segment", low=1)
     segments: int = option(default=1, help="trajectory segments per minibatch", low=1)
     minibatches: int = option(default=1536, help="minibatches per update", low=1)
     epochs: int = option(default=10, help="epochs per update", low=1)
-    total_steps: int = option(
-        default=60_000, help="total environment steps, rounded up to whole updates", low=1
-    )
+    total_steps: int = option(default=60_000, help="total environment steps, rounded up to whole updates", low=1)
     hidden: tuple[int, ...] = option(default=(64, 64), help="widths of the hidden layers of both networks", low=1)
     redrawn: bool = option(
-        default=False, help="draw a new theta for every episode; otherwise each environment keeps its own, as in the paper"
+        default=False,
+        help="draw a new theta for every episode; otherwise each environment keeps its own, as in the paper",
     )
 
     def __post_init__(self):

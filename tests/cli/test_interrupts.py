@@ -177,10 +177,17 @@ def test_who_handles_signals_meanwhile_is_left_alone():
     assert status == 130 and errors == "stopped\njaxlfi: interrupted\n"
 
 
+def inferring(*words: str) -> subprocess.Popen:
+    """A run whose process has come to our program: what Python does before takes seconds on a busy machine."""
+    start = "import sys; from jaxlfi.cli.start import main; print('ready', flush=True); sys.exit(main())"
+    process = started(sys.executable, "-c", start, "infer", "gaussian_linear", "--no-figures", *words)
+    assert process.stdout.readline() == "ready\n", process.stderr.read()
+    return process
+
+
 @pytest.mark.parametrize("seconds", [0.4, 1.5, 3.0])
 def test_a_run_is_interrupted_at_any_moment(seconds, tmp_path):
-    words = ("infer", "gaussian_linear", "--no-figures", "--no-cache", "--out", str(tmp_path / "out"))
-    process = started(sys.executable, "-m", "jaxlfi", *words)
+    process = inferring("--no-cache", "--out", str(tmp_path / "out"))
     time.sleep(seconds)
     status, errors, took = interrupted(process)
     assert status == 130 and took < PATIENCE, errors
@@ -193,8 +200,7 @@ def test_fifty_of_fifty(tmp_path):
     """At moments that spread over the start, imports, compiling and the rounds."""
     late = []
     for place in range(50):
-        out = tmp_path / str(place)
-        process = started(sys.executable, "-m", "jaxlfi", "infer", "gaussian_linear", "--no-figures", "--out", str(out))
+        process = inferring("--out", str(tmp_path / str(place)))
         time.sleep(0.4 * 1.06**place)
         status, errors, took = interrupted(process)
         if status != 130 or took > PATIENCE:

@@ -1,7 +1,6 @@
 """Figures: what is drawn is what was saved, for runs of all kinds, and nothing else is touched."""
 
 import collections
-import csv
 import json
 import sys
 import warnings
@@ -38,6 +37,7 @@ from jaxlfi.figures import (
     supports,
 )
 from jaxlfi.figures.history import robust_sd
+from jaxlfi.runs import folder as run_store
 
 COMPARED = ("ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre")
 TRUTH = np.log([0.01, 0.5, 1.0, 0.01])
@@ -219,14 +219,12 @@ def write_compare(folder: Path, configurations=COMPARED, count: int = 3, **optio
         for seed in range(count):
             run = load(write_run(folder / name / f"seed_{seed:03d}", configuration=name, seed=seed, **options))
             errors = run.final_theta_error, run.final_trajectory_error
-            rows.append([name, seed, *errors, run.success_rate, run.seconds.sum()])
+            row = name, seed, *errors, run.success_rate, run.seconds.sum()
+            rows.append(dict(zip(run_store.TABLE_COLUMNS, row, strict=True)))
     config = {"format": "jaxlfi-compare", "task": "lotka_volterra", "preset": "quick"}
     config |= {"command_line": "jaxlfi compare lotka_volterra --preset quick --seeds 3"}
     (folder / "config.json").write_text(json.dumps(config))
-    with (folder / "table.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds"])
-        writer.writerows([["" if value != value else value for value in row] for row in rows])
+    run_store.write_table(folder / "table.csv", rows)
     return folder
 
 
@@ -234,6 +232,17 @@ def write_compare(folder: Path, configurations=COMPARED, count: int = 3, **optio
 def compared(tmp_path_factory):
     """A comparison of six configurations with three seeds each."""
     return open_collection(write_compare(tmp_path_factory.mktemp("compare")))
+
+
+def test_runs_that_never_took_place_have_names_of_the_format_alone(tmp_path):
+    """Whatever else a picture is drawn from would not be in a user's folder."""
+    made = write_run(tmp_path / "run")
+    written = Path(__file__).parents[1] / "golden" / "formats" / str(run_store.VERSION) / "run"
+    names = lambda folder: {path.name: set(np.load(path)) for path in folder.glob("*.npz")}
+    for file, arrays in names(made).items():
+        assert arrays <= names(written)[file], file
+    config = lambda folder: json.loads((folder / "config.json").read_text()).keys()
+    assert config(made) - {"platform"} <= config(written)  # the kept folder says nothing of a machine
 
 
 @pytest.fixture(autouse=True)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from experiments.fuzzing.damage import DEEP, Pickled, bomb
 from jaxlfi.io import files
+from tests.fuzzing.damage import DEEP, Pickled, bomb
 
 ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "b": np.array([True, False]), "c": np.asarray("text")}
 

@@ -296,7 +296,7 @@ def test_who_may_import_which_library(path):
         "tensorboardX": ("jaxlfi.rl.tensorboard",),
         "pyarrow": ("jaxlfi.io.lerobot",),
         "mcap": ("jaxlfi.io.mcap",),
-        "distributed": ("jaxlfi.tasks.executors", "experiments.reliability"),
+        "distributed": ("jaxlfi.tasks.executors",),
         "cloudpickle": ("jaxlfi.tasks.host", "jaxlfi.tasks.worker"),  # from a run to the processes that it starts
     }
     forbidden = dict.fromkeys(("pickle", "dill", "joblib"), ())

@@ -11,8 +11,8 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.reliability import injection
-from experiments.reliability.injection import Blow, Window
+from tests.reliability import injection
+from tests.reliability.injection import Blow, Window
 
 ENDED = 120.0
 """Seconds after which a process is taken to hang."""

@@ -10,7 +10,7 @@ FAST = (
 ).split()
 """Two rounds of 20 simulations."""
 CART = (
-    "experiments.reliability.tasks:Cart --environments 4 --unroll 5 --segments 1 --minibatches 4 --epochs 1 "
+    "tests.reliability.tasks:Cart --environments 4 --unroll 5 --segments 1 --minibatches 4 --epochs 1 "
     "--total-steps 960 --hidden 4 --no-figures --domain uniform"
 ).split()
 """48 updates, in three checkpoints."""
@@ -55,10 +55,10 @@ def commands(scheduler: str) -> dict[str, Command]:
             ),
         ),
         Command("train", ("train", *CART, *OUT)),
-        Command("r2s2r", loop, loop, "experiments.reliability.loop"),
+        Command("r2s2r", loop, loop, "tests.reliability.loop"),
         Command(
             "dask",
-            ("infer", "experiments.reliability.tasks:one_by_one", *FAST, *dask, *OUT),
+            ("infer", "tests.reliability.tasks:one_by_one", *FAST, *dask, *OUT),
             ("resume", "run", "--no-figures", *dask),
         ),
     )

@@ -1,6 +1,6 @@
 """What survives: runs that are killed, a full disk, a read-only folder, a moved one, a clock that jumps, two at once.
 
-    python -m experiments.reliability --kills 100
+    python -m tests.reliability --kills 100
 
 Each trial starts a command, kills it by SIGKILL, and goes on by `jaxlfi resume` (or by the same command, where nothing
 had been begun), which is killed again; after three kills it goes on to its end, and its folder is compared bit by bit
@@ -34,14 +34,14 @@ import numpy as np
 
 import jaxlfi.cli.commands
 import jaxlfi.rl.training  # noqa: F401 - likewise
-from experiments.reliability import adversities
-from experiments.reliability.commands import Command, commands
-from experiments.reliability.comparing import LEFT_OUT
-from experiments.reliability.injection import Blow
-from experiments.reliability.process import Ended, Running
-from experiments.reliability.undisturbed import Undisturbed
 from jaxlfi.io import files as atomic
 from jaxlfi.io.provenance import environment
+from tests.reliability import adversities
+from tests.reliability.commands import Command, commands
+from tests.reliability.comparing import LEFT_OUT
+from tests.reliability.injection import Blow
+from tests.reliability.process import Ended, Running
+from tests.reliability.undisturbed import Undisturbed
 
 KILLS_PER_TRIAL = 3
 AT_A_MOMENT, IN_A_WINDOW = "at a moment", "in a window"

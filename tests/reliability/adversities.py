@@ -8,10 +8,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from experiments.reliability.comparing import content, files
-from experiments.reliability.injection import Blow
-from experiments.reliability.process import Ended, Running, run
-from experiments.reliability.undisturbed import Undisturbed
+from tests.reliability.comparing import content, files
+from tests.reliability.injection import Blow
+from tests.reliability.process import Ended, Running, run
+from tests.reliability.undisturbed import Undisturbed
 
 COLUMNS = ("command", "adversity", "status", "lines", "said", "then")
 DAY = 86400.0

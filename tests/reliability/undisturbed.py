@@ -6,10 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from experiments.reliability.commands import Command
-from experiments.reliability.comparing import differences
-from experiments.reliability.injection import Blow
-from experiments.reliability.process import run
+from tests.reliability.commands import Command
+from tests.reliability.comparing import differences
+from tests.reliability.injection import Blow
+from tests.reliability.process import run
 
 
 class Undisturbed:

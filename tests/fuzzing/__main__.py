@@ -1,6 +1,6 @@
 """Bad input by the thousand: every command ends with status 2 and one line that names what was expected, or works.
 
-    python -m experiments.fuzzing --cases 10000 --seed 0 --out runs/fuzzing
+    python -m tests.fuzzing --cases 10000 --seed 0 --out runs/fuzzing
 
 Each case is one command with something wrong in it (or, by chance, nothing): its words, a configuration, an array file
 or an observation. A case must end within a minute with status 0, or with status 2 and one line on stderr; it must not
@@ -23,9 +23,9 @@ from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
-from experiments.fuzzing.running import Ended, fuzz, prepared_folder
 from jaxlfi.io import files
 from jaxlfi.io.provenance import environment
+from tests.fuzzing.running import Ended, fuzz, prepared_folder
 
 ADDRESSES = 24 * 2**30
 """Bytes of addresses that the process may ask for, so that a case that would fill the machine ends itself."""

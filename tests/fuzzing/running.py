@@ -8,9 +8,9 @@ import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from experiments.fuzzing.cases import made, prepare
-from experiments.fuzzing.judging import PASSED, Case, Result, forget, judged, peak, sped_up
-from experiments.fuzzing.words import RIGHT
+from tests.fuzzing.cases import made, prepare
+from tests.fuzzing.judging import PASSED, Case, Result, forget, judged, peak, sped_up
+from tests.fuzzing.words import RIGHT
 
 HERE = Path("a", "here")
 """Where commands run, below the folder that is watched: deep enough for names that lead up."""

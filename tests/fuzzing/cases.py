@@ -12,10 +12,6 @@ import numpy as np
 from rich.console import Console
 
 import jaxlfi.envs.whip
-from experiments.fuzzing import words as grammar
-from experiments.fuzzing.damage import damaged
-from experiments.fuzzing.judging import Case, Reached, stubs
-from experiments.fuzzing.words import RIGHT, SMALL, TASK, picked
 from jaxlfi.cli import commands
 from jaxlfi.cli import parser as cli
 from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS
@@ -23,6 +19,10 @@ from jaxlfi.io import files
 from jaxlfi.io.processes import ALONE
 from jaxlfi.rl.policy import Policy
 from jaxlfi.runs import execute as executing
+from tests.fuzzing import words as grammar
+from tests.fuzzing.damage import damaged
+from tests.fuzzing.judging import Case, Reached, stubs
+from tests.fuzzing.words import RIGHT, SMALL, TASK, picked
 
 # ------------------------------------------------------------------------------------------------------- good input
 

@@ -10,7 +10,7 @@ from jaxlfi.cli import parser as core
 from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip import r2s2r
 
-TASK, HOST = "gaussian_linear", "experiments.fuzzing.words:on_host"
+TASK, HOST = "gaussian_linear", "tests.fuzzing.words:on_host"
 SMALL = (
     "--estimator mdn --hidden 16 --ensemble-size 1 --components 2 --rounds 2 --min-rounds 0 "
     "--simulations-per-round 20 --steps 20 --no-cache --no-figures"

@@ -28,10 +28,10 @@ from unittest import mock
 import jax
 from matplotlib.figure import Figure
 
-from experiments.fuzzing.words import OWN
 from jaxlfi import registry
 from jaxlfi.bayessim import programs
 from jaxlfi.cli import parser as cli
+from tests.fuzzing.words import OWN
 
 SECONDS, MEMORY = 60, 4 * 2**30
 """What a case may take: time, and bytes of the process's memory."""

@@ -1,6 +1,6 @@
 """`jaxlfi r2s2r` with small stages: the loop is the real one, and so are `jaxlfi train` and `jaxlfi infer` within it.
 
-    python -m experiments.reliability.loop --object dlo-0 --out runs/loop
+    python -m tests.reliability.loop --object dlo-0 --out runs/loop
 
 A loop of the whip takes a quarter of an hour even at its smallest. Here a cart is trained on, the linear Gaussian task
 is inferred, and the rollout, the policies' deployment on the object and the page are files of a line.
@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
-from experiments.reliability.commands import CART, FAST
 from jaxlfi.cli import parser, train
 from jaxlfi.envs.whip import r2s2r, r2s2r_page
 from jaxlfi.io import files
+from tests.reliability.commands import CART, FAST
 
 UNDRAWN = "--no-figures"
 

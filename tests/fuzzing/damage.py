@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.fuzzing.words import picked
+from tests.fuzzing.words import picked
 
 VALUES = (
     None, True, False, 0, 1, -1, 2, 0.5, 1e308, -0.0, 10**30, float("nan"), float("inf"), "", "x", "..",

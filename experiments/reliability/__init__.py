@@ -1,1 +1,0 @@
-"""What survives a kill, a full disk, and other adversities: `python -m experiments.reliability`."""
