@@ -313,9 +313,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
         tables.show(summaries.summary_table(plan, runs), console)
     for warning in summaries.warnings(plan, runs):
         _warn(console, warning)
-    several = (
-        () if plan.kind == run_store.RUN else (*summaries.failure_lines(runs), *summaries.rounds_lines(plan, runs))
-    )
+    several = () if plan.kind == RUN else (*summaries.failure_lines(runs), *summaries.rounds_lines(plan, runs))
     for line in (*several, *summaries.widths_lines(plan, runs)):  # of a single run, its summary says so
         _say(console, line)
     kind = "table" if plan.kind == COMPARE else "results"

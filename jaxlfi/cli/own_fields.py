@@ -5,151 +5,203 @@ from math import inf
 from jaxlfi.fields import Declared, described, hyperparameter, option
 
 ESTIMATOR = {
-    "learning_rate": hyperparameter(default=1e-05, help="Adam's step size", above=0.0),
+    "learning_rate": hyperparameter(default=1e-05, help="learning rate of Adam", above=0.0),
     "weight_decay": hyperparameter(default=0.0, help="decoupled weight decay", low=0.0),
-    "clip_norm": hyperparameter(inf, help="norm the gradients are clipped to; inf: not clipped", high=inf, above=0.0),
-    "components": option(default=4, help="Gaussians K in each network's mixture", low=1, high=1000000),
-    "ensemble_size": option(default=1, help="networks in the ensemble", low=1, high=1000000),
-    "epochs": option(default=1000, help="full passes over the data each round", low=0),
-    "steps": option(default=0, help="gradient steps each round, in place of epochs", low=0),
-    "batch_size": option(default=100, help="simulations in a minibatch", low=1),
-    "schedule": option(default="constant", help="of the learning rate within a round", choices=("constant", "cosine")),
-    "validation": option(default=0.0, help="fraction held out to choose the best weights by", low=0.0, high=0.9),
-    "patience": option(
-        default=0, help="epochs without a better validation loss before training stops; 0: no limit", low=0
+    "clip_norm": hyperparameter(
+        default=inf,
+        help="largest norm of a gradient, to which longer ones are clipped; inf: no clipping",
+        high=inf,
+        above=0.0,
     ),
-    "warm_start": option(default=True, help="train on from the last round's weights, or start anew"),
+    "components": option(default=4, help="number K of Gaussians in each network's mixture", low=1, high=1000000),
+    "ensemble_size": option(default=1, help="number of networks in the ensemble", low=1, high=1000000),
+    "epochs": option(default=1000, help="passes over the data per round", low=0),
+    "steps": option(default=0, help="gradient steps per round, instead of epochs", low=0),
+    "batch_size": option(default=100, help="simulations per minibatch", low=1),
+    "schedule": option(
+        default="constant", help="learning-rate schedule within a round", choices=("constant", "cosine")
+    ),
+    "validation": option(
+        default=0.0, help="fraction of the data held out for validation, which selects the weights", low=0.0, high=0.9
+    ),
+    "patience": option(
+        default=0, help="epochs without a better validation loss before training stops; 0: it never stops early", low=0
+    ),
+    "warm_start": option(default=True, help="start each round from the last round's weights, or from new ones"),
     "loss": option(
-        "likelihood",
-        help="likelihood; atomic, combined: no correction for the proposals needed",
+        default="likelihood",
+        help="training loss; atomic and combined need no correction for the proposals",
         choices=("likelihood", "atomic", "combined"),
     ),
     "normaliser": option(default="zscore", help="how summaries are normalised", choices=("none", "zscore", "asinh")),
     "embedding": option(
-        "none",
-        help="network that makes features of long summaries, trained with the other",
+        default="none",
+        help="network that extracts features from long summaries, trained together with the density",
         choices=("none", "mlp", "series", "trials"),
     ),
-    "features": option(default=16, help="numbers that the embedding makes of a summary", low=1),
+    "features": option(default=16, help="number of features that the embedding extracts", low=1),
     "reduction": option(
-        "none",
-        help="the networks see what regressions predict; or half of them",
+        default="none",
+        help="whether networks see what regressions predict: none, all of them, or half",
         choices=("none", "regression", "half"),
     ),
     "record_size": option(
-        0, help="numbers of a record (channels of a series, length of a trial) in the summary; 0: the task's", low=0
+        default=0,
+        help="numbers per record of the summary (channels of a series, length of a trial); 0: the task's",
+        low=0,
     ),
 }
 MASKED_FLOW = ESTIMATOR | {
-    "hidden": option(default=(50, 50), help="units of each hidden layer", low=1),
-    "activation": option(default="tanh", help="relu, tanh or silu", choices=("relu", "tanh", "silu")),
-    "transforms": option(default=5, help="transforms of a flow", low=1),
+    "hidden": option(default=(50, 50), help="units per hidden layer", low=1),
+    "activation": option(default="tanh", help="activation function", choices=("relu", "tanh", "silu")),
+    "transforms": option(default=5, help="number of transforms per flow", low=1),
 }
 SPLINE_FLOW = ESTIMATOR | {
-    "hidden": option(default=(50, 50), help="units of each hidden layer", low=1),
-    "activation": option(default="tanh", help="relu, tanh or silu", choices=("relu", "tanh", "silu")),
-    "transforms": option(default=5, help="transforms of a flow", low=1),
-    "bins": option(default=10, help="pieces of each spline", low=1, high=999),
-    "tail_bound": option(default=5.0, help="half the splines' range, in standard deviations", low=0.1),
-    "regression": option(default=0, help="networks that start from a ridge regression on the summaries", low=0),
+    "hidden": option(default=(50, 50), help="units per hidden layer", low=1),
+    "activation": option(default="tanh", help="activation function", choices=("relu", "tanh", "silu")),
+    "transforms": option(default=5, help="number of transforms per flow", low=1),
+    "bins": option(default=10, help="number of pieces per spline", low=1, high=999),
+    "tail_bound": option(default=5.0, help="half of the range of the splines, in standard deviations", low=0.1),
+    "regression": option(
+        default=0, help="number of networks that start from a ridge regression on the summaries", low=0
+    ),
 }
 MIXTURE_LIKELIHOOD = ESTIMATOR | {
     "noise_floor": hyperparameter(
-        default=0.03, help="noise added to normalised summaries, of a likelihood", low=0.0, high=1.0
+        default=0.03, help="noise added to the summaries before training a likelihood", low=0.0, high=1.0
     ),
-    "particles": option(default=1000, help="draws that a likelihood's posterior is found by", low=10),
-    "hidden": option(default=(50, 50), help="units of each hidden layer", low=1),
-    "activation": option(default="tanh", help="relu, tanh or silu", choices=("relu", "tanh", "silu")),
+    "particles": option(default=1000, help="SMC particles (likelihood methods)", low=10),
+    "hidden": option(default=(50, 50), help="units per hidden layer", low=1),
+    "activation": option(default="tanh", help="activation function", choices=("relu", "tanh", "silu")),
 }
 MIXTURE_NETWORK = ESTIMATOR | {
-    "hidden": option(default=(1024, 1024, 1024), help="units of each hidden layer", low=1),
-    "activation": option(default="tanh", help="relu, tanh or silu", choices=("relu", "tanh", "silu")),
-    "parameters": option(default="feasible", help="what parameters are scaled by", choices=("feasible", "zscore")),
-    "prune": hyperparameter(default=0.0, help="components of less weight than this are dropped", low=0.0, high=0.5),
+    "hidden": option(default=(1024, 1024, 1024), help="units per hidden layer", low=1),
+    "activation": option(default="tanh", help="activation function", choices=("relu", "tanh", "silu")),
+    "parameters": option(
+        default="feasible",
+        help="how parameters are scaled: by Phi, or to unit variance",
+        choices=("feasible", "zscore"),
+    ),
+    "prune": hyperparameter(
+        default=0.0, help="smallest weight of a component; lighter ones are dropped", low=0.0, high=0.5
+    ),
 }
 CENTRE = {}
 EDGE = {
     "zone_fraction": hyperparameter(
-        0.1, help="the zone along a bound, as a fraction of the support's width", symbol="delta", low=0, high=1
+        default=0.1,
+        help="width of the zone along a bound, as a fraction of the support's width",
+        symbol="delta",
+        low=0,
+        high=1,
     ),
     "mass_threshold": hyperparameter(
-        0.12, help="posterior mass in the zone above which its bound moves", symbol="tau", low=0, high=1
+        default=0.12, help="posterior mass in the zone above which the bound moves", symbol="tau", low=0, high=1
     ),
     "expansion": hyperparameter(
-        0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
+        default=0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
     ),
-    "zone_width": hyperparameter(default=0.0, help="an absolute width added to the zone", symbol="delta", low=0),
-    "tail": hyperparameter(default=1.0, help="fraction of the mass beyond the bound that counts", low=0, high=1),
+    "zone_width": hyperparameter(
+        default=0.0,
+        help="width of the zone along a bound, in the parameter's units, added to the fraction",
+        symbol="delta",
+        low=0,
+    ),
+    "tail": hyperparameter(
+        default=1.0, help="fraction of the mass beyond the bound that counts as in the zone", low=0, high=1
+    ),
 }
 FIXED = {}
 MODE = {
     "shift_threshold": hyperparameter(
-        0.01, help="how far a mode must have moved since the last round", symbol="nu_TH", low=0
+        default=0.01, help="how far a mode must have moved since the last round", symbol="nu_TH", low=0
     ),
     "proximity": hyperparameter(
-        0.4, help="how near a bound a mode must be, as a fraction of the support's width", symbol="rho", low=0, high=1
+        default=0.4,
+        help="how near a bound a mode must be, as a fraction of the support's width",
+        symbol="rho",
+        low=0,
+        high=1,
     ),
     "mass_threshold": hyperparameter(
-        0.05, help="weight of the modes moving towards a bound above which it moves", symbol="tau", low=0, high=1
+        default=0.05,
+        help="weight of the modes that move towards a bound, above which the bound moves",
+        symbol="tau",
+        low=0,
+        high=1,
     ),
     "expansion": hyperparameter(
-        0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
+        default=0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
     ),
 }
 TRUNCATE = {
-    "quantile": hyperparameter(default=0.001, help="posterior mass given up beyond each bound", low=0, below=0.5),
+    "quantile": hyperparameter(default=0.001, help="posterior mass left beyond each bound", low=0, below=0.5),
 }
 PPO = {
-    "learning_rate": hyperparameter(default=0.0003, help="of Adam", low=0),
+    "learning_rate": hyperparameter(default=0.0003, help="learning rate of Adam", low=0),
     "annealing": hyperparameter(
-        0.0, help="fraction of the learning rate that is taken off, evenly, until the last update", low=0, high=1
+        default=0.0, help="fraction by which the learning rate falls, linearly, until the last update", low=0, high=1
     ),
-    "discount": hyperparameter(default=0.99, help="of a reward one step later", symbol="gamma", low=0, high=1),
+    "discount": hyperparameter(default=0.99, help="discount factor", symbol="gamma", low=0, high=1),
     "gae_lambda": hyperparameter(
-        default=0.95, help="of the generalised advantage estimate", symbol="lambda", low=0, high=1
+        default=0.95, help="decay of the generalised advantage estimate", symbol="lambda", low=0, high=1
     ),
-    "entropy": hyperparameter(default=0.0, help="weight of the policy's entropy in the loss", low=0),
-    "clipping": hyperparameter(default=0.2, help="of the ratio of probabilities", symbol="epsilon", above=0),
+    "entropy": hyperparameter(default=0.0, help="entropy bonus: weight of the policy's entropy in the loss", low=0),
+    "clipping": hyperparameter(
+        default=0.2, help="PPO clipping range of the probability ratio", symbol="epsilon", above=0
+    ),
     "value_weight": hyperparameter(default=0.5, help="weight of the value function's loss", low=0),
-    "max_gradient_norm": hyperparameter(default=0.5, help="length that gradients are shortened to", above=0),
-    "adam_epsilon": hyperparameter(default=1e-05, help="in the denominator of Adam", above=0),
-    "initial_deviation": hyperparameter(
-        1.0, help="standard deviation of the first policy's actions, as a fraction of their limit", above=0
+    "max_gradient_norm": hyperparameter(
+        default=0.5, help="largest norm of a gradient, to which longer ones are clipped", above=0
     ),
-    "environments": option(default=12, help="environments side by side, each with its own theta", low=1),
-    "unroll": option(default=16, help="steps of a trajectory segment", low=1),
-    "segments": option(default=1, help="trajectory segments in a minibatch", low=1),
-    "minibatches": option(default=1536, help="minibatches of an update's transitions", low=1),
-    "epochs": option(default=10, help="epochs over an update's transitions", low=1),
-    "total_steps": option(default=60000, help="steps of all environments together, rounded up to whole updates", low=1),
+    "adam_epsilon": hyperparameter(default=1e-05, help="epsilon of Adam", above=0),
+    "initial_deviation": hyperparameter(
+        default=1.0, help="standard deviation of the first policy's actions, as a fraction of their limit", above=0
+    ),
+    "environments": option(
+        default=12, help="number of environments stepped in parallel, each with its own theta", low=1
+    ),
+    "unroll": option(default=16, help="steps per trajectory segment", low=1),
+    "segments": option(default=1, help="trajectory segments per minibatch", low=1),
+    "minibatches": option(default=1536, help="minibatches per update", low=1),
+    "epochs": option(default=10, help="epochs per update", low=1),
+    "total_steps": option(default=60000, help="total environment steps, rounded up to whole updates", low=1),
     "hidden": option(default=(64, 64), help="widths of the hidden layers of both networks", low=1),
     "redrawn": option(
-        False, help="draw theta anew for every episode; else each environment keeps its own, as in the paper"
+        default=False,
+        help="draw a new theta for every episode; otherwise each environment keeps its own, as in the paper",
     ),
 }
 SETTINGS = {
-    "rounds": option(default=10, help="inference rounds, N_LFI, at most", low=1, high=100000),
+    "rounds": option(default=10, help="largest number of inference rounds, N_LFI", low=1, high=100000),
     "min_rounds": option(
-        0, help="rounds after which a run ends once its posterior has settled; 0: it makes all", low=0, high=100000
+        default=0,
+        help="rounds after which a run may end, once its posterior has settled; 0: it makes all",
+        low=0,
+        high=100000,
     ),
-    "simulations_per_round": option(default=100, help="simulations added each round, at most", low=1, high=100000000),
+    "simulations_per_round": option(
+        default=100, help="largest number of valid simulations added per round", low=1, high=100000000
+    ),
     "simulation_budget": option(
-        125, help="simulations attempted each round, at most, failures included", low=1, high=100000000
+        default=125, help="largest number of simulations attempted per round, failures included", low=1, high=100000000
     ),
     "correction": option(
-        "none", help="from the network to the posterior", choices=("none", "paper", "quotient", "pooled", "importance")
+        default="none",
+        help="how to correct for proposals that are not the prior",
+        choices=("none", "paper", "quotient", "pooled", "importance"),
     ),
     "restriction": option(
         default="clip", help="how proposals are kept in the support", choices=("clip", "reject", "mixed")
     ),
     "defensive": hyperparameter(
-        0.0, help="fraction of proposals drawn from the prior over the support", low=0.0, high=1.0
+        default=0.0, help="fraction of proposals drawn from the prior over the support", low=0.0, high=1.0
     ),
     "inflation": hyperparameter(
-        1.0, help="how many times as wide as the posterior proposals are drawn", low=1.0, high=100.0
+        default=1.0, help="width of the proposals, in widths of the posterior", low=1.0, high=100.0
     ),
     "predictive": option(
-        default=True, help="simulate 20 draws of each round's posterior, to compare with the observation"
+        default=True, help="simulate 20 draws of each round's posterior and compare them with the observation"
     ),
 }
 

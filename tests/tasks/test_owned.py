@@ -265,7 +265,7 @@ def test_what_is_masked_is_missing(row):
     assert {task.reasons[code - 1] for code in failure} == {"non_finite"}
     if np.ndim(row) == 1:
         assert np.isnan(many.batch(KEY, THETA)[0][0, 1])
-    with pytest.raises(ValueError, match="^observation: expected finite numbers"):  # of a task without gaps
+    with pytest.raises(ValueError, match=r"^observation: expected finite numbers"):  # of a task without gaps
         observe(KEY, task, row)
     simulations, _ = presimulated(task, {"theta": THETA, "x": np.ma.array(THETA, mask=THETA == 3.0)}, BOX)
     assert simulations.kept.tolist() == [True, False, True, True]
