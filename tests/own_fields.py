@@ -16,7 +16,9 @@ from jaxlfi.rl.settings import PPO
 PLACE = Path(jaxlfi.__file__).parent / "cli" / "own_fields.py"
 HEAD = '''"""What `--help` says of our classes and commands, none of which it imports; by tests/own_fields.py."""
 
+from dataclasses import Field
 from math import inf
+from typing import Any
 
 from jaxlfi.fields import Declared, described, hyperparameter, option
 
@@ -73,7 +75,7 @@ def source() -> str:
         inherited = fields.declared(base) if base else {}
         new = {name: one for name, one in fields.declared(kind).items() if inherited.get(name) != one}
         names[kind] = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", kind.__name__).upper()
-        text += f"{names[kind]} = {f'{names[base]} | ' if base else ''}{{\n"
+        text += f"{names[kind]}: dict[str, Field[Any]] = {f'{names[base]} | ' if base else ''}{{\n"
         text += "".join(f'    "{name}": {call(one)},\n' for name, one in new.items()) + "}\n"
         entries.append(f'    "{kind.__module__}:{kind.__qualname__}": described({names[kind]}),')
     helps = "\n".join(f"    {shown(place)}: {shown(text)}," for place, text in commands().items())

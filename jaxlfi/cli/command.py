@@ -16,9 +16,9 @@ from jaxlfi.cli.exit_status import exit_status
 class OneLineParser(argparse.ArgumentParser):
     """A parser whose errors are one line, and whose flags are written out: `--seed 3` is not `--seeds 3`."""
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        """As argparse's."""
-        super().__init__(*args, allow_abbrev=False, **kwargs)
+    def __init__(self, **kwargs: Any):
+        """As argparse's, by keywords."""
+        super().__init__(**{**kwargs, "allow_abbrev": False})
 
     def error(self, message: str) -> NoReturn:
         """One line on stderr, and exit status 2."""

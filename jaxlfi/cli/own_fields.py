@@ -1,10 +1,12 @@
 """What `--help` says of our classes and commands, none of which it imports; by tests/own_fields.py."""
 
+from dataclasses import Field
 from math import inf
+from typing import Any
 
 from jaxlfi.fields import Declared, described, hyperparameter, option
 
-ESTIMATOR = {
+ESTIMATOR: dict[str, Field[Any]] = {
     "learning_rate": hyperparameter(default=1e-05, help="learning rate of Adam", above=0.0),
     "weight_decay": hyperparameter(default=0.0, help="decoupled weight decay", low=0.0),
     "clip_norm": hyperparameter(
@@ -51,12 +53,12 @@ ESTIMATOR = {
         low=0,
     ),
 }
-MASKED_FLOW = ESTIMATOR | {
+MASKED_FLOW: dict[str, Field[Any]] = ESTIMATOR | {
     "hidden": option(default=(50, 50), help="units per hidden layer", low=1),
     "activation": option(default="tanh", help="activation function", choices=("relu", "tanh", "silu")),
     "transforms": option(default=5, help="number of transforms per flow", low=1),
 }
-SPLINE_FLOW = ESTIMATOR | {
+SPLINE_FLOW: dict[str, Field[Any]] = ESTIMATOR | {
     "hidden": option(default=(50, 50), help="units per hidden layer", low=1),
     "activation": option(default="tanh", help="activation function", choices=("relu", "tanh", "silu")),
     "transforms": option(default=5, help="number of transforms per flow", low=1),
@@ -66,7 +68,7 @@ SPLINE_FLOW = ESTIMATOR | {
         default=0, help="number of networks that start from a ridge regression on the summaries", low=0
     ),
 }
-MIXTURE_LIKELIHOOD = ESTIMATOR | {
+MIXTURE_LIKELIHOOD: dict[str, Field[Any]] = ESTIMATOR | {
     "noise_floor": hyperparameter(
         default=0.03, help="noise added to the summaries before training a likelihood", low=0.0, high=1.0
     ),
@@ -74,7 +76,7 @@ MIXTURE_LIKELIHOOD = ESTIMATOR | {
     "hidden": option(default=(50, 50), help="units per hidden layer", low=1),
     "activation": option(default="tanh", help="activation function", choices=("relu", "tanh", "silu")),
 }
-MIXTURE_NETWORK = ESTIMATOR | {
+MIXTURE_NETWORK: dict[str, Field[Any]] = ESTIMATOR | {
     "hidden": option(default=(1024, 1024, 1024), help="units per hidden layer", low=1),
     "activation": option(default="tanh", help="activation function", choices=("relu", "tanh", "silu")),
     "parameters": option(
@@ -86,8 +88,8 @@ MIXTURE_NETWORK = ESTIMATOR | {
         default=0.0, help="smallest weight of a component; lighter ones are dropped", low=0.0, high=0.5
     ),
 }
-CENTRE = {}
-EDGE = {
+CENTRE: dict[str, Field[Any]] = {}
+EDGE: dict[str, Field[Any]] = {
     "zone_fraction": hyperparameter(
         default=0.1,
         help="width of the zone along a bound, as a fraction of the support's width",
@@ -111,8 +113,8 @@ EDGE = {
         default=1.0, help="fraction of the mass beyond the bound that counts as in the zone", low=0, high=1
     ),
 }
-FIXED = {}
-MODE = {
+FIXED: dict[str, Field[Any]] = {}
+MODE: dict[str, Field[Any]] = {
     "shift_threshold": hyperparameter(
         default=0.01, help="how far a mode must have moved since the last round", symbol="nu_TH", low=0
     ),
@@ -134,10 +136,10 @@ MODE = {
         default=0.2, help="how far a bound moves, as a fraction of the support's width", symbol="eta", low=0
     ),
 }
-TRUNCATE = {
+TRUNCATE: dict[str, Field[Any]] = {
     "quantile": hyperparameter(default=0.001, help="posterior mass left beyond each bound", low=0, below=0.5),
 }
-PPO = {
+PPO: dict[str, Field[Any]] = {
     "learning_rate": hyperparameter(default=0.0003, help="learning rate of Adam", low=0),
     "annealing": hyperparameter(
         default=0.0, help="fraction by which the learning rate falls, linearly, until the last update", low=0, high=1
@@ -172,7 +174,7 @@ PPO = {
         help="draw a new theta for every episode; otherwise each environment keeps its own, as in the paper",
     ),
 }
-SETTINGS = {
+SETTINGS: dict[str, Field[Any]] = {
     "rounds": option(default=10, help="largest number of inference rounds, N_LFI", low=1, high=100000),
     "min_rounds": option(
         default=0,

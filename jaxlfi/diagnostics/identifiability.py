@@ -259,7 +259,8 @@ def _complement(rows: np.ndarray) -> np.ndarray:
 
 def _reduced(rows: np.ndarray, within: float = EXACT) -> np.ndarray:
     """Rows of the same span, each with a 1 where all others are 0, and as many zeros as that gives."""
-    rows, taken = np.array(rows, float), []
+    rows = np.array(rows, float)
+    taken: list[int] = []
     scale = np.abs(rows).max(axis=0, initial=1e-300)
     for row in range(len(rows)):
         free = np.abs(rows[row]) / np.where(scale > 0, scale, 1.0)

@@ -148,8 +148,8 @@ class GaussianMixture(struct.PyTreeNode):
             >>> float(both.marginal((1,)).scale_tril[0, 0, 0])
             5.0
         """
-        kept = np.asarray(kept)
-        return GaussianMixture(self.logits, self.means[:, kept], lower_factor(self.scale_tril[:, kept]))
+        rows = np.asarray(kept)
+        return GaussianMixture(self.logits, self.means[:, rows], lower_factor(self.scale_tril[:, rows]))
 
     def conditional(self, given: Sequence[int], values: Float[Array, " given"]) -> "GaussianMixture":
         """The mixture of the other dimensions, where some have the values given: closed form.
@@ -167,8 +167,7 @@ class GaussianMixture(struct.PyTreeNode):
             >>> [round(float(value[0].squeeze()), 3) for value in (other.means, other.scale_tril)]
             [1.6, 0.6]
         """
-        given = np.asarray(given)
-        order = np.concatenate([given, np.setdiff1d(np.arange(self.means.shape[-1]), given)])
+        order = np.concatenate([given, np.setdiff1d(np.arange(self.means.shape[-1]), given)]).astype(int)
         first, means = len(given), self.means[:, order]
         factor = lower_factor(self.scale_tril[:, order])
         known = GaussianMixture(self.logits, means[:, :first], factor[:, :first, :first])

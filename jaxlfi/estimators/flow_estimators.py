@@ -86,7 +86,7 @@ class SplineFlow(FlowEstimator):
         if not self.regression or self.embedding != "none":
             return params
 
-        def start(view: Array | None) -> Array:
+        def start(view: Array | np.ndarray | None) -> Array:
             coefficients, intercept, _ = ridge(viewed(x, view), theta, valid)
             return jnp.concatenate([coefficients, intercept[:, None]], axis=1)
 

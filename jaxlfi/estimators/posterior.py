@@ -2,9 +2,8 @@
 
 import functools
 import html
-import operator
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -255,12 +254,12 @@ class Posterior(struct.PyTreeNode):
 
     def _places(self, names: Names) -> tuple[int, ...]:
         """Places of some parameters, from 0."""
-        known = {**{name: d for d, name in enumerate(self.space.names)}, **{d: d for d in range(self.space.dim)}}
+        known: dict[Any, int] = {name: d for d, name in enumerate(self.space.names)}
+        known |= {d: d for d in range(self.space.dim)}
         several = [names] if isinstance(names, str | int | np.integer) else list(names)
-        places = tuple(known.get(operator.index(one) if isinstance(one, np.integer) else one) for one in several)
-        if not places or None in places or len(set(places)) < len(places):
+        if not several or len(set(several)) < len(several) or not set(several) <= set(known):
             raise ValueError(f"names: expected some of {list(self.space.names)}, each once, got {names!r}")
-        return places
+        return tuple(known[one] for one in several)
 
     def _moments(self, natural: bool) -> tuple[Array, Array]:
         """Mean and covariance."""
@@ -338,7 +337,7 @@ class MarginalDensity(struct.PyTreeNode):
         """
         if not self.full._closed:
             raise ValueError(f"log_prob: expected the marginal of {_CLOSED}, got that of {_kind(self.full)}")
-        mixture, box = self.full.density, self.full.support
+        mixture, box = _mixture_of(self.full), self.full.support
         others = np.setdiff1d(np.arange(box.dim), self.kept)
         if not len(others):
             return mixture.marginal(self.kept).log_prob(theta)
@@ -361,6 +360,8 @@ class Marginal(Posterior, repr=False):
 
     `mass_inside` is that of the whole posterior, inside the bounds of all parameters.
     """
+
+    density: MarginalDensity
 
     def inner_draws(self, key: jax.Array, n: int) -> Float[Array, "n dim"]:
         """`n` draws in inference space."""
@@ -409,6 +410,11 @@ def _kind(posterior: Posterior) -> str:
     return kind + " under a prior" * (posterior.prior is not None)
 
 
+def _mixture_of(posterior: Posterior) -> GaussianMixture:
+    """The density of a posterior that has a closed form."""
+    return cast(GaussianMixture, posterior.density)
+
+
 def _sub_space(space: Space, kept: Sequence[int]) -> Space:
     return Space(tuple(space.names[d] for d in kept), tuple(space.log[d] for d in kept))
 
@@ -453,7 +459,7 @@ def _sample(key: jax.Array, posterior: Posterior, n: int) -> Array:
 @functools.partial(jax.jit, static_argnums=(1, 2))
 @single
 def _conditional(posterior: Posterior, given: tuple[int, ...], others: tuple[int, ...], values: Array) -> Posterior:
-    mixture, box, rows = posterior.density.conditional(given, values), posterior.support, np.array(others)
+    mixture, box, rows = _mixture_of(posterior).conditional(given, values), posterior.support, np.array(others)
     return truncated(mixture, mixture, Support(box.low[rows], box.high[rows]), _sub_space(posterior.space, others))
 
 
@@ -466,7 +472,7 @@ def _without_prior(posterior: Posterior) -> Posterior:
 @functools.partial(jax.jit, static_argnums=1)
 @single
 def _mixture_moments(posterior: Posterior, natural: bool) -> tuple[Array, Array]:
-    points, log_weight = weighted_points(posterior.density, posterior.support)
+    points, log_weight = weighted_points(_mixture_of(posterior), posterior.support)
     return _weighted_moments(posterior.space.to_natural(points) if natural else points, jnp.exp(log_weight))
 
 
@@ -486,7 +492,7 @@ def _weighted_moments(points: Array, weights: Array) -> tuple[Array, Array]:
 @jax.jit
 @single
 def _mixture_quantiles(posterior: Posterior, levels: Array) -> Array:
-    return truncated_quantiles(posterior.density, posterior.support, levels)
+    return truncated_quantiles(_mixture_of(posterior), posterior.support, levels)
 
 
 @jax.jit

@@ -79,11 +79,12 @@ def channels(run: "Run") -> tuple[list[str], np.ndarray, np.ndarray]:
         Names [C], simulations [N, T, C] and the observation [T, C].
     """
     observed, x = np.asarray(run.observed), np.asarray(run.x)
+    series: tuple[str, ...]
     names, series = (run.summary_names, ()) if run.task is None else names_of(run.task, observed.shape, len(x))
     if observed.ndim == 2 and len(observed) > 1:
         count = observed.shape[1]
-        known = () if run.task is None else run.task.channels
-        series = known if len(known) == count else [f"channel {c + 1}" for c in range(count)]
+        known = () if run.task is None else tuple(run.task.channels)
+        series = known if len(known) == count else tuple(f"channel {c + 1}" for c in range(count))
     if series:
         observed = observed.reshape(len(observed), -1)
         return list(series), np.asarray(run.history["final_trajectory"]).reshape(-1, *observed.shape), observed

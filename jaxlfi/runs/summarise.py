@@ -69,8 +69,8 @@ def summarised(
         ]
         steps += _wider(one, now, limits)
     known = [one.verdict == "identified" for one in parameters]
-    for one in together:
-        sentences.append(trade_off_sentence(space.names, one, all(known[d] for d in one.places)))
+    for trade_off in together:
+        sentences.append(trade_off_sentence(space.names, trade_off, all(known[d] for d in trade_off.places)))
     unclear = [one.name for d, one in enumerate(parameters) if one.verdict == "not at all" and d not in shared]
     steps += [ANOTHER.format(f"{listed(unclear)} {'changes' if len(unclear) == 1 else 'change'}")] * bool(unclear)
     steps += [_apart(space, one) for one in together if not all(known[d] for d in one.places)]
