@@ -82,8 +82,8 @@ class Declared:
 
 
 def hyperparameter(
-    *,
     default: Any,
+    *,
     help: str,
     symbol: str = "",
     low: float | None = None,
@@ -94,7 +94,7 @@ def hyperparameter(
     """A number that is a leaf of the pytree, so that `vmap` can map over it.
 
     Args:
-        default: its value where none is given.
+        default: its value where none is given; type checkers see that there is one if it is given by keyword.
         help: what it is, in one line.
         symbol: the paper's, spelt out.
         low: least value.
@@ -113,8 +113,8 @@ def hyperparameter(
 
 
 def option(
-    *,
     default: Any,
+    *,
     help: str,
     symbol: str = "",
     choices: tuple | None = None,

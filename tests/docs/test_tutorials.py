@@ -3,7 +3,6 @@
 import importlib.util
 import re
 import shlex
-import sys
 from pathlib import Path
 
 import pytest
@@ -81,6 +80,6 @@ def test_commands_of_a_tutorial_are_understood(name):
             if words[:1] != ["jaxlfi"]:
                 continue
             if command := cli.foreign_command(words[1]):
-                sys.modules[command.__module__].parser().parse_args(words[2:])
+                command.parser().parse_args(words[2:])
             else:
                 cli.parse(words[1:])

@@ -234,7 +234,7 @@ def test_statistics_follow_a_change_of_units(mixture, scale, shift):
 def flow(space=PLAIN) -> Posterior:
     """The mixture behind another class of densities, as a flow's posterior is."""
     each = jax.tree.map(lambda leaf: leaf[None], MIXTURE)
-    density = EnsembleDensity(each, jnp.zeros(3), jnp.ones(3), 1)
+    density = EnsembleDensity(each, jnp.zeros(3), jnp.ones(3), jnp.zeros(1))
     return jax.jit(truncated, static_argnums=3)(density, MIXTURE, BOX, space)
 
 
@@ -288,7 +288,7 @@ def test_wrong_arguments_are_refused():
     for level in (1.5, [-0.1, 0.5], float("nan")):
         with pytest.raises(ValueError, match=r"^level: expected numbers from 0 to 1, got"):
             CUT.quantile(level)
-    for mass in (0.0, 1.0, 2):
+    for mass in (0.0, 1.0, 2.0):
         with pytest.raises(ValueError, match=r"^mass: expected a number between 0 and 1, got"):
             CUT.interval(mass)
     for names in ("d", [], ["a", "a"], 3, -1):

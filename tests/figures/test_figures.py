@@ -37,6 +37,7 @@ from jaxlfi.figures import (
     supports,
 )
 from jaxlfi.figures.history import robust_sd
+from jaxlfi.io.formats import VERSION
 from jaxlfi.runs import folder as run_store
 
 COMPARED = ("ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre")
@@ -237,7 +238,7 @@ def compared(tmp_path_factory):
 def test_runs_that_never_took_place_have_names_of_the_format_alone(tmp_path):
     """Whatever else a picture is drawn from would not be in a user's folder."""
     made = write_run(tmp_path / "run")
-    written = Path(__file__).parents[1] / "golden" / "formats" / str(run_store.VERSION) / "run"
+    written = Path(__file__).parents[1] / "golden" / "formats" / str(VERSION) / "run"
     names = lambda folder: {path.name: set(np.load(path)) for path in folder.glob("*.npz")}
     for file, arrays in names(made).items():
         assert arrays <= names(written)[file], file

@@ -52,7 +52,7 @@ def test_two_processes_of_two_devices_train_what_one_trains(tmp_path):
 def test_more_processes_than_trainings_are_refused(tmp_path):
     processes = started(2, *WORDS, "--seeds", 1, "--total-steps", 80, "--out", tmp_path / "out")
     _, said = processes[0].communicate(timeout=60)
-    assert said == "jaxlfi train: error: processes: expected at most one a run, got 2 for 1\n"
+    assert said == "jaxlfi train: error: processes: expected at most one per run, got 2 for 1\n"
     processes[1].communicate(timeout=60)
     assert [process.returncode for process in processes] == [2, 2] and not (tmp_path / "out").exists()
 

@@ -269,7 +269,7 @@ def test_a_changed_or_damaged_grid_is_not_resumed(case, finished, tmp_path, caps
 
 def test_a_task_that_has_changed_is_not_resumed(finished, monkeypatch):
     changed = dataclasses.replace(TASK, truth=np.array([1.0, 0.5]))
-    monkeypatch.setattr(store.tasks, "load", lambda reference: changed)
+    monkeypatch.setattr(type(store.TASKS), "load", lambda self, reference: changed)
     with pytest.raises(StoreError, match="the task as they were"):
         study.reopen(finished[0])
 

@@ -170,7 +170,7 @@ def at_import(tree: ast.AST) -> list[ast.AST]:
     return found
 
 
-SELVES = {("jaxlfi.runs.folder", "jaxlfi.runs.run"), ("jaxlfi.runs.unlike", "jaxlfi.runs.run")}
+SELVES = {(f"jaxlfi.runs.{module}", "jaxlfi.runs.run") for module in ("account", "folder", "unlike")}
 """Modules that name, for readers only, the class of the module that calls them: a run saves and checks itself."""
 
 

@@ -139,7 +139,14 @@ def test_directions_are_those_of_the_whole_decomposition():
         ([DAMPING, IDLE], [1, 0.1], 0.5, 0, [True, False], ["The observation does not constrain joint/other/damping."]),
         ([GAIN, GEAR, DAMPING], [1, 3, 1], 0.5, 0, [False, False, True], ["/gainprm[0] * actuator/motor/gear[0]."]),
         ([GAIN, MASS], [1, 1], 0, -0.2, [True, True], []),  # which the known damping of the motor tells apart
-        ([GAIN, MASS], [1, 1], 0, 0, [False, False], ["only actuator/motor/gainprm[0] / body/cart/mass."]),
+        (
+            [GAIN, MASS],
+            [1, 1],
+            0,
+            0,
+            [False, False],
+            ["only actuator/motor/gainprm[0] / body/cart/mass is well determined."],
+        ),
         ([DAMPING, BACK], [1, 0], 0.5, -0.2, [False, False], ["/rail/damping - 4 * actuator/motor/biasprm[2]."]),
     ],
 )
@@ -161,7 +168,7 @@ def test_points_that_one_combination_joins_are_the_same():
     fits = best_fits(task, np.array([[1.0, 3.0, 1.5], [2.0, 1.0, 3.0], [0.7, 5.0, 2.0]]), keep=3)
     assert len(fits) == 1 and not fits[0].informed.any() and fits[0].uninformed.shape == (3, 2)
     (line,) = said(task, fits[0])
-    assert line.endswith("only actuator/motor/gainprm[0] * actuator/motor/gear[0] / body/cart/mass.")
+    assert line.endswith("only actuator/motor/gainprm[0] * actuator/motor/gear[0] / body/cart/mass is well determined.")
     gain, gear, mass = fits[0].theta
     assert gain * gear / mass == pytest.approx(1.5, rel=0.01)
 
