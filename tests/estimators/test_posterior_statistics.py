@@ -270,6 +270,7 @@ class Everywhere:
         return jnp.where(theta[..., 0] < theta[..., 1], -jnp.inf, log_prob) if self.cut else log_prob
 
 
+@pytest.mark.slow
 def test_only_a_prior_that_is_zero_in_places_stands_in_the_way(drawn):
     under = lambda cut: jax.jit(lambda mixture: truncated(mixture, mixture, BOX, PLAIN, Everywhere(cut)))(MIXTURE)
     points = jnp.array([[0.1], [0.3]])

@@ -58,7 +58,7 @@ def on_a_grid(log_likelihood, low, high, x, points: int = 300) -> tuple[np.ndarr
     return mean, np.sqrt(weight @ (theta - mean) ** 2)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", ["spring", pytest.param("autoregression", marks=pytest.mark.slow)])
 def test_posteriors_are_as_wide_as_exact_ones(name):
     simulate, log_likelihood, names, (low, high), truth = PROBLEMS[name]
     box = jaxlfi.Support(low, high)

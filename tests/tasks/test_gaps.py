@@ -96,7 +96,7 @@ def exact_sd(counts):
     return 0.5 / np.sqrt(np.asarray(counts))
 
 
-@pytest.mark.parametrize("embedding", ["none", "series"])
+@pytest.mark.parametrize("embedding", ["none", pytest.param("series", marks=pytest.mark.slow)])
 def test_posteriors_are_those_given_what_was_recorded(embedding):
     """Most of the second channel is missing, so that its parameter is known half as well."""
     observed = np.random.default_rng(2).normal([1.0, -1.0], 0.5, (20, 2))
