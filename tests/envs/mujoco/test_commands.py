@@ -105,7 +105,11 @@ def test_what_a_fit_says(runs):
     one, other = (dict(zip(("theta", "misfit"), pair, strict=True)) for pair in (([0.5, 1.0], 1.05), ([0.4, 2.0], 9.0)))
     changed = [commands.dataclasses.replace(best, **changes) for changes in (one, other)]
     bound = commands.dataclasses.replace(
-        best, misfit=1.0, at_bound=np.array([True, False]), covariance=np.array([[1.0, 0.99], [0.99, 1.0]])
+        best,
+        misfit=1.0,
+        theta=np.array([0.5, 1.0]),
+        at_bound=np.array([True, False]),
+        covariance=1e-4 * np.array([[1.0, 0.99], [0.99, 1.0]]),
     )
     lines = "\n".join(commands.said(task, [bound, *changed]))
     assert "2 points explain the recording as well" in lines
