@@ -77,7 +77,7 @@ def panels(runs: Runs) -> list[Panel]:
         thetas |= {} if theta is None else {name: theta}
         trajectories |= {} if trajectory is None else {name: trajectory}
     result = []
-    units = [unit_label(first.names, first.units, d) for d in range(first.dim)]
+    units = [unit_label(first.units, d) for d in range(first.dim)]
     width = 20 if len(set(units)) == 1 else 15  # panels of several units have a scale each
     for d, unit in enumerate(units if thetas else ()):
         title = parameter_name(first.names, d, width)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxlfi.figures import statistics
 from jaxlfi.figures.collection import Collection
 from jaxlfi.figures.history import heuristic_name
-from jaxlfi.figures.style import Look, looks, unit_label
+from jaxlfi.figures.style import Look, looks, natural, unit_label
 from jaxlfi.io.run_summary import RunSummary
 
 
@@ -346,8 +346,8 @@ def _swatch(own: Look) -> str:
 
 def _labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
     """Names of parameters with their units in brackets."""
-    brackets = [_without_escapes(unit_label(names, units, d)) for d in range(len(names))]
-    return [f"{name} {bracket}".strip() for name, bracket in zip(names, brackets, strict=True)]
+    brackets = [_without_escapes(unit_label(units, d)) for d in range(len(names))]
+    return [f"{natural(name)} {bracket}".strip() for name, bracket in zip(names, brackets, strict=True)]
 
 
 def _without_escapes(label: str) -> str:

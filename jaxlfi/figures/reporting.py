@@ -197,7 +197,7 @@ def _pairs(collection: Collection) -> Made:
     histories, titles = columns(runs)
     dim = histories[0].dim
     rows, across = pairs.arrangement(len(histories), dim)
-    width = TEXT_WIDTH if across * dim > 4 else COLUMN_WIDTH
+    width = TEXT_WIDTH if across * dim > 4 or len(histories) == 1 < dim else COLUMN_WIDTH
     figure = style.new_figure(width, 1.0 + rows * (0.3 + width * dim / (across * dim + 0.6)))
     pairs.draw(figure, histories, titles)
     caption = (

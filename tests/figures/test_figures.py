@@ -37,11 +37,14 @@ from jaxlfi.figures import (
     supports,
 )
 from jaxlfi.figures.history import robust_sd
+from jaxlfi.io import formats
 from jaxlfi.runs import folder as run_store
 
 COMPARED = ("ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre")
 TRUTH = np.log([0.01, 0.5, 1.0, 0.01])
 NAMES = ("ln predator birth", "ln predator death", "ln prey birth", "ln prey death")
+NATURAL = [name.removeprefix("ln ") for name in NAMES]
+"""As pictures call them, whose axes are logarithmic."""
 
 
 def write_run(
@@ -237,7 +240,7 @@ def compared(tmp_path_factory):
 def test_runs_that_never_took_place_have_names_of_the_format_alone(tmp_path):
     """Whatever else a picture is drawn from would not be in a user's folder."""
     made = write_run(tmp_path / "run")
-    written = Path(__file__).parents[1] / "golden" / "formats" / str(run_store.VERSION) / "run"
+    written = Path(__file__).parents[1] / "golden" / "formats" / str(formats.VERSION) / "run"
     names = lambda folder: {path.name: set(np.load(path)) for path in folder.glob("*.npz")}
     for file, arrays in names(made).items():
         assert arrays <= names(written)[file], file
@@ -353,7 +356,7 @@ def test_samples_shows_proposals_boxes_means_and_truth(compared):
     np.testing.assert_allclose(boxes, np.concatenate([low, high - low], 1))
     assert len({to_hex(box.get_edgecolor()) for box in axes.patches}) == history.rounds
     np.testing.assert_allclose(marked(axes, "truth")[0].get_xydata(), TRUTH[None, :2])
-    assert axes.get_xlabel() == "$\\theta_{1}$ ln predator birth\n[ln(1/time)]"
+    assert axes.get_xlabel() == "$\\theta_{1}$ predator birth\n[1/time]"
 
 
 def test_samples_shows_the_last_mixture_and_the_path_of_the_mean(compared):
@@ -405,7 +408,7 @@ def test_curves_are_means_of_exp_of_negative_losses(compared):
     expected = np.where(np.isnan(error), 0.0, np.exp(-0.5 * error)).mean((0, 2))
     label = "misspecified + MODE"
     np.testing.assert_allclose(line(panel(figure, "trajectory"), label).get_ydata(), expected)
-    for d, name in enumerate(NAMES):
+    for d, name in enumerate(NATURAL):
         theta = np.stack([h.theta_error[..., d] for h in histories])
         np.testing.assert_allclose(line(panel(figure, name), label).get_ydata(), np.exp(-0.5 * theta).mean((0, 2)))
 
@@ -416,7 +419,7 @@ def test_discrepancy_bars_are_means_with_standard_deviations(compared):
         trajectory = np.concatenate([h.trajectory_error[-1] for h in histories])
         trajectory = trajectory[~np.isnan(trajectory)]
         expected = {"trajectory": trajectory}
-        expected |= {n: np.concatenate([h.theta_error[-1, :, d] for h in histories]) for d, n in enumerate(NAMES)}
+        expected |= {n: np.concatenate([h.theta_error[-1, :, d] for h in histories]) for d, n in enumerate(NATURAL)}
         for title, values in expected.items():
             bars = panel(figure, title).containers
             drawn_bars = [bar for bar in bars if bar.get_label() == style.configuration_label(name)]
@@ -432,7 +435,7 @@ def test_support_draws_the_configurations_that_adapt(compared):
     assert set(supports.adapting(compared.runs)) == {n for n in COMPARED if "+" in n}
     assert set(supports.adapting({"ok": compared.runs["ok"]})) == {"ok"}
     figure = drawn(supports.draw, compared.runs)
-    axes = panel(figure, NAMES[1])
+    axes = panel(figure, NATURAL[1])
     histories = compared.runs["misspecified+edge"]
     upper = np.stack([np.concatenate([h.proposal_high[:1], h.support_high])[:, 1] for h in histories]).mean(0)
     shown = [artist.get_ydata() for artist in axes.lines if artist.get_label() == "misspecified + EDGE"]
@@ -674,7 +677,8 @@ def cielab(rgb: np.ndarray) -> np.ndarray:
 
 
 def test_labels_name_symbol_and_unit():
-    assert style.parameter_label(["ln rate"], ["1/s"], 0) == "$\\theta_{1}$ ln rate\n[ln(1/s)]"
+    assert style.parameter_label(["ln rate"], ["1/s"], 0) == "$\\theta_{1}$ rate\n[1/s]"
+    assert style.parameter_label(["ln rate"], ["ln(1/s)"], 0) == "$\\theta_{1}$ rate\n[1/s]"
     assert style.parameter_label(["a_b", "cost$"], ["", "N"], 1) == "$\\theta_{2}$ cost\\$\n[N]"
     assert style.parameter_label(["a_b"], [""], 0) == "$\\theta_{1}$ a b"
 
@@ -734,7 +738,7 @@ def test_report_of_one_run(tmp_path, options, missing):
 
 def test_legends_fit_into_figures_of_one_column(tmp_path):
     collection = open_collection(write_run(tmp_path / "run", rounds=2, records=21))
-    for name in ("curves", "predictive", "pairs", "polars"):
+    for name in ("curves", "predictive", "polars"):
         with style.context():
             figure, _, _ = reporting.PICTURES[name](collection)
             figure.draw_without_rendering()
