@@ -102,15 +102,14 @@ def logarithmic(axis: Axis, count: int, scale: float = 1.0, before: str = "") ->
     axis.set_minor_formatter(NullFormatter())
 
 
-def prefix(unit: str, low: float, high: float) -> tuple[float, str]:
-    """How many of a unit the prefixed unit is that makes the numbers between two short, and its name.
+def prefix(unit: str, magnitude: float) -> tuple[float, str]:
+    """How many of a unit the prefixed unit is that makes numbers of some magnitude short, and its name.
 
     Example:
-        >>> prefix("Pa", 2e4, 3e6), prefix("Pa", 2.0, 30.0), prefix("mm", 2e4, 3e6)
+        >>> prefix("Pa", 3e5), prefix("Pa", 30.0), prefix("mm", 3e5)
         ((1000.0, 'kPa'), (1.0, 'Pa'), (1.0, 'mm'))
     """
-    large = min(filter(None, (abs(low), abs(high))), default=0.0) if low * high > 0 else max(abs(low), abs(high))
-    fitting = ((size, letter + unit) for size, letter in _PREFIXES if unit in PREFIXED and large >= size)
+    fitting = ((size, letter + unit) for size, letter in _PREFIXES if unit in PREFIXED and magnitude >= size)
     return next(fitting, (1.0, unit))
 
 
@@ -137,10 +136,10 @@ class Scale:
         """
         low, high = sorted(axis.get_view_interval())
         if self.log:
-            size, unit = prefix(self.unit, *(math.exp(max(-LARGEST, min(end, LARGEST))) for end in (low, high)))
+            size, unit = prefix(self.unit, math.exp(max(-LARGEST, min((low + high) / 2, LARGEST))))
             logarithmic(axis, count, size)
         else:
-            size, unit = prefix(self.unit, low, high)
+            size, unit = prefix(self.unit, max(abs(low), abs(high)) / 2)
             round_ticks(axis, count)
             if size > 1:
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / size:.6g}"))

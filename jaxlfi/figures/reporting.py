@@ -186,13 +186,16 @@ def _predictive(collection: Collection) -> Made:
     if not runs:
         return None
     histories, titles = columns(runs)
-    width = COLUMN_WIDTH if len(histories) == 1 else TEXT_WIDTH
-    figure = style.new_figure(width, 0.8 + 1.35 * len(histories[0].channels))
+    rows, across = predictive.grid(histories)
+    figure = style.new_figure(COLUMN_WIDTH if across == 1 else TEXT_WIDTH, 0.8 + 1.35 * rows)
     predictive.draw(figure, histories, titles)
     caption = (
         "Trajectories simulated with samples of the last posterior, and the observed trajectory. The bands hold the "
         "central 50 % and 90 % of the simulations of each record." + _which_seed(runs)
     )
+    drawn, every = len(predictive.shown(histories)), len(histories[0].channels)
+    if drawn < every:
+        caption += f" Of {every} channels, the {drawn} that vary most are shown."
     return figure, "Posterior predictive", caption
 
 

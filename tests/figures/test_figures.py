@@ -482,6 +482,20 @@ def test_predictive_shows_few_records_as_points(tmp_path):
     assert (observed.get_marker(), observed.get_linestyle()) == ("o", "None")
 
 
+def test_predictive_shows_the_channels_that_vary_most(tmp_path):
+    """Thirty channels fit on a page; those that are left out vary least, and the caption says so."""
+    channels = tuple(f"k{i}" for i in range(30))
+    folder = write_run(tmp_path / "run", records=21, channels=channels, rounds=1)
+    history = load(folder)
+    with style.context():
+        figure, _, caption = reporting.PICTURES["predictive"](open_collection(folder))
+    ranges = np.ptp(history.observed, axis=0)
+    expected = {channels[i] for i in np.argsort(ranges)[-10:]}
+    assert {axes.get_ylabel() for axes in figure.axes} == expected
+    assert figure.get_size_inches()[1] * 300 <= 2400 and "Of 30 channels, the 10" in caption
+    assert len(predictive.shown([history, history])) == predictive.ROWS
+
+
 def test_predictive_counts_records_by_their_label(tmp_path):
     folder = write_run(tmp_path / "run", records=21)
     label = lambda: drawn(predictive.draw, [load(folder)]).axes[-1].get_xlabel()
