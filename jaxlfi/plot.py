@@ -1,5 +1,6 @@
 """Plots of anybody's arrays; matplotlib is imported when the first of them is drawn."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,7 +45,7 @@ def pairs(
         support: box to mark, an object with `low` and `high` or a pair of them, shape [D] each.
         points: estimates by label, each with an interval of every parameter, shapes [D] and [D, 2]; NaN for none.
             One that is called as a set of samples has its look.
-        log: parameters to be drawn as natural logarithms: their names, or D booleans.
+        log: parameters to be drawn on logarithmic axes: their names, or D booleans.
         path: file to write the figure to as well, .png, .pdf or .svg.
         dpi: resolution of a .png.
 
@@ -63,7 +64,7 @@ def pairs(
         ...     truth=(2.7, 0.4), log=("stiffness",),
         ... )
         >>> [axes.get_xlabel().replace("\n", " ") for axes in figure.axes if axes.get_xlabel()]
-        ['ln stiffness [ln(N/m)]', 'damping [N s/m]']
+        ['stiffness [N/m]', 'damping [N s/m]']
     """
     sets = _sets(samples)
     dim = next(iter(sets.values())).shape[1]
@@ -84,18 +85,21 @@ def pairs(
 
     # Imported here so that `import jaxlfi.plot` does not load matplotlib.
     from jaxlfi.figures import style
+    from jaxlfi.figures.natural import Scale
     from jaxlfi.figures.pairs import Cloud, Point, draw_overlay
 
     looks = dict(zip(all_labels, style.set_looks(all_labels), strict=True))
     clouds = [Cloud(draws, looks[label], marked, box) for label, draws in sets.items()]
     marks = [Point(value, np.stack(ends, axis=1), looks[label]) for label, (value, *ends) in estimates.items()]
     texts = [style.symbol(d) if names is None else style.plain(name) for d, name in enumerate(names_)]
-    texts = [f"ln {text}" if logarithm else text for text, logarithm in zip(texts, is_log, strict=True)]
-    labels = [style.with_unit(text, unit) for text, unit in zip(texts, units_, strict=True)]
+    scale = [
+        Scale("\n".join(textwrap.wrap(text, 18)), style.plain_unit(unit), bool(logarithm))
+        for text, unit, logarithm in zip(texts, units_, is_log, strict=True)
+    ]
     width = style.TEXT_WIDTH if dim > 2 else style.COLUMN_WIDTH
     with style.context():
         figure = style.new_figure(width, 0.65 * width + 0.5 if dim == 1 else width + 0.3)
-        draw_overlay(figure, clouds, labels, marks)
+        draw_overlay(figure, clouds, scale, marks)
         if path is None:
             figure.draw_without_rendering()  # makes ticks and layout in this style, before the settings are restored
         else:
@@ -188,7 +192,7 @@ def _texts(what: str, given: Sequence[str] | None, dim: int, default: str) -> tu
 
 
 def _mask(log: Sequence[bool] | Sequence[str], names: Sequence[str] | None, dim: int) -> np.ndarray:
-    """Which parameters are drawn as logarithms, shape [D]."""
+    """Which parameters are drawn on logarithmic axes, shape [D]."""
     given = [log] if isinstance(log, str) else list(log)
     if all(isinstance(name, str) for name in given) and (names is not None or not given):
         known = [None] * dim if names is None else list(names)

@@ -13,17 +13,13 @@ from jaxlfi.envs.whip.reference_objects import film
 from jaxlfi.envs.whip.reference_objects.deployment import deploy
 from jaxlfi.envs.whip.reference_objects.objects import load as load_object
 from jaxlfi.envs.whip.reference_objects.scene import PLACE
-from jaxlfi.io import files
+from jaxlfi.io import files, web_page
 from jaxlfi.rl import policy
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Run
 
 REPETITIONS = 16
 """Places at which policies are compared in the end."""
-STYLE = (
-    "body{font-family:sans-serif;max-width:60em;margin:2em auto}td,th{padding:.2em .8em;text-align:left}"
-    "img{max-width:100%}"
-)
 
 
 def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
@@ -46,7 +42,6 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
     pictures = [path for path in (out / "film.gif", out / "sheet.png") if path.exists()]
     pictures += [*sorted(out.glob("**/policy*/curves.png")), *sorted(out.glob("iteration_*/posterior/figures/*.png"))]
     parts = (
-        f"<h1>{html.escape(arguments.object)}: from the object to a policy, and back</h1>",
         f"<p>Heuristic {html.escape(arguments.heuristic)}, preset {arguments.preset}, seed {arguments.seed}, "
         f"seen by the detector {arguments.detector}.</p>",
         "<h2>What was believed</h2>",
@@ -56,9 +51,9 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
         f"<h2>How it fared on the object</h2><p>At {REPETITIONS} places; the first is nominal, at the others stack and "
         "camera are displaced as in training. All policies meet the same places.</p>",
         _table(fared),
-        *(_figure(path.relative_to(out).as_posix()) for path in pictures),
+        *(_figure(path.relative_to(out)) for path in pictures),
     )
-    page = f"<!doctype html><meta charset=utf-8><title>jaxlfi r2s2r</title><style>{STYLE}</style>{''.join(parts)}\n"
+    page = web_page.document(f"{arguments.object}: from the object to a policy, and back", parts)
     files.write_bytes(out / "page.html", page.encode())
     return out / "page.html"
 
@@ -89,8 +84,10 @@ def _short(value: str) -> str:
 def _table(rows: Sequence[Mapping[str, str]]) -> str:
     head = "".join(f"<th>{html.escape(name)}</th>" for name in rows[0])
     lines = ("".join(f"<td>{html.escape(value)}</td>" for value in row.values()) for row in rows)
-    return f"<table><tr>{head}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    return web_page.wide(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
 
 
-def _figure(path: str) -> str:
-    return f'<figure><img src="{html.escape(path)}" alt=""><figcaption>{html.escape(path)}</figcaption></figure>'
+def _figure(path: Path) -> str:
+    where = "" if path.parent == Path() else f", of {path.parent.as_posix()}"
+    return web_page.figure(path.as_posix(), f"{path.stem}{where}", path.as_posix())

@@ -5,7 +5,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.bands import draw_band
 from jaxlfi.figures.collection import Runs, seed_count
 from jaxlfi.figures.legends import of_configurations
 from jaxlfi.figures.style import iterations_axis, looks
@@ -26,7 +25,7 @@ def quantities(runs: Runs, configuration: str) -> dict[str, np.ndarray]:
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Simulations, success rate and cumulative failures over iterations: means ± standard deviations over seeds.
+    """Simulations, success rate and cumulative failures over iterations: means over seeds, and each seed.
 
     Args:
         figure: empty.
@@ -37,8 +36,10 @@ def draw(figure: Figure, runs: Runs) -> None:
     rounds = next(iter(runs.values()))[0].rounds
     for name in runs:
         for panel, values in quantities(runs, name).items():
-            middle, deviation = statistics.mean(values, 0), statistics.sd(values, 0)
-            draw_band(axes[panel], np.arange(1, rounds + 1), middle, deviation, look[name])
+            iteration = np.arange(1, rounds + 1)
+            if len(values) > 1:
+                axes[panel].plot(iteration, values.T, color=look[name].colour, linewidth=0.4, alpha=0.6)
+            axes[panel].plot(iteration, statistics.mean(values, 0), **look[name].line)
     for panel, title in PANELS.items():
         axes[panel].set_title(title)
         axes[panel].grid(True)
@@ -48,4 +49,4 @@ def draw(figure: Figure, runs: Runs) -> None:
     axes["success_rate"].set_ylim(max(low, -3.0), 103.0)
     axes["cumulative"].set_ylim(bottom=0)
     seeds = seed_count(runs)
-    of_configurations(figure, look, f"mean ± standard deviation over {seeds} seeds" if seeds > 1 else "one seed")
+    of_configurations(figure, look, f"mean over {seeds} seeds, thin: each seed" if seeds > 1 else "one seed")

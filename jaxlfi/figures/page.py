@@ -13,8 +13,10 @@ import numpy as np
 from jaxlfi.figures import statistics
 from jaxlfi.figures.collection import Collection
 from jaxlfi.figures.history import heuristic_name
-from jaxlfi.figures.style import Look, looks, unit_label
+from jaxlfi.figures.style import Look, looks, natural, unit_label
+from jaxlfi.io import web_page
 from jaxlfi.io.run_summary import RunSummary
+from jaxlfi.io.web_page import prose, wide
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,43 +35,6 @@ class Picture:
     caption: str
     width: float
 
-
-_CSS = """
-:root { color-scheme: light; --ink: #1d2329; --soft: #5b6670; --line: #e2e6ea; --tint: #f6f8fa; }
-* { box-sizing: border-box; }
-body { margin: 0; background: #fff; color: var(--ink); font: 16px/1.55 system-ui, -apple-system, "Segoe UI",
-  Roboto, "Helvetica Neue", Arial, sans-serif; }
-main { max-width: 60rem; margin: 0 auto; padding: 2.5rem 1.25rem 4rem; }
-h1 { font-size: 1.7rem; line-height: 1.25; margin: 0 0 .25rem; }
-h2 { font-size: 1.1rem; margin: 2.75rem 0 .6rem; padding-top: .9rem; border-top: 1px solid var(--line); }
-p { margin: .4rem 0; } .soft, figcaption, caption { color: var(--soft); }
-code, pre { font: .86rem/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace;
-  background: var(--tint); border-radius: 4px; }
-code { padding: .1rem .3rem; overflow-wrap: anywhere; }
-pre { padding: .8rem 1rem; overflow: auto; max-height: 30rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: .86rem; font-variant-numeric: tabular-nums; }
-caption { caption-side: bottom; text-align: left; padding-top: .5rem; font-size: .86rem; }
-th, td { padding: .32rem .55rem; text-align: right; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
-thead th { font-weight: 600; border-bottom: 1px solid var(--line); }
-thead tr:last-child th { border-bottom: 2px solid var(--ink); font-weight: 400; color: var(--soft); }
-tbody tr { border-bottom: 1px solid var(--line); } td.first, th.first { padding-left: 1.2rem; }
-i.swatch { display: inline-block; width: .75rem; height: .75rem; border-radius: 2px; margin-right: .5rem; }
-figure { margin: 0; } figure img { display: block; max-width: 100%; height: auto; margin: .5rem 0; }
-figcaption { font-size: .9rem; max-width: 46rem; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.2rem; margin: 1rem 0 0;
-  font-size: .92rem; }
-dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
-summary { cursor: pointer; }
-ul.verdicts { margin: .3rem 0 1rem; padding-left: 1.2rem; } ul.verdicts li { margin: .15rem 0; }
-.good { color: #1a7f37; } .bad { color: #b42318; }
-.note { background: #fff7e6; border-left: 3px solid #f5a025; padding: .5rem .9rem; }
-nav a { color: #174ea6; margin-right: .9rem; text-decoration: none; font-size: .92rem; }
-@media print { main { max-width: none; padding: 0; } h2 { break-after: avoid; }
-  figure { break-inside: avoid; }
-  details, nav { display: none; } }
-"""
 
 _COLUMNS = {
     "theta_error": "parameter error",
@@ -152,7 +117,7 @@ def render_diagnostics(found: Mapping[str, Any], pictures: Sequence[Picture]) ->
     )
     verdicts = "".join(
         f'<h3>{html.escape(one["heading"])}</h3><ul class="verdicts">'
-        + "".join(f'<li class="{_tone(row["verdict"])}">{html.escape(row["sentence"])}</li>' for row in one["found"])
+        + "".join(f'<li class="{_tone(row["verdict"])}">{prose(row["sentence"])}</li>' for row in one["found"])
         + "</ul>"
         for one in found["widths"]
     )
@@ -188,11 +153,11 @@ def _widths_table(found: Mapping[str, Any]) -> str:
             values = [*held, _estimate(row["factor"], lambda x: f"{x:.2f}"), row["verdict"]]
             cells += "".join(f'<td class="{"first" * (i == 0)}">{html.escape(v)}</td>' for i, v in enumerate(values))
         lines.append(f"<tr><td>{html.escape(rows[0]['name'])}</td>{cells}</tr>")
-    return (
-        f'<div class="wide"><table><thead><tr><th></th>{head}</tr><tr><th></th>{below * len(found["widths"])}</tr>'
-        f"</thead><tbody>{''.join(lines)}</tbody><caption>Held: percentage of the truths inside intervals of that "
-        "level; all together: inside densest regions. Right width: how many times as wide 90 % intervals would have to "
-        "be to hold 90 %.</caption></table></div>"
+    below = "<th>parameter</th>" + below * len(found["widths"])
+    return wide(
+        f"<table><thead><tr><th></th>{head}</tr><tr>{below}</tr></thead><tbody>{''.join(lines)}</tbody>"
+        "<caption>Held: percentage of the truths inside intervals of that level; all together: inside densest regions. "
+        "Right width: how many times as wide 90 % intervals would have to be to hold 90 %.</caption></table>"
     )
 
 
@@ -211,7 +176,7 @@ def _checks_table(checks: Sequence[Mapping[str, Any]]) -> str:
         row = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
         lines.append(f'<tr>{row}<td class="{_tone(check["verdict"])}">{html.escape(check["verdict"])}</td></tr>')
     head = "".join(f"<th>{name}</th>" for name in ("check", "statistic", "expected", "p-value", "verdict"))
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+    return wide(f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>")
 
 
 def _document(
@@ -224,25 +189,21 @@ def _document(
     """A whole page: a heading, its first parts, the pictures with links to them, and config.json."""
     shown = [(f"picture-{i}", picture) for i, picture in enumerate(pictures, 1)]
     links = "".join(f'<a href="#{name}">{html.escape(picture.title)}</a>' for name, picture in shown)
-    every = [
-        "<!DOCTYPE html>",
-        '<html lang="en"><head><meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{html.escape(title)}</title><style>{_CSS}</style></head><body><main>",
-        f"<h1>{html.escape(title)}</h1>",
-        *parts,
-        f"<nav>{links}</nav>",
-        *(_figure(name, picture) for name, picture in shown),
-        f"<h2>Configuration</h2><details><summary>{name_of_config}</summary><pre>{_json(config)}</pre></details>",
-        "</main></body></html>",
-    ]
-    return "\n".join(every) + "\n"
+    return web_page.document(
+        title,
+        [
+            *parts,
+            f"<nav>{links}</nav>",
+            *(_figure(name, picture) for name, picture in shown),
+            f"<h2>Configuration</h2><details><summary>{name_of_config}</summary><pre>{_json(config)}</pre></details>",
+        ],
+    )
 
 
 def _answer(collection: Collection) -> str:
     """What a single run found, stated; nothing where its folder does not say."""
     found = RunSummary.read(collection.folder)
-    return f'<h2>Answer</h2><div class="wide">{found.to_html()}</div>' if found else ""
+    return f"<h2>Answer</h2>{found.to_html()}" if found else ""
 
 
 def _widths(collection: Collection) -> str:
@@ -257,7 +218,7 @@ def _widths(collection: Collection) -> str:
             if text and own not in lines.setdefault(str(text), []):
                 lines[str(text)].append(own)
     of = {text: html.escape(" of " + ", ".join(names)) if len(lines) > 1 else "" for text, names in lines.items()}
-    return "".join(f"<p><strong>Widths{of[text]}</strong>: {html.escape(text)}.</p>" for text in lines)
+    return "".join(f"<p><strong>Widths{of[text]}</strong>: {prose(text)}.</p>" for text in lines)
 
 
 def _facts(collection: Collection) -> str:
@@ -311,7 +272,7 @@ def _notes(collection: Collection) -> str:
             "There are no simulated trajectories of posterior samples: none were simulated, or all simulations failed. "
             "Trajectory errors and the posterior predictive are left out."
         )
-    return "".join(f'<p class="note">{html.escape(note)}</p>' for note in notes)
+    return "".join(f'<p class="note">{prose(note)}</p>' for note in notes)
 
 
 def _table(collection: Collection) -> str:
@@ -330,13 +291,13 @@ def _table(collection: Collection) -> str:
             cells.append('<td class="first">{}</td><td>{}</td><td>{}</td>'.format(*three))
         seeds = len(values[name])
         lines.append(f"<tr><td>{_swatch(own)}</td><td>{seeds}</td>{''.join(cells)}</tr>")
-    return (
-        f'<div class="wide"><table><thead><tr><th>configuration</th><th>seeds</th>{head}</tr>'
-        f"<tr><th></th><th></th>{below}</tr></thead><tbody>{''.join(lines)}</tbody>"
+    return wide(
+        f"<table><thead><tr><th></th><th></th>{head}</tr>"
+        f"<tr><th>configuration</th><th>seeds</th>{below}</tr></thead><tbody>{''.join(lines)}</tbody>"
         "<caption>Parameter error: |θ − θ<sub>gt</sub>| summed over parameters, mean over posterior samples. "
         "Trajectory error: distance per record from the observed trajectory in its standard deviations, mean over the "
         "posterior samples whose simulation succeeded. Success rate: percentage of all simulations that succeeded. "
-        "Mean, median and standard deviation (sd) are over seeds.</caption></table></div>"
+        "Mean, median and standard deviation (sd) are over seeds.</caption></table>"
     )
 
 
@@ -346,8 +307,8 @@ def _swatch(own: Look) -> str:
 
 def _labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
     """Names of parameters with their units in brackets."""
-    brackets = [_without_escapes(unit_label(names, units, d)) for d in range(len(names))]
-    return [f"{name} {bracket}".strip() for name, bracket in zip(names, brackets, strict=True)]
+    brackets = [_without_escapes(unit_label(units, d)) for d in range(len(names))]
+    return [f"{natural(name)} {bracket}".strip() for name, bracket in zip(names, brackets, strict=True)]
 
 
 def _without_escapes(label: str) -> str:
@@ -359,10 +320,10 @@ def _figure(name: str, picture: Picture) -> str:
     data = base64.b64encode(picture.path.read_bytes()).decode("ascii")
     # A third larger than in print (96 pixels an inch), to be read on a screen.
     pixels = round(picture.width * 128)
-    title, caption = html.escape(picture.title), html.escape(picture.caption)
-    return (
-        f'<h2 id="{name}">{title}</h2><figure><img width="{pixels}" alt="{title}" '
-        f'src="data:image/png;base64,{data}"><figcaption>{caption}</figcaption></figure>'
+    source = f"data:image/png;base64,{data}"
+    alternative = f"{picture.title}. {picture.caption.partition('. ')[0]}"
+    return f'<h2 id="{name}">{html.escape(picture.title)}</h2>' + web_page.figure(
+        source, alternative, picture.caption, pixels
     )
 
 

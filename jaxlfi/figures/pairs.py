@@ -13,6 +13,7 @@ from matplotlib.patches import Patch, Rectangle
 from jaxlfi.figures.extent import cells, extent
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import below
+from jaxlfi.figures.natural import Scale, scales
 from jaxlfi.figures.style import (
     GREY,
     TRUTH,
@@ -23,7 +24,6 @@ from jaxlfi.figures.style import (
     looks,
     or_labels,
     parameter_label,
-    round_ticks,
     shade,
     symbol,
 )
@@ -279,22 +279,25 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
     look = looks([h.configuration for h in histories])
     clouds = [cloud_of(history, look[history.configuration]) for history in histories]
     titles = or_labels(titles, [cloud.look for cloud in clouds])
-    draw_groups(figure, [[cloud] for cloud in clouds], [symbol(d) for d in range(clouds[0].dim)], titles)
+    scale, key = scales(histories[0].names, histories[0].units, 12), None
+    if len(histories) > 1:  # names would be too long for panels that small
+        scale = [dataclasses.replace(one, label=symbol(d), unit="") for d, one in enumerate(scale)]
+        key = parameter_key(histories[0], figure)
+    draw_groups(figure, [[cloud] for cloud in clouds], scale, titles)
     handles = [*_fraction_handles(clouds, _colour(clouds)), *_mark_handles(clouds)]
-    key = parameter_key(histories[0], figure)
     below(figure, handles, at_most=len(handles) if is_wide(figure) else 2, title=key, handlelength=1.6)
 
 
-def draw_overlay(figure: Figure, clouds: Sequence[Cloud], labels: Sequence[str], points: Sequence[Point] = ()) -> None:
+def draw_overlay(figure: Figure, clouds: Sequence[Cloud], scale: Sequence[Scale], points: Sequence[Point] = ()) -> None:
     """One pair plot with all clouds drawn over one another.
 
     Args:
         figure: empty.
         clouds: draws of the same parameters.
-        labels: of the axes, one for each parameter.
+        scale: of each parameter.
         points: estimates of the same parameters; one that is labelled as a cloud shares its entry in the legend.
     """
-    draw_groups(figure, [clouds], labels, points=points)
+    draw_groups(figure, [clouds], scale, points=points)
     own = _cloud_handles(clouds) if len(clouds) > 1 else _fraction_handles(clouds, _colour(clouds))
     shared = {handle.get_label(): handle for handle in own if isinstance(handle, Line2D)}
     for row, point in enumerate(points):
@@ -310,7 +313,7 @@ def draw_overlay(figure: Figure, clouds: Sequence[Cloud], labels: Sequence[str],
 def draw_groups(
     figure: Figure,
     groups: Sequence[Sequence[Cloud]],
-    labels: Sequence[str],
+    scale: Sequence[Scale],
     titles: Sequence[str] | None = None,
     points: Sequence[Point] = (),
 ) -> None:
@@ -319,7 +322,7 @@ def draw_groups(
     Args:
         figure: empty.
         groups: clouds over the same parameters.
-        labels: of the axes, one for each parameter.
+        scale: of each parameter.
         titles: of the groups, in the colour of their first cloud; or None.
         points: drawn over every group.
     """
@@ -344,9 +347,7 @@ def draw_groups(
                     draw_marginal(axes, group, i, points)
                 else:
                     draw_pair(axes, group, (j, i), points)
-                _frame(axes, (j, i), windows, labels, last=i == dim - 1, numbered=left == 0)
-                for axis in (axes.xaxis, axes.yaxis) if i != j else (axes.xaxis,):
-                    round_ticks(axis, 4 if columns * dim <= 4 else 3)
+                _frame(axes, (j, i), windows, scale, last=i == dim - 1, numbered=left == 0)
     figure.align_labels()
 
 
@@ -366,23 +367,25 @@ def _frame(
     axes: Axes,
     pair: tuple[int, int],
     windows: list[tuple[float, float]],
-    labels: Sequence[str],
+    scale: Sequence[Scale],
     last: bool,
     numbered: bool,
 ) -> None:
     """Limits and ticks; numbers and labels at the left and lower sides of the group."""
     x, y = pair
     axes.set_xlim(*windows[x])
+    scale[x].show(axes.xaxis, 4)
     axes.tick_params(labelsize=6, labelbottom=last, pad=1.2)
     axes.tick_params(axis="x", labelrotation=90)
-    if last:
-        axes.set_xlabel(labels[x])
+    if not last:
+        axes.set_xlabel("")
     if x == y:
         return
     axes.set_ylim(*windows[y])
+    scale[y].show(axes.yaxis, 4)
     axes.tick_params(axis="y", labelleft=x == 0 and numbered)
-    if x == 0:
-        axes.set_ylabel(labels[y])
+    if x > 0:
+        axes.set_ylabel("")
 
 
 def _fraction_handles(clouds: Sequence[Cloud], colour: str) -> list[Artist]:
@@ -413,7 +416,7 @@ def _mark_handles(clouds: Sequence[Cloud]) -> list[Artist]:
     if any(cloud.support is not None for cloud in clouds):
         handles.append(Line2D([], [], color=_colour(clouds), label="support", **_SUPPORT))
     if any(cloud.first_support is not None for cloud in clouds):
-        handles.append(Line2D([], [], color=_colour(clouds), label="first support", **_FIRST_SUPPORT))
+        handles.append(Line2D([], [], color=_colour(clouds), label="first guess", **_FIRST_SUPPORT))
     if any(np.isfinite(cloud.truth).any() for cloud in clouds):
         marker = {"label": "truth", **_TRUTH_POINT} if clouds[0].dim > 1 else {"label": "truth", **TRUTH_LINE}
         handles.append(Line2D([], [], **marker))

@@ -10,9 +10,11 @@ from matplotlib.patches import Patch
 
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import below
-from jaxlfi.figures.style import GREY, Look, is_wide, looks, or_labels, plain
+from jaxlfi.figures.style import GREY, Look, grid_shape, is_wide, looks, or_labels, plain
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+ROWS = 5
+"""Panels one above the other, at most; a single run has two such columns."""
 MAX_POINTS = 40
 """Records up to which an observation is drawn as points, and as a line beyond."""
 
@@ -47,8 +49,26 @@ def draw_channel(axes: Axes, history: History, channel: int, look: Look) -> None
     axes.margins(x=0.02 if _few(history) else 0)
 
 
+def shown(histories: Sequence[History]) -> list[int]:
+    """Indices of the channels that are drawn: all, or as many as there is room for, of the largest observed ranges.
+
+    Args:
+        histories: the runs to draw.
+    """
+    observed = histories[0].observed
+    ranges = np.nan_to_num(np.nanmax(observed, axis=0) - np.nanmin(observed, axis=0))
+    room = ROWS * (2 if len(histories) == 1 else 1)
+    return sorted(np.argsort(-ranges, kind="stable")[:room].tolist())
+
+
+def grid(histories: Sequence[History]) -> tuple[int, int]:
+    """Rows and columns of panels: a column for each run, or up to two for the channels of a single one."""
+    channels = len(shown(histories))
+    return (channels, len(histories)) if len(histories) > 1 else grid_shape(channels, 1 if channels <= ROWS else 2)
+
+
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """A column for each run, a row for each channel.
+    """A column for each run, a row for each channel; many channels of a single run in two columns.
 
     Args:
         figure: empty.
@@ -57,19 +77,29 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
     """
     look = looks([h.configuration for h in histories])
     titles = or_labels(titles, [look[h.configuration] for h in histories])
-    first = histories[0]
-    axes = figure.subplots(len(first.channels), len(histories), squeeze=False, sharex=True, sharey="row")
-    for column, history in enumerate(histories):
-        own = look[history.configuration]
-        axes[0, column].set_title(titles[column], color=own.colour, fontweight="bold")
-        for channel in range(len(first.channels)):
-            draw_channel(axes[channel, column], history, channel, own)
-            axes[channel, column].grid(True)
-        axes[-1, column].set_xlabel(plain(history.record_label))
-        axes[-1, column].locator_params(axis="x", nbins=5)
-    for channel, name in enumerate(first.channels):
-        axes[channel, 0].set_ylabel(plain(name))
-        _robust_limits(axes[channel, 0], histories, channel)
+    first, channels = histories[0], shown(histories)
+    rows, columns = grid(histories)
+    several = len(histories) > 1
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey="row" if several else False)
+    if several:
+        places = [(h, c, panels[row, column]) for column, h in enumerate(histories) for row, c in enumerate(channels)]
+    else:
+        places = [(first, c, axes) for c, axes in zip(channels, panels.ravel(), strict=False)]
+        for axes in panels.ravel()[len(channels) :]:
+            axes.remove()
+    for history, channel, axes in places:
+        draw_channel(axes, history, channel, look[history.configuration])
+        axes.grid(True)
+        if not several or history is first:
+            axes.set_ylabel(plain(first.channels[channel]))
+            _robust_limits(axes, histories, channel)
+    lowest = panels[-1] if several else [axes for _, _, axes in places[-columns:]]
+    for axes in lowest:
+        axes.set_xlabel(plain(first.record_label))
+        axes.tick_params(labelbottom=True)
+        axes.locator_params(axis="x", nbins=5)
+    for title, history, axes in zip(titles, histories, panels[0], strict=False):
+        axes.set_title(title, color=look[history.configuration].colour, fontweight="bold")
     handles = [
         Line2D([], [], label="observed", **_observed(first)),
         Line2D([], [], color=GREY, label="median of posterior simulations"),

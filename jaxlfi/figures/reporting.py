@@ -105,17 +105,20 @@ def _samples(collection: Collection) -> Made:
 
 
 def _efficiency(collection: Collection) -> Made:
+    every = [history for histories in collection.runs.values() for history in histories]
+    if len(every) == 1 and (every[0].rounds == 1 or not every[0].failed.any()):
+        return None  # a constant line says no more than the summary
     figure = style.new_figure(TEXT_WIDTH, 2.1 + _legend_height(collection.runs))
     efficiency.draw(figure, collection.runs)
     caption = (
         "Number of simulations in each iteration, the percentage of them that succeeded, and the cumulative number "
-        "of failed simulations." + _lines(collection.runs, "standard deviations")
+        "of failed simulations." + (" Thin lines are seeds." if seed_count(collection.runs) > 1 else "")
     )
     return figure, "Data efficiency", caption
 
 
 def _curves(collection: Collection) -> Made:
-    if not curves.drawable(collection.runs):
+    if not curves.drawable(collection.runs) or _first(collection).rounds == 1:
         return None
     known, simulated = _measured(collection.runs)
     dim = _first(collection).dim
@@ -135,7 +138,7 @@ def _curves(collection: Collection) -> Made:
 
 
 def _discrepancy(collection: Collection) -> Made:
-    if not discrepancy.drawable(collection.runs):
+    if not discrepancy.drawable(collection.runs) or sum(map(len, collection.runs.values())) == 1:
         return None
     panels = discrepancy.panels(collection.runs)
     width = COLUMN_WIDTH if len(panels) <= 2 else TEXT_WIDTH
@@ -144,13 +147,16 @@ def _discrepancy(collection: Collection) -> Made:
     known, simulated = _measured(collection.runs)
     references = known * ["the true parameters"] + simulated * ["the observed trajectory"]
     caption = (
-        f"Mean discrepancy of posterior samples after the last iteration from {' and '.join(references)}. Error bars "
-        "are standard deviations over samples and seeds" + simulated * "; failed simulations are left out" + "."
+        f"Mean discrepancy of each seed's posterior samples after the last iteration from {' and '.join(references)}: "
+        "one dot for each seed, a line at their median" + simulated * "; failed simulations are left out" + "."
+        " Of a parameter whose logarithm is inferred it is the factor between sample and truth."
     )
     return figure, "Final discrepancy", caption
 
 
 def _supports(collection: Collection) -> Made:
+    if len(collection.runs) == 1 and not any(history.adapts for history in next(iter(collection.runs.values()))):
+        return None
     width = COLUMN_WIDTH if _first(collection).dim == 1 else TEXT_WIDTH
     figure = style.new_figure(width, 0.6 + 1.6 * -(-_first(collection).dim // 4))
     supports.draw(figure, collection.runs)
@@ -180,13 +186,16 @@ def _predictive(collection: Collection) -> Made:
     if not runs:
         return None
     histories, titles = columns(runs)
-    width = COLUMN_WIDTH if len(histories) == 1 else TEXT_WIDTH
-    figure = style.new_figure(width, 0.8 + 1.35 * len(histories[0].channels))
+    rows, across = predictive.grid(histories)
+    figure = style.new_figure(COLUMN_WIDTH if across == 1 else TEXT_WIDTH, 0.8 + 1.35 * rows)
     predictive.draw(figure, histories, titles)
     caption = (
         "Trajectories simulated with samples of the last posterior, and the observed trajectory. The bands hold the "
         "central 50 % and 90 % of the simulations of each record." + _which_seed(runs)
     )
+    drawn, every = len(predictive.shown(histories)), len(histories[0].channels)
+    if drawn < every:
+        caption += f" Of {every} channels, the {drawn} that vary most are shown."
     return figure, "Posterior predictive", caption
 
 
@@ -197,7 +206,7 @@ def _pairs(collection: Collection) -> Made:
     histories, titles = columns(runs)
     dim = histories[0].dim
     rows, across = pairs.arrangement(len(histories), dim)
-    width = TEXT_WIDTH if across * dim > 4 else COLUMN_WIDTH
+    width = TEXT_WIDTH if across * dim > 4 or len(histories) == 1 < dim else COLUMN_WIDTH
     figure = style.new_figure(width, 1.0 + rows * (0.3 + width * dim / (across * dim + 0.6)))
     pairs.draw(figure, histories, titles)
     caption = (
@@ -245,6 +254,7 @@ def _seeds(collection: Collection) -> Made:
 
 
 PICTURES: dict[str, Callable[[Collection], Made]] = {
+    "pairs": _pairs,
     "samples": _samples,
     "efficiency": _efficiency,
     "curves": _curves,
@@ -252,7 +262,6 @@ PICTURES: dict[str, Callable[[Collection], Made]] = {
     "support": _supports,
     "losses": _losses,
     "predictive": _predictive,
-    "pairs": _pairs,
     "polars": _polars,
     "seeds": _seeds,
 }

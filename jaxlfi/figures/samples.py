@@ -15,6 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from jaxlfi.figures import density
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import below
+from jaxlfi.figures.natural import scales
 from jaxlfi.figures.style import (
     TRUTH,
     TRUTH_LINE,
@@ -24,8 +25,6 @@ from jaxlfi.figures.style import (
     iteration_colours,
     looks,
     or_labels,
-    parameter_label,
-    round_ticks,
 )
 
 _OUTLINE = [patheffects.withStroke(linewidth=1.5, foreground="white")]
@@ -183,6 +182,9 @@ def draw_mixture(
     low, high = (bound[-1] for bound in history.supports)
     if len(pair) == 2:
         _add_box(axes, low, high, pair, 0, edgecolor=look.colour, linewidth=0.9, zorder=2)
+        if history.adapts:
+            first = (bound[0] for bound in history.supports)
+            _add_box(axes, *first, pair, 0, edgecolor=look.colour, linestyle=(0, (1, 1.2)), linewidth=0.9, zorder=2)
     else:
         axes.axvspan(low[pair[0]], high[pair[0]], color=look.colour, alpha=0.08, linewidth=0, zorder=0)
     _draw_path(axes, history, pair)
@@ -281,12 +283,11 @@ def _mark_truth(axes: Axes, history: History, pair: tuple[int, ...]) -> None:
 
 def _frame(axes: Axes, history: History, pair: tuple[int, ...], window: Sequence[tuple[float, float]]) -> None:
     axes.set_xlim(*window[0])
-    axes.set_xlabel(parameter_label(history.names, history.units, pair[0]))
-    round_ticks(axes.xaxis, 5)
+    scale = scales(history.names, history.units)
+    scale[pair[0]].show(axes.xaxis, 5)
     if len(pair) == 2:
         axes.set_ylim(*window[1])
-        axes.set_ylabel(parameter_label(history.names, history.units, pair[1]))
-        round_ticks(axes.yaxis, 5)
+        scale[pair[1]].show(axes.yaxis, 5)
 
 
 def _legend(figure: Figure, histories: Sequence[History]) -> None:
@@ -298,7 +299,7 @@ def _legend(figure: Figure, histories: Sequence[History]) -> None:
         marker("o", 2.5, "simulated", markeredgewidth=0),
         marker("x", 3, "failed", markeredgewidth=0.7),
         marker("o", 5.5, "mean of data", markeredgecolor="white"),
-        marker("s", 6, "support", markerfacecolor="none"),
+        marker("s", 6, "support (dotted: first guess)", markerfacecolor="none"),
         marker(r"$\rightarrow$", 7, "weighted mean", color="black", markeredgewidth=0.3),
     ]
     if any(np.isfinite(h.truth).all() for h in histories):

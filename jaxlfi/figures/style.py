@@ -216,31 +216,46 @@ def symbol(d: int) -> str:
     return rf"$\theta_{{{d + 1}}}$"
 
 
+def is_log(name: str) -> bool:
+    """Whether a parameter of this name in inference space is a natural logarithm."""
+    return name.startswith("ln ")
+
+
+def natural(name: str) -> str:
+    """The name of what a parameter in inference space is the logarithm of, or its own."""
+    return name.removeprefix("ln ")
+
+
+def plain_unit(unit: str) -> str:
+    """The unit of what a parameter in inference space is the logarithm of, or its own; "" for a pure number.
+
+    Example:
+        >>> plain_unit("ln(1/year)"), plain_unit("mm"), plain_unit("-")
+        ('1/year', 'mm', '')
+    """
+    unit = unit[3:-1] if unit.startswith("ln(") and unit.endswith(")") else unit
+    return "" if unit in ("1", "-") else unit
+
+
 def parameter_name(names: Sequence[str], d: int, width: int = 26) -> str:
     """A parameter's symbol and name, broken where it is longer than `width`."""
-    return "\n".join(textwrap.wrap(f"{symbol(d)} {plain(names[d])}", width + len(symbol(d))))
+    return "\n".join(textwrap.wrap(f"{symbol(d)} {plain(natural(names[d]))}", width + len(symbol(d))))
 
 
-def unit_label(names: Sequence[str], units: Sequence[str], d: int) -> str:
-    """A parameter's unit in brackets, or ""; a logarithm's unit is the logarithm of the unit."""
-    return _unit(names[d], units[d])
+def unit_label(units: Sequence[str], d: int) -> str:
+    """A parameter's natural unit in brackets, or ""."""
+    unit = plain(plain_unit(units[d]))
+    return f"[{unit}]" if unit else ""
 
 
-def _unit(name: str, unit: str) -> str:
-    unit = plain(unit)
-    if unit in ("", "1", "-"):
-        return ""
-    return f"[ln({unit})]" if name.startswith("ln ") and not unit.startswith("ln") else f"[{unit}]"
-
-
-def with_unit(text: str, unit: str, width: int = 18) -> str:
-    """A label broken where it is longer than `width`, with the unit on a line of its own."""
-    return "\n".join([*textwrap.wrap(text, width), *filter(None, [_unit(text, unit)])])
+def named_with_unit(text: str, unit: str) -> str:
+    """A label, and the unit on a line of its own where there is one."""
+    return f"{text}\n[{plain(unit)}]" if unit else text
 
 
 def parameter_label(names: Sequence[str], units: Sequence[str], d: int, width: int = 26) -> str:
-    """Axis label: symbol and name, and the unit on a line of its own."""
-    return "\n".join(filter(None, [parameter_name(names, d, width), unit_label(names, units, d)]))
+    """Axis label: symbol and name, and the natural unit on a line of its own."""
+    return named_with_unit(parameter_name(names, d, width), plain_unit(units[d]))
 
 
 def round_ticks(axis: Axis, count: int) -> None:

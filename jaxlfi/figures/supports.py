@@ -1,5 +1,6 @@
 """The bounds of each parameter over iterations."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +12,7 @@ from jaxlfi.figures import statistics
 from jaxlfi.figures.collection import Runs, seed_count
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import above, balanced
+from jaxlfi.figures.natural import scales
 from jaxlfi.figures.style import (
     TRUTH_LINE,
     Look,
@@ -18,7 +20,6 @@ from jaxlfi.figures.style import (
     iterations_axis,
     looks,
     parameter_name,
-    unit_label,
 )
 
 _LIMIT = {"color": "#777777", "linestyle": (0, (1, 1.5)), "linewidth": 0.9}
@@ -60,6 +61,7 @@ def draw(figure: Figure, runs: Runs) -> None:
     look = {name: own for name, own in looks(list(runs)).items() if name in shown}
     first = next(iter(shown.values()))[0]
     rows, columns = grid_shape(first.dim, 4)
+    scale = scales(first.names, first.units)
     every = figure.subplots(rows, columns, squeeze=False).ravel()
     for d, axes in enumerate(every):
         if d >= first.dim:
@@ -73,9 +75,7 @@ def draw(figure: Figure, runs: Runs) -> None:
             if limit is not None:
                 axes.axhline(limit[d], **_LIMIT, gid="limit")
         axes.set_title(parameter_name(first.names, d))
-        unit = unit_label(first.names, first.units, d)
-        if d % columns == 0 or unit != unit_label(first.names, first.units, d - 1):
-            axes.set_ylabel(f"bounds {unit}".strip())
+        dataclasses.replace(scale[d], label="bounds").show(axes.yaxis, 5)
         axes.grid(True)
         iterations_axis(axes, first.rounds, first=0, label=d + columns >= first.dim)
     handles = [Line2D([], [], **own.line) for own in look.values()]

@@ -1,13 +1,13 @@
 """summary.json: what a run found, stated, and its forms as text, table and HTML."""
 
 import dataclasses
-import html
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxlfi.io import files, text_table
+from jaxlfi.io.web_page import prose, wide
 
 if TYPE_CHECKING:
     import pandas
@@ -132,9 +132,9 @@ class RunSummary:
 
     def to_html(self) -> str:
         """The table and the sentences, as a page or a notebook shows them."""
-        items = lambda texts: "<ul>" + "".join(f"<li>{html.escape(one)}</li>" for one in texts) + "</ul>"
+        items = lambda texts: "<ul>" + "".join(f"<li>{prose(one)}</li>" for one in texts) + "</ul>"
         steps = f"<p>Next:</p>{items(self.next_steps)}" if self.next_steps else ""
-        return text_table.as_html(*self.table()) + items(self.sentences) + steps
+        return wide(text_table.as_html(*self.table())) + items(self.sentences) + steps
 
     _repr_html_ = to_html
 

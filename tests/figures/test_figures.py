@@ -37,12 +37,14 @@ from jaxlfi.figures import (
     supports,
 )
 from jaxlfi.figures.history import robust_sd
-from jaxlfi.io.formats import VERSION
+from jaxlfi.io import formats
 from jaxlfi.runs import folder as run_store
 
 COMPARED = ("ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre")
 TRUTH = np.log([0.01, 0.5, 1.0, 0.01])
 NAMES = ("ln predator birth", "ln predator death", "ln prey birth", "ln prey death")
+NATURAL = [name.removeprefix("ln ") for name in NAMES]
+"""As pictures call them, whose axes are logarithmic."""
 
 
 def write_run(
@@ -238,7 +240,7 @@ def compared(tmp_path_factory):
 def test_runs_that_never_took_place_have_names_of_the_format_alone(tmp_path):
     """Whatever else a picture is drawn from would not be in a user's folder."""
     made = write_run(tmp_path / "run")
-    written = Path(__file__).parents[1] / "golden" / "formats" / str(VERSION) / "run"
+    written = Path(__file__).parents[1] / "golden" / "formats" / str(formats.VERSION) / "run"
     names = lambda folder: {path.name: set(np.load(path)) for path in folder.glob("*.npz")}
     for file, arrays in names(made).items():
         assert arrays <= names(written)[file], file
@@ -354,7 +356,7 @@ def test_samples_shows_proposals_boxes_means_and_truth(compared):
     np.testing.assert_allclose(boxes, np.concatenate([low, high - low], 1))
     assert len({to_hex(box.get_edgecolor()) for box in axes.patches}) == history.rounds
     np.testing.assert_allclose(marked(axes, "truth")[0].get_xydata(), TRUTH[None, :2])
-    assert axes.get_xlabel() == "$\\theta_{1}$ ln predator birth\n[ln(1/time)]"
+    assert axes.get_xlabel() == "$\\theta_{1}$ predator birth\n[1/time]"
 
 
 def test_samples_shows_the_last_mixture_and_the_path_of_the_mean(compared):
@@ -406,34 +408,33 @@ def test_curves_are_means_of_exp_of_negative_losses(compared):
     expected = np.where(np.isnan(error), 0.0, np.exp(-0.5 * error)).mean((0, 2))
     label = "misspecified + MODE"
     np.testing.assert_allclose(line(panel(figure, "trajectory"), label).get_ydata(), expected)
-    for d, name in enumerate(NAMES):
+    for d, name in enumerate(NATURAL):
         theta = np.stack([h.theta_error[..., d] for h in histories])
         np.testing.assert_allclose(line(panel(figure, name), label).get_ydata(), np.exp(-0.5 * theta).mean((0, 2)))
 
 
-def test_discrepancy_bars_are_means_with_standard_deviations(compared):
+def test_discrepancy_shows_each_seed_and_their_median(compared):
     figure = drawn(discrepancy.draw, compared.runs)
     for place, (name, histories) in enumerate(compared.runs.items()):
-        trajectory = np.concatenate([h.trajectory_error[-1] for h in histories])
-        trajectory = trajectory[~np.isnan(trajectory)]
-        expected = {"trajectory": trajectory}
-        expected |= {n: np.concatenate([h.theta_error[-1, :, d] for h in histories]) for d, n in enumerate(NAMES)}
+        expected = {"trajectory": [h.final_trajectory_error for h in histories]}
+        expected |= {n: [h.theta_error[-1, :, d].mean() for h in histories] for d, n in enumerate(NATURAL)}
         for title, values in expected.items():
-            bars = panel(figure, title).containers
-            drawn_bars = [bar for bar in bars if bar.get_label() == style.configuration_label(name)]
-            patch = drawn_bars[0].patches[0]
-            assert patch.get_height() == pytest.approx(values.mean())
-            assert to_hex(patch.get_facecolor()) == style.looks([name])[name].colour.lower()
-            assert patch.get_x() + patch.get_width() / 2 == pytest.approx(place)
-            (low, high) = drawn_bars[0].errorbar.lines[2][0].get_segments()[0][:, 1]
-            assert high - low == pytest.approx(2 * values.std(ddof=1))
+            axes = panel(figure, title)
+            dots = line(axes, style.configuration_label(name))
+            np.testing.assert_allclose(dots.get_ydata(), values)
+            assert to_hex(dots.get_color()) == style.looks([name])[name].colour.lower()
+            assert np.abs(dots.get_xdata() - place).max() < 0.4
+            assert marked(axes, "median")[place].get_ydata()[0] == pytest.approx(np.median(values))
+    # An error of a logarithm is read as a factor.
+    axes = panel(figure, NATURAL[0])
+    assert axes.yaxis.get_major_formatter()(np.log(3)) == "×3" and axes.get_ylabel() == "discrepancy (factor)"
 
 
 def test_support_draws_the_configurations_that_adapt(compared):
     assert set(supports.adapting(compared.runs)) == {n for n in COMPARED if "+" in n}
     assert set(supports.adapting({"ok": compared.runs["ok"]})) == {"ok"}
     figure = drawn(supports.draw, compared.runs)
-    axes = panel(figure, NAMES[1])
+    axes = panel(figure, NATURAL[1])
     histories = compared.runs["misspecified+edge"]
     upper = np.stack([np.concatenate([h.proposal_high[:1], h.support_high])[:, 1] for h in histories]).mean(0)
     shown = [artist.get_ydata() for artist in axes.lines if artist.get_label() == "misspecified + EDGE"]
@@ -479,6 +480,20 @@ def test_predictive_shows_few_records_as_points(tmp_path):
     history = load(write_run(tmp_path / "run", records=21))
     observed = marked(drawn(predictive.draw, [history]).axes[0], "observed")[0]
     assert (observed.get_marker(), observed.get_linestyle()) == ("o", "None")
+
+
+def test_predictive_shows_the_channels_that_vary_most(tmp_path):
+    """Thirty channels fit on a page; those that are left out vary least, and the caption says so."""
+    channels = tuple(f"k{i}" for i in range(30))
+    folder = write_run(tmp_path / "run", records=21, channels=channels, rounds=1)
+    history = load(folder)
+    with style.context():
+        figure, _, caption = reporting.PICTURES["predictive"](open_collection(folder))
+    ranges = np.ptp(history.observed, axis=0)
+    expected = {channels[i] for i in np.argsort(ranges)[-10:]}
+    assert {axes.get_ylabel() for axes in figure.axes} == expected
+    assert figure.get_size_inches()[1] * 300 <= 2400 and "Of 30 channels, the 10" in caption
+    assert len(predictive.shown([history, history])) == predictive.ROWS
 
 
 def test_predictive_counts_records_by_their_label(tmp_path):
@@ -675,7 +690,8 @@ def cielab(rgb: np.ndarray) -> np.ndarray:
 
 
 def test_labels_name_symbol_and_unit():
-    assert style.parameter_label(["ln rate"], ["1/s"], 0) == "$\\theta_{1}$ ln rate\n[ln(1/s)]"
+    assert style.parameter_label(["ln rate"], ["1/s"], 0) == "$\\theta_{1}$ rate\n[1/s]"
+    assert style.parameter_label(["ln rate"], ["ln(1/s)"], 0) == "$\\theta_{1}$ rate\n[1/s]"
     assert style.parameter_label(["a_b", "cost$"], ["", "N"], 1) == "$\\theta_{2}$ cost\\$\n[N]"
     assert style.parameter_label(["a_b"], [""], 0) == "$\\theta_{1}$ a b"
 
@@ -694,8 +710,10 @@ def names_of(paths: list[Path]) -> list[str]:
     return [path.name for path in paths]
 
 
-EVERYTHING = ["samples", "efficiency", "curves", "discrepancy", "support", "losses"]
-EVERYTHING += ["predictive", "pairs", "polars", "seeds"]
+EVERYTHING = ["pairs", "samples", "efficiency", "curves", "discrepancy", "support", "losses"]
+EVERYTHING += ["predictive", "polars", "seeds"]
+OF_SEVERAL = {"discrepancy", "seeds"}
+"""Pictures in which a single run would be a single dot."""
 
 
 @pytest.mark.slow
@@ -719,23 +737,24 @@ def test_report_of_a_comparison(compared):
 @pytest.mark.parametrize(
     ("options", "missing"),
     [
-        ({"dim": 1, "channels": ("x",)}, {"seeds"}),
-        ({"dim": 3, "truth": False}, {"seeds"}),
-        ({"dim": 4, "rounds": 1, "epochs": 1, "components": 1, "records": 21}, {"seeds"}),
-        ({"dim": 2, "failures": 1.0, "records": 1}, {"seeds", "predictive"}),
+        ({"dim": 1, "channels": ("x",)}, set()),
+        ({"dim": 3, "truth": False}, set()),
+        ({"dim": 4, "rounds": 1, "epochs": 1, "components": 1, "records": 21}, {"efficiency", "curves"}),
+        ({"dim": 2, "failures": 1.0, "records": 1}, {"predictive"}),
+        ({"dim": 2, "failures": 0.0, "configuration": "ok"}, {"efficiency", "support"}),
     ],
-    ids=["one", "unknown-truth", "one-round", "all-failed"],
+    ids=["one", "unknown-truth", "one-round", "all-failed", "constant"],
 )
 def test_report_of_one_run(tmp_path, options, missing):
     paths = report(write_run(tmp_path / "run", **options), dpi=30)
-    assert names_of(paths[1:]) == [f"{name}.png" for name in EVERYTHING if name not in missing]
+    assert names_of(paths[1:]) == [f"{name}.png" for name in EVERYTHING if name not in missing | OF_SEVERAL]
     assert all(path.stat().st_size > 1000 for path in paths)
     assert "&lt;somewhere&gt;" in paths[0].read_text(encoding="utf-8")
 
 
 def test_legends_fit_into_figures_of_one_column(tmp_path):
     collection = open_collection(write_run(tmp_path / "run", rounds=2, records=21))
-    for name in ("curves", "predictive", "pairs", "polars"):
+    for name in ("curves", "predictive", "polars"):
         with style.context():
             figure, _, _ = reporting.PICTURES[name](collection)
             figure.draw_without_rendering()

@@ -61,7 +61,7 @@ def one():
 
 def test_axes_have_names_and_units_and_round_ticks(one):
     grid, _ = one
-    assert [axes.get_xlabel() for axes in grid[-1]] == ["ln stiffness\n[ln(N/m)]", r"cost \$", "friction"]
+    assert [axes.get_xlabel() for axes in grid[-1]] == ["stiffness\n[N/m]", r"cost \$", "friction"]
     assert [axes.get_ylabel() for axes in grid[:, 0]] == ["", r"cost \$", "friction"]
     for axes in grid[-1]:
         low, high = axes.get_xlim()

@@ -1,0 +1,158 @@
+"""Natural units: axes of inferred logarithms, read as what they are logarithms of."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axis import Axis
+from matplotlib.ticker import Formatter, FuncFormatter, Locator, MaxNLocator, NullFormatter
+
+from jaxlfi.figures.style import is_log, named_with_unit, parameter_name, plain_unit, round_ticks
+
+WITHIN = ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,))
+"""Ticks of a decade; the most that there is room for are taken."""
+LINEAR = 8.0
+"""Ratio of the ends of an axis up to which evenly spaced numbers may be its ticks."""
+LARGEST = 600.0
+"""Logarithms beyond which numbers are written as powers of ten only, since their exponentials overflow."""
+PREFIXED = ("Pa", "N", "J", "W", "N/m", "N m", "Hz")
+"""Units that take a prefix, so that numbers on the axis are short."""
+_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
+
+
+class LogTicks(Locator):
+    """Ticks of an axis of natural logarithms, at round numbers of what they are logarithms of.
+
+    Args:
+        count: at most `count` + 1 ticks.
+        scale: of one unit of the numbers on the axis.
+
+    Example:
+        >>> np.exp(LogTicks(4).tick_values(np.log(0.8), np.log(60.0))).round(2).tolist()
+        [1.0, 3.0, 10.0, 30.0]
+        >>> np.exp(LogTicks(4).tick_values(np.log(0.8), np.log(2.0))).round(2).tolist()
+        [0.8, 1.2, 1.6, 2.0]
+    """
+
+    def __init__(self, count: int, scale: float = 1.0) -> None:
+        self.count, self.scale = count, scale
+
+    def __call__(self) -> np.ndarray:
+        """Ticks of the axis as it is shown."""
+        return self.tick_values(*self.axis.get_view_interval())
+
+    def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
+        """Ticks between two logarithms."""
+        low, high = sorted((vmin, vmax))
+        shift = math.log(self.scale)
+        ticks = self._ticks(low - shift, high - shift) + shift
+        return ticks[(ticks >= low - 1e-9) & (ticks <= high + 1e-9)]
+
+    def _ticks(self, low: float, high: float) -> np.ndarray:
+        decades = np.arange(math.floor(low / math.log(10)), math.ceil(high / math.log(10)) + 1)
+        candidates = [(decades[:, None] * math.log(10) + np.log(within)).ravel() for within in WITHIN]
+        if max(abs(low), abs(high)) < LARGEST and high - low < math.log(LINEAR):
+            even = MaxNLocator(self.count, steps=[1, 2, 2.5, 4, 5, 10]).tick_values(math.exp(low), math.exp(high))
+            candidates.append(np.log(even[even > 0]))
+        inside = lambda ticks: int(np.sum((ticks >= low) & (ticks <= high)))
+        fitting = [ticks for ticks in candidates if inside(ticks) <= self.count + 1]
+        if fitting:
+            return max(fitting, key=inside)
+        return decades[:: math.ceil(len(decades) / (self.count + 1))] * math.log(10)
+
+
+class LogNumbers(Formatter):
+    """Numbers of an axis of natural logarithms: what they are logarithms of.
+
+    Args:
+        scale: of one unit of the numbers on the axis.
+        before: of the number, such as a sign of multiplication.
+
+    Example:
+        >>> LogNumbers()(np.log(0.02)), LogNumbers(scale=1e3)(np.log(5e4)), LogNumbers()(np.log(1e7))
+        ('0.02', '50', '$10^{7}$')
+    """
+
+    def __init__(self, scale: float = 1.0, before: str = "") -> None:
+        self.scale, self.before = scale, before
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """The number at a logarithm."""
+        exponent = (x - math.log(self.scale)) / math.log(10)
+        if -3.5 <= exponent < 5:
+            return f"{self.before}{10**exponent:.6g}"
+        power = math.floor(exponent + 1e-9)
+        mantissa = f"{10 ** (exponent - power):.5g}"
+        times = "" if mantissa == "1" else rf"{mantissa}\times"
+        return rf"{self.before}${times}10^{{{power}}}$"
+
+
+def logarithmic(axis: Axis, count: int, scale: float = 1.0, before: str = "") -> None:
+    """Let an axis of natural logarithms show round numbers of what they are logarithms of.
+
+    Args:
+        axis: whose data are logarithms.
+        count: at most `count` + 1 ticks.
+        scale: of one unit of the numbers on the axis.
+        before: each number.
+    """
+    axis.set_major_locator(LogTicks(count, scale))
+    axis.set_major_formatter(LogNumbers(scale, before))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def prefix(unit: str, magnitude: float) -> tuple[float, str]:
+    """How many of a unit the prefixed unit is that makes numbers of some magnitude short, and its name.
+
+    Example:
+        >>> prefix("Pa", 3e5), prefix("Pa", 30.0), prefix("mm", 3e5)
+        ((1000.0, 'kPa'), (1.0, 'Pa'), (1.0, 'mm'))
+    """
+    fitting = ((size, letter + unit) for size, letter in _PREFIXES if unit in PREFIXED and magnitude >= size)
+    return next(fitting, (1.0, unit))
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """How the axis of a parameter is read: in its natural unit, and logarithmically where its logarithm is inferred.
+
+    Attributes:
+        label: of the axis, without unit.
+        unit: natural, "" for none.
+        log: whether the data are natural logarithms.
+    """
+
+    label: str
+    unit: str = ""
+    log: bool = False
+
+    def show(self, axis: Axis, count: int) -> None:
+        """Set ticks and label of an axis whose limits are set.
+
+        Args:
+            axis: whose data are the parameter in inference space.
+            count: at most `count` + 1 ticks.
+        """
+        low, high = sorted(axis.get_view_interval())
+        if self.log:
+            size, unit = prefix(self.unit, math.exp(max(-LARGEST, min((low + high) / 2, LARGEST))))
+            logarithmic(axis, count, size)
+        else:
+            size, unit = prefix(self.unit, max(abs(low), abs(high)) / 2)
+            round_ticks(axis, count)
+            if size > 1:
+                axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / size:.6g}"))
+        axis.set_label_text(named_with_unit(self.label, unit))
+
+
+def scales(names: Sequence[str], units: Sequence[str], width: int = 26) -> list[Scale]:
+    """The scales of parameters in inference space, labelled with their symbols and names.
+
+    Args:
+        names: of the parameters in inference space, "ln k" for a logarithm.
+        units: of the parameters.
+        width: of a label, in letters, beyond which it is broken.
+    """
+    each = zip(names, units, strict=True)
+    return [Scale(parameter_name(names, d, width), plain_unit(u), is_log(n)) for d, (n, u) in enumerate(each)]

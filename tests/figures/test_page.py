@@ -1,0 +1,95 @@
+"""Tests of pages: what a browser needs of them, by a parser and, where there is one, in Chromium itself."""
+
+import base64
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from jaxlfi.figures import report
+from jaxlfi.io import files, web_page
+from jaxlfi.io.run_summary import ParameterSummary, RunSummary
+from tests.figures.test_figures import write_run
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+VOID = {"meta", "img", "br", "link", "hr"}
+
+
+class Page(HTMLParser):
+    """Elements of a page with what they stand in, its pictures, and its text outside code and scripts."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.open, self.unclosed, self.pictures, self.loose_tables, self.text = [], [], [], 0, ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        if tag == "img":
+            self.pictures.append(attributes)
+        if tag == "table":
+            self.loose_tables += not any(inside == "wide" for _, inside in self.open)
+        if tag not in VOID:
+            self.open.append((tag, attributes.get("class")))
+
+    def handle_endtag(self, tag):
+        if self.open.pop()[0] != tag:
+            self.unclosed.append(tag)
+
+    def handle_data(self, data):
+        if not {"pre", "script", "style"} & {tag for tag, _ in self.open}:
+            self.text += data
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> Path:
+    """The page of a run whose summary names commands."""
+    folder = write_run(tmp_path_factory.mktemp("page") / "run", dim=2, rounds=2, records=21, channels=("x",))
+    mass = ParameterSummary("mass", "kg", 1.0, (0.9, 1.1), (0.8, 1.2), 3.0, 4.0, "identified", (), None, 2)
+    found = RunSummary((mass,), ("The box was `low`.",), ("Run `jaxlfi diagnose <run>`.",))
+    files.write_json(folder / "summary.json", found.to_dict())
+    return report(folder, dpi=30)[0]
+
+
+def test_a_page_is_well_formed_and_says_what_its_pictures_show(written):
+    page = Page(written.read_text(encoding="utf-8"))
+    assert not page.unclosed and not page.open
+    assert len(page.pictures) >= 5 and page.loose_tables == 0
+    for picture in page.pictures:
+        assert len(picture["alt"]) > 20
+        assert base64.b64decode(picture["src"].partition("base64,")[2]).startswith(b"\x89PNG")
+    assert "`" not in page.text and "jaxlfi diagnose <run>" in page.text
+    assert page.text.index("Answer") < page.text.index("Posterior by pairs of parameters")
+
+
+def test_nothing_of_fixed_width_is_wider_than_a_phone():
+    """Pictures shrink, tables and code scroll, long words break."""
+    for rule in ("img { display: block; max-width: 100%", ".wide { overflow-x: auto", "overflow-wrap: anywhere"):
+        assert rule in web_page.CSS
+    assert "prefers-color-scheme: dark" in web_page.CSS
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_a_browser_loads_every_picture_and_scrolls_nothing_sideways(written, tmp_path, width):
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium, and there is none on the path")
+    probe = (
+        "<script>window.faults=[];window.onerror=(m)=>window.faults.push(m);</script>",
+        "<script>document.title=JSON.stringify([window.faults.length,"
+        "[...document.images].filter(i=>!i.complete||!i.naturalWidth).length,"
+        "document.documentElement.scrollWidth<=window.innerWidth,document.querySelectorAll('button').length>0])</script>",
+    )
+    text = written.read_text(encoding="utf-8")
+    page = tmp_path / "page.html"
+    text = text.replace("<head>", f"<head>{probe[0]}", 1).replace("</body>", f"{probe[1]}</body>", 1)
+    # A window of the shell is never narrower than 500 pixels, a frame in it is.
+    page.write_text(text, encoding="utf-8")
+    frame = tmp_path / "frame.html"
+    frame.write_text(
+        f"<iframe src=page.html width={width} height=800 onload='document.title=this.contentDocument.title'></iframe>"
+    )
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--allow-file-access-from-files", "--window-size=1400,900"]
+    shown = subprocess.run([*command, "--dump-dom", frame.as_uri()], capture_output=True, text=True, timeout=120)
+    assert "<title>[0,0,true,true]</title>" in shown.stdout
