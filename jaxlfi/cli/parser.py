@@ -191,6 +191,7 @@ def _infer(command: argparse.ArgumentParser, families: Families) -> None:
         metavar="NAME",
         help=_registered("how the support is adapted", families.rules, "edge"),
     )
+    _add_json(command)
     _add_shared(command, families, seeds=1)
 
 
@@ -201,6 +202,7 @@ def _compare(command: argparse.ArgumentParser, families: Families) -> None:
         metavar="SUPPORT[+HEURISTIC]",
         help="what to compare (default: ok, misspecified, broad, and misspecified with edge, mode, centre)",
     )
+    _add_json(command)
     _add_shared(command, families, seeds=4)
 
 
@@ -235,6 +237,7 @@ def _resume(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
     _add_executor(command)
     joined.add_flags(command)
+    _add_json(command)
     _add_machine(command)
 
 
@@ -246,7 +249,8 @@ def _sample(command: argparse.ArgumentParser) -> None:
         "--out",
         type=flags.output,
         metavar="FILE",
-        help="a new .csv or .npz file, or .nc for ArviZ's InferenceData (default: samples.csv in the folder)",
+        help="a new .csv or .npz file, .nc for ArviZ's InferenceData, or - for CSV on standard output (default: "
+        "samples.csv in the folder)",
     )
 
 
@@ -392,9 +396,19 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
     command.set_defaults(settings={}, hyperparameters={})
 
 
+def _add_json(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--json",
+        action="store_true",
+        help="print the summary as JSON on standard output, and the rest on standard error; of several runs, an "
+        "object of summaries by folder",
+    )
+
+
 def _add_machine(command: argparse.ArgumentParser) -> None:
     """Arguments about how, not what."""
     command.add_argument("--no-figures", action="store_true", help="draw no figures at the end")
+    command.add_argument("--quiet", action="store_true", help="print results and warnings only")
     command.add_argument("--debug", action="store_true", help="show the traceback of an error")
     command.add_argument("--no-cache", action="store_true", help="compile without the cache of compiled programs")
 
@@ -526,11 +540,12 @@ def _work(arguments: argparse.Namespace) -> int:
         return refuse("jaxlfi", error, debug)
     from jaxlfi.cli import commands, tables
 
-    console = tables.console(quiet=not arguments.joined.writes)
+    quiet, json = getattr(arguments, "quiet", False), getattr(arguments, "json", False)
+    output = tables.Output.of(quiet, json, silent=not arguments.joined.writes)
     with contextlib.ExitStack() as closing:
         arguments.closing = closing
         try:
-            prepared = commands.COMMANDS[arguments.command](arguments, console)
+            prepared = commands.COMMANDS[arguments.command](arguments, output)
         except (ValueError, OSError) as error:
             if interrupts.is_unread(error):
                 raise
@@ -538,7 +553,7 @@ def _work(arguments: argparse.Namespace) -> int:
         if prepared is not None:
             arguments.begun.append(prepared[0])
             try:
-                commands.run(*prepared, arguments, console)
+                commands.run(*prepared, arguments, output)
             except commands.EXPECTED as error:
                 if interrupts.is_unread(error):
                     raise

@@ -74,8 +74,9 @@ def infer(
     Args:
         key: consumed; or a seed, as `--first-seed` of the command line.
         task: simulator, names and bounds.
-        observation: the real trajectory, in the shape the simulator produces, with NaN where a number is missing
-            (`jaxlfi.with_gaps`); or a list of several, independent trials of the same parameters, of which shorter ones
+        observation: the real trajectory, in the shape the simulator produces, with or without an axis for one channel,
+            with NaN where a number is missing (`jaxlfi.with_gaps`); or a data frame, whose columns are taken by the
+            channels' names; or a list of several, independent trials of the same parameters, of which shorter ones
             count as missing their ends, combined into one posterior (`jaxlfi.repeated`). By default the task's
             own, or, where the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the

@@ -37,6 +37,7 @@ from jaxlfi.tasks import failures, owned
 from jaxlfi.tasks.errors import SimulatorWarning
 from jaxlfi.tasks.failures import Failure, FailureLog
 from jaxlfi.tasks.gaps import gaps_of
+from jaxlfi.tasks.observation import as_given
 from jaxlfi.tasks.reference import counted_from, summaries_in_double
 from jaxlfi.tasks.task import Task
 
@@ -291,6 +292,7 @@ class Run(struct.PyTreeNode):
 
     def _summary(self, observation: Any) -> jax.Array:
         on_host = self.task is not None and self.task.on_host
+        observation = observation if self.task is None else as_given(self.task, observation)
         observation = owned.array(observation) if is_concrete(observation) else observation
         observation = np.array(observation, float) if on_host else jnp.array(observation, jnp.float32)
         if observation.shape == self.observed.shape and self.task is not None:

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import json
 import os
 import re
 import signal
@@ -294,6 +295,31 @@ def test_resuming_what_is_complete_says_so(comparison, capsys):
     for folder in (comparison, comparison / "ok" / "seed_000"):
         assert command("resume", folder) == 0
         assert "is complete" in capsys.readouterr().out
+
+
+def test_results_alone_for_programs_and_for_the_quiet(tmp_path, capsys):
+    out, flags = tmp_path / "run", (*FLAGS, "--no-figures")
+    assert command("infer", TASK, *flags, "--json", "--out", out) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == json.loads((out / "summary.json").read_text())
+    assert "compiled in" in printed.err and f"results: {out}" in printed.err
+    assert command("resume", out, "--json", "--quiet") == 0
+    again = capsys.readouterr()
+    assert again.out == printed.out and again.err == ""
+    assert command("infer", TASK, *flags, "--quiet", "--out", tmp_path / "quiet") == 0
+    quiet = capsys.readouterr()
+    assert all(name in quiet.out for name in ("first", "second", "narrower"))
+    assert not any(word in quiet.out for word in ("compiled", "round 1", "results:", "warning:"))
+    assert all(line.startswith("warning: ") for line in quiet.err.splitlines())
+
+
+def test_json_of_several_runs_is_by_folder(comparison, capsys):
+    capsys.readouterr()
+    assert command("resume", comparison, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found.keys() == {run["folder"] for run in run_store.read_config(comparison)["runs"]}
+    name, one = next(iter(found.items()))
+    assert one == json.loads((comparison / name / "summary.json").read_text())
 
 
 def test_report_names_what_it_drew(comparison, monkeypatch, capsys):
