@@ -260,20 +260,22 @@ class Run(struct.PyTreeNode):
         """The posterior draws that are saved with the run, in natural units; the same each time."""
         return self.posterior.sample(run_keys(self.key).of_check(self.settings.rounds), n)
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path, exist_ok: bool = False) -> Path:
         """Write a run folder, which `jaxlfi.load` reads and the command line's `sample`, `diagnose` and `report` take.
 
         Args:
             path: a new or empty folder.
+            exist_ok: it may also hold a finished run, which is replaced together with its pictures and diagnostics
+                once everything is written. Nothing else is ever replaced.
 
         Returns:
             The folder.
 
         Raises:
-            ValueError: if something is there already, or for a run under `vmap`.
+            ValueError: if something else is there, or for a run under `vmap`.
         """
         _require_one(self, "save")
-        return folders.save(self, Path(path))
+        return folders.save(self, Path(path), exist_ok)
 
     def __repr__(self) -> str:
         if not is_concrete(self) or self.x.ndim != 1:
