@@ -21,6 +21,7 @@ from jaxlfi.cli import help_texts, interrupts, joined, warned
 from jaxlfi.cli.command import Command, OneLineParser
 from jaxlfi.cli.exit_status import refuse, resuming
 from jaxlfi.cli.own_fields import FIELDS, HELP
+from jaxlfi.cli.own_fields import PRESETS as VALUES
 from jaxlfi.fields import declared
 from jaxlfi.io.formats import PLAN, recorded
 from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, Classes, package_of
@@ -130,10 +131,10 @@ def own_commands(families: Families) -> list[Command]:
         ),
         Command(
             "resume",
-            "go on with a run that was stopped",
+            "go on with a run that was stopped, or for more rounds",
             _resume,
             _work,
-            "Go on with a run that was stopped or killed.",
+            "Go on with a run that was stopped or killed, or for more rounds with one that is finished.",
         ),
         Command(
             "sample",
@@ -235,6 +236,12 @@ def _grid(command: argparse.ArgumentParser, families: Families) -> None:
 
 def _resume(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
+    command.add_argument(
+        "--rounds",
+        type=int,
+        metavar="N",
+        help="go on to so many rounds in all, also with a run that is finished (default: those it was begun with)",
+    )
     _add_executor(command)
     joined.add_flags(command)
     _add_json(command)
@@ -384,13 +391,17 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         _add_executor(command)
         command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
 
-    rounds = command.add_argument_group("rounds (default: the preset's)")
-    flags.add(rounds, {"run": FIELDS[SETTINGS]}, into="settings", defaults=False)
-    network = command.add_argument_group("network and training (default: the preset's)")
+    rounds = command.add_argument_group(
+        "rounds (default: the preset's, shown for bayessim; a task or method may have its own)"
+    )
+    flags.add(rounds, {"run": FIELDS[SETTINGS]}, into="settings", presets=VALUES)
+    network = command.add_argument_group(
+        "network and training (default: the preset's, shown for bayessim; a task or method may have its own)"
+    )
     network.add_argument(
         "--estimator", metavar="NAME", help=_registered("the density estimator", families.networks, "the method's")
     )
-    flags.add(network, families.networks, into="settings", defaults=False)
+    flags.add(network, families.networks, into="settings", presets=VALUES)
     hyper = command.add_argument_group("heuristics (one number, or one per parameter)")
     flags.add(hyper, families.rules, into="hyperparameters", several=True)
     command.set_defaults(settings={}, hyperparameters={})

@@ -15,7 +15,7 @@ from jaxlfi.cli import joined
 from jaxlfi.cli.command import Command
 from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import resuming
-from jaxlfi.cli.own_fields import FIELDS
+from jaxlfi.cli.own_fields import FIELDS, POLICIES
 from jaxlfi.io.formats import TRAINING, recorded
 from jaxlfi.registry import ENVIRONMENTS
 
@@ -72,7 +72,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
     joined.add_flags(parser)
     group = parser.add_argument_group("PPO (default: the preset's)")
-    flags.add(group, {"PPO": FIELDS[SETTINGS]}, into="settings", defaults=False)
+    flags.add(group, {"PPO": FIELDS[SETTINGS]}, into="settings", presets=POLICIES)
     parser.set_defaults(settings={})
 
 

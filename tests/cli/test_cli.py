@@ -56,6 +56,16 @@ def test_help_teaches_and_does_not_wait_for_jax():
         assert "examples:" in done.stdout and wanted in done.stdout
 
 
+def test_a_shell_is_told_what_words_can_be_completed_to(tmp_path):
+    pytest.importorskip("argcomplete")
+    words, answer = "jaxlfi infer lynx_hare --keep-n", tmp_path / "answer"
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": words, "COMP_POINT": str(len(words)), "_ARGCOMPLETE_IFS": " "}
+    script = "import sys; sys.argv[0] = 'jaxlfi'; from jaxlfi.cli.start import main; main()"
+    shell = ["sh", "-c", 'exec "$@" 8>"$0" 9>/dev/null', answer, sys.executable, "-c", script]
+    subprocess.run(shell, env=os.environ | asked, check=True)
+    assert answer.read_text().split() == ["--keep-network"]
+
+
 def test_every_setting_and_hyperparameter_has_a_documented_flag():
     choices = cli.parser()._subparsers._group_actions[0].choices
     for name in ("infer", "compare", "grid"):
