@@ -62,10 +62,10 @@ def _exchange(staging: Path, folder: Path) -> None:
     try:
         staging.rename(folder)
     except BaseException:
-        aside.rename(folder)
+        aside.rename(folder)  # where this fails, too, it stays aside
+        aside.parent.rmdir()
         raise
-    finally:
-        shutil.rmtree(aside.parent, ignore_errors=True)
+    shutil.rmtree(aside.parent, ignore_errors=True)
 
 
 def begun(folder: Path, record: str, expected: str = "a new or empty folder") -> bool:
