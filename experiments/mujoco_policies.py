@@ -38,6 +38,7 @@ from scipy.optimize import least_squares
 from jaxlfi.cli import parser as cli
 from jaxlfi.cli import train as training_cli
 from jaxlfi.cli.domains import domain
+from jaxlfi.cli.tables import Output
 from jaxlfi.envs.mujoco import task as mujoco_task
 from jaxlfi.envs.mujoco.effects import STATE, built, effects, initial_state, state_place
 from jaxlfi.envs.mujoco.environment import MujocoEnvironment, environment
@@ -169,11 +170,10 @@ def trained(
     reference: str, env: MujocoEnvironment, draws: Mapping[str, Callable], settings: PPO, seeds: int, out: Path
 ):
     """Train all policies side by side, unless they are there."""
-    console = Console()
     if not formats.recorded(out).get("format") == formats.TRAINING:
         training.begin(training.Plan(reference, env, settings, None, draws, tuple(range(seeds))), out)
     if not training.finished(out):
-        training_cli.run(out, env, console, figures=True)
+        training_cli.run(out, env, Output.of(), figures=True)
 
 
 def played(reality: Reality, policies: Mapping[tuple[str, int], Policy], episodes: int) -> dict[tuple[str, int], Any]:

@@ -21,7 +21,11 @@ WIDTH = 120
 
 
 def add(
-    group: argparse._ArgumentGroup, families: Families, into: str, several: bool = False, defaults: bool = True
+    group: argparse._ArgumentGroup,
+    families: Families,
+    into: str,
+    several: bool = False,
+    presets: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> None:
     """Add a flag for every field, one for all classes that have a field of that name.
 
@@ -33,7 +37,7 @@ def add(
         families: classes and their fields.
         into: the argument that collects the values; make it an empty dictionary by `set_defaults`.
         several: whether a number can be given for each parameter of the task.
-        defaults: whether the fields' own defaults are those of the command line, and shown.
+        presets: the defaults of the command line, by the preset and the field; None: the fields' own.
     """
     for name, owners in by_field(families).items():
         flag = f"--{name.replace('_', '-')}"
@@ -45,7 +49,7 @@ def add(
             names = (flag, f"--no-{flag[2:]}")
         else:
             reading, names = {"action": _Collect} | _reading(some, several), (flag,)
-        group.add_argument(*names, dest=name, into=into, help=_help(owners, defaults), **reading)
+        group.add_argument(*names, dest=name, into=into, help=_help(name, owners, presets), **reading)
 
 
 def seed(text: str) -> int:
@@ -130,20 +134,21 @@ def _truth(text: str) -> bool:
     return text == "yes"
 
 
-def _help(owners: Mapping[str, Declared], with_defaults: bool) -> str:
+def _help(name: str, owners: Mapping[str, Declared], presets: Mapping[str, Mapping[str, Any]] | None) -> str:
     """Whose field it is, what it is, its symbol, range and default."""
     some = next(iter(owners.values())).info
     facts = [some.symbol] if some.symbol else []
     ranges = dict.fromkeys(_range(field) for field in owners.values())
     facts += [word for word in ranges if word] if len(ranges) == 1 else []
-    defaults = {family: _shown(field.default) for family, field in owners.items()}
-    if not with_defaults:
-        pass
-    elif len(set(defaults.values())) == 1:
-        facts.append(f"default: {next(iter(defaults.values()))}")
+    if presets is None:
+        defaults = {family: _shown(field.default) for family, field in owners.items()}
     else:
+        defaults = {preset: _shown(values[name]) for preset, values in presets.items() if name in values}
+    if len(set(defaults.values())) == 1:
+        facts.append(f"default: {next(iter(defaults.values()))}")
+    elif defaults:
         facts.append("default: " + ", ".join(f"{value} ({family})" for family, value in defaults.items()))
-    text = _described(owners, always=with_defaults)
+    text = _described(owners, always=presets is None)
     return (f"{text} ({'; '.join(facts)})" if facts else text).replace("%", "%%")
 
 

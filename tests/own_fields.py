@@ -9,9 +9,11 @@ from typing import Any
 
 import jaxlfi
 from jaxlfi import fields, registry
+from jaxlfi.bayessim.presets import PRESETS
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.estimators.base import Estimator
 from jaxlfi.rl.settings import PPO
+from jaxlfi.rl.settings import PRESETS as POLICIES
 
 PLACE = Path(jaxlfi.__file__).parent / "cli" / "own_fields.py"
 HEAD = '''"""What `--help` says of our classes and commands, none of which it imports; by tests/own_fields.py."""
@@ -28,6 +30,14 @@ FIELDS: dict[str, dict[str, Declared]] = {{
 {entries}
 }}
 \"\"\"Fields by the class that declares them, as "module:Class", and by their own name.\"\"\"
+PRESETS: dict[str, dict[str, Any]] = {{
+{presets}
+}}
+\"\"\"Settings of a run by the preset and the name, its estimator's among them.\"\"\"
+POLICIES: dict[str, dict[str, Any]] = {{
+{policies}
+}}
+\"\"\"Settings of a training of policies, likewise.\"\"\"
 HELP = {{
 {commands}
 }}
@@ -79,7 +89,19 @@ def source() -> str:
         text += "".join(f'    "{name}": {call(one)},\n' for name, one in new.items()) + "}\n"
         entries.append(f'    "{kind.__module__}:{kind.__qualname__}": described({names[kind]}),')
     helps = "\n".join(f"    {shown(place)}: {shown(text)}," for place, text in commands().items())
-    return text + FOOT.format(entries="\n".join(entries), commands=helps)
+    presets = entries_of({name: (one, one.estimator) for name, one in PRESETS.items()})
+    policies = entries_of({name: (one,) for name, one in POLICIES.items()})
+    return text + FOOT.format(entries="\n".join(entries), presets=presets, policies=policies, commands=helps)
+
+
+def entries_of(presets: dict[str, tuple[Any, ...]]) -> str:
+    """The values of presets by the names of their fields."""
+    lines = []
+    for preset, parts in presets.items():
+        values = {name: getattr(part, name) for part in parts for name in fields.declared(part)}
+        listed = ", ".join(f"{shown(name)}: {shown(value)}" for name, value in values.items())
+        lines.append(f"    {shown(preset)}: {{{listed}}},")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import jaxlfi
 from jaxlfi import fields, flags
 from jaxlfi.bayessim.presets import PRESETS
 from jaxlfi.cli import parser as cli
-from jaxlfi.cli.own_fields import FIELDS, HELP
+from jaxlfi.cli.own_fields import FIELDS, HELP, POLICIES
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.fields import Checked, hyperparameter, option
@@ -119,6 +119,10 @@ def test_the_table_is_what_our_classes_and_commands_declare():
         name: list(found.items()) for name, found in declared.items()
     }
     assert own_fields.commands() == HELP
+    for name, settings in PRESETS.items():
+        of = lambda part: {field: getattr(part, field) for field in fields.declared(part)}
+        assert cli.VALUES[name] == of(settings) | of(settings.estimator)
+        assert POLICIES[name] == of(own_fields.POLICIES[name])
     assert all(field.info.help for found in FIELDS.values() for field in found.values())
 
 

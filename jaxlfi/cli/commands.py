@@ -4,7 +4,10 @@ import argparse
 import csv
 import dataclasses
 import io
+import json
 import shutil
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +21,10 @@ from jaxlfi.bayessim.keys import key_of
 from jaxlfi.bayessim.presets import all_rounds
 from jaxlfi.cli import asked, interrupts, summaries, tables, train
 from jaxlfi.cli.exit_status import resuming
+from jaxlfi.cli.tables import Output
 from jaxlfi.distributions.truncation import TRIES
 from jaxlfi.io import files as atomic
-from jaxlfi.io import host_devices, workfolder
+from jaxlfi.io import host_devices, run_summary, workfolder
 from jaxlfi.io.formats import COMPARE, GRID, RUN, RUNS, TRAINING
 from jaxlfi.io.locks import locked
 from jaxlfi.io.progress import RoundProgress
@@ -30,6 +34,7 @@ from jaxlfi.io.workfolder import StoreError
 from jaxlfi.registry import TASKS
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import export
+from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import CheckpointError
 from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
@@ -43,7 +48,9 @@ from jaxlfi.tasks.presimulated import presimulated, read_simulations
 from jaxlfi.tasks.task import Task
 
 Prepared = tuple[Path, tuple[BatchPlan, Observed] | Work]
-REPORTED = (RUN, RUNS, COMPARE, GRID)
+SUMMARISED = (RUN, RUNS, COMPARE)
+"""Formats of the folders whose runs have summaries, for `--json`."""
+REPORTED = (*SUMMARISED, GRID)
 """Formats of the folders that `report` draws."""
 EXPECTED = (SimulatorError, CheckpointError, StoreError, OSError)
 """Errors that the input of a run causes, and the disk; they are reported in one line."""
@@ -53,10 +60,10 @@ DIAGNOSTICS = "diagnostics"
 """Folder of the diagnostics in that of their run, where no other is given; a run's page looks for them there."""
 
 
-def tasks(arguments: argparse.Namespace, console: Console) -> None:
+def tasks(arguments: argparse.Namespace, output: Output) -> None:
     """`jaxlfi tasks [NAME]`."""
     if arguments.name:
-        _describe_task(TASKS.load(arguments.name), console)
+        _describe_task(TASKS.load(arguments.name), output.results)
         return
     table = Table("task", "parameters", "supports", "observation")
     for name in TASKS.names():
@@ -70,8 +77,8 @@ def tasks(arguments: argparse.Namespace, console: Console) -> None:
             continue
         given = "given" if task.observation is not None else "simulated at the truth" if task.truth is not None else "-"
         table.add_row(*map(escape, (name, ", ".join(task.names), ", ".join(task.supports), given)))
-    tables.show(table, console)
-    console.print("Details: jaxlfi tasks NAME. Your own: module:factory in place of a name.")
+    tables.show(table, output.results)
+    output.results.print("Details: jaxlfi tasks NAME. Your own: module:factory in place of a name.")
 
 
 def _describe_task(task: Task, console: Console) -> None:
@@ -88,7 +95,7 @@ def _describe_task(task: Task, console: Console) -> None:
     console.print(escape(f"Supports, Phi and truth in natural units; the first support is the default.{logs}"))
 
 
-def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
+def infer(arguments: argparse.Namespace, output: Output) -> Prepared:
     """Prepare `jaxlfi infer`."""
     task = asked.task_of(arguments)
     settings = asked.build_settings(arguments, task)
@@ -105,10 +112,10 @@ def infer(arguments: argparse.Namespace, console: Console) -> Prepared:
     specs = tuple(RunSpec(configuration, support_name, support, rule, seed) for seed in asked.seeds_of(arguments))
     kind = RUN if len(specs) == 1 else RUNS
     plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
-    return _begun(arguments, plan, console, first)
+    return _begun(arguments, plan, output, first)
 
 
-def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
+def compare(arguments: argparse.Namespace, output: Output) -> Prepared:
     """Prepare `jaxlfi compare`."""
     task = asked.task_of(arguments)
     settings = asked.build_settings(arguments, task, all_rounds)
@@ -126,15 +133,15 @@ def compare(arguments: argparse.Namespace, console: Console) -> Prepared:
     )
     kind = COMPARE
     plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
-    return _begun(arguments, plan, console, None)
+    return _begun(arguments, plan, output, None)
 
 
-def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, first: Any) -> Prepared:
+def _begun(arguments: argparse.Namespace, plan: BatchPlan, output: Output, first: Any) -> Prepared:
     """The folder of a plan, after everything was checked."""
     processes = arguments.joined
     if processes.writes:
         workfolder.refuse_occupied(arguments.out)
-    observation = asked.observation_of(arguments, plan.task, lambda line: _say(console, line))
+    observation = asked.observation_of(arguments, plan.task, lambda line: _say(output.notes, line))
     task = with_gaps_of(plan.task, observation, plan.settings.estimator.embedding != "none")
     plan = dataclasses.replace(plan, task=task)
     observed = executing.prepare(plan, observation, first, processes)
@@ -142,7 +149,7 @@ def _begun(arguments: argparse.Namespace, plan: BatchPlan, console: Console, fir
         if (mass := priors.require_mass(plan.task.inference.prior, box, name)) < priors.LOW_INSIDE:
             missed = (1 - mass) ** TRIES
             _warn(
-                console,
+                output,
                 f"only {mass:.2g} of the prior lies in {name}: {missed:.0%} of its draws are approximate, picked from "
                 "uniform ones by the prior's density",
             )
@@ -158,7 +165,7 @@ def _hold(arguments: argparse.Namespace, folder: Path) -> None:
         arguments.closing.enter_context(locked(folder))
 
 
-def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
+def grid_command(arguments: argparse.Namespace, output: Output) -> Prepared:
     """Prepare `jaxlfi grid`."""
     task = TASKS.load(arguments.task)
     settings = asked.build_settings(arguments, task, all_rounds)
@@ -179,28 +186,41 @@ def grid_command(arguments: argparse.Namespace, console: Console) -> Prepared:
         preset=arguments.preset,
         support_name=name,
     )
-    observation = asked.observation_of(arguments, task, lambda line: _say(console, line))
+    observation = asked.observation_of(arguments, task, lambda line: _say(output.notes, line))
     if arguments.joined.writes:
         workfolder.refuse_occupied(arguments.out)
-    _say(console, f"{task.name}: compiling for {plan.size} runs")
+    _say(output.notes, f"{task.name}: compiling for {plan.size} runs")
     work = grid.begin(arguments.out, plan, observation, arguments.runs_per_chunk, arguments.joined)
     _hold(arguments, arguments.out)
     return arguments.out, work
 
 
-def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
+def resume(arguments: argparse.Namespace, output: Output) -> Prepared | None:
     """Prepare `jaxlfi resume`: nothing is left to do where the run is complete."""
     folder = arguments.folder
     if folder.is_dir():
         _hold(arguments, folder)
     config = workfolder.read(folder, *REPORTED, TRAINING)
+    if arguments.json and config["format"] not in SUMMARISED:
+        raise ValueError(f"json: expected a folder of infer or compare, which has summaries, got {folder}")
+    if arguments.rounds is not None and config["format"] != RUN:
+        raise ValueError(f"rounds: expected the folder of one run (of one seed), got {folder}")
     if config["format"] == TRAINING:
-        train.resume(folder, console, not arguments.no_figures, arguments.joined)
+        train.resume(folder, output, not arguments.no_figures, arguments.joined)
         return None
+    if arguments.rounds is not None:
+        if arguments.joined.count > 1:
+            raise ValueError("rounds: expected one process, got several")
+        executing.extend(folder, arguments.rounds)
+        config = workfolder.read(folder, RUN)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
         if arguments.joined.writes:
             executing.clean(folder)
-        _say(console, f"{folder} is complete: nothing to resume. Its pictures: {quoted('jaxlfi', 'report', folder)}")
+        _say(
+            output.notes, f"{folder} is complete: nothing to resume. Its pictures: {quoted('jaxlfi', 'report', folder)}"
+        )
+        if arguments.json and arguments.joined.writes:
+            _print_json(folder, config)
         return None
     if config["format"] == GRID:
         work, what = grid.reopen(folder), "results differ by rounding"
@@ -208,26 +228,29 @@ def resume(arguments: argparse.Namespace, console: Console) -> Prepared | None:
         plan, observed = executing.reopen(folder)
         if config.get("executor", False) and (arguments.workers, arguments.scheduler) == (None, None):
             arguments.workers = host_devices.processors()
-            _say(console, f"simulations: in {arguments.workers} processes on this machine")
+            _say(output.notes, f"simulations: in {arguments.workers} processes on this machine")
         work = dataclasses.replace(plan, task=asked.simulated_again(arguments, folder, plan.task)), observed
         what = "the result may differ in rounding from an uninterrupted one"
     if changed := executing.changed_machine(config, arguments.joined):
-        _warn(console, f"begun with {', '.join(changed)}: {what}")
+        _warn(output, f"begun with {', '.join(changed)}: {what}")
     return folder, work
 
 
-def report(arguments: argparse.Namespace, console: Console) -> None:
+def report(arguments: argparse.Namespace, output: Output) -> None:
     """`jaxlfi report`."""
     workfolder.read(arguments.folder, *REPORTED)
-    draw(arguments.folder, console)
+    draw(arguments.folder, output.notes)
 
 
-def sample(arguments: argparse.Namespace, console: Console) -> None:
+def sample(arguments: argparse.Namespace, output: Output) -> None:
     """`jaxlfi sample DIR`."""
     out = arguments.out or arguments.folder / "samples.csv"
-    if out.suffix not in (".csv", ".npz", ".nc"):
-        raise ValueError(f"out: expected a name that ends in .csv or .npz, or .nc for ArviZ, got {out}")
-    if out.exists() or out.is_symlink():
+    printed = str(out) == "-"
+    if printed:
+        output = Output.of(quiet=True)  # warnings on standard error
+    elif out.suffix not in (".csv", ".npz", ".nc"):
+        raise ValueError(f"out: expected a name that ends in .csv or .npz, or .nc for ArviZ, or -, got {out}")
+    elif out.exists() or out.is_symlink():
         raise ValueError(f"out: expected a new file, got {out}, which exists")
     posterior = load(arguments.folder).posterior
     if out.suffix == ".nc":
@@ -241,17 +264,20 @@ def sample(arguments: argparse.Namespace, console: Console) -> None:
             text = io.StringIO()
             writer = csv.writer(text, lineterminator="\n")
             writer.writerows([names, *([f"{value:.8g}" for value in row] for row in draws)])
-            atomic.write_bytes(out, text.getvalue().encode())
-    _say(console, f"samples: {out}")
+            if printed:
+                sys.stdout.write(text.getvalue())
+            else:
+                atomic.write_bytes(out, text.getvalue().encode())
+    _say(output.notes, f"samples: {out}")
     if posterior.mass_inside < LOW_MASS:
         _warn(
-            console,
+            output,
             f"only {float(posterior.mass_inside):.2g} of the posterior lies in the support it was truncated to; it may "
             "be wrong.",
         )
 
 
-def diagnose(arguments: argparse.Namespace, console: Console) -> None:
+def diagnose(arguments: argparse.Namespace, output: Output) -> None:
     """`jaxlfi diagnose DIR`."""
     task = None if arguments.task is None else TASKS.load(arguments.task)
     run = calibration.read_run(arguments.folder, task)
@@ -265,26 +291,26 @@ def diagnose(arguments: argparse.Namespace, console: Console) -> None:
         reference = arguments.against.name, calibration.read_reference(arguments.against, run.task)
     out = arguments.out or arguments.folder / DIAGNOSTICS
     with interrupts.orderly(run.task.on_host):
-        found = calibration.diagnose(out, run, plans, console, reference)
+        found = calibration.diagnose(out, run, plans, output.notes, reference)
     for widths in found.widths:
-        _say(console, f"{widths.heading}:")
+        _say(output.results, f"{widths.heading}:")
         for name, one in widths.rows:
-            _say(console, f"  {sentence(name, one)}")
-    tables.show(summaries.checks_table(found.checks), console)
-    _say(console, f"diagnostics: {out}")
+            _say(output.results, f"  {sentence(name, one)}")
+    tables.show(summaries.checks_table(found.checks), output.results)
+    _say(output.notes, f"diagnostics: {out}")
     if arguments.no_figures:
         return
     for path in _figures().checks.report(out):
-        _say(console, f"{'page' if path.suffix == '.html' else 'picture'}: {path}")
+        _say(output.notes, f"{'page' if path.suffix == '.html' else 'picture'}: {path}")
     if out == arguments.folder / DIAGNOSTICS and (arguments.folder / "report.html").exists():
         _figures().report(arguments.folder)  # it says how far widths can be trusted, and this is known now
-        _say(console, f"page of the run, again: {arguments.folder / 'report.html'}")
+        _say(output.notes, f"page of the run, again: {arguments.folder / 'report.html'}")
 
 
-def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argparse.Namespace, console: Console) -> None:
+def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argparse.Namespace, output: Output) -> None:
     """Run what `infer`, `compare`, `grid` or `resume` prepared, and print what came of it."""
     if isinstance(work, Work):
-        _run_grid(folder, work, arguments, console)
+        _run_grid(folder, work, arguments, output)
         return
     plan, observed = work
     processes, count = arguments.joined, len(plan.specs)
@@ -292,7 +318,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     done = executing.rounds_done(folder) if processes.writes else 0
     try:
         orderly = interrupts.orderly(plan.task.on_host)
-        with orderly, RoundProgress(console, plan.settings.rounds, done, label) as progress:
+        with orderly, RoundProgress(output.notes, plan.settings.rounds, done, label) as progress:
             on_round = lambda index, row: progress.advance()
             runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated, processes)
     except (ExecutorError, OSError):
@@ -304,22 +330,41 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     if not processes.writes:
         return
     executing.finish(folder, plan, runs)
+    if arguments.json:
+        _print_json(folder, folders.read_config(folder))
     if plan.kind == RUN:
         found = RunSummary.read(folder)
-        tables.show(summaries.parameter_table(found), console)
+        tables.show(summaries.parameter_table(found), output.results)
         for line in (*found.sentences, *found.steps()):
-            _say(console, line)
+            _say(output.results, line)
     if plan.kind != RUN or plan.task.truth is not None:
-        tables.show(summaries.summary_table(plan, runs), console)
+        tables.show(summaries.summary_table(plan, runs), output.results)
     for warning in summaries.warnings(plan, runs):
-        _warn(console, warning)
+        _warn(output, warning)
     several = () if plan.kind == RUN else (*summaries.failure_lines(runs), *summaries.rounds_lines(plan, runs))
     for line in (*several, *summaries.widths_lines(plan, runs)):  # of a single run, its summary says so
-        _say(console, line)
+        _say(output.results, line)
     kind = "table" if plan.kind == COMPARE else "results"
-    _say(console, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")
+    _say(output.notes, f"{kind}: {folder / 'table.csv' if kind == 'table' else folder}")
     if not arguments.no_figures:
-        draw(folder, console)
+        draw(folder, output.notes)
+
+
+def _print_json(folder: Path, config: Mapping[str, Any]) -> None:
+    """Print the summary of a finished run; of several, an object of them by the runs' folders.
+
+    Raises:
+        StoreError: where there is none, as in folders of earlier versions.
+    """
+
+    def summary(one: Path) -> Any:
+        if not (path := one / run_summary.NAME).exists():
+            raise StoreError(f"json: expected a run with {path}, got one of an earlier version")
+        return atomic.read_json(path)
+
+    several = {run["folder"]: folder / run["folder"] for run in config.get("runs", ()) if run["folder"] != "."}
+    found = {name: summary(one) for name, one in several.items()} if several else summary(folder)
+    print(json.dumps(found, indent=2))
 
 
 def advice(error: Exception, prepared: Prepared) -> str:
@@ -328,9 +373,9 @@ def advice(error: Exception, prepared: Prepared) -> str:
     return resuming(prepared[0]) if from_outside and prepared[0].exists() else ""
 
 
-def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: Console) -> None:
+def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, output: Output) -> None:
     try:
-        arrays = grid.advance(folder, work, console, arguments.joined)
+        arrays = grid.advance(folder, work, output.notes, arguments.joined)
     except OSError:
         raise  # as of a full disk: the folder can be gone on from
     except Exception:
@@ -340,10 +385,10 @@ def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, console: 
         raise
     if not arguments.joined.writes:
         return
-    tables.show(summaries.marginal_table(work.grid, arrays), console)
-    _say(console, f"table: {folder / 'table.csv'}")
+    tables.show(summaries.marginal_table(work.grid, arrays), output.results)
+    _say(output.notes, f"table: {folder / 'table.csv'}")
     if not arguments.no_figures:
-        draw(folder, console)
+        draw(folder, output.notes)
 
 
 def draw(folder: Path, console: Console) -> None:
@@ -366,8 +411,8 @@ def _say(console: Console, text: str) -> None:
     console.print(escape(text), soft_wrap=True, highlight=False)
 
 
-def _warn(console: Console, text: str) -> None:
-    console.print(escape(f"warning: {text}"), style="yellow", soft_wrap=True, highlight=False)
+def _warn(output: Output, text: str) -> None:
+    output.warnings.print(escape(f"warning: {text}"), style="yellow", soft_wrap=True, highlight=False)
 
 
 COMMANDS = {

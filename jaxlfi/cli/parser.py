@@ -21,6 +21,7 @@ from jaxlfi.cli import help_texts, interrupts, joined, warned
 from jaxlfi.cli.command import Command, OneLineParser
 from jaxlfi.cli.exit_status import refuse, resuming
 from jaxlfi.cli.own_fields import FIELDS, HELP
+from jaxlfi.cli.own_fields import PRESETS as VALUES
 from jaxlfi.fields import declared
 from jaxlfi.io.formats import PLAN, recorded
 from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, Classes, package_of
@@ -130,10 +131,10 @@ def own_commands(families: Families) -> list[Command]:
         ),
         Command(
             "resume",
-            "go on with a run that was stopped",
+            "go on with a run that was stopped, or for more rounds",
             _resume,
             _work,
-            "Go on with a run that was stopped or killed.",
+            "Go on with a run that was stopped or killed, or for more rounds with one that is finished.",
         ),
         Command(
             "sample",
@@ -191,6 +192,7 @@ def _infer(command: argparse.ArgumentParser, families: Families) -> None:
         metavar="NAME",
         help=_registered("how the support is adapted", families.rules, "edge"),
     )
+    _add_json(command)
     _add_shared(command, families, seeds=1)
 
 
@@ -201,6 +203,7 @@ def _compare(command: argparse.ArgumentParser, families: Families) -> None:
         metavar="SUPPORT[+HEURISTIC]",
         help="what to compare (default: ok, misspecified, broad, and misspecified with edge, mode, centre)",
     )
+    _add_json(command)
     _add_shared(command, families, seeds=4)
 
 
@@ -233,8 +236,15 @@ def _grid(command: argparse.ArgumentParser, families: Families) -> None:
 
 def _resume(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
+    command.add_argument(
+        "--rounds",
+        type=int,
+        metavar="N",
+        help="go on to so many rounds in all, also with a run that is finished (default: those it was begun with)",
+    )
     _add_executor(command)
     joined.add_flags(command)
+    _add_json(command)
     _add_machine(command)
 
 
@@ -246,7 +256,8 @@ def _sample(command: argparse.ArgumentParser) -> None:
         "--out",
         type=flags.output,
         metavar="FILE",
-        help="a new .csv or .npz file, or .nc for ArviZ's InferenceData (default: samples.csv in the folder)",
+        help="a new .csv or .npz file, .nc for ArviZ's InferenceData, or - for CSV on standard output (default: "
+        "samples.csv in the folder)",
     )
 
 
@@ -380,21 +391,35 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         _add_executor(command)
         command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
 
-    rounds = command.add_argument_group("rounds (default: the preset's)")
-    flags.add(rounds, {"run": FIELDS[SETTINGS]}, into="settings", defaults=False)
-    network = command.add_argument_group("network and training (default: the preset's)")
+    rounds = command.add_argument_group(
+        "rounds (default: the preset's, shown for bayessim; a task or method may have its own)"
+    )
+    flags.add(rounds, {"run": FIELDS[SETTINGS]}, into="settings", presets=VALUES)
+    network = command.add_argument_group(
+        "network and training (default: the preset's, shown for bayessim; a task or method may have its own)"
+    )
     network.add_argument(
         "--estimator", metavar="NAME", help=_registered("the density estimator", families.networks, "the method's")
     )
-    flags.add(network, families.networks, into="settings", defaults=False)
+    flags.add(network, families.networks, into="settings", presets=VALUES)
     hyper = command.add_argument_group("heuristics (one number, or one per parameter)")
     flags.add(hyper, families.rules, into="hyperparameters", several=True)
     command.set_defaults(settings={}, hyperparameters={})
 
 
+def _add_json(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--json",
+        action="store_true",
+        help="print the summary as JSON on standard output, and the rest on standard error; of several runs, an "
+        "object of summaries by folder",
+    )
+
+
 def _add_machine(command: argparse.ArgumentParser) -> None:
     """Arguments about how, not what."""
     command.add_argument("--no-figures", action="store_true", help="draw no figures at the end")
+    command.add_argument("--quiet", action="store_true", help="print results and warnings only")
     command.add_argument("--debug", action="store_true", help="show the traceback of an error")
     command.add_argument("--no-cache", action="store_true", help="compile without the cache of compiled programs")
 
@@ -526,11 +551,12 @@ def _work(arguments: argparse.Namespace) -> int:
         return refuse("jaxlfi", error, debug)
     from jaxlfi.cli import commands, tables
 
-    console = tables.console(quiet=not arguments.joined.writes)
+    quiet, json = getattr(arguments, "quiet", False), getattr(arguments, "json", False)
+    output = tables.Output.of(quiet, json, silent=not arguments.joined.writes)
     with contextlib.ExitStack() as closing:
         arguments.closing = closing
         try:
-            prepared = commands.COMMANDS[arguments.command](arguments, console)
+            prepared = commands.COMMANDS[arguments.command](arguments, output)
         except (ValueError, OSError) as error:
             if interrupts.is_unread(error):
                 raise
@@ -538,7 +564,7 @@ def _work(arguments: argparse.Namespace) -> int:
         if prepared is not None:
             arguments.begun.append(prepared[0])
             try:
-                commands.run(*prepared, arguments, console)
+                commands.run(*prepared, arguments, output)
             except commands.EXPECTED as error:
                 if interrupts.is_unread(error):
                     raise

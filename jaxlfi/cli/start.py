@@ -1,5 +1,6 @@
 """The program `jaxlfi`: everything after its first milliseconds, imports included, can be interrupted."""
 
+import os
 import sys
 
 from jaxlfi.cli import interrupts
@@ -13,4 +14,8 @@ def main() -> int:
 def _work() -> int:
     from jaxlfi.cli import parser
 
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks what a word can be completed to
+        import argcomplete
+
+        argcomplete.autocomplete(parser.parser())
     return parser.main(sys.argv[1:])

@@ -1,5 +1,6 @@
 """What commands print on, and tables that lose no number in a narrow window."""
 
+import dataclasses
 import sys
 from typing import NoReturn
 
@@ -21,6 +22,36 @@ class _Output(Console):
 def console(quiet: bool = False) -> Console:
     """Standard output, as wide as its window."""
     return _Output(width=None if sys.stdout.isatty() else FILE_WIDTH, quiet=quiet)
+
+
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """Where a command prints what; one and the same console unless the command is to be read by a program.
+
+    Attributes:
+        results: what was found.
+        notes: progress, and the files that were written.
+        warnings: what looks wrong.
+    """
+
+    results: Console
+    notes: Console
+    warnings: Console
+
+    @classmethod
+    def of(cls, quiet: bool = False, json: bool = False, silent: bool = False) -> "Output":
+        """Everything on standard output, or results alone.
+
+        Args:
+            quiet: no notes; warnings on standard error.
+            json: no tables, as JSON is printed in their place; notes and warnings on standard error.
+            silent: nothing at all, as of a process that does not write.
+        """
+        out = console(quiet=silent or json)
+        if not (quiet or json):
+            return cls(out, out, out)
+        errors = lambda quiet: _Output(width=None if sys.stderr.isatty() else FILE_WIDTH, stderr=True, quiet=quiet)
+        return cls(out, errors(silent or quiet), errors(silent))
 
 
 def show(table: Table, on: Console | None = None) -> None:

@@ -15,13 +15,14 @@ from jaxlfi.cli import joined
 from jaxlfi.cli.command import Command
 from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import resuming
-from jaxlfi.cli.own_fields import FIELDS
+from jaxlfi.cli.own_fields import FIELDS, POLICIES
 from jaxlfi.io.formats import TRAINING, recorded
 from jaxlfi.registry import ENVIRONMENTS
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from jaxlfi.cli.tables import Output
     from jaxlfi.io.processes import Processes
     from jaxlfi.rl.environment import Environment
 
@@ -71,7 +72,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
     joined.add_flags(parser)
     group = parser.add_argument_group("PPO (default: the preset's)")
-    flags.add(group, {"PPO": FIELDS[SETTINGS]}, into="settings", defaults=False)
+    flags.add(group, {"PPO": FIELDS[SETTINGS]}, into="settings", presets=POLICIES)
     parser.set_defaults(settings={})
 
 
@@ -94,7 +95,7 @@ def _train(arguments: argparse.Namespace) -> None:
     training.begin(plan, arguments.out, processes)
     try:
         with locked(arguments.out):
-            run(arguments.out, plan.environment, tables.console(), not arguments.no_figures, processes)
+            run(arguments.out, plan.environment, tables.Output.of(), not arguments.no_figures, processes)
         processes.leave()
     except OSError:
         raise  # as of a full disk, or of another process that goes on with it: the folder is not to be lost
@@ -105,14 +106,14 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def run(
-    out: Path, environment: "Environment", console: "Console", figures: bool, processes: "Processes | None" = None
+    out: Path, environment: "Environment", output: "Output", figures: bool, processes: "Processes | None" = None
 ) -> None:
     """Train what a folder asks for, print how the policies fare, and draw the learning curves.
 
     Args:
         out: the folder, which this process writes.
         environment: that of the folder.
-        console: to print on.
+        output: to print on.
         figures: whether to draw.
         processes: that share the trainings out among them; None for this one alone.
     """
@@ -131,7 +132,7 @@ def run(
     count = len(names)
     label = f"{environment.name}: {count} {'policy' if count == 1 else 'policies side by side'}"
     with contextlib.ExitStack() as stack:
-        progress = RoundProgress(console, settings.updates, training.updates_done(out), label, unit="update")
+        progress = RoundProgress(output.notes, settings.updates, training.updates_done(out), label, unit="update")
         stack.enter_context(progress)
         scalars = None
         if config.get("tensorboard"):
@@ -152,10 +153,10 @@ def run(
     for place, (trained_on, seed) in enumerate(result.names):
         means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]
         table.add_row(escape(trained_on), str(seed), *(f"{mean:.2f}" for mean in means))
-    tables.show(table, console)
-    console.print(f"policies: {out}/DOMAIN/seed_NNN/policy.npz", markup=False, soft_wrap=True)
+    tables.show(table, output.results)
+    output.notes.print(f"policies: {out}/DOMAIN/seed_NNN/policy.npz", markup=False, soft_wrap=True)
     if figures:
-        draw(out, console)
+        draw(out, output.notes)
 
 
 def draw(out: Path, console: "Console") -> None:
@@ -171,7 +172,7 @@ def draw(out: Path, console: "Console") -> None:
     console.print(f"learning curves: {out / 'curves.png'}", markup=False, soft_wrap=True)
 
 
-def resume(out: Path, console: "Console", figures: bool, processes: "Processes") -> None:
+def resume(out: Path, output: "Output", figures: bool, processes: "Processes") -> None:
     """Go on with a training that was stopped; see `run`. Every process reads the folder."""
     from jaxlfi.rl import training
     from jaxlfi.runs.execute import changed_machine
@@ -181,17 +182,17 @@ def resume(out: Path, console: "Console", figures: bool, processes: "Processes")
         if processes.writes:
             training.clean(out)
             if figures and not (out / "curves.png").exists():  # it was stopped while it drew them
-                draw(out, console)
-        console.print(f"{out} is complete: nothing to resume", markup=False, soft_wrap=True)
+                draw(out, output.notes)
+        output.notes.print(f"{out} is complete: nothing to resume", markup=False, soft_wrap=True)
         return
     if config["environment"] is None:
         raise ValueError(f"{out}: expected an environment that can be found by name; resume it in Python")
     if changed := changed_machine(config, processes):
         warning = f"begun with {', '.join(changed)}: the policies may be other than without an interruption"
-        console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True, highlight=False)
+        output.warnings.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True, highlight=False)
     environment = ENVIRONMENTS.load(config["environment"])
     if processes.writes:
-        run(out, environment, console, figures, processes)
+        run(out, environment, output, figures, processes)
     else:
         training.resumed(out, environment, lambda updates, curves: None, processes)
 

@@ -21,18 +21,21 @@ class StoreError(ValueError):
     """A folder that cannot be read, resumed or written to."""
 
 
-def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any]) -> None:
+def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any], replace: bool = False) -> None:
     """Bring a work folder into being, complete or not at all.
 
     Args:
         folder: where; it must not exist or be empty.
         config: written as config.json.
         fill: called with the folder's temporary path, to write what else belongs into it.
+        replace: the folder may hold something, which is removed once the new one is in its place. A kill in between
+            leaves it beside that place, under a hidden name.
 
     Raises:
         StoreError: where something is there, or nothing can be written.
     """
-    refuse_occupied(folder)
+    if not replace:
+        refuse_occupied(folder)
     folder = folder.resolve()  # a link to an empty folder stands for that folder
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -43,10 +46,26 @@ def create(folder: Path, config: Mapping[str, Any], fill: Callable[[Path], Any])
         staging.chmod(0o755)
         fill(staging)
         files.write_json(staging / CONFIG, config)
-        staging.rename(folder)
+        if replace:
+            _exchange(staging, folder)
+        else:
+            staging.rename(folder)
     except BaseException:
         shutil.rmtree(staging, ignore_errors=True)
         raise
+
+
+def _exchange(staging: Path, folder: Path) -> None:
+    """Put a new folder in the place of one, which is removed, or put back where that fails."""
+    aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent)) / folder.name
+    folder.rename(aside)
+    try:
+        staging.rename(folder)
+    except BaseException:
+        aside.rename(folder)  # where this fails, too, it stays aside
+        aside.parent.rmdir()
+        raise
+    shutil.rmtree(aside.parent, ignore_errors=True)
 
 
 def begun(folder: Path, record: str, expected: str = "a new or empty folder") -> bool:

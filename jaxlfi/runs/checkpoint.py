@@ -9,7 +9,7 @@ round that is not done.
 """
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,12 @@ FOLDER = "checkpoint"
 _DONE = "rounds_done"
 GIVEN = "given/"
 """Prefix of the arrays of simulations that were given."""
+
+
+EXTENDED = "extended"
+"""Name in config.json of what a run was asked for before it was given more rounds."""
+OF_ALL_ROUNDS = (".dataset", ".proposals", ".attempts")
+"""Parts of a state whose second axis has room for all rounds."""
 
 
 class CheckpointError(ValueError):
@@ -91,9 +97,11 @@ class Checkpoint:
         """The last state.
 
         Args:
-            template: a state of the same shapes, or of `jax.ShapeDtypeStruct`.
+            template: a state of the same shapes; where the run was given more rounds since, one that has not begun.
         """
         arrays = self._read("state.npz")
+        if self._config().get(EXTENDED):
+            arrays = _with_room(arrays, trees.named_leaves(template))
         try:
             return trees.from_arrays(arrays, template)
         except ValueError as error:
@@ -113,15 +121,23 @@ class Checkpoint:
 
     def _begun_by(self) -> str:
         """The jaxlfi that can go on with the run, for the end of an error."""
-        try:
-            author = written_by(atomic.read_json(self.folder.parent / "config.json"))
-        except (ValueError, AttributeError):
-            return ""
+        author = written_by(self._config())
         return f"; {author} began the run and goes on with it" if author else ""
 
-    def remove(self) -> None:
-        """Clean up after a run that is complete."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+    def _config(self) -> dict[str, Any]:
+        """The folder's record of itself; an empty one where there is none that can be read."""
+        try:
+            config = atomic.read_json(self.folder.parent / "config.json")
+        except ValueError:
+            return {}
+        return config if isinstance(config, dict) else {}
+
+    def remove(self, keep_state: bool = False) -> None:
+        """Clean up after a run that is complete; the state is kept for more rounds."""
+        if keep_state:
+            self.simulations.unlink(missing_ok=True)
+        else:
+            shutil.rmtree(self.folder, ignore_errors=True)
 
     def _read(self, name: str) -> dict[str, np.ndarray]:
         try:
@@ -133,6 +149,19 @@ class Checkpoint:
         if name not in arrays:
             raise CheckpointError(f"{self.folder / file}: expected an array {name}, got none")
         return arrays[name]
+
+
+def _with_room(arrays: dict[str, np.ndarray], fresh: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The arrays of a state with the room for all rounds that one has which has not begun, by its entries there."""
+    found = dict(arrays)
+    for name, leaf in fresh.items():
+        old = arrays.get(name)
+        if old is None or old.ndim < 2 or old.ndim != leaf.ndim or not name.startswith(OF_ALL_ROUNDS):
+            continue
+        if (old.shape[0], *old.shape[2:]) == (leaf.shape[0], *leaf.shape[2:]):
+            whole = np.concatenate([old, np.asarray(leaf)[:, old.shape[1] :]], axis=1)
+            found[name] = whole[:, : leaf.shape[1]]  # less room, too, where it had ended long before its last round
+    return found
 
 
 def _round_name(index: int) -> str:

@@ -29,7 +29,7 @@ from jaxlfi.io.workfolder import StoreError
 from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
-from jaxlfi.runs.checkpoint import Checkpoint
+from jaxlfi.runs.checkpoint import EXTENDED, Checkpoint
 from jaxlfi.runs.run import Origin, Run
 from jaxlfi.tasks import failures, priors
 from jaxlfi.tasks.executors import one_by_one
@@ -213,6 +213,8 @@ def execute(
                 folders.append_ledger(folder / name, index, own, plan.task.reasons, seconds[-1])
         on_round(index, row)
 
+    if not plan.settings.min_rounds:  # one that had settled was given more rounds
+        rows = [row | {"settled": np.zeros_like(row["settled"])} for row in rows]
     last = done if rows and np.all(rows[-1]["settled"]) else plan.settings.rounds
     done, last = map(int, processes.broadcast((np.asarray(done), np.asarray(last))))
     with contextlib.closing(journal):
@@ -413,8 +415,43 @@ def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
 
 
 def clean(folder: Path) -> None:
-    """Remove from a finished folder what only an unfinished one needs."""
-    Checkpoint(folder).remove()
+    """Remove from a finished folder what only an unfinished one needs; one run can be given more rounds (`extend`)."""
+    Checkpoint(folder).remove(keep_state=folders.read_config(folder)["format"] == RUN)
+
+
+def extend(folder: Path, rounds: int) -> None:
+    """Ask a run for more rounds than it was begun with; `reopen` and `execute` then go on with it.
+
+    The rounds that were made stay as they are, bit for bit. Those to come differ by chance from the same rounds of a
+    run that was begun with as many, whose simulations have more room from the start: sums over them round differently.
+    A run that ended because its posterior had settled makes all of them.
+
+    Args:
+        folder: of one run, finished or not.
+        rounds: of the run in all.
+
+    Raises:
+        ValueError: for no more rounds than there are, several runs, a run of one round, or one without its state.
+    """
+    config = folders.read_config(folder)
+    if config["format"] != RUN or "runs" not in config:
+        raise StoreError(f"rounds: expected the folder of a command with one run (of one seed), got {folder}")
+    checkpoint = Checkpoint(folder)
+    settings = describe.settings_from_json(config["settings"])
+    done = checkpoint.rounds_done()
+    if not done:
+        raise StoreError(f"rounds: expected a run with {checkpoint.folder / 'state.npz'} to go on from, got none")
+    if rounds <= done or (rounds < settings.rounds and not workfolder.is_finished(config)):
+        raise ValueError(f"rounds: expected more than the {max(done, settings.rounds)} of {folder}, got {rounds}")
+    if settings.rounds == 1:
+        raise ValueError("rounds: expected a run of several rounds, got one, whose network is for any observation")
+    rows, _, _ = checkpoint.read_rounds(done)
+    settled = bool(np.all(rows[-1]["settled"]))
+    more = settings.replace(rounds=rounds, min_rounds=0 if settled else settings.min_rounds).check()
+    asked = {"rounds": settings.rounds, "min_rounds": settings.min_rounds, "made": done}
+    before = [*config.get(EXTENDED, ()), asked]
+    changed = {"settings": describe.settings_to_json(more), "status": "running", EXTENDED: before}
+    atomic.write_json(folder / "config.json", config | changed)
 
 
 def results(plan: BatchPlan, runs: Sequence[Run]) -> list[dict[str, Any]]:

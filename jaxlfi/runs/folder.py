@@ -8,6 +8,7 @@ A comparison:   config.json table.csv CONFIGURATION/seed_000/ ...     each one p
 While a command runs its folder also holds `checkpoint/` (`jaxlfi.runs.checkpoint`).
 """
 
+import contextlib
 import csv
 import io
 import json
@@ -25,6 +26,7 @@ from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.io import files as atomic
 from jaxlfi.io import formats, provenance, run_summary, trees, workfolder
 from jaxlfi.io.formats import COMPARE, RUN, RUNS
+from jaxlfi.io.locks import locked
 from jaxlfi.io.workfolder import StoreError
 from jaxlfi.runs import describe
 from jaxlfi.tasks import failures, priors, summaries
@@ -33,6 +35,11 @@ from jaxlfi.tasks.task import Task
 if TYPE_CHECKING:  # runs know how to save themselves
     from jaxlfi.runs.run import Origin, Run
 
+OF_RUN = (
+    "config.json", "ledger.jsonl", "posterior.npz", "dataset.npz", "history.npz", "observation.npz", "network.npz",
+    "samples.csv", "report.html", "figures", "diagnostics", "checkpoint", run_summary.NAME, failures.FILE,
+)  # fmt: skip
+"""What the folder of a run may hold that commands wrote."""
 TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")
 
 
@@ -111,13 +118,22 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
         atomic.write_arrays(folder / "network.npz", trees.named_leaves(run.network), durable=True)
 
 
-def save(run: "Run", folder: Path) -> Path:
-    """Write one run into a new folder, complete or not at all.
+def save(run: "Run", folder: Path, exist_ok: bool = False) -> Path:
+    """Write one run into a folder, complete or not at all.
+
+    Args:
+        run: one run, with the task.
+        folder: new or empty.
+        exist_ok: it may also hold a finished run, which is replaced.
 
     Raises:
-        StoreError: for a run without its task, or one of an earlier version that lacks what is recorded now.
+        StoreError: where something else is there; for a run without its task, or one of an earlier version that lacks
+            what is recorded now.
     """
     task = _task_of(run)
+    replace = exist_ok and folder.is_dir() and any(folder.iterdir())
+    if replace:
+        _require_replaceable(folder)
 
     def fill(staging: Path) -> None:
         for index, seconds in enumerate(np.asarray(run.history["seconds"])):
@@ -132,8 +148,22 @@ def save(run: "Run", folder: Path) -> Path:
         failures.append(staging, run.failure_log.messages)
         write_run(staging, run)
 
-    workfolder.create(folder, run_config(task, run.origin, run.spec, run.settings), fill)
+    with locked(folder) if replace else contextlib.nullcontext():
+        workfolder.create(folder, run_config(task, run.origin, run.spec, run.settings), fill, replace)
     return folder
+
+
+def _require_replaceable(folder: Path) -> None:
+    """Refuse a folder that holds anything but a finished run and what commands write beside one.
+
+    Raises:
+        StoreError: naming what it holds.
+    """
+    config = workfolder.read(folder, RUN)
+    if not workfolder.is_finished(config) or not (folder / "posterior.npz").exists():
+        raise StoreError(f"save: expected a finished run to replace, got {str(folder)!r}, which is not")
+    if others := sorted(path.name for path in folder.iterdir() if path.name not in OF_RUN):
+        raise StoreError(f"save: expected the folder of a run alone to replace, got {str(folder)!r} with {others[0]!r}")
 
 
 def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:

@@ -1,5 +1,6 @@
 """infer: one whole inference run as a library call."""
 
+import dataclasses
 import functools
 import warnings as python_warnings
 from collections.abc import Callable, Mapping
@@ -29,8 +30,10 @@ from jaxlfi.io import formats, workfolder
 from jaxlfi.io.locks import locked
 from jaxlfi.io.progress import RoundProgress
 from jaxlfi.registry import HEURISTICS
+from jaxlfi.runs import describe
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs import folder as folders
+from jaxlfi.runs.checkpoint import EXTENDED
 from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
 from jaxlfi.runs.run import Origin, Run
@@ -69,13 +72,15 @@ def infer(
     The same numbers as `jaxlfi infer` gives for the seed that the key was made from. Compiled on first use for a task
     and the static part of `settings`; further calls reuse the program. It can be traced: jitted, and vmapped over keys,
     observations, supports, and the leaves of `heuristic` and `settings`. A traced run is one scan over its rounds, and
-    takes neither a host simulator nor the last six arguments.
+    takes neither a host simulator nor the last six arguments. A scan has a fixed length: once a traced run has settled
+    (`min_rounds`) its state stays as it is and its further rounds count no simulations, but they are computed.
 
     Args:
         key: consumed; or a seed, as `--first-seed` of the command line.
         task: simulator, names and bounds.
-        observation: the real trajectory, in the shape the simulator produces, with NaN where a number is missing
-            (`jaxlfi.with_gaps`); or a list of several, independent trials of the same parameters, of which shorter ones
+        observation: the real trajectory, in the shape the simulator produces, with or without an axis for one channel,
+            with NaN where a number is missing (`jaxlfi.with_gaps`); or a data frame, whose columns are taken by the
+            channels' names; or a list of several, independent trials of the same parameters, of which shorter ones
             count as missing their ends, combined into one posterior (`jaxlfi.repeated`). By default the task's
             own, or, where the truth is known, a fresh simulation at the truth.
         support: Theta_0: a name among `task.supports`, or a box. By default the task's first, or with `simulations` the
@@ -90,7 +95,7 @@ def infer(
         progress: show a progress bar.
         callback: called as each round ends; it makes this round the last by raising StopIteration.
         out: a new folder to keep the run in as it goes on. Where it holds the same run, unfinished or not, the run goes
-            on from there, to the same result.
+            on from there, to the same result; where `settings` ask for more rounds than it has, after those.
         executor: makes the simulations of a host simulator one by one, each with a generator of its own: any
             `concurrent.futures.Executor`. One that fails, crashes or hangs is counted by its reason. The result is the
             same for any executor.
@@ -155,7 +160,8 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
         executing.begin(out, plan, observed)
     with locked(out):
         config = folders.read_config(out)
-        _require_same(out, config, plan)
+        plan = _require_same(out, config, plan)
+        config = folders.read_config(out)
         if workfolder.is_finished(config):
             executing.clean(out)
             run = load(out, plan.task)
@@ -187,8 +193,8 @@ def _executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Cal
     return run
 
 
-def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
-    """Refuse to go on in the folder of another run."""
+def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> BatchPlan:
+    """The plan of a folder, which is asked for more rounds where the given plan is; refuse that of another run."""
     (spec,) = plan.specs
     wanted = workfolder.as_json(folders.run_config(plan.task, plan.origin(spec), spec, plan.settings))
     compared = (
@@ -206,8 +212,18 @@ def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> None:
         and not np.allclose(priors[0], priors[1], rtol=1e-3, atol=1e-3, equal_nan=True)
     ):
         other.append("prior")
+    if other == ["settings"] and plan.settings.rounds > 1:
+        asked = {"min_rounds": config[EXTENDED][0]["min_rounds"]} if config.get(EXTENDED) else {}
+        recorded = config["settings"] | asked
+        if recorded == wanted["settings"] | {"rounds": recorded["rounds"]}:
+            if plan.settings.rounds > recorded["rounds"]:
+                executing.extend(out, plan.settings.rounds)
+                config = folders.read_config(out)
+            if config["settings"]["rounds"] == plan.settings.rounds:
+                return dataclasses.replace(plan, settings=describe.settings_from_json(config["settings"]))
     if other:
         raise _of_another_run(out, other)
+    return plan
 
 
 def _require_observation(out: Path, recorded: Any, observed: Any) -> None:

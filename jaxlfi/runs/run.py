@@ -37,6 +37,7 @@ from jaxlfi.tasks import failures, owned
 from jaxlfi.tasks.errors import SimulatorWarning
 from jaxlfi.tasks.failures import Failure, FailureLog
 from jaxlfi.tasks.gaps import gaps_of
+from jaxlfi.tasks.observation import as_given
 from jaxlfi.tasks.reference import counted_from, summaries_in_double
 from jaxlfi.tasks.task import Task
 
@@ -259,20 +260,22 @@ class Run(struct.PyTreeNode):
         """The posterior draws that are saved with the run, in natural units; the same each time."""
         return self.posterior.sample(run_keys(self.key).of_check(self.settings.rounds), n)
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path, exist_ok: bool = False) -> Path:
         """Write a run folder, which `jaxlfi.load` reads and the command line's `sample`, `diagnose` and `report` take.
 
         Args:
             path: a new or empty folder.
+            exist_ok: it may also hold a finished run, which is replaced together with its pictures and diagnostics
+                once everything is written. Nothing else is ever replaced.
 
         Returns:
             The folder.
 
         Raises:
-            ValueError: if something is there already, or for a run under `vmap`.
+            ValueError: if something else is there, or for a run under `vmap`.
         """
         _require_one(self, "save")
-        return folders.save(self, Path(path))
+        return folders.save(self, Path(path), exist_ok)
 
     def __repr__(self) -> str:
         if not is_concrete(self) or self.x.ndim != 1:
@@ -291,6 +294,7 @@ class Run(struct.PyTreeNode):
 
     def _summary(self, observation: Any) -> jax.Array:
         on_host = self.task is not None and self.task.on_host
+        observation = observation if self.task is None else as_given(self.task, observation)
         observation = owned.array(observation) if is_concrete(observation) else observation
         observation = np.array(observation, float) if on_host else jnp.array(observation, jnp.float32)
         if observation.shape == self.observed.shape and self.task is not None:

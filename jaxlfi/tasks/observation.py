@@ -220,6 +220,49 @@ def _numbers(observation: Any) -> np.ndarray:
     return array
 
 
+def as_given(task: Task, observation: Any) -> Any:
+    """An observation, or each of a list, as an array of the channels in their order; everything else as it is.
+
+    An axis of one channel is there or not as the task's simulator has it; what a host simulator gives follows the
+    observation.
+
+    Raises:
+        ValueError: for frames whose columns are named, and not as the channels.
+    """
+    if hasattr(observation, "columns") and hasattr(observation, "to_numpy"):
+        observation = _of_frame(observation, Columns.of(task))
+    trials = isinstance(observation, list | tuple)
+    if trials and any(hasattr(one, "shape") for one in observation):
+        return [as_given(task, one) if len(np.shape(one)) > 1 else one for one in observation]
+    if observation is None or task.on_host:
+        return observation
+    if trials and all(np.shape(one) in ((), (1,)) for one in observation):  # records of one channel
+        observation = _numbers(observation)
+    length, *channel = simulator_shapes(task).trajectory
+    if hasattr(observation, "shape") and tuple(observation.shape) == ((length,) if channel == [1] else (length, 1)):
+        array = _numbers(observation) if is_concrete(observation) else observation
+        return array.reshape(length, *channel) if channel in ([], [1]) else observation
+    return observation
+
+
+def _of_frame(frame: Any, columns: "Columns") -> np.ndarray:
+    """The channels of a data frame of pandas or polars; columns that are named are told by their names."""
+    named = all(isinstance(name, str) for name in frame.columns)
+    headings = list(frame.columns) if named else []
+    if columns.names and set(columns.names) <= set(headings) and len(set(headings)) == len(headings):
+        return owned.array(frame[list(columns.names)])  # others may be dates
+    try:
+        table = _channels(headings, owned.array(frame), columns, lambda line: None)
+    except ValueError as error:
+        raise ValueError(f"observation: {error}") from error
+    if headings and len(columns.names) > 1:
+        raise ValueError(
+            f"observation: expected columns {', '.join(columns.names)}, got {', '.join(headings)}: rename them, or "
+            "pass frame.to_numpy() to have them taken in their order"
+        )
+    return table
+
+
 def trials_of(task: Task, observation: Any, pooling: str = "moments") -> tuple[Task, Any]:
     """The task and observation of an inference: where a list of trajectories is given, of all of them together.
 
@@ -230,6 +273,7 @@ def trials_of(task: Task, observation: Any, pooling: str = "moments") -> tuple[T
     Raises:
         ValueError: for a list of vectors that may be either.
     """
+    observation = as_given(task, observation)
     if not isinstance(observation, list | tuple) or not observation:
         return task, observation
     if is_concrete(observation):
@@ -377,6 +421,9 @@ def _channels(headings: list[str], table: np.ndarray, columns: Columns, say: Say
         if places != sorted(places):
             say(f"columns taken by their names, in the order {', '.join(columns.names)}")
         return table[:, places]
+    lacking = [name for name in columns.names if name not in headings]
+    if 0 < len(lacking) < len(columns.names):
+        raise ValueError(f"expected columns {', '.join(columns.names)}, got none for {', '.join(lacking)}")
     if table.shape[1] > 1 and headings and _is_time(headings[0]) and np.all(np.diff(table[:, 0]) > 0):
         if table.shape[1] != columns.count:
             say(f"the first column, {headings[0]!r}, is taken for the time and left out")

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import json
 import os
 import re
 import signal
@@ -53,6 +54,16 @@ def test_help_teaches_and_does_not_wait_for_jax():
         done = subprocess.run([sys.executable, "-c", check + script, name], capture_output=True, text=True, check=True)
         assert done.stdout.rstrip().endswith("False"), "jax was imported"
         assert "examples:" in done.stdout and wanted in done.stdout
+
+
+def test_a_shell_is_told_what_words_can_be_completed_to(tmp_path):
+    pytest.importorskip("argcomplete")
+    words, answer = "jaxlfi infer lynx_hare --keep-n", tmp_path / "answer"
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": words, "COMP_POINT": str(len(words)), "_ARGCOMPLETE_IFS": " "}
+    script = "import sys; sys.argv[0] = 'jaxlfi'; from jaxlfi.cli.start import main; main()"
+    shell = ["sh", "-c", 'exec "$@" 8>"$0" 9>/dev/null', answer, sys.executable, "-c", script]
+    subprocess.run(shell, env=os.environ | asked, check=True)
+    assert answer.read_text().split() == ["--keep-network"]
 
 
 def test_every_setting_and_hyperparameter_has_a_documented_flag():
@@ -294,6 +305,31 @@ def test_resuming_what_is_complete_says_so(comparison, capsys):
     for folder in (comparison, comparison / "ok" / "seed_000"):
         assert command("resume", folder) == 0
         assert "is complete" in capsys.readouterr().out
+
+
+def test_results_alone_for_programs_and_for_the_quiet(tmp_path, capsys):
+    out, flags = tmp_path / "run", (*FLAGS, "--no-figures")
+    assert command("infer", TASK, *flags, "--json", "--out", out) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == json.loads((out / "summary.json").read_text())
+    assert "compiled in" in printed.err and f"results: {out}" in printed.err
+    assert command("resume", out, "--json", "--quiet") == 0
+    again = capsys.readouterr()
+    assert again.out == printed.out and again.err == ""
+    assert command("infer", TASK, *flags, "--quiet", "--out", tmp_path / "quiet") == 0
+    quiet = capsys.readouterr()
+    assert all(name in quiet.out for name in ("first", "second", "narrower"))
+    assert not any(word in quiet.out for word in ("compiled", "round 1", "results:", "warning:"))
+    assert all(line.startswith("warning: ") for line in quiet.err.splitlines())
+
+
+def test_json_of_several_runs_is_by_folder(comparison, capsys):
+    capsys.readouterr()
+    assert command("resume", comparison, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found.keys() == {run["folder"] for run in run_store.read_config(comparison)["runs"]}
+    name, one = next(iter(found.items()))
+    assert one == json.loads((comparison / name / "summary.json").read_text())
 
 
 def test_report_names_what_it_drew(comparison, monkeypatch, capsys):

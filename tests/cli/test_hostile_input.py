@@ -140,7 +140,7 @@ def named(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
     return run.save(tmp_path_factory.mktemp("named") / "run"), run
 
 
-def test_samples_have_the_names_and_values_of_the_parameters(named, tmp_path):
+def test_samples_have_the_names_and_values_of_the_parameters(named, tmp_path, capsys):
     """A name that begins with "ln " is no logarithm, and a comma in a name is no second column."""
     folder, run = named
     draws = np.asarray(run.posterior.sample(jax.random.key(0), 1000))
@@ -149,6 +149,9 @@ def test_samples_have_the_names_and_values_of_the_parameters(named, tmp_path):
         heading, *rows = csv.reader(file)
     assert tuple(heading) == NAMES
     np.testing.assert_allclose(np.array(rows, float), draws, rtol=1e-6)
+    capsys.readouterr()
+    assert command("sample", folder, "-n", 1000, "--out", "-") == 0
+    assert capsys.readouterr().out == (tmp_path / "draws.csv").read_text()
     assert command("sample", folder, "-n", 1000, "--out", tmp_path / "draws.npz") == 0
     arrays = atomic.read_arrays(tmp_path / "draws.npz")
     assert tuple(arrays["names"]) == NAMES

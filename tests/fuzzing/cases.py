@@ -9,11 +9,11 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from rich.console import Console
 
 import jaxlfi.envs.whip
 from jaxlfi.cli import commands
 from jaxlfi.cli import parser as cli
+from jaxlfi.cli.tables import Output
 from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS
 from jaxlfi.io import files
 from jaxlfi.io.processes import ALONE
@@ -34,7 +34,7 @@ def prepare(here: Path) -> None:
     with contextlib.ExitStack() as closing:
         arguments = cli.parse(["infer", TASK, *SMALL, "--out", str(good / "run")])
         arguments.closing, arguments.joined = closing, ALONE
-        folder, (plan, observed) = commands.infer(arguments, Console(quiet=True))
+        folder, (plan, observed) = commands.infer(arguments, Output.of(silent=True))
 
     def stop(index: int, row: Any) -> None:
         raise KeyboardInterrupt

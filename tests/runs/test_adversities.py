@@ -52,10 +52,10 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on(tmp_path, capsys, monkeypat
         assert message.count("\n") == 1 and "expected a folder that no other process works in" in message
     assert command("resume", out, "--no-figures") == 0
     shutil.copytree(out, tmp_path / "killed")
-    (tmp_path / "killed" / "checkpoint").mkdir()  # it was killed after it had said that it is finished
-    (tmp_path / "killed" / "checkpoint" / "state.npz").touch()
+    (tmp_path / "killed" / "checkpoint" / "simulations.bin").touch()  # killed after it had said that it is finished
     assert command("resume", tmp_path / "killed") == 0
-    assert sorted(p.name for p in (tmp_path / "killed").iterdir()) == sorted(p.name for p in out.iterdir())
+    left = lambda folder: sorted(path.relative_to(folder) for path in folder.rglob("*"))
+    assert left(tmp_path / "killed") == left(out)
 
 
 def test_a_grid_on_a_full_disk_goes_on(tmp_path, capsys, monkeypatch):

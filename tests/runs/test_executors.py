@@ -91,7 +91,7 @@ def test_a_run_that_was_killed_repeats_no_finished_simulation(whole, tmp_path):
     assert results(out) == whole[0]
     assert (out / failures.FILE).read_text() == (whole[2] / failures.FILE).read_text()
     assert whole[1] <= calls(folder) <= whole[1] + 2  # those that were under way as it was killed
-    assert not (out / "checkpoint").exists()
+    assert not (out / "checkpoint" / "simulations.bin").exists()
 
 
 def until(condition, seconds=120.0):

@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -80,6 +81,36 @@ def test_saving_what_was_loaded_gives_the_same_files(saved, tmp_path):
         for measured in ("started", "command_line"):
             config.pop(measured)
     assert configs[0] == configs[1]
+
+
+def test_a_finished_run_can_be_replaced_and_nothing_else(run, saved, tmp_path, monkeypatch):
+    out, files = tmp_path / "run", lambda folder: {path.name: path.read_bytes() for path in folder.rglob("*.npz")}
+    whole = files(run.save(out, exist_ok=True))  # nothing is there yet
+    (out / "figures").mkdir()
+    assert files(run.save(out, exist_ok=True)) == whole and not (out / "figures").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    with pytest.raises(ValueError, match="expected a new or empty folder"):
+        run.save(out)
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match=r"^save: expected the folder of a run alone to replace, got .* 'notes.txt'$"):
+        run.save(out, exist_ok=True)
+    (out / "notes.txt").unlink()
+    for name, text in {"config.json": "{}", "posterior.npz": None}.items():
+        spoilt = shutil.copytree(out, tmp_path / f"without {name}")
+        (spoilt / name).write_text(text) if text else (spoilt / name).unlink()
+        with pytest.raises(ValueError, match="expected"):
+            run.save(spoilt, exist_ok=True)
+    renamed = Path.rename
+
+    def refused(self, target):
+        if self.name.startswith(".run-"):
+            raise OSError("no")
+        return renamed(self, target)
+
+    monkeypatch.setattr(Path, "rename", refused)
+    with pytest.raises(OSError, match="no"):
+        run.save(out, exist_ok=True)
+    assert files(out) == whole
 
 
 def test_a_run_of_a_task_made_in_python_is_loaded_without_it(run, saved, tmp_path):

@@ -6,12 +6,14 @@ import shutil
 import numpy as np
 import pytest
 
+import jaxlfi
 from jaxlfi.io import files as atomic
+from jaxlfi.runs import execute as executing
 from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.runs.execute import changed_machine
 from jaxlfi.runs.folder import read_ledger
 from tests.killed import Killed, kill_at
-from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401 - a fixture
+from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
 ARGUMENTS = ("infer", TASK, "--support", "misspecified", *FLAGS, "--seeds", "2", "--out")
 """One program for all tests; what is killed has two runs, and so two of some files."""
@@ -135,3 +137,56 @@ def test_resuming_on_another_number_of_devices_is_told_apart(stopped):
     assert config["devices"] == 1 and changed_machine(config) == []
     assert changed_machine(config | {"devices": 7}) == ["7 devices, now 1"]
     assert changed_machine({"runs": 12, "devices": None}) == []  # not recorded
+
+
+def test_a_finished_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
+    """Those it has made stay as they are, whatever ended it, and a kill on the way changes nothing."""
+    flags = (*FLAGS[: FLAGS.index("--rounds")], "--rounds", 9, "--min-rounds", 4, "--simulations-per-round", 20)
+    flags = (*flags, "--simulation-budget", 25, "--learning-rate", 1e-9, "--no-figures")  # it settles at once
+    out = tmp_path / "run"
+    assert command("infer", TASK, *flags, "--out", out) == 0
+    before, made = atomic.read_arrays(out / "history.npz"), atomic.read_arrays(out / "dataset.npz")
+    assert len(before["theta"]) == 4 and before["settled"][-1]
+    lines = (out / "ledger.jsonl").read_text()
+    shutil.copytree(out, tmp_path / "killed")
+    assert command("resume", out, "--rounds", 6, "--no-figures") == 0
+    after = atomic.read_arrays(out / "history.npz")
+    assert len(after["theta"]) == 6 and (after["attempted"] > 0).all() and not after["settled"].any()
+    for name in before.keys() - {"settled", "names", "reasons"}:
+        if not name.startswith("final_"):
+            assert after[name][:4].tobytes() == before[name].tobytes(), name
+    for name, rows in atomic.read_arrays(out / "dataset.npz").items():
+        assert rows[: len(made[name])].tobytes() == made[name].tobytes(), name
+    assert len(rows) > 0 and (out / "ledger.jsonl").read_text().startswith(lines)
+    config = json.loads((out / "config.json").read_text())
+    assert config["status"] == "finished" and config["settings"]["rounds"] == 6
+    assert config["extended"] == [{"rounds": 9, "min_rounds": 4, "made": 4}]
+    with monkeypatch.context() as patch:
+        kill_at(patch, 4, midway=False)
+        with pytest.raises(Killed):
+            command("resume", tmp_path / "killed", "--rounds", 6, "--no-figures")
+    assert command("resume", tmp_path / "killed", "--no-figures") == 0
+    for name in ("posterior.npz", "dataset.npz"):
+        assert_same_arrays(out / name, tmp_path / "killed" / name)
+    capsys.readouterr()
+    for rounds, message in ((6, "expected more than the 6 of"), (0, "expected more than the 6 of")):
+        assert command("resume", out, "--rounds", rounds) == 2
+        assert f"error: rounds: {message}" in capsys.readouterr().err
+    shutil.rmtree(out / "checkpoint")  # as earlier versions and run.save leave it
+    assert command("resume", out, "--rounds", 8) == 2
+    assert "error: rounds: expected a run with" in capsys.readouterr().err
+
+
+def test_more_rounds_in_python_are_those_of_the_command_line(tmp_path):
+    for name in ("python", "cli"):
+        jaxlfi.infer(0, gaussian(), settings=SETTINGS, out=tmp_path / name)
+    more = lambda: jaxlfi.infer(0, gaussian(), settings=SETTINGS.replace(rounds=3), out=tmp_path / "python")
+    run = more()
+    assert run.history["theta"].shape[0] == 3 == run.settings.rounds
+    np.testing.assert_array_equal(more().draws(), run.draws())  # it is complete, and is read
+    executing.extend(tmp_path / "cli", 3)
+    plan, observed = executing.reopen(tmp_path / "cli", gaussian())
+    (same,) = executing.execute(plan, observed, tmp_path / "cli")
+    np.testing.assert_array_equal(same.draws(), run.draws())
+    with pytest.raises(ValueError, match="of a run with another settings"):
+        jaxlfi.infer(0, gaussian(), settings=SETTINGS, out=tmp_path / "python")

@@ -31,6 +31,7 @@ from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.run import Origin
 from jaxlfi.studies import calibration as study
 from jaxlfi.studies.calibration import CalibrationPlan, plan
+from jaxlfi.studies.calibration.repeat import cost
 from jaxlfi.tasks.host import SimulatorError
 from tests.small import SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
@@ -492,3 +493,13 @@ def test_keys_are_not_those_of_a_run_of_the_same_seed(purpose):
     own = jax.random.key_data(CalibrationPlan("ok", seed=0).key(purpose))
     for key in jax.tree.leaves(run_keys(jax.random.key(0))):
         assert not np.array_equal(own, jax.random.key_data(key))
+
+
+def test_the_cost_is_said_before_anything_is_made(folder):
+    run = study.read_run(folder)
+    plans = study.plans_of("posterior,ok", run.task, 30, 20, 0)
+    assert cost(run, plans) == "cost: the run again for each of 60 truths, up to 3060 simulations in all."
+    timed = run.replace(history=run.history | {"seconds": np.array([1.0, 0.5])})
+    assert cost(timed, plans).endswith(" in all. One run took 1.5 s; side by side each takes less.")
+    once = run.replace(settings=run.settings.replace(rounds=1))
+    assert cost(once, plans) == "cost: 60 simulations, and the run's network conditioned on each"

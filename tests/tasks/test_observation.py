@@ -9,7 +9,16 @@ import pytest
 
 from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.host import HostSimulator, SimulatorError
-from jaxlfi.tasks.observation import Columns, checked, observe, read, read_for, simulate_observation, simulator_shapes
+from jaxlfi.tasks.observation import (
+    Columns,
+    as_given,
+    checked,
+    observe,
+    read,
+    read_for,
+    simulate_observation,
+    simulator_shapes,
+)
 from jaxlfi.tasks.task import Task
 
 VALUES = np.float32([8.0, 5.3626, 3.5946, -2.4096])
@@ -298,3 +307,47 @@ def test_the_truth_is_simulated_until_it_succeeds(key):
     host = dataclasses.replace(never, simulate=HostSimulator(lambda rng, theta: 1 / 0))
     with pytest.raises(SimulatorError, match=r"^simulate: ZeroDivisionError: division by zero$"):
         simulate_observation(jax.random.key(0), host)
+
+
+# ------------------------------------------------------------------------------------------- other forms of the same
+
+
+def two_channels(key, theta):
+    """A trajectory [4, 2]."""
+    return jnp.stack([decay(key, theta), theta[0] + jnp.arange(4.0)], axis=1)
+
+
+@pytest.mark.parametrize("simulate", [decay, lambda key, theta: decay(key, theta)[:, None]])
+@pytest.mark.parametrize("given", [VALUES, COLUMN, VALUES.tolist(), COLUMN.tolist()])
+def test_the_axis_of_one_channel_is_the_simulators(simulate, given):
+    own = task(simulate)
+    found = as_given(own, given)
+    shape = simulator_shapes(own).trajectory
+    assert np.shape(found) == shape and np.ravel(found).tolist() == VALUES.tolist()
+    assert jax.eval_shape(lambda one: as_given(own, one), np.asarray(given)).shape == shape
+
+
+def test_frames_are_read_by_the_names_of_their_columns():
+    pandas = pytest.importorskip("pandas")
+    own = task(two_channels, channels=("height", "speed"))
+    table = np.stack([VALUES, [1.0, 2.0, 3.0, 4.0]], axis=1)
+    frame = pandas.DataFrame(table, columns=["height", "speed"])
+    dates = pandas.date_range("2020-01-01", periods=4)
+    for one in (frame, frame[["speed", "height"]], frame.assign(when=dates), pandas.DataFrame(table), table):
+        np.testing.assert_array_equal(as_given(own, one), table)
+    np.testing.assert_array_equal(as_given(own, [frame, frame[["speed", "height"]]]), [table, table])
+    with pytest.raises(ValueError, match=r"^observation: expected columns height, speed, got none for speed$"):
+        as_given(own, frame.rename(columns={"speed": "velocity"}))
+    with pytest.raises(
+        ValueError, match=r"^observation: expected columns height, speed, got a, b: rename them, or pass"
+    ):
+        as_given(own, frame.set_axis(["a", "b"], axis=1))
+    column = frame[["height"]]
+    for one in (column, column.rename(columns={"height": "signal"}), column["height"]):
+        np.testing.assert_array_equal(as_given(task(), one), VALUES)
+
+
+def test_a_file_that_names_some_of_the_channels_is_refused(tmp_path):
+    (tmp_path / "x.csv").write_text("height,velocity\n1,2\n3,4\n")
+    with pytest.raises(ValueError, match="expected columns height, speed, got none for speed"):
+        read(tmp_path / "x.csv", Columns(("height", "speed"), 2))

@@ -22,7 +22,7 @@ from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.run import Run
 from jaxlfi.studies.calibration.checks import Check, against, calibration, predictive
 from jaxlfi.studies.calibration.plan import CalibrationPlan
-from jaxlfi.studies.calibration.repeat import chunk_length, posteriors, read_arrays
+from jaxlfi.studies.calibration.repeat import chunk_length, cost, posteriors, read_arrays
 from jaxlfi.studies.calibration.truths import draw_truths
 from jaxlfi.studies.calibration.widths import Widths, arrays_of, measured
 from jaxlfi.tasks.host import SimulatorError
@@ -128,6 +128,7 @@ def diagnose(
     """
     new = not (out / PLAN).exists()
     found = begin(out, run, plans)
+    console.print(cost(run, plans), markup=False, soft_wrap=True, highlight=False)
     try:
         truths = [_truths(out / plan.folder / "truths.npz", run, plan) for plan in plans]
     except SimulatorError:

@@ -2,7 +2,7 @@
 
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from jaxlfi.bayessim.batch import RunInputs, posterior_after, stack, start_one
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.memory import PROGRAM_PER_STATE, budget, even_length, state_bytes
+from jaxlfi.diagnostics.discrepancy import POSTERIOR_SAMPLES
 from jaxlfi.distributions.precision import single
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.io import files as atomic
@@ -100,8 +101,16 @@ def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) ->
         began = time.perf_counter()
         engine = engine_for(run.task, run.settings, run_inputs(run, plan, truths["observed"], truths["x"], first))
         compiled = lambda seconds: progress.compiled(seconds) if first == 0 else None
-        rounds = range(run.settings.rounds)
-        state = drive(engine, engine.start(), rounds, lambda *_: progress.advance(), compiled)
+        made = 0
+
+        def each(*_: Any) -> None:
+            nonlocal made
+            made += 1
+            progress.advance()
+
+        state = drive(engine, engine.start(), range(run.settings.rounds), each, compiled)
+        if made < run.settings.rounds:  # all had settled, and the next chunk's are going to
+            progress.advance(run.settings.rounds - made)
         keys, x = _keys(plan, DRAWS, first, len(truths["x"])), np.asarray(engine.inputs.x)[: len(truths["x"])]
         found = jax.device_get(_by_states(keys, truths["theta"], x, engine.fetch(state), plan.draws))
         return found, time.perf_counter() - began
@@ -129,6 +138,19 @@ def _by_states(key: jax.Array, truth: jax.Array, x: jax.Array, state: Any, draws
 
 def _keys(plan: CalibrationPlan, purpose: int, first: int, count: int) -> jax.Array:
     return jax.vmap(lambda place: jax.random.fold_in(plan.key(purpose), place))(first + jnp.arange(count))
+
+
+def cost(run: Run, plans: Sequence[CalibrationPlan]) -> str:
+    """What the posteriors of all truths are going to cost, in a line."""
+    count = sum(plan.truths for plan in plans)
+    if run.amortised:
+        return f"cost: {count} simulations, and the run's network conditioned on each"
+    settings = run.settings
+    each = settings.simulation_budget + POSTERIOR_SAMPLES * settings.predictive
+    simulations = count * (1 + settings.rounds * each)
+    seconds = float(np.sum(run.history.get("seconds", np.nan)))
+    took = f" One run took {seconds:.3g} s; side by side each takes less." if np.isfinite(seconds) else ""
+    return f"cost: the run again for each of {count} truths, up to {simulations} simulations in all.{took}"
 
 
 def posteriors(
