@@ -75,11 +75,11 @@ def test_python_tidies_a_finished_run_and_respects_another_process(tmp_path, mon
     with monkeypatch.context() as patch:
         patch.setattr(executing, "clean", lambda folder: None)
         infer()
-    assert Checkpoint(out).folder.exists()
+    Checkpoint(out).simulations.write_bytes(b"of a round that is over")
     with locked(out), pytest.raises(BlockingIOError, match="no other process"):
         infer()
     infer()
-    assert not Checkpoint(out).folder.exists()
+    assert not Checkpoint(out).simulations.exists() and Checkpoint(out).folder.exists()  # the state, for more rounds
 
 
 def test_a_picture_is_drawn_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
