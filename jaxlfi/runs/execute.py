@@ -23,7 +23,7 @@ from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
 from jaxlfi.io import provenance, workfolder
-from jaxlfi.io.formats import COMPARE, RUN, RUNS
+from jaxlfi.io.formats import COMPARE, GRID, RUN, RUNS
 from jaxlfi.io.processes import ALONE, Partition, Processes
 from jaxlfi.io.workfolder import StoreError
 from jaxlfi.registry import TASKS
@@ -416,7 +416,7 @@ def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
 
 def clean(folder: Path) -> None:
     """Remove from a finished folder what only an unfinished one needs; one run can be given more rounds (`extend`)."""
-    Checkpoint(folder).remove(keep_state=folders.read_config(folder)["format"] == RUN)
+    Checkpoint(folder).remove(keep_state=workfolder.read(folder, RUN, RUNS, COMPARE, GRID)["format"] == RUN)
 
 
 def extend(folder: Path, rounds: int) -> None:

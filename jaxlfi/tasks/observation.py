@@ -236,13 +236,20 @@ def as_given(task: Task, observation: Any) -> Any:
         return [as_given(task, one) if len(np.shape(one)) > 1 else one for one in observation]
     if observation is None or task.on_host:
         return observation
-    if trials and all(np.shape(one) in ((), (1,)) for one in observation):  # records of one channel
+    if trials and all(_is_single(one) for one in observation):  # records of one channel
         observation = _numbers(observation)
     length, *channel = simulator_shapes(task).trajectory
     if hasattr(observation, "shape") and tuple(observation.shape) == ((length,) if channel == [1] else (length, 1)):
         array = _numbers(observation) if is_concrete(observation) else observation
         return array.reshape(length, *channel) if channel in ([], [1]) else observation
     return observation
+
+
+def _is_single(record: Any) -> bool:
+    """Whether a record is one number, or a list of one."""
+    while isinstance(record, list | tuple) and len(record) == 1:
+        record = record[0]
+    return not isinstance(record, list | tuple) and np.shape(record) in ((), (1,))
 
 
 def _of_frame(frame: Any, columns: "Columns") -> np.ndarray:

@@ -50,6 +50,7 @@ ELSEWHERE = {
     "jaxlfi r2s2r": "an hour: run by tests/envs/whip",
     "jaxlfi infer my_task": "the reader's own task",
     "jaxlfi resume runs/arm": "the reader's own task",
+    "jaxlfi resume runs/lynx": "more rounds: run by tests/runs/test_resume.py",
     "jaxlfi infer examples.command.spring:task": "needs a C compiler: run by tests/tasks/test_command.py",
     "jaxlfi grid lotka_volterra --seeds 100": "needs several hosts: run by tests/runs/test_several_processes.py",
     "srun": "needs Slurm",

@@ -17,7 +17,7 @@ from tests.fuzzing.running import HERE, fuzz, prepared_folder
 from tests.fuzzing.words import RIGHT, flags_of
 from tests.small import whole_runs  # noqa: F401 - a fixture
 
-CASES = 120
+CASES = 250
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,7 @@ from jaxlfi import infer
 from jaxlfi.cli import domains as words_of
 from jaxlfi.cli import evaluate as evaluating
 from jaxlfi.cli import train as command
+from jaxlfi.cli.tables import Output
 from jaxlfi.distributions.support import Support
 from jaxlfi.io import files
 from jaxlfi.io.workfolder import StoreError
@@ -244,7 +245,7 @@ def test_a_return_is_shown_where_an_episode_has_ended(finished, monkeypatch, val
         return result
 
     monkeypatch.setattr(training, "resumed", resumed)
-    command.run(out, LINE, Console(quiet=True), figures=False)
+    command.run(out, LINE, Output(*[Console(quiet=True)] * 3), figures=False)
     assert shown == [expected] and not recwarn.list
 
 
