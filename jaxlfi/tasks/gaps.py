@@ -42,7 +42,8 @@ def with_gaps(task: Task, missing: Any, keep_places: bool = False) -> Task:
 
     `jaxlfi.infer` makes it of an observation with NaN. The summary "identity" is then of the numbers that are there,
     "series" is computed from the records and pairs of records that are there, and a summary of one's own sees NaN in
-    the same places of the observation and of all simulations.
+    the same places of the observation and of all simulations. A traced observation cannot be looked at: under `vmap` or
+    `jit`, pass a task made by this function.
 
     Args:
         task: of a whole recording.

@@ -107,7 +107,7 @@ def together(trials: Sequence[Any], length: int | None = None) -> np.ndarray:
         length: what trials of different lengths are filled up to, T; that of the longest by default.
 
     Raises:
-        ValueError: for none, or records of different shapes.
+        ValueError: for none, records of different shapes, or a trial that is too long.
     """
     arrays = [np.array(trial) for trial in trials]
     shapes = sorted({array.shape for array in arrays})
@@ -115,7 +115,10 @@ def together(trials: Sequence[Any], length: int | None = None) -> np.ndarray:
         raise ValueError(f"observation: expected trials of one shape [T, ...], got {[list(shape) for shape in shapes]}")
     if len(shapes) == 1:
         return np.concatenate(arrays)
-    length = max(map(len, arrays)) if length is None else length
+    longest = max(map(len, arrays))
+    length = longest if length is None else length
+    if longest > length:
+        raise ValueError(f"observation: expected trials of at most {length} records each, got one of {longest}")
     filled = np.full((len(arrays), length, *arrays[0].shape[1:]), np.nan)
     for place, array in zip(filled, arrays, strict=True):
         place[: len(array)] = array

@@ -96,6 +96,10 @@ def test_a_host_simulator_makes_all_trials_in_one_call():
             lambda: repeated(gaussian(), 2, "median"),
             r"pooling: expected one of \['all', 'mean', 'moments'\], got 'median'",
         ),
+        (
+            lambda: together([np.zeros((3, 2)), np.zeros((5, 2))], 4),
+            "observation: expected trials of at most 4 records each, got one of 5",
+        ),
         (lambda: TASKS.load(f"{TASK},trials=two"), "trials: expected a value of type int, got 'two'"),
         (
             lambda: together([np.zeros((3, 2)), np.zeros((3, 1))]),
