@@ -25,6 +25,8 @@ CHANNELS = 4
 EDGE = "A support that can grow: `--heuristic edge`, or `heuristic=jaxlfi.Edge()`."
 LOOK = "Look at the misfit: `jaxlfi report FOLDER` draws simulations of the posterior beside the observation."
 DIAGNOSE = "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER`."
+DIAGNOSE_OWN = f"{DIAGNOSE[:-2]} --task MODULE:TASK`, where TASK is the task's name in the file MODULE.py."
+"""Of a task made in Python, which the command line has to be told of."""
 
 
 def account(run: "Run", found: RunSummary) -> RunSummary:
@@ -38,7 +40,11 @@ def account(run: "Run", found: RunSummary) -> RunSummary:
     settled, more = _settled(run)
     steps = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more + list(found.next_steps)
     sentences = (*found.sentences, strange, fit, _failures(run), settled)
-    return RunSummary(found.parameters, tuple(filter(None, sentences)), tuple(steps) or (DIAGNOSE,))
+    return RunSummary(found.parameters, tuple(filter(None, sentences)), tuple(steps) or (_diagnose(run),))
+
+
+def _diagnose(run: "Run") -> str:
+    return DIAGNOSE_OWN if run.origin.reference is None else DIAGNOSE
 
 
 def _held_back(run: "Run", found: RunSummary) -> bool:

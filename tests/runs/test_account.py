@@ -1,5 +1,7 @@
 """What a run says of itself: each sentence on a run for which it must be said, and on one for which it must not."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import jaxlfi
 from jaxlfi.diagnostics.predictive import FAR, Residual, residuals
 from jaxlfi.io.run_summary import ParameterSummary, RunSummary
-from jaxlfi.runs.account import DIAGNOSE, EDGE, LOOK, account, fit_sentence
+from jaxlfi.runs.account import DIAGNOSE, DIAGNOSE_OWN, EDGE, LOOK, account, fit_sentence
 from jaxlfi.tasks.failures import FailureLog, Message
 from tests.small import settings, whole_runs  # noqa: F401
 
@@ -66,7 +68,7 @@ def test_a_model_that_fits_is_said_to_do_so(run):
     found = told(run, final_trajectory=around(run), **STILL)
     (sentence,) = [one for one in found.sentences if one.startswith("Simulations of the posterior fit")]
     assert "times their scatter in" in sentence and all(channel in sentence for channel in CHANNELS)
-    assert found.next_steps == (DIAGNOSE,)
+    assert found.next_steps == (DIAGNOSE_OWN,)
 
 
 def test_a_channel_that_the_model_misses_is_named(run):
@@ -175,7 +177,9 @@ def test_what_to_do_next_follows_from_what_was_found(run):
     assert account(fixed.replace(heuristic=jaxlfi.Edge()), leaning).next_steps == ("A wider Phi: ...",)
     at_phi = fixed.replace(feasible=run.belief.support)
     assert EDGE not in account(at_phi, leaning).next_steps
-    assert account(fixed, RunSummary(parameters(), ())).next_steps == (DIAGNOSE,)
+    assert account(fixed, RunSummary(parameters(), ())).next_steps == (DIAGNOSE_OWN,)
+    by_name = fixed.replace(origin=dataclasses.replace(fixed.origin, reference="lotka_volterra"))
+    assert account(by_name, RunSummary(parameters(), ())).next_steps == (DIAGNOSE,)
 
 
 def test_a_run_shows_a_few_lines_and_a_table(run):

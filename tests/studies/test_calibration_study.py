@@ -372,7 +372,7 @@ def test_folders_that_cannot_be_diagnosed(kind, folder, tmp_path, capsys):
         "grid": ({"format": formats.GRID}, "got a grid's"),
         "changed": ({"parameters": ["other", "second"]}, "expected the task as it was when the run was made"),
         "older": ({"version": 1}, "expected jaxlfi-run of version 4, got version 1, which jaxlfi"),
-        "made in Python": ({"task": None}, "--task module:factory names it"),
+        "made in Python": ({"task": None}, "give --task MODULE:TASK"),
     }[kind]
     copy = tmp_path / "one"
     shutil.copytree(folder, copy)

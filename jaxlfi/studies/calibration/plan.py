@@ -125,8 +125,8 @@ def read_run(folder: Path, task: Task | None = None) -> Run:
             ) from error
     if run.task is None:
         raise StoreError(
-            f"{folder}: expected a run whose task can be found by name, got one made in Python: --task module:factory "
-            "names it"
+            f"{folder}: expected a run whose task can be found by name, got one made in Python: give --task "
+            "MODULE:TASK, where TASK is its name, or that of what makes it, in the file MODULE.py of the current folder"
         )
     if run.origin.given_simulations and not run.amortised:
         raise StoreError(
