@@ -13,20 +13,24 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.distributions.belief import Belief
-from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.distributions.decomposition import svd
+from jaxlfi.distributions.mixture import GaussianMixture, lower_factor
 from jaxlfi.distributions.region import region
 from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.priors import prior_mass
 from jaxlfi.tasks.task import Task
 
 COMPONENT_POINTS = 64
-"""Points of each component, at least, that its mass in a support and its weighted moments are taken over."""
+"""Points of each component, at least, that its mass in a support and the pool's slope are taken over."""
 HIGHEST = 4.0
-"""Highest weight of a point, in geometric means of the weights under q: where the pool is thinner, q is hardly known.
+"""Highest mass of a component's quotient, in geometric means of all: where the pool is thinner, q is hardly known.
 
-Without it a stray component where hardly anything was proposed counts fiftyfold, in runs that have not settled. Weights
-of posteriors that are known are within it.
+Without it a stray component where hardly anything was proposed counts fiftyfold, in runs that have not settled.
 """
+WIDEST = 1.5
+"""How many times as wide as the component a quotient may be; it is 1.15 where rounds propose twice the width found."""
+FARTHEST = 1.0
+"""How far a component may move, in its standard deviations."""
 
 
 def log_pool(
@@ -83,10 +87,9 @@ def without_pool(
     defensive: Float[Array, ""] | float,
     support: Support,
 ) -> tuple[GaussianMixture, Float[Array, ""]]:
-    """The mixture q / p_pool: each component of q times 1 / p_pool, by its mass, mean and covariance.
+    """The mixture q / p_pool: each component of q divided by the Gaussian that the pool is to it.
 
-    Weights are truncated at `HIGHEST`. Outside the support, where nothing was proposed, the weight is that of the
-    nearest point in it.
+    Outside the support, where nothing was proposed, the pool is what it is at the nearest point inside.
 
     Args:
         task: for its prior.
@@ -97,29 +100,57 @@ def without_pool(
         support: that the last round proposed in.
 
     Returns:
-        The mixture, of as many components, and the effective share of q's draws under the weights.
+        The mixture, of as many components, and the effective share of q's draws under the weights 1 / p_pool.
     """
-    theta, share = (leaf.reshape(len(q.logits), -1, *leaf.shape[1:]) for leaf in _points(q))
-    log_weight = -log_pool(task, proposals, round, defensive, support.clip(theta.reshape(-1, theta.shape[-1])))
-    log_weight = log_weight.reshape(share.shape)
-    known = jnp.isfinite(log_weight) & (share > 0)
-    typical = jnp.sum(share * log_weight, where=known) / jnp.maximum(jnp.sum(share, where=known), 1e-30)
-    weight = jnp.where(known, jnp.minimum(jnp.exp(log_weight - typical), HIGHEST), 0.0)
-    total = jnp.sum(weight, axis=1)
-    relative = weight / jnp.where(total > 0, total, 1.0)[:, None]
-    means = jnp.einsum("kn,kni->ki", relative, theta)
-    offset = theta - means[:, None]
-    covariance = jnp.einsum("kn,kni,knj->kij", relative, offset, offset)
-    scale_tril = jnp.linalg.cholesky(covariance)
-    sound = (total > 0) & jnp.all(jnp.isfinite(scale_tril), axis=(1, 2))
-    mixture = GaussianMixture(
-        logits=jnp.where(sound, jnp.log(q.weights) + jnp.log(jnp.where(total > 0, total, 1.0)), -jnp.inf),
-        means=jnp.where(sound[:, None], means, q.means),
-        scale_tril=jnp.where(sound[:, None, None], scale_tril, q.scale_tril),
-    )
-    mixture = jax.tree.map(lambda new, old: jnp.where(jnp.any(sound), new, old), mixture, q)
-    effective = jnp.sum(share * weight) ** 2 / jnp.sum(share * weight**2)
+    points, share = (leaf.reshape(len(q.logits), -1, *leaf.shape[1:]) for leaf in _points(q))
+    pool = lambda theta: log_pool(task, proposals, round, defensive, support.clip(theta))
+    log_p, slopes = jax.vjp(pool, points.reshape(-1, points.shape[-1]))
+    (slope,) = slopes(jnp.ones_like(log_p))
+    log_p, slope = log_p.reshape(share.shape), slope.reshape(points.shape)
+    sound = (q.weights > 0) & jnp.all(jnp.isfinite(log_p) & jnp.all(jnp.isfinite(slope), axis=-1), axis=1)
+    log_p, slope = jnp.where(sound[:, None], log_p, 0.0), jnp.where(sound[:, None, None], slope, 0.0)
+
+    log_mass, means, scale_tril = jax.vmap(_quotient)(q.means, q.scale_tril, log_p, slope)
+    weights = jnp.where(sound, q.weights, 0.0)
+    typical = jnp.sum(weights * log_mass) / jnp.maximum(jnp.sum(weights), 1e-30)
+    log_mass = jnp.minimum(log_mass - typical, jnp.log(HIGHEST))
+    found = GaussianMixture(jnp.where(sound, jnp.log(q.weights) + log_mass, -jnp.inf), means, scale_tril)
+    mixture = jax.tree.map(lambda new, old: jnp.where(jnp.any(sound), new, old), found, q)
+    share = jnp.where(sound[:, None], share, 0.0)
+    weight = share * jnp.exp(jnp.min(log_p, where=sound[:, None], initial=jnp.inf) - log_p)
+    effective = jnp.sum(weight) ** 2 / jnp.maximum(jnp.sum(weight * weight / jnp.maximum(share, 1e-30)), 1e-30)
     return mixture, jnp.where(jnp.any(sound), effective, 0.0)
+
+
+def _quotient(
+    mean: Float[Array, " dim"], factor: Float[Array, "dim dim"], log_p: Float[Array, " n"], slope: Float[Array, "n dim"]
+) -> tuple[Float[Array, ""], Float[Array, " dim"], Float[Array, "dim dim"]]:
+    """N(mean, L L') / p, as mass times Gaussian: its log-mass, mean and factor.
+
+    With theta = mean + L z, log p is a + g'z + z'Hz / 2: g and H are the means of its gradient and Hessian under the
+    Gaussian, and the latter is that of z times the gradient (Stein's lemma). The quotient has precision I + H in z.
+    Weights of points, as in importance sampling, would not do: what wide proposals have cut off is in the tails, where
+    there are no points, the more so the more parameters there are.
+
+    Args:
+        mean: of the component.
+        factor: L.
+        log_p: at the component's points.
+        slope: its gradient there.
+    """
+    normal = _normal_points(len(mean))
+    along = slope @ factor
+    g, hessian = jnp.mean(along, axis=0), normal.T @ along / len(normal)
+    hessian = 0.5 * (hessian + hessian.T)
+    # Eigenvalues of either sign, as singular values of what is moved to be positive.
+    shift = 1.0 + jnp.linalg.norm(hessian)
+    axes, values, _ = svd(hessian + shift * jnp.eye(len(mean)))
+    precision = jnp.clip(1.0 + values - shift, 1 / WIDEST**2, WIDEST**2)
+    moved = -(axes.T @ g) / precision
+    moved = moved * jnp.minimum(1.0, FARTHEST / jnp.maximum(jnp.linalg.norm(moved), 1e-30))
+    log_mass = -0.5 * (axes.T @ g) @ moved - 0.5 * jnp.sum(jnp.log(precision)) - jnp.mean(log_p)
+    log_mass = log_mass + 0.5 * jnp.trace(hessian)
+    return log_mass, mean + factor @ (axes @ moved), lower_factor(factor @ (axes / jnp.sqrt(precision)))
 
 
 def _points(mixture: GaussianMixture) -> tuple[Float[Array, "n dim"], Float[Array, " n"]]:

@@ -15,6 +15,8 @@ from jaxtyping import Array, Float, Int
 if TYPE_CHECKING:
     import distrax
 
+FARTHEST = 2.0
+"""How far a component moves where a mixture is made wider about its mean, in its standard deviations."""
 HALVINGS = 40
 """Bisections that find a quantile: 2^-40 of the interval it is known to lie in is below the spacing of float32."""
 
@@ -193,12 +195,18 @@ class GaussianMixture(struct.PyTreeNode):
     def inflated(self, factor: Float[Array, ""] | float) -> "GaussianMixture":
         """The mixture of mean + factor * (theta - mean): `factor` times as wide about the same mean.
 
+        But a component moves away from the mean by at most `FARTHEST` of its standard deviations: those of one peak are
+        spread with it, and peaks far from each other stay where they are.
+
         Example:
             >>> one = GaussianMixture(jnp.zeros(1), jnp.array([[3.0]]), jnp.array([[[0.5]]]))
             >>> float(one.inflated(2.0).scale_tril[0, 0, 0])
             1.0
         """
-        return self.affine(jnp.full_like(self.mean, factor), (1 - factor) * self.mean)
+        moved = (factor - 1) * (self.means - self.mean[..., None, :])
+        distance = jnp.linalg.norm(solve_triangular(self.scale_tril, moved[..., None], lower=True), axis=(-2, -1))
+        moved = moved * (FARTHEST / jnp.maximum(distance, FARTHEST))[..., None]
+        return self.replace(means=self.means + moved, scale_tril=factor * self.scale_tril)
 
     def prune(self, least: Float[Array, ""] | float) -> "GaussianMixture":
         """The mixture without its components of less weight than `least` (logit -inf); the heaviest always stays."""

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 import jaxlfi
-from jaxlfi.bayessim.pooled import HIGHEST, log_pool, without_pool
+from jaxlfi.bayessim.pooled import FARTHEST, HIGHEST, log_pool, without_pool
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
@@ -18,19 +18,20 @@ BOX = Support(LOW, HIGH)
 MEAN, FACTOR = np.array([0.8, 1.5]), np.array([[0.5, 0.0], [0.3, 0.4]])
 
 
-def task_of(prior=None):
-    return jaxlfi.Task(lambda key, theta: theta, names=("a", "b"), supports={"box": BOX}, feasible=BOX, prior=prior)
+def task_of(prior=None, box=BOX):
+    names = tuple("abcdef"[: box.dim])
+    return jaxlfi.Task(lambda key, theta: theta, names=names, supports={"box": box}, feasible=box, prior=prior)
 
 
 def gaussian(mean=MEAN, factor=FACTOR):
     return GaussianMixture(jnp.zeros(1), jnp.asarray(mean, jnp.float32)[None], jnp.asarray(factor, jnp.float32)[None])
 
 
-def proposals(*informed):
+def proposals(*informed, box=BOX):
     """Of one uninformed round over the box, and of rounds that drew from the Gaussians given."""
-    flat = gaussian(np.zeros(2), np.eye(2))
-    beliefs = [Belief(flat, BOX, jnp.asarray(False))]
-    beliefs += [Belief(mixture, BOX, jnp.asarray(True)) for mixture in informed]
+    flat = gaussian(np.zeros(box.dim), np.eye(box.dim))
+    beliefs = [Belief(flat, box, jnp.asarray(False))]
+    beliefs += [Belief(mixture, box, jnp.asarray(True)) for mixture in informed]
     return jax.tree.map(
         lambda *leaves: jnp.stack([jnp.asarray(leaf, jnp.asarray(leaf).dtype) for leaf in leaves]), *beliefs
     )
@@ -48,39 +49,43 @@ def test_the_pool_is_the_mixture_of_the_rounds():
     assert np.isneginf(log_pool(task_of(), proposals(wide), 1, 0.0, jnp.array([[5.0, 0.0]])))
 
 
+@pytest.mark.parametrize("dim", [2, 6])
 @pytest.mark.parametrize("inflation", [1.5, 2.0, 3.0])
-def test_what_a_gaussian_lost_by_wide_proposals_it_gets_back(inflation):
-    """q has the precision of the posterior and of the proposals; nearly all rounds proposed the same."""
-    exact = FACTOR @ FACTOR.T
+def test_what_a_gaussian_lost_by_wide_proposals_it_gets_back(inflation, dim):
+    """q has the precision of the posterior and of the proposals; nearly all rounds proposed the same.
+
+    By importance weights of q's own draws, truncated at four geometric means, variances in six dimensions are a fifth
+    too small.
+    """
+    mean, factor = np.resize(MEAN, dim), np.kron(np.eye(dim // 2), FACTOR)
+    box = Support(np.resize(LOW, dim), np.resize(HIGH, dim))
+    exact = factor @ factor.T
     proposed = inflation**2 * exact
     learnt = np.linalg.inv(np.linalg.inv(exact) + np.linalg.inv(proposed))
-    wide = gaussian(factor=inflation * FACTOR)
-    q = gaussian(factor=np.linalg.cholesky(learnt))
-    found, effective = without_pool(task_of(), q, proposals(*[wide] * 40), 40, 0.0, BOX)
-    np.testing.assert_allclose(found.covariance, exact, rtol=0.15, atol=0.01)
-    np.testing.assert_allclose(found.mean, MEAN, atol=0.05)
-    assert 0.4 < effective < 1
+    rounds = proposals(*[gaussian(mean, inflation * factor)] * 40, box=box)
+    q = gaussian(mean, np.linalg.cholesky(learnt))
+    found, effective = without_pool(task_of(box=box), q, rounds, 40, 0.0, box)
+    np.testing.assert_allclose(found.covariance, exact, rtol=0.06, atol=0.006)
+    np.testing.assert_allclose(found.mean, mean, atol=0.02)
+    assert 0.05 < effective < 1
 
 
 def test_each_component_is_moved_by_the_slope_of_the_pool():
     """Against importance resampling of q in NumPy, with two unlike components and a pool that leans to one side."""
     q = GaussianMixture(
         jnp.log(jnp.array([0.7, 0.3])),
-        jnp.array([[0.5, 1.0], [-1.0, 2.0]]),
+        jnp.array([[0.5, 1.0], [-0.3, 1.5]]),
         jnp.array([[[0.4, 0.0], [0.1, 0.3]], [[0.3, 0.0], [0.0, 0.5]]]),
     )
     leaning = gaussian(np.array([1.5, 0.5]), 1.2 * np.eye(2))
     pool = proposals(leaning, leaning, leaning)
     found, _ = without_pool(task_of(), q, pool, 3, 0.0, BOX)
-    draws = np.asarray(q.sample(jax.random.key(3), 100_000))
-    density = 1 / 64 + 3 * stats.multivariate_normal([1.5, 0.5], 1.44 * np.eye(2)).pdf(draws) / 0.92
-    weight = 1 / density
-    assert np.mean(weight > HIGHEST * stats.gmean(weight)) > 0.01
-    weight = np.minimum(weight, HIGHEST * stats.gmean(weight))
+    draws = np.asarray(q.sample(jax.random.key(3), 200_000))
+    weight = 1 / (1 / 64 + 3 * stats.multivariate_normal([1.5, 0.5], 1.44 * np.eye(2)).pdf(draws) / 0.92)
     weight /= weight.sum()
     mean = weight @ draws
-    np.testing.assert_allclose(found.mean, mean, atol=0.06)
-    np.testing.assert_allclose(found.covariance, (draws - mean).T @ ((draws - mean) * weight[:, None]), atol=0.06)
+    np.testing.assert_allclose(found.mean, mean, atol=0.02)
+    np.testing.assert_allclose(found.covariance, (draws - mean).T @ ((draws - mean) * weight[:, None]), atol=0.02)
     assert np.asarray(found.mean)[0] < np.asarray(q.mean)[0] - 0.1  # away from where most was proposed
 
 
@@ -89,8 +94,8 @@ def test_a_stray_component_where_nothing_was_proposed_stays_light():
     near, far = gaussian(), gaussian(MEAN - [3.5, 0.0])
     q = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), near, far).replace(logits=jnp.log(jnp.array([0.98, 0.02])))
     found, _ = without_pool(task_of(), q, proposals(*[gaussian(factor=2 * FACTOR)] * 9), 9, 0.0, BOX)
-    assert float(found.weights[1]) < HIGHEST * 0.02
-    np.testing.assert_allclose(found.means[1], far.means[0], atol=0.1)
+    assert float(found.weights[1]) < 1.1 * HIGHEST * 0.02
+    assert np.linalg.norm(found.means[1] - far.means[0]) < FARTHEST * 0.6
 
 
 def test_a_constant_pool_changes_nothing():

@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.optimize import brentq
 from scipy.special import logsumexp, ndtr
 
-from jaxlfi.distributions.mixture import GaussianMixture, component_log_prob, systematic
+from jaxlfi.distributions.mixture import FARTHEST, GaussianMixture, component_log_prob, systematic
 from tests.strategies import floats, keys, mixtures, shapes, vectors
 
 N = 20_000
@@ -88,10 +88,12 @@ def test_distrax_gives_the_same_densities_and_draws(drawn, key):
     np.testing.assert_allclose(ours, theirs.sample(seed=key, sample_shape=50), rtol=1e-4, atol=1e-4)
 
 
-@given(shapes().flatmap(lambda kd: st.tuples(mixtures(*kd), vectors(-3.0, 3.0, kd[1]))), floats(0.5, 4.0))
+@given(shapes().flatmap(lambda kd: st.tuples(mixtures(*kd), vectors(-3.0, 3.0, kd[1]))), floats(1.0, 4.0))
 def test_inflated_is_the_density_of_points_moved_away_from_the_mean(drawn, factor):
     mixture, theta = drawn
-    wide, (mean, covariance) = INFLATED(mixture, factor), MOMENTS(mixture)
+    mean, covariance = MOMENTS(mixture)
+    factor = min(factor, 1 + 0.999 * FARTHEST / max(distances(mixture, mean).max(), 1e-6))  # so that all can move
+    wide = INFLATED(mixture, factor)
     wide_mean, wide_covariance = MOMENTS(wide)
     scale = np.abs(np.asarray(covariance)).max()
     np.testing.assert_allclose(wide_mean, mean, rtol=1e-4, atol=1e-4)
@@ -99,6 +101,22 @@ def test_inflated_is_the_density_of_points_moved_away_from_the_mean(drawn, facto
     mean = np.asarray(mean, np.float64)
     expected = reference_log_prob(mixture, theta) - len(mean) * np.log(factor)
     np.testing.assert_allclose(reference_log_prob(wide, mean + factor * (theta - mean)), expected, rtol=2e-3, atol=2e-2)
+
+
+@given(shapes().flatmap(lambda kd: mixtures(*kd)), floats(1.0, 4.0))
+def test_inflated_leaves_peaks_far_apart_where_they_are(mixture, factor):
+    wide, (mean, _) = INFLATED(mixture, factor), MOMENTS(mixture)
+    np.testing.assert_allclose(wide.scale_tril, factor * np.asarray(mixture.scale_tril), rtol=1e-6)
+    wanted = np.minimum((factor - 1) * distances(mixture, mean), FARTHEST)
+    moved = distances(mixture, mixture.means - (wide.means - mixture.means))
+    np.testing.assert_allclose(moved, wanted, rtol=2e-2, atol=2e-3)
+
+
+def distances(mixture, points):
+    """Of each component's mean from a point, or a point of its own, in its standard deviations."""
+    offset = np.asarray(mixture.means, np.float64) - np.asarray(points, np.float64)
+    whitened = np.linalg.solve(np.asarray(mixture.scale_tril, np.float64), offset[..., None])
+    return np.linalg.norm(whitened, axis=(-2, -1))
 
 
 @given(shapes().flatmap(lambda kd: mixtures(*kd)))
