@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxlfi.distributions.precision import single
+from jaxlfi.io import compile_cache
 
 KEPT = 64
 """Number of jitted functions that are kept, and number of their compiled versions for some shapes of arguments."""
@@ -82,6 +83,7 @@ def compiled(many: Any, arguments: tuple) -> Any:
         tuple((np.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves),
     )
     if signature not in _EXECUTABLES:
+        compile_cache.start()
         while len(_EXECUTABLES) >= KEPT:
             del _EXECUTABLES[next(iter(_EXECUTABLES))]
         _EXECUTABLES[signature] = many.lower(*arguments).compile()

@@ -11,6 +11,7 @@ import argparse
 import contextlib
 import dataclasses
 import math
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -446,13 +447,13 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
     Raises:
         ValueError: where the other processes cannot be joined.
     """
-    from jaxlfi.io import host_devices
+    from jaxlfi.io import compile_cache, host_devices
 
     if hasattr(arguments, "joined"):  # it was started already, for a class of another package
         return
-    if not getattr(arguments, "no_cache", True):
-        from jaxlfi.io import compile_cache
-
+    if getattr(arguments, "no_cache", True):
+        os.environ[compile_cache.SWITCH] = "0"
+    else:
         compile_cache.enable()
     arguments.joined = joined.join(arguments)
     runs, processes = _runs(arguments), arguments.joined.count

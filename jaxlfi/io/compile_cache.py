@@ -13,8 +13,13 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import warnings
 from pathlib import Path
 
+SWITCH = "JAXLFI_COMPILE_CACHE"
+"""Environment variable that turns the cache off where it is 0."""
+LEAST_SECONDS = 0.5
+"""Programs that compile in less are not kept."""
 FEATURE_LINES = ("model name", "flags", "Features", "CPU implementer", "CPU part")
 """Lines of /proc/cpuinfo that identify which machine code a processor runs, on x86 and on Arm."""
 
@@ -26,7 +31,7 @@ def enable() -> Path | None:
         The cache's folder, or None where it cannot be written and the cache stays off.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(LEAST_SECONDS))
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
     folder = default_folder()
@@ -36,6 +41,28 @@ def enable() -> Path | None:
         return None
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     return folder
+
+
+def start() -> None:
+    """Switch the cache on in a process whose jax has started, unless it has one of its own or `SWITCH` says no."""
+    import jax  # here, as the command line enables the cache before jax is there
+    from jax.experimental.compilation_cache import compilation_cache
+
+    # jax makes both at run time
+    given = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    enabled = jax.config.jax_enable_compilation_cache  # type: ignore[attr-defined]
+    if given is not None or not enabled or os.environ.get(SWITCH) == "0":
+        return
+    folder = default_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        warnings.warn(f"programs are not kept for the next process: {error}", stacklevel=2)
+        os.environ[SWITCH] = "0"  # it is said once
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_SECONDS)
+    compilation_cache.reset_cache()  # jax has looked for a folder once, and found none
 
 
 def default_folder() -> Path:

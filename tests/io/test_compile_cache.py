@@ -1,0 +1,82 @@
+"""The cache of compiled programs in Python: on by default, off by a switch, never in the way."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+from jaxlfi.bayessim import programs
+from jaxlfi.io import compile_cache
+
+SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch, tmp_path):
+    """A process without a cache, whose user's folder for caches is empty."""
+    before = {name: getattr(jax.config, name) for name in SETTINGS}
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    monkeypatch.delenv(compile_cache.SWITCH, raising=False)
+    monkeypatch.setattr(compile_cache, "LEAST_SECONDS", 0.0)
+    jax.config.update(SETTINGS[0], None)
+    compilation_cache.reset_cache()
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def kept(folder) -> set[str]:
+    """Programs of `compiled`, and not those of jax's own functions."""
+    return {path.name for path in folder.rglob("jit__lambda*-cache")}
+
+
+def compiled(number: float) -> float:
+    """By a program of its own for each number."""
+    return float(programs.compiled(jax.jit(lambda x: jnp.sin(x) * number), (jnp.ones(3),))(jnp.ones(3))[0])
+
+
+def test_programs_are_kept_and_found(tmp_path):
+    first = compiled(3.25)
+    there = kept(tmp_path)
+    assert len(there) == 1
+    jax.clear_caches()
+    assert compiled(3.25) == first and kept(tmp_path) == there
+    compiled(4.25)
+    assert kept(tmp_path) > there
+
+
+def test_a_folder_of_the_users_own_is_left_as_it_is(tmp_path):
+    jax.config.update(SETTINGS[0], str(tmp_path / "own"))
+    compile_cache.start()
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "own")
+
+
+@pytest.mark.parametrize("off", ["switch", "jax"])
+def test_it_can_be_turned_off(tmp_path, monkeypatch, off):
+    if off == "switch":
+        monkeypatch.setenv(compile_cache.SWITCH, "0")
+    jax.config.update("jax_enable_compilation_cache", off != "jax")
+    compile_cache.start()
+    jax.config.update("jax_enable_compilation_cache", True)
+    assert jax.config.jax_compilation_cache_dir is None and not kept(tmp_path)
+
+
+def test_without_a_folder_the_run_goes_on_and_says_so_once(tmp_path):
+    (tmp_path / "caches").write_text("in the way")
+    with pytest.warns(UserWarning, match="programs are not kept for the next process"):
+        assert compiled(5.25) == pytest.approx(5.25 * 0.8414710)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        compiled(6.25)
+
+
+def test_a_damaged_program_is_compiled_anew(tmp_path):
+    compiled(7.25)
+    for path in tmp_path.rglob("jit_*-cache"):
+        path.write_bytes(path.read_bytes()[:20])
+    jax.clear_caches()
+    with pytest.warns(UserWarning, match="Error reading persistent compilation cache entry"):
+        assert compiled(7.25) == pytest.approx(7.25 * 0.8414710)
