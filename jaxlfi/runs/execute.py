@@ -30,7 +30,8 @@ from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import EXTENDED, Checkpoint
-from jaxlfi.runs.run import Origin, Run
+from jaxlfi.runs.result import Origin
+from jaxlfi.runs.run import Run
 from jaxlfi.tasks import failures, priors
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.failures import FailureLog, Message

@@ -14,7 +14,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -28,12 +28,10 @@ from jaxlfi.io import formats, provenance, run_summary, trees, workfolder
 from jaxlfi.io.formats import COMPARE, RUN, RUNS
 from jaxlfi.io.locks import locked
 from jaxlfi.io.workfolder import StoreError
-from jaxlfi.runs import describe
+from jaxlfi.runs import account, describe
+from jaxlfi.runs.result import Origin, Result
 from jaxlfi.tasks import failures, priors, summaries
 from jaxlfi.tasks.task import Task
-
-if TYPE_CHECKING:  # runs know how to save themselves
-    from jaxlfi.runs.run import Origin, Run
 
 OF_RUN = (
     "config.json", "ledger.jsonl", "posterior.npz", "dataset.npz", "history.npz", "observation.npz", "network.npz",
@@ -58,13 +56,13 @@ def append_ledger(folder: Path, index: int, row: Mapping[str, np.ndarray], reaso
     atomic.append_line(folder / "ledger.jsonl", line)
 
 
-def _task_of(run: "Run") -> Task:
+def _task_of(run: Result) -> Task:
     if run.task is None:
         raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
     return run.task
 
 
-def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
+def write_run(folder: Path, run: Result, keep_network: bool = False) -> None:
     """Write the arrays of one finished run into its folder, which exists and has its ledger.
 
     Args:
@@ -90,7 +88,7 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
         },
         durable=True,
     )
-    atomic.write_json(folder / run_summary.NAME, run.summary(draws).to_dict())
+    atomic.write_json(folder / run_summary.NAME, account.summary(run, draws).to_dict())
     dataset = jax.device_get(run.dataset)
     rows = slice(int(dataset.size))
     columns = {name: getattr(dataset, name)[rows] for name in ("theta", "x", "round", "weight")}
@@ -118,7 +116,7 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
         atomic.write_arrays(folder / "network.npz", trees.named_leaves(run.network), durable=True)
 
 
-def save(run: "Run", folder: Path, exist_ok: bool = False) -> Path:
+def save(run: Result, folder: Path, exist_ok: bool = False) -> Path:
     """Write one run into a folder, complete or not at all.
 
     Args:
@@ -176,7 +174,7 @@ def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     atomic.write_bytes(path, text.getvalue().encode(), durable=True)
 
 
-def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) -> dict[str, Any]:
+def run_config(task: Task, origin: Origin, spec: RunSpec, settings: Settings) -> dict[str, Any]:
     """The config.json of one run."""
     feasible = task.inference.feasible
     return {

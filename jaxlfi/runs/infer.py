@@ -36,7 +36,8 @@ from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import EXTENDED
 from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
-from jaxlfi.runs.run import Origin, Run
+from jaxlfi.runs.result import Origin
+from jaxlfi.runs.run import Run
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.failures import FailureLog
 from jaxlfi.tasks.observation import observe, trials_of, with_gaps_of

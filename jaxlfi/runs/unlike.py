@@ -1,19 +1,16 @@
 """In what the observation of a finished run is unlike its simulations."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxlfi.diagnostics.misspecification import RECORDS, Finding, unlike
+from jaxlfi.runs.result import Result
 from jaxlfi.tasks import summaries
 from jaxlfi.tasks.task import Task
 
-if TYPE_CHECKING:  # runs know their findings
-    from jaxlfi.runs.run import Run
 
-
-def observation_findings(run: "Run") -> list[Finding]:
+def observation_findings(run: Result) -> list[Finding]:
     """The findings of `jaxlfi.diagnostics.unlike` on the observation and all simulations of one run.
 
     Args:
@@ -25,14 +22,6 @@ def observation_findings(run: "Run") -> list[Finding]:
     if run.task is not None:
         names, channels = names_of(run.task, np.shape(run.observed), len(run.x))
     return unlike(np.asarray(run.x), np.asarray(run.dataset.x)[rows], names, channels)
-
-
-def observation_summary(runs: Sequence["Run"]) -> list[str]:
-    """The warnings of several runs of a configuration: what the first of them finds, and how many find something."""
-    found = [texts for run in runs if (texts := run.misspecification)]
-    if not found or len(runs) == 1:
-        return [text for texts in found for text in texts]
-    return [f"{found[0][0]} (in {len(found)} of {len(runs)} runs, this is the first)"]
 
 
 def names_of(task: Task, trajectory: Sequence[int], size: int) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -33,7 +33,7 @@ from jaxlfi.io.workfolder import StoreError
 from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as run_store
-from jaxlfi.runs.run import Origin
+from jaxlfi.runs.result import Origin
 from jaxlfi.studies.chunk_store import ChunkStore
 from jaxlfi.studies.grid.chunks import MEASURES, Work, arranged, prepare, run_chunk
 from jaxlfi.studies.grid.grid import Axis, Grid, combinations, hyperparameters, observations
