@@ -118,14 +118,7 @@ def npe(settings: Settings) -> Settings:
     )
 
 
-LIKELIHOOD = MixtureLikelihood(
-    hidden=(50, 50),
-    components=2,
-    epochs=0,
-    steps=1000,
-    learning_rate=1e-3,
-    **ENSEMBLE,
-)
+LIKELIHOOD = MixtureLikelihood(hidden=(50, 50), components=2, epochs=0, steps=1000, learning_rate=1e-3, **ENSEMBLE)
 """Four networks of two Gaussians over the summaries; hardly tuned."""
 
 

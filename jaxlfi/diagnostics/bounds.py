@@ -191,11 +191,7 @@ def _usual(degrees: int, z: float) -> float:
 
 
 def bound_warnings(
-    space: Space,
-    units: Sequence[str] | None,
-    evidence: Sequence[BoundEvidence],
-    feasible: Support,
-    grows: bool = False,
+    space: Space, units: Sequence[str] | None, evidence: Sequence[BoundEvidence], feasible: Support, grows: bool = False
 ) -> list[str]:
     """Say in words which bounds of a support look wrong, and what to do.
 

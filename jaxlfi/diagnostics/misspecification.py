@@ -86,10 +86,7 @@ class _Column:
 
 
 def unlike(
-    x: ArrayLike,
-    simulations: ArrayLike,
-    names: Sequence[str] | None = None,
-    channels: Sequence[str] = (),
+    x: ArrayLike, simulations: ArrayLike, names: Sequence[str] | None = None, channels: Sequence[str] = ()
 ) -> list[Finding]:
     """Find how an observation is unlike all simulations; nothing if the model could have produced it.
 

@@ -444,16 +444,7 @@ def untrained(
         regression = unfitted(scale.dim, obs, estimator.record_size)
         log_weights = estimator.equal_weights
     normalisers = _normalisers(estimator, nothing, scale)
-    return Network(
-        estimator,
-        params,
-        *normalisers,
-        scale,
-        space,
-        prior,
-        regression=regression,
-        log_weights=log_weights,
-    )
+    return Network(estimator, params, *normalisers, scale, space, prior, regression=regression, log_weights=log_weights)
 
 
 def _normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tuple[Normaliser, Normaliser | None]:

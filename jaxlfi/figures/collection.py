@@ -125,11 +125,7 @@ def read_table(path: Path) -> tuple[Row, ...]:
             if missing := [name for name in columns if name not in (reader.fieldnames or ())]:
                 raise ValueError(f"expected the columns {', '.join(columns)}; missing {', '.join(missing)}")
             return tuple(
-                Row(
-                    line["configuration"],
-                    int(line["seed"]),
-                    *(float(line[name] or "nan") for name in MEASURES),
-                )
+                Row(line["configuration"], int(line["seed"]), *(float(line[name] or "nan") for name in MEASURES))
                 for line in reader
             )
     except (OSError, ValueError, TypeError) as error:

@@ -9,11 +9,7 @@ from jaxlfi.figures.collection import Runs, seed_count
 from jaxlfi.figures.legends import of_configurations
 from jaxlfi.figures.style import iterations_axis, looks
 
-PANELS = {
-    "attempted": "simulations",
-    "success_rate": "success rate [%]",
-    "cumulative": "cumulative failures",
-}
+PANELS = {"attempted": "simulations", "success_rate": "success rate [%]", "cumulative": "cumulative failures"}
 
 
 def quantities(runs: Runs, configuration: str) -> dict[str, np.ndarray]:

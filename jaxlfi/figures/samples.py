@@ -226,13 +226,7 @@ def _draw_path(axes: Axes, history: History, pair: tuple[int, ...]) -> None:
         path = history.weighted_means[:, list(pair)]
     path = path[np.isfinite(path).all(-1)]
     axes.plot(
-        *path.T,
-        "o",
-        color="black",
-        markersize=1.6,
-        markeredgecolor="white",
-        markeredgewidth=0.3,
-        gid="weighted mean",
+        *path.T, "o", color="black", markersize=1.6, markeredgecolor="white", markeredgewidth=0.3, gid="weighted mean"
     )
     for start, end in itertools.pairwise(path):
         if np.array_equal(start, end):

@@ -73,10 +73,4 @@ def draw_strips(axes: Axes, values: Mapping[str, np.ndarray]) -> None:
     axes.grid(True, axis="y")
 
 
-_MEAN = {
-    "marker": "D",
-    "markersize": 3.6,
-    "color": "white",
-    "markeredgecolor": "black",
-    "markeredgewidth": 0.8,
-}
+_MEAN = {"marker": "D", "markersize": 3.6, "color": "white", "markeredgecolor": "black", "markeredgewidth": 0.8}

@@ -175,10 +175,7 @@ def looks(configurations: Sequence[str]) -> dict[str, Look]:
             colour, (marker, line) = HEURISTIC_COLOURS[heuristic], _MARKERS[heuristic]
             colour = shade(colour, amount) if amount else colour
         else:
-            colour, marker = (
-                OTHER_COLOURS[spare % len(OTHER_COLOURS)],
-                _OTHER_MARKERS[spare % len(_OTHER_MARKERS)],
-            )
+            colour, marker = OTHER_COLOURS[spare % len(OTHER_COLOURS)], _OTHER_MARKERS[spare % len(_OTHER_MARKERS)]
             line, spare = "-", spare + 1
         result[name] = Look(configuration_label(name), colour, marker, line)
     return result

@@ -13,14 +13,7 @@ from jaxlfi.figures.collection import Runs, seed_count
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import above, balanced
 from jaxlfi.figures.natural import scales
-from jaxlfi.figures.style import (
-    TRUTH_LINE,
-    Look,
-    grid_shape,
-    iterations_axis,
-    looks,
-    parameter_name,
-)
+from jaxlfi.figures.style import TRUTH_LINE, Look, grid_shape, iterations_axis, looks, parameter_name
 
 _LIMIT = {"color": "#777777", "linestyle": (0, (1, 1.5)), "linewidth": 0.9}
 

@@ -47,28 +47,16 @@ def description(work: Work) -> dict[str, Any]:
     run = run_store.run_config(grid.task, origin, spec, grid.settings)
     left_out = ("configuration", "seed", "versions", "platform", "command_line", "started")
     defaults = hyperparameters(grid.rule)
+    truth = np.asarray(np.nan if grid.task.truth is None else grid.task.truth, np.float32)
     return {name: value for name, value in run.items() if name not in left_out} | {
         "format": GRID,
         "axes": [
-            {
-                "name": axis.name,
-                "values": list(axis.values),
-                "default": serialise.plain_value(defaults[axis.name]),
-            }
+            {"name": axis.name, "values": list(axis.values), "default": serialise.plain_value(defaults[axis.name])}
             for axis in grid.axes
         ],
         "seeds": list(grid.seeds),
         "runs_per_chunk": work.length,
-        "observation": _digest(
-            *(
-                np.ascontiguousarray(a)
-                for a in (
-                    work.observed,
-                    work.x,
-                    np.asarray(np.nan if grid.task.truth is None else grid.task.truth, np.float32),
-                )
-            )
-        ),
+        "observation": _digest(*map(np.ascontiguousarray, (work.observed, work.x, truth))),
     }
 
 
@@ -85,11 +73,7 @@ def _digest(*parts) -> str:
 
 
 def begin(
-    folder: Path,
-    grid: Grid,
-    observation: Any = None,
-    runs_per_chunk: int | None = None,
-    processes: Processes = ALONE,
+    folder: Path, grid: Grid, observation: Any = None, runs_per_chunk: int | None = None, processes: Processes = ALONE
 ) -> Work:
     """Check all there is to check, compile, then bring the folder into being; nothing is written before.
 

@@ -153,11 +153,7 @@ def grid_runs(grid: Grid) -> list[RunSpec]:
     named = zip(combinations(grid.axes), heuristics(grid.rule, grid.axes), strict=True)
     return [
         RunSpec(
-            " ".join(f"{name}={value:g}" for name, value in values.items()),
-            grid.support_name,
-            grid.support,
-            rule,
-            seed,
+            " ".join(f"{name}={value:g}" for name, value in values.items()), grid.support_name, grid.support, rule, seed
         )
         for values, rule in named
         for seed in grid.seeds
