@@ -77,11 +77,7 @@ def _imported(foreign: Mapping[Classes, Sequence[str]]) -> Families:
 
 
 def parser(families: Families | None = None) -> argparse.ArgumentParser:
-    """The whole command line.
-
-    Args:
-        families: classes whose fields have flags; by default all that are installed.
-    """
+    """The whole command line, with flags for the fields of classes: by default of all that are installed."""
     families = families or Families()
     top = OneLineParser(
         prog="jaxlfi",

@@ -55,12 +55,7 @@ class Output:
 
 
 def show(table: Table, on: Console | None = None) -> None:
-    """Print a table in whole words: where they do not fit side by side, one cell a line.
-
-    Args:
-        table: of texts, each with a heading.
-        on: where to; standard output by default.
-    """
+    """Print a table in whole words: where they do not fit side by side, one cell a line."""
     on = on or console()
     wide = on.options.update(width=10_000, max_width=10_000)
     sizes = [[Measurement.get(on, wide, cell) for cell in (column.header, *column.cells)] for column in table.columns]

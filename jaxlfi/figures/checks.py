@@ -78,12 +78,7 @@ def standardised(arrays: Arrays) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw(figure: Figure, arrays: Arrays) -> None:
-    """Left: each observed summary among the simulated ones. Right: their joint distance from the simulations' centre.
-
-    Args:
-        figure: empty.
-        arrays: of diagnostics.npz.
-    """
+    """Left: each observed summary among simulated ones. Right: their joint distance from the simulations' centre."""
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [2.2, 1.0]})
     simulated, observed = standardised(arrays)
     place = np.arange(1, len(observed) + 1)

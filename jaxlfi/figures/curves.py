@@ -38,13 +38,7 @@ def drawable(runs: Runs) -> bool:
 
 
 def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:
-    """A panel for the trajectory, if trajectories were simulated, and one per parameter, if the truth is known.
-
-    Args:
-        figure: empty.
-        runs: configurations with their seeds.
-        alpha: factor of the loss in exp(-alpha loss).
-    """
+    """Panels of exp(-alpha loss): of trajectories, if there are any, and of each parameter, if the truth is known."""
     look = looks(list(runs))
     first = next(iter(runs.values()))[0]
     trajectories = {name: trajectory_curve(runs, name, alpha) for name in runs}

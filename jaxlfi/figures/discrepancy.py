@@ -29,13 +29,7 @@ def final_errors(runs: Runs, configuration: str) -> tuple[np.ndarray, np.ndarray
 
 
 def draw_dots(axes: Axes, errors: dict[str, np.ndarray], look: dict[str, Look]) -> None:
-    """A dot for each seed of each configuration, and a line at their median.
-
-    Args:
-        axes: to draw on.
-        errors: by configuration, each [seeds]; NaN is left out.
-        look: of the configurations.
-    """
+    """A dot for each seed of each configuration, and a line at their median; NaN is left out."""
     for place, (name, own) in enumerate(look.items()):
         values = errors[name][np.isfinite(errors[name])]
         if not values.size:
@@ -85,12 +79,7 @@ def panels(runs: Runs) -> list[Panel]:
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """A panel for each parameter (on one scale where they have one unit) and one for the trajectory.
-
-    Args:
-        figure: empty.
-        runs: configurations with their seeds.
-    """
+    """A panel for each parameter (on one scale where they have one unit) and one for the trajectory."""
     look = looks(list(runs))
     shown = panels(runs)
     parameters = [place for place, panel in enumerate(shown) if panel.title != "trajectory"]

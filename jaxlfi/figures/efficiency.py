@@ -21,12 +21,7 @@ def quantities(runs: Runs, configuration: str) -> dict[str, np.ndarray]:
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Simulations, success rate and cumulative failures over iterations: means over seeds, and each seed.
-
-    Args:
-        figure: empty.
-        runs: configurations with their seeds.
-    """
+    """Simulations, success rate and cumulative failures over iterations: means over seeds, and each seed."""
     look = looks(list(runs))
     axes = dict(zip(PANELS, figure.subplots(1, len(PANELS)), strict=True))
     rounds = next(iter(runs.values()))[0].rounds

@@ -39,12 +39,7 @@ def drawable(runs: Runs) -> bool:
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Losses of one run epoch by epoch, or of several runs round by round.
-
-    Args:
-        figure: empty.
-        runs: configurations with their seeds.
-    """
+    """Losses of one run epoch by epoch, or of several runs round by round."""
     every = [history for histories in runs.values() for history in histories]
     shown = [panel for panel in PANELS if any(getattr(h, panel) is not None for h in every)]
     axes = dict(zip(shown, figure.subplots(1, len(shown), squeeze=False, sharey=True)[0], strict=True))
@@ -72,13 +67,7 @@ def draw(figure: Figure, runs: Runs) -> None:
 
 
 def draw_epochs(axes: Axes, history: History, panel: str) -> None:
-    """One line per round over the epochs of its training, coloured by iteration.
-
-    Args:
-        axes: to draw on.
-        history: the run.
-        panel: "loss" or "validation_loss".
-    """
+    """One line per round over the epochs of its training, coloured by iteration."""
     values = by_epoch(history, panel)
     colours, norm = iteration_colours(history.rounds)
     single = "o" if values.shape[1] == 1 else None

@@ -49,12 +49,7 @@ UNMEASURED = "not measured"
 
 
 def render(collection: Collection, pictures: Sequence[Picture]) -> str:
-    """The page as text.
-
-    Args:
-        collection: the runs.
-        pictures: in their order on the page.
-    """
+    """The page as text."""
     config = collection.config
     first = next(iter(collection.runs.values()))[0]
     task = _short(
@@ -76,12 +71,7 @@ def render(collection: Collection, pictures: Sequence[Picture]) -> str:
 
 
 def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
-    """The page of a sensitivity grid as text.
-
-    Args:
-        config: the grid's config.json.
-        pictures: in their order on the page.
-    """
+    """The page of a sensitivity grid as text, from its config.json."""
     heuristic = heuristic_name(config["heuristic"])
     task = _short(config["task"] or config["task_name"])
     title = f"{task}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
@@ -98,12 +88,7 @@ def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
 
 
 def render_diagnostics(found: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
-    """The page of a run's diagnostics as text: first how far its widths can be trusted, in plain words.
-
-    Args:
-        found: diagnostics.json.
-        pictures: in their order on the page.
-    """
+    """The page of a diagnostics.json as text: first how far its widths can be trusted, in plain words."""
     run = found["run"]
     title = f"{_short(run['task'] or run['configuration'])}: can its widths be trusted?"
     way = {

@@ -174,14 +174,7 @@ def histogram(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int, points: Sequence[Point] = ()) -> None:
-    """Histograms of one parameter's draws, with the supports' bounds and the truth; above them points.
-
-    Args:
-        axes: to draw on.
-        clouds: to draw over one another.
-        d: index of the parameter.
-        points: with their intervals, one above the other.
-    """
+    """Histograms of one parameter's draws, with the supports' bounds and the truth; above them points."""
     found = [histogram(cloud.draws[:, d]) for cloud in clouds]
     highest = max(heights.max() for heights, _ in found)
     for cloud, (heights, edges) in zip(clouds, found, strict=True):
@@ -208,13 +201,7 @@ def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int, points: Sequence[
 def draw_pair(axes: Axes, clouds: Sequence[Cloud], pair: tuple[int, int], points: Sequence[Point] = ()) -> None:
     """Contours around fractions of the draws of two parameters, with the supports, the truth and points.
 
-    One cloud has filled contours; several have lines over a light fill.
-
-    Args:
-        axes: to draw on.
-        clouds: to draw over one another.
-        pair: indices of the parameters, the horizontal one first.
-        points: with their intervals, as crosses.
+    The first of the pair is the horizontal one. One cloud has filled contours; several have lines over a light fill.
     """
     chosen = list(pair)
     for cloud in clouds:
@@ -269,13 +256,7 @@ def _draw_contours(axes: Axes, cloud: Cloud, chosen: list[int], filled: bool) ->
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """A pair plot for each run, side by side, all on the same axes.
-
-    Args:
-        figure: empty.
-        histories: runs of the same parameters, of which draws were saved.
-        titles: of the plots; by default the configurations' names.
-    """
+    """A pair plot for each run, side by side, all on the same axes."""
     look = looks([h.configuration for h in histories])
     clouds = [cloud_of(history, look[history.configuration]) for history in histories]
     titles = or_labels(titles, [cloud.look for cloud in clouds])
@@ -289,14 +270,7 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
 
 
 def draw_overlay(figure: Figure, clouds: Sequence[Cloud], scale: Sequence[Scale], points: Sequence[Point] = ()) -> None:
-    """One pair plot with all clouds drawn over one another.
-
-    Args:
-        figure: empty.
-        clouds: draws of the same parameters.
-        scale: of each parameter.
-        points: estimates of the same parameters; one that is labelled as a cloud shares its entry in the legend.
-    """
+    """One pair plot of all clouds over one another; a point labelled as a cloud shares its entry in the legend."""
     draw_groups(figure, [clouds], scale, points=points)
     own = _cloud_handles(clouds) if len(clouds) > 1 else _fraction_handles(clouds, _colour(clouds))
     shared = {handle.get_label(): handle for handle in own if isinstance(handle, Line2D)}
@@ -317,15 +291,7 @@ def draw_groups(
     titles: Sequence[str] | None = None,
     points: Sequence[Point] = (),
 ) -> None:
-    """A pair plot for each group of clouds; the clouds of a group are drawn over one another.
-
-    Args:
-        figure: empty.
-        groups: clouds over the same parameters.
-        scale: of each parameter.
-        titles: of the groups, in the colour of their first cloud; or None.
-        points: drawn over every group.
-    """
+    """A pair plot for each group of clouds, drawn over one another; its title has the colour of the first."""
     dim = groups[0][0].dim
     rows, columns = arrangement(len(groups), dim)
     windows = [window([cloud for group in groups for cloud in group], d, points) for d in range(dim)]

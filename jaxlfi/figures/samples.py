@@ -72,11 +72,6 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
     """One column per run: proposals by iteration above, the last mixture below, for each pair of parameters.
 
     A single run has them side by side.
-
-    Args:
-        figure: empty.
-        histories: one run for each column, of the same parameters.
-        titles: of the columns; by default the configurations' names.
     """
     look = looks([h.configuration for h in histories])
     titles = or_labels(titles, [look[h.configuration] for h in histories])
@@ -113,14 +108,7 @@ def _panels(figure: Figure, rows: int, columns: int) -> tuple[np.ndarray, np.nda
 def draw_proposals(
     axes: Axes, history: History, pair: tuple[int, ...], window: Sequence[tuple[float, float]] | None = None
 ) -> None:
-    """Proposals of all iterations over a pair of parameters (or one), with the supports they were drawn from.
-
-    Args:
-        axes: to draw on.
-        history: the run.
-        pair: indices of one or two parameters.
-        window: axis limits for each of them.
-    """
+    """Proposals of all iterations over a pair of parameters (or one), with the supports they were drawn from."""
     window = window or [limits([history], d) for d in pair]
     colours, norm = iteration_colours(history.rounds)
     iteration = np.broadcast_to(np.arange(1, history.rounds + 1)[:, None], history.counted.shape)
@@ -162,15 +150,7 @@ def draw_mixture(
     window: Sequence[tuple[float, float]] | None = None,
     look: Look | None = None,
 ) -> None:
-    """The last mixture's marginal over a pair of parameters (or one), and the path of the weighted means.
-
-    Args:
-        axes: to draw on.
-        history: the run.
-        pair: indices of one or two parameters.
-        window: axis limits for each of them.
-        look: its colour is the density's.
-    """
+    """The last mixture's marginal over a pair of parameters (or one), and the path of the weighted means."""
     window = window or [closer_limits([history], d) for d in pair]
     look = look or looks([history.configuration])[history.configuration]
     weight = density.weights(history.logits[-1])

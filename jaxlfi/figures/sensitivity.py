@@ -141,23 +141,13 @@ def size(grid: Grid, bars: int) -> tuple[float, float]:
 
 
 def draw(figure: Figure, grid: Grid) -> None:
-    """Trajectory error above the diagonal, where trajectories were simulated, and parameter error below it.
-
-    Args:
-        figure: empty, of `size(grid, len(errors(grid)))`.
-        grid: the results.
-    """
+    """Trajectory error, where there is one, above the diagonal, and parameter error below it; `size` says how large."""
     *above, below = errors(grid)
     _matrix(figure, grid, above=above[0] if above else None, below=below)
 
 
 def draw_success(figure: Figure, grid: Grid) -> None:
-    """Simulation success rate over all rounds, below the diagonal only, as the matrix is symmetric.
-
-    Args:
-        figure: empty, of `size(grid, bars=1)`.
-        grid: the results.
-    """
+    """Simulation success rate over all rounds, below the diagonal only, as the matrix is symmetric."""
     _matrix(figure, grid, above=None, below=SUCCESS)
 
 

@@ -25,14 +25,7 @@ def adapting(runs: Runs) -> dict[str, Sequence[History]]:
 
 
 def draw_bounds(axes: Axes, histories: Sequence[History], d: int, look: Look) -> None:
-    """Mean bounds of a parameter over seeds from Theta_0 (iteration 0) on, and each seed's as a thin line.
-
-    Args:
-        axes: to draw on.
-        histories: the seeds of one configuration.
-        d: index of the parameter.
-        look: of the configuration.
-    """
+    """Mean bounds of a parameter over seeds from Theta_0 (iteration 0) on, and each seed's as a thin line."""
     bounds = np.stack([np.stack(h.supports)[..., d] for h in histories])
     low, high = statistics.mean(bounds, 0)
     iteration = np.arange(bounds.shape[-1])
@@ -44,12 +37,7 @@ def draw_bounds(axes: Axes, histories: Sequence[History], d: int, look: Look) ->
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """One panel per parameter, with the configurations that adapt, the truth and the feasible limits Phi.
-
-    Args:
-        figure: empty.
-        runs: configurations with their seeds.
-    """
+    """One panel per parameter, with the configurations that adapt, the truth and the feasible limits Phi."""
     shown = adapting(runs)
     look = {name: own for name, own in looks(list(runs)).items() if name in shown}
     first = next(iter(shown.values()))[0]

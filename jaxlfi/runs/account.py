@@ -40,12 +40,7 @@ def summary(run: Result, draws: Float[Array | np.ndarray, "n dim"]) -> RunSummar
 
 
 def account(run: Result, found: RunSummary) -> RunSummary:
-    """The summary of a run's parameters with sentences on the run as a whole, and all that there is to do next.
-
-    Args:
-        run: one run, concrete.
-        found: of its parameters.
-    """
+    """The summary of a run's parameters with sentences on the run as a whole, and all that there is to do next."""
     strange, (fit, fits) = _observation(run), _fit(run)
     settled, more = _settled(run)
     steps = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more + list(found.next_steps)

@@ -65,10 +65,7 @@ def _task_of(run: Result) -> Task:
 def write_run(folder: Path, run: Result, keep_network: bool = False) -> None:
     """Write the arrays of one finished run into its folder, which exists and has its ledger.
 
-    Args:
-        folder: of the run.
-        run: one run, with the task.
-        keep_network: save the network also where the posterior can do without.
+    The network is kept where the posterior cannot do without, or on request.
     """
     task, history = _task_of(run), jax.device_get(run.history)
     belief, labels = jax.device_get(run.belief), np.asarray(run.space.labels)

@@ -11,11 +11,7 @@ from jaxlfi.tasks.task import Task
 
 
 def observation_findings(run: Result) -> list[Finding]:
-    """The findings of `jaxlfi.diagnostics.unlike` on the observation and all simulations of one run.
-
-    Args:
-        run: one run, concrete.
-    """
+    """The findings of `jaxlfi.diagnostics.unlike` on the observation and all simulations of one run."""
     rows = slice(int(run.dataset.size))
     names: tuple[str, ...] | None = None
     channels: tuple[str, ...] = ()

@@ -90,14 +90,7 @@ def _values_of(distribution: Any) -> Any:
 
 
 def prior_draws(key: jax.Array, prior: Any, support: Support, n: int) -> Float[Array, "n dim"]:
-    """`n` draws of the prior inside the support: uniform for None, else by rejection (`jaxlfi.distributions.region`).
-
-    Args:
-        key: consumed.
-        prior: `Task.inference.prior`.
-        support: in inference space.
-        n: number of draws.
-    """
+    """Draws of the prior in a support: uniform ones for None, else by rejection (`jaxlfi.distributions.region`)."""
     return region(support, prior).sample(key, n)
 
 

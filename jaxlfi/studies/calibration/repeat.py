@@ -49,14 +49,9 @@ def chunk_length(run: Run, plan: CalibrationPlan) -> int:
 
 
 def run_inputs(run: Run, plan: CalibrationPlan, observed: jax.Array, x: jax.Array, first: int = 0) -> RunInputs:
-    """Inputs of a batch that repeats the run for observations stacked along the first axis.
+    """Inputs of a batch that repeats the run for observations [n, ...] with summaries [n, S].
 
-    Args:
-        run: the run under test.
-        plan: for keys.
-        observed: shape [n, ...].
-        x: shape [n, S].
-        first: place of the first among all truths; each place has a key of its own.
+    `first` is the place of the first among all truths; each place has a key of its own.
     """
     support = jax.tree.map(jnp.asarray, run.support)
     support, heuristic = (stack([tree] * len(x)) for tree in (support, run.heuristic))
