@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine
-from jaxlfi.bayessim.shared import SharedEngine
+from jaxlfi.bayessim.multi_process import SharedEngine
 from jaxlfi.tasks.host import SimulatorError
 from jaxlfi.tasks.task import Task
 

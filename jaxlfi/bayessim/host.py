@@ -13,10 +13,10 @@ import numpy as np
 
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_draws, propose_one, update_one
+from jaxlfi.bayessim.multi_process import SharedEngine
 from jaxlfi.bayessim.programs import compiled, program
 from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
 from jaxlfi.distributions.precision import single
 from jaxlfi.io.processes import ALONE, Processes

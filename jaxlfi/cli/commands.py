@@ -19,7 +19,7 @@ from rich.table import Table
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.keys import key_of
 from jaxlfi.bayessim.presets import all_rounds
-from jaxlfi.cli import asked, interrupts, summaries, tables, train
+from jaxlfi.cli import choices, interrupts, summaries, tables, train
 from jaxlfi.cli.exit_status import resuming
 from jaxlfi.cli.tables import Output
 from jaxlfi.distributions.truncation import TRIES
@@ -97,19 +97,19 @@ def _describe_task(task: Task, console: Console) -> None:
 
 def infer(arguments: argparse.Namespace, output: Output) -> Prepared:
     """Prepare `jaxlfi infer`."""
-    task = asked.task_of(arguments)
-    settings = asked.build_settings(arguments, task)
+    task = choices.task_of(arguments)
+    settings = choices.build_settings(arguments, task)
     first = None
     if arguments.simulations is None:
-        support_name, support = asked.support_of(arguments, task)
+        support_name, support = choices.support_of(arguments, task)
     else:
         own = arguments.support is not None or arguments.support_low is not None or arguments.support_high is not None
-        support_name, support = asked.support_of(arguments, task) if own else ("own", None)
+        support_name, support = choices.support_of(arguments, task) if own else ("own", None)
         first, support = presimulated(task, read_simulations(arguments.simulations), support)
-    kinds = asked.heuristics_of(arguments, [arguments.heuristic])
-    rule = asked.build_heuristic(arguments, arguments.heuristic, kinds, settings, task)
+    kinds = choices.heuristics_of(arguments, [arguments.heuristic])
+    rule = choices.build_heuristic(arguments, arguments.heuristic, kinds, settings, task)
     configuration = support_name if arguments.heuristic == "none" else f"{support_name}+{arguments.heuristic}"
-    specs = tuple(RunSpec(configuration, support_name, support, rule, seed) for seed in asked.seeds_of(arguments))
+    specs = tuple(RunSpec(configuration, support_name, support, rule, seed) for seed in choices.seeds_of(arguments))
     kind = RUN if len(specs) == 1 else RUNS
     plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
     return _begun(arguments, plan, output, first)
@@ -117,18 +117,18 @@ def infer(arguments: argparse.Namespace, output: Output) -> Prepared:
 
 def compare(arguments: argparse.Namespace, output: Output) -> Prepared:
     """Prepare `jaxlfi compare`."""
-    task = asked.task_of(arguments)
-    settings = asked.build_settings(arguments, task, all_rounds)
-    configurations = arguments.configurations or asked.default_configurations(task)
+    task = choices.task_of(arguments)
+    settings = choices.build_settings(arguments, task, all_rounds)
+    configurations = arguments.configurations or choices.default_configurations(task)
     if len(set(configurations)) < len(configurations):
         raise ValueError(f"configurations: expected distinct ones, got {configurations}")
-    parts = [asked.configuration_parts(name) for name in configurations]
-    kinds = asked.heuristics_of(arguments, [heuristic for _, heuristic in parts])
-    build = lambda heuristic: asked.build_heuristic(arguments, heuristic, kinds, settings, task)
+    parts = [choices.configuration_parts(name) for name in configurations]
+    kinds = choices.heuristics_of(arguments, [heuristic for _, heuristic in parts])
+    build = lambda heuristic: choices.build_heuristic(arguments, heuristic, kinds, settings, task)
     # Seeds are the slow index, so that every device gets all configurations, fast and slow ones.
     specs = tuple(
         RunSpec(name, support, task.support(support), build(heuristic), seed)
-        for seed in asked.seeds_of(arguments)
+        for seed in choices.seeds_of(arguments)
         for name, (support, heuristic) in zip(configurations, parts, strict=True)
     )
     kind = COMPARE
@@ -141,7 +141,7 @@ def _begun(arguments: argparse.Namespace, plan: BatchPlan, output: Output, first
     processes = arguments.joined
     if processes.writes:
         workfolder.refuse_occupied(arguments.out)
-    observation = asked.observation_of(arguments, plan.task, lambda line: _say(output.notes, line))
+    observation = choices.observation_of(arguments, plan.task, lambda line: _say(output.notes, line))
     task = with_gaps_of(plan.task, observation, plan.settings.estimator.embedding != "none")
     plan = dataclasses.replace(plan, task=task)
     observed = executing.prepare(plan, observation, first, processes)
@@ -168,9 +168,9 @@ def _hold(arguments: argparse.Namespace, folder: Path) -> None:
 def grid_command(arguments: argparse.Namespace, output: Output) -> Prepared:
     """Prepare `jaxlfi grid`."""
     task = TASKS.load(arguments.task)
-    settings = asked.build_settings(arguments, task, all_rounds)
+    settings = choices.build_settings(arguments, task, all_rounds)
     axes = grid.parse_axes(arguments.vary)
-    kinds = asked.heuristics_of(arguments, [arguments.heuristic])
+    kinds = choices.heuristics_of(arguments, [arguments.heuristic])
     for axis in axes:
         if axis.name in arguments.hyperparameters:
             raise ValueError(f"{axis.name}: expected it on an axis or as a flag of its own, got both")
@@ -178,15 +178,15 @@ def grid_command(arguments: argparse.Namespace, output: Output) -> Prepared:
     plan = grid.Grid(
         task=task,
         support=task.support(name),
-        rule=asked.build_heuristic(arguments, arguments.heuristic, kinds, settings, task),
+        rule=choices.build_heuristic(arguments, arguments.heuristic, kinds, settings, task),
         axes=axes,
-        seeds=tuple(asked.seeds_of(arguments)),
+        seeds=tuple(choices.seeds_of(arguments)),
         settings=settings,
         reference=arguments.task,
         preset=arguments.preset,
         support_name=name,
     )
-    observation = asked.observation_of(arguments, task, lambda line: _say(output.notes, line))
+    observation = choices.observation_of(arguments, task, lambda line: _say(output.notes, line))
     if arguments.joined.writes:
         workfolder.refuse_occupied(arguments.out)
     _say(output.notes, f"{task.name}: compiling for {plan.size} runs")
@@ -229,7 +229,7 @@ def resume(arguments: argparse.Namespace, output: Output) -> Prepared | None:
         if config.get("executor", False) and (arguments.workers, arguments.scheduler) == (None, None):
             arguments.workers = host_devices.processors()
             _say(output.notes, f"simulations: in {arguments.workers} processes on this machine")
-        work = dataclasses.replace(plan, task=asked.simulated_again(arguments, folder, plan.task)), observed
+        work = dataclasses.replace(plan, task=choices.simulated_again(arguments, folder, plan.task)), observed
         what = "the result may differ in rounding from an uninterrupted one"
     if changed := executing.changed_machine(config, arguments.joined):
         _warn(output, f"begun with {', '.join(changed)}: {what}")
@@ -281,7 +281,7 @@ def diagnose(arguments: argparse.Namespace, output: Output) -> None:
     """`jaxlfi diagnose DIR`."""
     task = None if arguments.task is None else TASKS.load(arguments.task)
     run = calibration.read_run(arguments.folder, task)
-    run = run.replace(task=asked.simulated_again(arguments, arguments.folder, run.task))
+    run = run.replace(task=choices.simulated_again(arguments, arguments.folder, run.task))
     references = arguments.reference
     if references is None:
         references = f"{calibration.POSTERIOR},{next(iter(run.task.supports))}"

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import jaxlfi
 from jaxlfi import flags, references
-from jaxlfi.cli import help_texts, interrupts, joined, warned
+from jaxlfi.cli import help_texts, interrupts, multi_process
 from jaxlfi.cli.command import Command, OneLineParser
-from jaxlfi.cli.exit_status import refuse, resuming
+from jaxlfi.cli.exit_status import refuse, resuming, warnings_in_lines
 from jaxlfi.cli.own_fields import FIELDS, HELP
 from jaxlfi.cli.own_fields import PRESETS as VALUES
 from jaxlfi.fields import declared
@@ -239,7 +239,7 @@ def _resume(command: argparse.ArgumentParser) -> None:
         help="go on to so many rounds in all, also with a run that is finished (default: those it was begun with)",
     )
     _add_executor(command)
-    joined.add_flags(command)
+    multi_process.add_flags(command)
     _add_json(command)
     _add_machine(command)
 
@@ -382,7 +382,7 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         "(default: the task's own, or one simulated at the known truth)",
     )
     _add_machine(command)
-    joined.add_flags(command)
+    multi_process.add_flags(command)
     if networks:
         _add_executor(command)
         command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
@@ -450,7 +450,7 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
         from jaxlfi.io import compile_cache
 
         compile_cache.enable()
-    arguments.joined = joined.join(arguments)
+    arguments.joined = multi_process.join(arguments)
     runs, processes = _runs(arguments), arguments.joined.count
     if runs > 1:
         # The same batch on the same number of devices repeats bit for bit.
@@ -503,7 +503,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     if argv is None:
         return interrupts.watched(lambda: main(sys.argv[1:]))
-    with warned.in_lines():
+    with warnings_in_lines():
         return _run(list(argv))
 
 
@@ -515,8 +515,8 @@ def _run(words: list[str]) -> int:
     if foreign:
         with interrupts.orderly(not getattr(foreign, "run", foreign).__module__.startswith("jaxlfi.")):
             return foreign(words[1:])
-    if joined.asked(words):
-        return joined.work(lambda: _main(words), lambda: _advice(words), "jaxlfi", "--debug" in words)
+    if multi_process.asked(words):
+        return multi_process.work(lambda: _main(words), lambda: _advice(words), "jaxlfi", "--debug" in words)
     return _main(words)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxlfi import flags
-from jaxlfi.cli import joined
+from jaxlfi.cli import multi_process
 from jaxlfi.cli.command import Command
 from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import resuming
@@ -70,7 +70,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
-    joined.add_flags(parser)
+    multi_process.add_flags(parser)
     group = parser.add_argument_group("PPO (default: the preset's)")
     flags.add(group, {"PPO": FIELDS[SETTINGS]}, into="settings", presets=POLICIES)
     parser.set_defaults(settings={})
@@ -82,7 +82,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from jaxlfi.io.locks import locked
 
     compile_cache.enable()
-    processes = joined.join(arguments)
+    processes = multi_process.join(arguments)
     from jaxlfi.rl import training
 
     if not processes.writes:

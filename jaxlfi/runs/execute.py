@@ -17,9 +17,9 @@ from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.memory import budget, state_bytes
+from jaxlfi.bayessim.multi_process import SharedEngine
 from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
 from jaxlfi.io import provenance, workfolder

@@ -18,7 +18,7 @@ from jaxlfi.runs import account
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.result import Result, require_one
 from jaxlfi.runs.unlike import observation_findings
-from jaxlfi.tasks import owned
+from jaxlfi.tasks import own_arrays
 from jaxlfi.tasks.errors import SimulatorWarning
 from jaxlfi.tasks.gaps import gaps_of
 from jaxlfi.tasks.observation import as_given
@@ -151,7 +151,7 @@ class Run(Result):
     def _summary(self, observation: Any) -> jax.Array:
         on_host = self.task is not None and self.task.on_host
         observation = observation if self.task is None else as_given(self.task, observation)
-        observation = owned.array(observation) if is_concrete(observation) else observation
+        observation = own_arrays.array(observation) if is_concrete(observation) else observation
         observation = np.array(observation, float) if on_host else jnp.array(observation, jnp.float32)
         if observation.shape == self.observed.shape and self.task is not None:
             missing = gaps_of(self.task)

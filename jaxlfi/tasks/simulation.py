@@ -11,8 +11,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlfi.distributions.precision import own, single
-from jaxlfi.tasks import owned
-from jaxlfi.tasks.each import stacked
+from jaxlfi.tasks import own_arrays
+from jaxlfi.tasks.dispatch import stacked
 from jaxlfi.tasks.host import numpy_generator
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.reference import counted_from, summaries_in_double
@@ -70,7 +70,8 @@ def _code(outcome: Array) -> Array:
     """An outcome in 32 bits, in which no large number becomes a small one."""
     if outcome.dtype.itemsize < 8:
         return outcome
-    return jnp.clip(outcome, -1 if jnp.issubdtype(outcome.dtype, jnp.signedinteger) else 0, owned.CODES).astype("int32")
+    least = -1 if jnp.issubdtype(outcome.dtype, jnp.signedinteger) else 0
+    return jnp.clip(outcome, least, own_arrays.CODES).astype("int32")
 
 
 def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, Int[Array, ""]]:
