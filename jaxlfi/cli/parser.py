@@ -14,6 +14,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jaxlfi
 from jaxlfi import flags, references
@@ -164,30 +165,24 @@ def _tasks(command: argparse.ArgumentParser) -> None:
 
 
 def _infer(command: argparse.ArgumentParser, families: Families) -> None:
-    command.add_argument(
-        "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
-    )
-    command.add_argument(
+    add = command.add_argument
+    _add_support(add)
+    add(
         "--support-low",
         nargs="+",
         type=float,
         metavar="X",
         help="lower bounds of a support of your own, one per parameter, in natural units",
     )
-    command.add_argument("--support-high", nargs="+", type=float, metavar="X", help="upper bounds of that support")
-    command.add_argument(
+    add("--support-high", nargs="+", type=float, metavar="X", help="upper bounds of that support")
+    add(
         "--simulations",
         type=Path,
         metavar="FILE",
         help="an .npz of simulations made before, in place of the first round's: theta [N, D] in natural units, "
         "trajectory [N, ...] or summaries x [N, S], and where they were not drawn uniformly log_density [N]",
     )
-    command.add_argument(
-        "--heuristic",
-        default="edge",
-        metavar="NAME",
-        help=_registered("how the support is adapted", families.rules, "edge"),
-    )
+    _add_heuristic(add, "how the support is adapted", families)
     _add_json(command)
     _add_shared(command, families, seeds=1)
 
@@ -204,7 +199,8 @@ def _compare(command: argparse.ArgumentParser, families: Families) -> None:
 
 
 def _grid(command: argparse.ArgumentParser, families: Families) -> None:
-    command.add_argument(
+    add = command.add_argument
+    add(
         "--vary",
         nargs="+",
         action="extend",
@@ -212,16 +208,9 @@ def _grid(command: argparse.ArgumentParser, families: Families) -> None:
         metavar="NAME=V,V,...",
         help="a hyperparameter and its values, as in expansion=0.1,0.2,0.4; several, or the flag again",
     )
-    command.add_argument(
-        "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
-    )
-    command.add_argument(
-        "--heuristic",
-        default="edge",
-        metavar="NAME",
-        help=_registered("whose hyperparameters vary", families.rules, "edge"),
-    )
-    command.add_argument(
+    _add_support(add)
+    _add_heuristic(add, "whose hyperparameters vary", families)
+    add(
         "--runs-per-chunk",
         type=int,
         metavar="N",
@@ -231,8 +220,9 @@ def _grid(command: argparse.ArgumentParser, families: Families) -> None:
 
 
 def _resume(command: argparse.ArgumentParser) -> None:
-    command.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
-    command.add_argument(
+    add = command.add_argument
+    add("folder", type=Path, metavar="DIR", help="the folder the command was given")
+    add(
         "--rounds",
         type=int,
         metavar="N",
@@ -245,10 +235,11 @@ def _resume(command: argparse.ArgumentParser) -> None:
 
 
 def _sample(command: argparse.ArgumentParser) -> None:
-    command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
-    command.add_argument("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
-    command.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="seed of the draws (default: 0)")
-    command.add_argument(
+    add = command.add_argument
+    add("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
+    add("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
+    add("--seed", type=flags.seed, default=0, metavar="N", help="seed of the draws (default: 0)")
+    add(
         "--out",
         type=flags.output,
         metavar="FILE",
@@ -258,31 +249,30 @@ def _sample(command: argparse.ArgumentParser) -> None:
 
 
 def _diagnose(command: argparse.ArgumentParser) -> None:
-    command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
-    command.add_argument(
+    add = command.add_argument
+    add("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
+    add(
         "--reference",
         metavar="NAME[,NAME]",
         help="where truths are drawn: posterior, the name of a support, or one of each (default: posterior, and the "
         "task's first support)",
     )
-    command.add_argument("--truths", type=int, default=100, metavar="N", help="of each reference (default: 100)")
-    command.add_argument(
-        "--draws", type=int, default=200, metavar="L", help="draws from the posterior of each (default: 200)"
-    )
-    command.add_argument("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
-    command.add_argument(
+    add("--truths", type=int, default=100, metavar="N", help="of each reference (default: 100)")
+    add("--draws", type=int, default=200, metavar="L", help="draws from the posterior of each (default: 200)")
+    add("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
+    add(
         "--task",
         metavar="TASK",
         help="what was inferred, for a run that was made in Python (default: the task recorded with the run)",
     )
-    command.add_argument(
+    add(
         "--against",
         type=Path,
         metavar="FILE",
         help="samples to compare the run's posterior with, in natural units: a .csv with the parameters' names as "
         'headings, or an .npz with an array "theta"',
     )
-    command.add_argument(
+    add(
         "--out",
         type=flags.output,
         metavar="DIR",
@@ -343,12 +333,19 @@ def _registered(what: str, families: flags.Families, default: str) -> str:
     return f"{what}: {names}, or your own as module:Class (default: {default})"
 
 
+def _add_support(add: Callable[..., Any]) -> None:
+    add("--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)")
+
+
+def _add_heuristic(add: Callable[..., Any], what: str, families: Families) -> None:
+    add("--heuristic", default="edge", metavar="NAME", help=_registered(what, families.rules, "edge"))
+
+
 def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int, networks: bool = True) -> None:
     """Arguments that `infer`, `compare` and `grid` have in common; `grid` saves no networks."""
-    command.add_argument(
-        "task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory; NAME,key=value sets options"
-    )
-    command.add_argument(
+    add = command.add_argument
+    add("task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory; NAME,key=value sets options")
+    add(
         "--object",
         nargs="+",
         action="extend",
@@ -357,22 +354,18 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         "names or files are recordings of one object, each under its own actions, and are combined into one posterior "
         "(short for TASK,object=NAME;NAME)",
     )
-    command.add_argument(
-        "--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results"
-    )
-    command.add_argument(
+    add("--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results")
+    add(
         "--method",
         choices=METHODS,
         default="bayessim",
         help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: flows, one round; snle: sequential, "
         "likelihoods (default: bayessim)",
     )
-    command.add_argument(
-        "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"
-    )
-    command.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})")
-    command.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first run's seed (default: 0)")
-    command.add_argument(
+    add("--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)")
+    add("--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})")
+    add("--first-seed", type=int, default=0, metavar="N", help="the first run's seed (default: 0)")
+    add(
         "--observation",
         type=Path,
         nargs="+",
@@ -385,7 +378,7 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
     multi_process.add_flags(command)
     if networks:
         _add_executor(command)
-        command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
+        add("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
 
     rounds = command.add_argument_group(
         "rounds (default: the preset's, shown for bayessim; a task or method may have its own)"
@@ -414,10 +407,11 @@ def _add_json(command: argparse.ArgumentParser) -> None:
 
 def _add_machine(command: argparse.ArgumentParser) -> None:
     """Arguments about how, not what."""
-    command.add_argument("--no-figures", action="store_true", help="draw no figures at the end")
-    command.add_argument("--quiet", action="store_true", help="print results and warnings only")
-    command.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    command.add_argument("--no-cache", action="store_true", help="compile without the cache of compiled programs")
+    add = command.add_argument
+    add("--no-figures", action="store_true", help="draw no figures at the end")
+    add("--quiet", action="store_true", help="print results and warnings only")
+    add("--debug", action="store_true", help="show the traceback of an error")
+    add("--no-cache", action="store_true", help="compile without the cache of compiled programs")
 
 
 def _add_executor(command: argparse.ArgumentParser) -> None:
