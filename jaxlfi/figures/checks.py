@@ -105,24 +105,15 @@ def _ranks_size(arrays: Arrays) -> tuple[float, float]:
     return TEXT_WIDTH if wide else COLUMN_WIDTH, (0.6 if wide else 0.9) + 2.2 * calibration.rows(arrays)
 
 
-def _square(arrays: Arrays) -> tuple[float, float]:
-    return COLUMN_WIDTH, 3.9
-
-
-def _predictive_size(arrays: Arrays) -> tuple[float, float]:
-    return TEXT_WIDTH, 2.3
-
-
-def _widths_size(arrays: Arrays) -> tuple[float, float]:
-    return TEXT_WIDTH, intervals.height(arrays)
-
+COLUMN = lambda arrays: (COLUMN_WIDTH, 3.9)
+"""Size of a square picture with its legend, whatever it shows."""
 
 Maker = tuple[tuple[str, ...], Callable[[Arrays], tuple[float, float]], Callable[[Figure, Arrays], None], str, str]
 
 PICTURES: dict[str, Maker] = {
     "widths": (
         ("widths_held", "widths_regions_held", "widths_level", "widths_factor"),
-        _widths_size, intervals.draw, "Intervals",
+        lambda arrays: (TEXT_WIDTH, intervals.height(arrays)), intervals.draw, "Intervals",
         "Left: the fraction of truths that intervals of each parameter, and densest regions of all parameters together "
         "(last row), held; they should hold 50 % and 90 % (lines). Right: the factor by which the width of 90 % "
         "intervals would have to be multiplied for them to hold 90 %. Bars are confidence intervals, of 95 % for all "
@@ -135,16 +126,16 @@ PICTURES: dict[str, Maker] = {
         "hill: too wide; a slope: biased.",
     ),
     "coverage": (
-        (COVERAGE, *CURVE), _square, calibration.draw_coverage, "Coverage of densest regions",
+        (COVERAGE, *CURVE), COLUMN, calibration.draw_coverage, "Coverage of densest regions",
         "For truths over the support. Below the diagonal: over-confident.",
     ),
     "tarp": (
-        (DISTANCE, *CURVE), _square, calibration.draw_tarp, "Coverage from random points (TARP)",
+        (DISTANCE, *CURVE), COLUMN, calibration.draw_tarp, "Coverage from random points (TARP)",
         "The same with regions around random points, which sees what densities do not.",
     ),
     "predictive": (
         ("predictive_x", "observed_x", "predictive_distances", "observed_distance", "predictive_p_value"),
-        _predictive_size, draw, "Posterior predictive",
+        lambda arrays: (TEXT_WIDTH, 2.3), draw, "Posterior predictive",
         "The run's own observation among simulations of its own posterior.",
     ),
 }  # fmt: skip

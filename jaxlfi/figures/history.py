@@ -169,14 +169,13 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     if config["format"] != "jaxlfi-run":
         raise ValueError(f"{folder}: expected config.json of format 'jaxlfi-run', got {config['format']!r}")
     arrays = read_arrays(folder / "history.npz", tuple(AXES), NUMBERS)
-    observation, posterior, dataset = (
-        _arrays_if_there(folder / f"{name}.npz") for name in ("observation", "posterior", "dataset")
-    )
+    others = [folder / f"{name}.npz" for name in ("observation", "posterior", "dataset")]
+    observation, posterior, dataset = (read_arrays(path, numbers=NUMBERS) if path.exists() else {} for path in others)
     _check_shapes(folder / "history.npz", arrays)
     rounds, _, dim = arrays["theta"].shape
     trajectory = _trajectory(observation.get("trajectory"))
     times = _times(observation.get("times"), trajectory)
-    x = observation.get("x")
+    x, truth = observation.get("x"), observation.get("truth")
     if x is not None and x.ndim != 1:
         raise ValueError(f"{folder / 'observation.npz'}: expected x of one dimension, got shape {x.shape}")
     obs = 0 if x is None else len(x)
@@ -205,7 +204,7 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
         x=x,
         x_scale=_x_scale(dataset, obs),
         summaries=_texts(observation.get("summaries"), None, obs, "x_{}"),
-        truth=_vector(observation.get("truth"), dim),
+        truth=np.asarray(truth if truth is not None and truth.shape == (dim,) else np.full(dim, np.nan), float),
         times=times,
         record_label=_record_label(observation, times),
         channels=_texts(observation.get("channels"), None, 0 if trajectory is None else trajectory.shape[1], "x{}"),
@@ -259,10 +258,6 @@ def robust_sd(x: np.ndarray) -> np.ndarray:
     """
     low, high = np.quantile(x, [0.16, 0.84], axis=0)
     return (high - low) / 2
-
-
-def _arrays_if_there(path: Path) -> dict[str, np.ndarray]:
-    return read_arrays(path, numbers=NUMBERS) if path.exists() else {}
 
 
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -336,10 +331,6 @@ def _record_label(observation: Mapping[str, np.ndarray], times: np.ndarray | Non
     if "record_label" in observation:
         return str(observation["record_label"])
     return "record" if times is None or np.array_equal(times, np.arange(len(times))) else "time"
-
-
-def _vector(array: np.ndarray | None, dim: int) -> np.ndarray:
-    return np.full(dim, np.nan) if array is None or array.shape != (dim,) else np.asarray(array, float)
 
 
 def _times(array: np.ndarray | None, trajectory: np.ndarray | None) -> np.ndarray | None:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxlfi.figures import statistics
 from jaxlfi.figures.collection import Collection
 from jaxlfi.figures.history import heuristic_name
-from jaxlfi.figures.style import Look, looks, natural, unit_label
+from jaxlfi.figures.style import looks, natural, unit_label
 from jaxlfi.io import web_page
 from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.io.web_page import prose, wide
@@ -173,6 +173,7 @@ def _document(
 ) -> str:
     """A whole page: a heading, its first parts, the pictures with links to them, and config.json."""
     shown = [(f"picture-{i}", picture) for i, picture in enumerate(pictures, 1)]
+    shown_config = html.escape(json.dumps(config, indent=2, ensure_ascii=False))
     links = "".join(f'<a href="#{name}">{html.escape(picture.title)}</a>' for name, picture in shown)
     return web_page.document(
         title,
@@ -180,7 +181,7 @@ def _document(
             *parts,
             f"<nav>{links}</nav>",
             *(_figure(name, picture) for name, picture in shown),
-            f"<h2>Configuration</h2><details><summary>{name_of_config}</summary><pre>{_json(config)}</pre></details>",
+            f"<h2>Configuration</h2><details><summary>{name_of_config}</summary><pre>{shown_config}</pre></details>",
         ],
     )
 
@@ -274,8 +275,9 @@ def _table(collection: Collection) -> str:
             deviation = float(statistics.sd(scaled)) if len(scaled) > 1 else float("nan")
             three = [_number(x) for x in (float(statistics.mean(scaled)), statistics.median(scaled), deviation)]
             cells.append('<td class="first">{}</td><td>{}</td><td>{}</td>'.format(*three))
-        seeds = len(values[name])
-        lines.append(f"<tr><td>{_swatch(own)}</td><td>{seeds}</td>{''.join(cells)}</tr>")
+        seeds, label = len(values[name]), html.escape(_without_escapes(own.label))
+        swatch = f'<i class="swatch" style="background:{own.colour}"></i>{label}'
+        lines.append(f"<tr><td>{swatch}</td><td>{seeds}</td>{''.join(cells)}</tr>")
     return wide(
         f"<table><thead><tr><th></th><th></th>{head}</tr>"
         f"<tr><th>configuration</th><th>seeds</th>{below}</tr></thead><tbody>{''.join(lines)}</tbody>"
@@ -284,10 +286,6 @@ def _table(collection: Collection) -> str:
         "posterior samples whose simulation succeeded. Success rate: percentage of all simulations that succeeded. "
         "Mean, median and standard deviation (sd) are over seeds.</caption></table>"
     )
-
-
-def _swatch(own: Look) -> str:
-    return f'<i class="swatch" style="background:{own.colour}"></i>{html.escape(_without_escapes(own.label))}'
 
 
 def _labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
@@ -320,7 +318,3 @@ def _number(x: float) -> str:
 
 def _short(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-
-
-def _json(config: Mapping[str, Any]) -> str:
-    return html.escape(json.dumps(config, indent=2, ensure_ascii=False))

@@ -177,7 +177,7 @@ def _losses(collection: Collection) -> Made:
     caption = (
         "Negative log-density of the parameters, scaled to [-1, 1], under the network, mean over the ensemble's "
         "networks: " + ("after each epoch of training." if one else "after the training of each iteration.")
-    ) + _lines(collection.runs, "standard deviations")
+    ) + " Lines are means over seeds, bands standard deviations." * (seed_count(collection.runs) > 1)
     return figure, "Training", caption
 
 
@@ -322,10 +322,6 @@ def _those(runs: Runs, drawable: Callable[[History], bool]) -> Runs:
 
 def _which_seed(runs: Runs) -> str:
     return " Of several seeds, the one of median parameter error is shown." if seed_count(runs) > 1 else ""
-
-
-def _lines(runs: Runs, bands: str) -> str:
-    return f" Lines are means over seeds, bands {bands}." if seed_count(runs) > 1 else ""
 
 
 def _legend_height(runs: Runs) -> float:

@@ -124,14 +124,10 @@ def require_mass(prior: Any, support: Support, label: str) -> float:
     Raises:
         ValueError: for a mass below `MIN_INSIDE`.
     """
-    mass = float(_prior_mass(prior, support)) if prior is not None else 1.0
+    mass = float(jax.jit(single(functools.partial(prior_mass, prior)))(support)) if prior is not None else 1.0
     if mass < MIN_INSIDE:
         raise ValueError(
             f"prior: expected some of its mass inside the support {label}, got {mass:.2g} of it ({MASS_DRAWS} draws): "
             "are both in the same units (Task's prior_space)?"
         )
     return mass
-
-
-def _prior_mass(prior: Any, support: Support) -> Array:
-    return jax.jit(single(functools.partial(prior_mass, prior)))(support)

@@ -185,7 +185,11 @@ def _on_host(task: Task, key: jax.Array, natural: np.ndarray, shape: Sequence[in
 @functools.partial(jax.jit, static_argnums=0)
 @single
 def _simulate_batch(task: Task, keys: jax.Array, theta: Array):
-    return jax.vmap(lambda key, theta: _with_summary(task, *trajectory_and_outcome(task, key, theta)))(keys, theta)
+    def one(key, theta):
+        trajectory, failure = trajectory_and_outcome(task, key, theta)
+        return trajectory, *summarised(task, trajectory, failure)
+
+    return jax.vmap(one)(keys, theta)
 
 
 def summarised_batch(task: Task, trajectories: np.ndarray, outcomes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -204,10 +208,6 @@ def summarised_batch(task: Task, trajectories: np.ndarray, outcomes: np.ndarray)
 def _rounded(values: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
-
-
-def _with_summary(task: Task, trajectory: Array, failure: Array):
-    return trajectory, *summarised(task, trajectory, failure)
 
 
 def simulate_in_waves(

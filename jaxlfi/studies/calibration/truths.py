@@ -52,7 +52,8 @@ def simulated_truths(key: jax.Array, task: Task, box: Support, count: int, shape
         SimulatorError: where a truth was drawn `TRIES` times in vain.
     """
     draw = lambda key, count: prior_draws(key, task.inference.prior, box, count)
-    return _simulated(key, task, draw, count, shapes, f"over {_words(box)}")
+    sides = (f"[{low:g}, {high:g}]" for low, high in zip(box.low.tolist(), box.high.tolist(), strict=True))
+    return _simulated(key, task, draw, count, shapes, f"over {' x '.join(sides)}")
 
 
 def _simulated(
@@ -88,7 +89,3 @@ def _simulated(
         f"simulate: expected a valid simulation of each truth drawn {where}, got none in {TRIES} "
         f"tries for {missing.sum()} of {count}"
     )
-
-
-def _words(box: Support) -> str:
-    return " x ".join(f"[{low:g}, {high:g}]" for low, high in zip(box.low.tolist(), box.high.tolist(), strict=True))

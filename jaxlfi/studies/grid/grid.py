@@ -86,15 +86,14 @@ def parse_axes(texts: Iterable[str]) -> tuple[Axis, ...]:
         >>> parse_axes(["expansion=0.1,0.2"])
         (Axis(name='expansion', values=(0.1, 0.2)),)
     """
-    return tuple(_parse_axis(text) for text in texts)
-
-
-def _parse_axis(text: str) -> Axis:
-    name, _, values = text.partition("=")
-    try:
-        return Axis(name, tuple(float(value) for value in values.split(",")))
-    except ValueError:
-        raise ValueError(f"vary: expected NAME=V,V,... with numbers, got {text!r}") from None
+    axes = []
+    for text in texts:
+        name, _, values = text.partition("=")
+        try:
+            axes.append(Axis(name, tuple(float(value) for value in values.split(","))))
+        except ValueError:
+            raise ValueError(f"vary: expected NAME=V,V,... with numbers, got {text!r}") from None
+    return tuple(axes)
 
 
 def hyperparameters(rule: Heuristic) -> dict[str, Any]:
