@@ -36,15 +36,10 @@ SETTINGS = "jaxlfi.bayessim.settings:Settings"
 
 @dataclasses.dataclass(frozen=True)
 class Families:
-    """Classes whose fields have flags: by name what they declare, which is nothing of packages not imported.
+    """Classes whose fields have flags: by name what they declare, which is nothing of packages not imported."""
 
-    Attributes:
-        rules: the heuristics.
-        networks: the estimators.
-    """
-
-    rules: flags.Families = dataclasses.field(default_factory=lambda: _own(HEURISTICS))
-    networks: flags.Families = dataclasses.field(default_factory=lambda: _own(ESTIMATORS))
+    rules: flags.Families = dataclasses.field(default_factory=lambda: _own(HEURISTICS))  # the heuristics
+    networks: flags.Families = dataclasses.field(default_factory=lambda: _own(ESTIMATORS))  # the estimators
 
     def __add__(self, others: "Families") -> "Families":
         """Both, and where both have a class what the others say of it."""

@@ -26,17 +26,11 @@ def console(quiet: bool = False) -> Console:
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """Where a command prints what; one and the same console unless the command is to be read by a program.
+    """Where a command prints what; one and the same console unless the command is to be read by a program."""
 
-    Attributes:
-        results: what was found.
-        notes: progress, and the files that were written.
-        warnings: what looks wrong.
-    """
-
-    results: Console
-    notes: Console
-    warnings: Console
+    results: Console  # what was found
+    notes: Console  # progress, and the files that were written
+    warnings: Console  # what looks wrong
 
     @classmethod
     def of(cls, quiet: bool = False, json: bool = False, silent: bool = False) -> "Output":

@@ -21,42 +21,25 @@ MEASURES = ("theta_error", "trajectory_error", "success_rate", "seconds")
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One run in the table of results.
+    """One run in the table of results."""
 
-    Attributes:
-        configuration: name of the configuration.
-        seed: the run's seed.
-        theta_error: |theta - theta_gt| summed over parameters, mean over posterior samples.
-        trajectory_error: distance from the observed trajectory, mean over posterior samples.
-        success_rate: fraction of the simulations that did not fail.
-        seconds: time the run took.
-    """
-
-    configuration: str
-    seed: int
-    theta_error: float
-    trajectory_error: float
-    success_rate: float
-    seconds: float
+    configuration: str  # name of the configuration
+    seed: int  # the run's seed
+    theta_error: float  # |theta - theta_gt| summed over parameters, mean over posterior samples
+    trajectory_error: float  # distance from the observed trajectory, mean over posterior samples
+    success_rate: float  # fraction of the simulations that did not fail
+    seconds: float  # time the run took
 
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """The content of a folder that figures are drawn from.
+    """The content of a folder that figures are drawn from."""
 
-    Attributes:
-        folder: where it was read from.
-        config: its config.json.
-        runs: histories by configuration.
-        table: one row a run.
-        unfinished: folders of runs with fewer rounds than the others; they are left out.
-    """
-
-    folder: Path
-    config: Mapping[str, Any]
-    runs: Runs
-    table: tuple[Row, ...]
-    unfinished: tuple[str, ...]
+    folder: Path  # where it was read from
+    config: Mapping[str, Any]  # its config.json
+    runs: Runs  # histories by configuration
+    table: tuple[Row, ...]  # one row a run
+    unfinished: tuple[str, ...]  # folders of runs with fewer rounds than the others; they are left out
 
     def values(self, measure: str) -> dict[str, np.ndarray]:
         """One measure of the table's rows, by configuration in the runs' order."""

@@ -47,19 +47,12 @@ def draw_dots(axes: Axes, errors: dict[str, np.ndarray], look: dict[str, Look]) 
 
 
 class Panel(NamedTuple):
-    """The content of one panel.
+    """The content of one panel."""
 
-    Attributes:
-        title: a parameter, or "trajectory".
-        unit: of the errors, in brackets.
-        errors: by configuration, each [seeds].
-        log: whether they are of a logarithm.
-    """
-
-    title: str
-    unit: str
-    errors: dict[str, np.ndarray]
-    log: bool = False
+    title: str  # a parameter, or "trajectory"
+    unit: str  # of the errors, in brackets
+    errors: dict[str, np.ndarray]  # by configuration, each [seeds]
+    log: bool = False  # whether they are of a logarithm
 
 
 def panels(runs: Runs) -> list[Panel]:

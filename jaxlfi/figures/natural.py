@@ -115,17 +115,11 @@ def prefix(unit: str, magnitude: float) -> tuple[float, str]:
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """How the axis of a parameter is read: in its natural unit, and logarithmically where its logarithm is inferred.
+    """How the axis of a parameter is read: in its natural unit, and logarithmically where its logarithm is inferred."""
 
-    Attributes:
-        label: of the axis, without unit.
-        unit: natural, "" for none.
-        log: whether the data are natural logarithms.
-    """
-
-    label: str
-    unit: str = ""
-    log: bool = False
+    label: str  # of the axis, without unit
+    unit: str = ""  # natural, "" for none
+    log: bool = False  # whether the data are natural logarithms
 
     def show(self, axis: Axis, count: int) -> None:
         """Set ticks and label of an axis whose limits are set.

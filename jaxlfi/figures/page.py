@@ -21,19 +21,12 @@ from jaxlfi.io.web_page import prose, wide
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A picture on the page.
+    """A picture on the page."""
 
-    Attributes:
-        path: the png.
-        title: its heading.
-        caption: the text below it.
-        width: in inches, as in a paper.
-    """
-
-    path: Path
-    title: str
-    caption: str
-    width: float
+    path: Path  # the png
+    title: str  # its heading
+    caption: str  # the text below it
+    width: float  # in inches, as in a paper
 
 
 _COLUMNS = {

@@ -49,21 +49,13 @@ Box = tuple[np.ndarray, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Cloud:
-    """Draws of one distribution over D parameters, with their support and true parameters.
+    """Draws of one distribution over D parameters, with their support and true parameters."""
 
-    Attributes:
-        draws: shape [n, D].
-        look: how they are drawn.
-        truth: shape [D], NaN where unknown.
-        support: the box that holds all draws, or None; densities do not fade towards its bounds.
-        first_support: the support before adaptation, or None where it is the same.
-    """
-
-    draws: np.ndarray
-    look: Look
-    truth: np.ndarray
-    support: Box | None = None
-    first_support: Box | None = None
+    draws: np.ndarray  # shape [n, D]
+    look: Look  # how they are drawn
+    truth: np.ndarray  # shape [D], NaN where unknown
+    support: Box | None = None  # the box that holds all draws, or None; densities do not fade towards its bounds
+    first_support: Box | None = None  # the support before adaptation, or None where it is the same
 
     @property
     def dim(self) -> int:
@@ -79,17 +71,11 @@ class Cloud:
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """An estimate of D parameters.
+    """An estimate of D parameters."""
 
-    Attributes:
-        value: shape [D].
-        interval: of each parameter, shape [D, 2]; NaN where there is none.
-        look: how it is drawn.
-    """
-
-    value: np.ndarray
-    interval: np.ndarray
-    look: Look
+    value: np.ndarray  # shape [D]
+    interval: np.ndarray  # of each parameter, shape [D, 2]; NaN where there is none
+    look: Look  # how it is drawn
 
 
 def drawable(history: History) -> bool:

@@ -36,21 +36,13 @@ SYMBOLS = {
 
 @dataclasses.dataclass(frozen=True)
 class Measure:
-    """A result of each run, and how it is drawn.
+    """A result of each run, and how it is drawn."""
 
-    Attributes:
-        name: of the array.
-        label: of the colour bar.
-        colours: colour map whose bright end is the better one.
-        scale: factor of the values shown.
-        smaller_is_better: true for errors.
-    """
-
-    name: str
-    label: str
-    colours: str
-    scale: float = 1.0
-    smaller_is_better: bool = True
+    name: str  # of the array
+    label: str  # of the colour bar
+    colours: str  # colour map whose bright end is the better one
+    scale: float = 1.0  # factor of the values shown
+    smaller_is_better: bool = True  # true for errors
 
 
 TRAJECTORY = Measure("trajectory_error", "trajectory error [observed sd]", "viridis_r")
@@ -60,21 +52,13 @@ SUCCESS = Measure("success_rate", "simulation success rate [%]", "cividis", scal
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """The results of a sensitivity grid.
+    """The results of a sensitivity grid."""
 
-    Attributes:
-        names: hyperparameters, in the order of the arrays' leading axes.
-        values: of each hyperparameter.
-        defaults: the heuristic's default of each, the paper's value.
-        arrays: measures, shape [axis..., seed].
-        heuristic: its name.
-    """
-
-    names: tuple[str, ...]
-    values: tuple[tuple[float, ...], ...]
-    defaults: tuple[float, ...]
-    arrays: Mapping[str, np.ndarray]
-    heuristic: str = ""
+    names: tuple[str, ...]  # hyperparameters, in the order of the arrays' leading axes
+    values: tuple[tuple[float, ...], ...]  # of each hyperparameter
+    defaults: tuple[float, ...]  # the heuristic's default of each, the paper's value
+    arrays: Mapping[str, np.ndarray]  # measures, shape [axis..., seed]
+    heuristic: str = ""  # its name
 
 
 def is_grid(folder: Path) -> bool:

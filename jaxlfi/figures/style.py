@@ -118,19 +118,12 @@ TRUTH_LINE = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 0.9}
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """How one configuration is drawn.
+    """How one configuration is drawn."""
 
-    Attributes:
-        label: its name for a reader.
-        colour: of lines, boxes and titles.
-        marker: matplotlib marker.
-        linestyle: matplotlib line style.
-    """
-
-    label: str
-    colour: str
-    marker: str
-    linestyle: str | tuple
+    label: str  # its name for a reader
+    colour: str  # of lines, boxes and titles
+    marker: str  # matplotlib marker
+    linestyle: str | tuple  # matplotlib line style
 
     @property
     def line(self) -> dict:
