@@ -73,9 +73,11 @@ def summarised(
         sentences.append(trade_off_sentence(space.names, trade_off, all(known[d] for d in trade_off.places)))
     unclear = [one.name for d, one in enumerate(parameters) if one.verdict == "not at all" and d not in shared]
     steps += [ANOTHER.format(f"{listed(unclear)} {'changes' if len(unclear) == 1 else 'change'}")] * bool(unclear)
-    for one in together:
-        if not all(known[d] for d in one.places):
-            steps.append(ANOTHER.format(f"{listed([space.names[d] for d in one.places])} change in different ways"))
+    for trade_off in together:
+        if not all(known[d] for d in trade_off.places):
+            steps.append(
+                ANOTHER.format(f"{listed([space.names[d] for d in trade_off.places])} change in different ways")
+            )
     return RunSummary(parameters, tuple(filter(None, sentences)), tuple(steps))
 
 
