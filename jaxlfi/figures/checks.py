@@ -1,6 +1,6 @@
 """Checks: the observation among simulations from the posterior; all pictures of diagnostics, and a page of them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ from jaxlfi.figures import calibration, intervals, page, style
 from jaxlfi.figures.calibration import BAND, COLOUR, COVERAGE, DISTANCE, Arrays
 from jaxlfi.figures.extent import extent
 from jaxlfi.figures.history import read_arrays, robust_sd
-from jaxlfi.figures.page import Picture
 from jaxlfi.figures.predictive import QUANTILES
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
 from jaxlfi.io import files
@@ -39,21 +38,18 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
     path = folder / "diagnostics.npz"
     arrays = read_arrays(path, ("names", "units"), [name for needed, *_ in PICTURES.values() for name in needed])
     found = _read(folder / "diagnostics.json")
-    pictures = []
     drawable = {name: maker for name, maker in PICTURES.items() if maker[0][0] in arrays}
     for needed, *_ in drawable.values():
         if missing := [name for name in needed if name not in arrays]:
             raise ValueError(f"{path}: expected {', '.join(needed)}; missing {', '.join(missing)}")
-    with style.context():
+
+    def drawings() -> Iterator[page.Drawing]:
         for name, (_, size, draw, title, caption) in drawable.items():
             figure = style.new_figure(*size(arrays))
             draw(figure, arrays)
-            path = style.save(figure, folder / "figures" / f"{name}.png", dpi)
-            pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
-    text = page.render_diagnostics(found, pictures)
-    index = folder / "report.html"
-    files.write_bytes(index, text.encode(errors="replace"))
-    return [index, *(picture.path for picture in pictures)]
+            yield name, figure, title, caption
+
+    return page.write(folder, drawings(), lambda pictures: page.render_diagnostics(found, pictures), dpi)
 
 
 def _read(path: Path) -> Mapping[str, Any]:

@@ -4,17 +4,18 @@ import base64
 import dataclasses
 import html
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from jaxlfi.figures import statistics
+from jaxlfi.figures import statistics, style
 from jaxlfi.figures.collection import Collection
 from jaxlfi.figures.history import heuristic_name
 from jaxlfi.figures.style import looks, natural, unit_label
-from jaxlfi.io import web_page
+from jaxlfi.io import files, web_page
 from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.io.web_page import prose, wide
 
@@ -27,6 +28,24 @@ class Picture:
     title: str  # its heading
     caption: str  # the text below it
     width: float  # in inches, as in a paper
+
+
+Drawing = tuple[str, Figure, str, str]
+"""A figure between its file's name and its title and caption."""
+
+
+def write(
+    folder: Path, drawings: Iterable[Drawing], render: Callable[[Sequence[Picture]], str], dpi: float
+) -> list[Path]:
+    """Save pictures in this package's style as they are drawn, then the page that shows them; returns it and them."""
+    pictures = []
+    with style.context():
+        for name, figure, title, caption in drawings:
+            path = style.save(figure, folder / "figures" / f"{name}.png", dpi)
+            pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
+    index = folder / "report.html"
+    files.write_bytes(index, render(pictures).encode(errors="replace"))
+    return [index, *(picture.path for picture in pictures)]
 
 
 _COLUMNS = {

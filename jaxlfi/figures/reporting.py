@@ -1,6 +1,6 @@
 """Report: all pictures of a run folder, and a page with them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +23,7 @@ from jaxlfi.figures import (
 )
 from jaxlfi.figures.collection import Collection, Runs, open_collection, representative, seed_count
 from jaxlfi.figures.history import History, read_config
-from jaxlfi.figures.page import Picture
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
-from jaxlfi.io import files
 
 COLUMNS = ("ok", "misspecified", "broad", "misspecified+edge")
 """The configurations to show side by side, where there are more than `MAX_COLUMNS`."""
@@ -49,26 +47,14 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
     folder = Path(folder)
     if sensitivity.is_grid(folder):
         grid, config = sensitivity.load(folder), read_config(folder)
-        return _written(folder, GRID_PICTURES, grid, lambda pictures: page.render_grid(config, pictures), dpi)
+        return page.write(folder, _drawings(GRID_PICTURES, grid), lambda drawn: page.render_grid(config, drawn), dpi)
     collection = open_collection(folder)
-    return _written(folder, PICTURES, collection, lambda pictures: page.render(collection, pictures), dpi)
+    return page.write(folder, _drawings(PICTURES, collection), lambda drawn: page.render(collection, drawn), dpi)
 
 
-def _written(folder: Path, makers: Mapping[str, Callable], loaded, render: Callable, dpi: float) -> list[Path]:
-    """Draw the pictures that apply to a collection or grid, and write the page."""
-    pictures: list[Picture] = []
-    with style.context():
-        for name, make in makers.items():
-            made = make(loaded)
-            if made is None:
-                continue
-            figure, title, caption = made
-            path = style.save(figure, folder / "figures" / f"{name}.png", dpi)
-            pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
-    text = render(pictures)
-    index = folder / "report.html"
-    files.write_bytes(index, text.encode(errors="replace"))
-    return [index, *(picture.path for picture in pictures)]
+def _drawings(makers: Mapping[str, Callable], loaded) -> Iterator[page.Drawing]:
+    """The pictures that apply to a collection or grid."""
+    return ((name, *made) for name, make in makers.items() if (made := make(loaded)) is not None)
 
 
 Made = tuple[Figure, str, str] | None
