@@ -37,14 +37,6 @@ def engine_for(
 ) -> BatchEngine | SharedEngine:
     """The engine that steps a batch: one compiled program, in several processes too, or rounds around a host simulator.
 
-    Args:
-        task: the task.
-        settings: the same for all runs.
-        inputs: stacked.
-        first: simulations that take the place of the first round's, the same for all runs.
-        journal: of simulations that are made one by one.
-        processes: that share the runs out among them.
-
     Raises:
         ValueError: for a host simulator in several processes.
     """

@@ -168,10 +168,6 @@ def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") ->
 def with_fields(settings: Settings, given: Mapping[str, Any]) -> Settings:
     """Settings with the named numbers replaced, be they the run's or its estimator's.
 
-    Args:
-        settings: to begin with.
-        given: by name.
-
     Raises:
         ValueError: for a name that neither has.
 

@@ -79,9 +79,6 @@ class Command:
     def __call__(self, words: Sequence[str] | None = None) -> int:
         """Do its work.
 
-        Args:
-            words: those after its name; by default those of the process.
-
         Returns:
             0, or what its work returned; 2 for bad input; 130 where it was interrupted.
         """

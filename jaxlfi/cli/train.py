@@ -108,14 +108,9 @@ def _train(arguments: argparse.Namespace) -> None:
 def run(
     out: Path, environment: "Environment", output: "Output", figures: bool, processes: "Processes | None" = None
 ) -> None:
-    """Train what a folder asks for, print how the policies fare, and draw the learning curves.
+    """Train what this process's folder asks for, print how the policies fare, and draw the learning curves.
 
-    Args:
-        out: the folder, which this process writes.
-        environment: that of the folder.
-        output: to print on.
-        figures: whether to draw.
-        processes: that share the trainings out among them; None for this one alone.
+    The trainings are shared out among `processes`; by default this one alone.
     """
     import numpy as np
     from rich.markup import escape
@@ -198,12 +193,7 @@ def resume(out: Path, output: "Output", figures: bool, processes: "Processes") -
 
 
 def check_seeds(first: int, count: int, name: str) -> None:
-    """Refuse seeds that make no key.
-
-    Args:
-        first: the first of them.
-        count: how many follow each other.
-        name: of the first one's argument.
+    """Refuse `count` seeds from `first` on that make no key; `name` is that of the first one's argument.
 
     Raises:
         ValueError: for seeds below 0 or of more than 32 bits.

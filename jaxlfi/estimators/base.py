@@ -408,11 +408,6 @@ class Network(struct.PyTreeNode):
 def converted(estimator: Estimator, kind: type[Estimator], values: Mapping[str, Any]) -> Estimator:
     """An estimator of another family, with the settings that both have, and some of them replaced.
 
-    Args:
-        estimator: whose settings are kept.
-        kind: the family.
-        values: settings to replace, by name.
-
     Raises:
         ValueError: for settings the family does not have or does not accept.
 

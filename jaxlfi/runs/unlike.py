@@ -23,10 +23,7 @@ def observation_findings(run: Result) -> list[Finding]:
 def names_of(task: Task, trajectory: Sequence[int], size: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of a summary's numbers, and those of its channels where it is a series of records as they are.
 
-    Args:
-        task: whose summary it is.
-        trajectory: shape of what is summarised.
-        size: length S of the summary.
+    The summary is of a trajectory of this shape, and of this size S.
 
     Returns:
         S names; and C names, or none where it is no series.

@@ -83,11 +83,7 @@ def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, 
 def failure_code(task: Task, finite: Any, outcome: Any, numpy: Any = jnp) -> Any:
     """The code of the reason for which a simulation failed, 0 for success.
 
-    Args:
-        task: for the reasons.
-        finite: whether its trajectory is.
-        outcome: what the simulator says of it.
-        numpy: the module to calculate with.
+    By the outcome that the simulator gives and whether its trajectory is finite, with `numpy` or JAX's.
     """
     failure = numpy.where(outcome, 0, 1) if outcome.dtype == bool else outcome
     # The simulator's own reasons, from -1 downwards, come after the task's (`HostSimulator.reasons`).

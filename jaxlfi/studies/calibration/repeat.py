@@ -157,16 +157,10 @@ def posteriors(
     fingerprint: str,
     console: Console,
 ) -> dict[str, np.ndarray]:
-    """The posteriors of all truths, chunk by chunk; those that are there already are read.
+    """The posteriors of all truths, in chunks of a length; those that are there already are read.
 
-    Args:
-        out: the folder of the diagnostics.
-        run: the run under test.
-        plan: what is asked of it.
-        truths: of `draw_truths`.
-        length: of a chunk. The last one is filled up by its last truth, so that one program serves them all.
-        fingerprint: of all that the results depend on.
-        console: for progress.
+    The last chunk is filled up by its last truth, so that one program serves them all. The fingerprint is of all that
+    the results depend on.
 
     Raises:
         StoreError: for a damaged chunk, before anything is computed.

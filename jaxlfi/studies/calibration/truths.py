@@ -38,13 +38,6 @@ def simulated_truths(key: jax.Array, task: Task, box: Support, count: int, shape
     A truth whose simulation fails is drawn again: inference learns from simulations that succeeded, so its posterior
     is that under the prior given success, and so must the truths be.
 
-    Args:
-        key: consumed.
-        task: the task.
-        box: in inference space.
-        count: number N of truths.
-        shapes: of a trajectory and its summary.
-
     Returns:
         `theta` [N, D], `observed` [N, ...], `x` [N, S], and `failed`, the failures by reason.
 

@@ -160,12 +160,7 @@ def grid_runs(grid: Grid) -> list[RunSpec]:
 
 
 def observations(grid: Grid, observation: Any = None) -> tuple[np.ndarray, np.ndarray]:
-    """Each seed's observed trajectory and its summary, stacked.
-
-    Args:
-        grid: for the task and the seeds.
-        observation: one for all seeds; by default the task's, or one simulated at the truth for each.
-    """
+    """Each seed's observed trajectory and its summary, stacked: one for all, the task's, or one simulated for each."""
     keys = [run_keys(key_of(seed)).observe for seed in grid.seeds]
     pairs = [observe(key, grid.task, observation) for key in keys]
     return tuple(np.stack([np.asarray(pair[i]) for pair in pairs]) for i in range(2))
