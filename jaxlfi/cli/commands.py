@@ -1,11 +1,8 @@
 """What the command line's commands do; `jaxlfi.cli.parser` parses, this module works."""
 
 import argparse
-import csv
 import dataclasses
-import io
 import json
-import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,11 +17,11 @@ from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.keys import key_of
 from jaxlfi.bayessim.presets import all_rounds
 from jaxlfi.cli import choices, interrupts, summaries, tables, train
-from jaxlfi.cli.exit_status import resuming
+from jaxlfi.cli.exit_status import removed_if, resuming
 from jaxlfi.cli.tables import Output
 from jaxlfi.distributions.truncation import TRIES
 from jaxlfi.io import files as atomic
-from jaxlfi.io import host_devices, run_summary, workfolder
+from jaxlfi.io import host_devices, run_summary, text_table, workfolder
 from jaxlfi.io.formats import COMPARE, GRID, RUN, RUNS, TRAINING
 from jaxlfi.io.locks import locked
 from jaxlfi.io.progress import RoundProgress
@@ -261,13 +258,11 @@ def sample(arguments: argparse.Namespace, output: Output) -> None:
         if out.suffix == ".npz":
             atomic.write_arrays(out, {"theta": draws, "names": np.asarray(names)})
         else:
-            text = io.StringIO()
-            writer = csv.writer(text, lineterminator="\n")
-            writer.writerows([names, *([f"{value:.8g}" for value in row] for row in draws)])
+            text = text_table.as_csv(names, ([f"{value:.8g}" for value in row] for row in draws))
             if printed:
-                sys.stdout.write(text.getvalue())
+                sys.stdout.write(text)
             else:
-                atomic.write_bytes(out, text.getvalue().encode())
+                atomic.write_bytes(out, text.encode())
     _say(output.notes, f"samples: {out}")
     if posterior.mass_inside < LOW_MASS:
         _warn(
@@ -316,17 +311,12 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     processes, count = arguments.joined, len(plan.specs)
     label = f"{plan.task.name}: {count} {'run' if count == 1 else 'runs in a batch'}"
     done = executing.rounds_done(folder) if processes.writes else 0
-    try:
-        orderly = interrupts.orderly(plan.task.on_host)
-        with orderly, RoundProgress(output.notes, plan.settings.rounds, done, label) as progress:
-            on_round = lambda index, row: progress.advance()
-            runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated, processes)
-    except (ExecutorError, OSError):
-        raise  # the simulator is not to blame: the folder can be gone on from, with the simulations it has
-    except Exception:
-        if processes.writes and arguments.command != "resume" and not executing.rounds_done(folder):
-            shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from
-        raise
+    made_here = processes.writes and arguments.command != "resume"
+    removing = removed_if(folder, lambda: made_here and not executing.rounds_done(folder))
+    progress = RoundProgress(output.notes, plan.settings.rounds, done, label)
+    with removing, interrupts.orderly(plan.task.on_host), progress:
+        on_round = lambda index, row: progress.advance()
+        runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated, processes)
     if not processes.writes:
         return
     executing.finish(folder, plan, runs)
@@ -374,15 +364,9 @@ def advice(error: Exception, prepared: Prepared) -> str:
 
 
 def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, output: Output) -> None:
-    try:
+    made_here = arguments.joined.writes and arguments.command != "resume"
+    with removed_if(folder, lambda: made_here and not (folder / "chunks").exists()):
         arrays = grid.advance(folder, work, output.notes, arguments.joined)
-    except OSError:
-        raise  # as of a full disk: the folder can be gone on from
-    except Exception:
-        made = arguments.joined.writes and arguments.command != "resume"
-        if made and not (folder / "chunks").exists():
-            shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from
-        raise
     if not arguments.joined.writes:
         return
     tables.show(summaries.marginal_table(work.grid, arrays), output.results)

@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+import shutil
 import sys
 import traceback
 import warnings
@@ -10,6 +11,7 @@ from pathlib import Path
 
 from jaxlfi.cli import interrupts
 from jaxlfi.io.shell import quoted
+from jaxlfi.tasks.errors import ExecutorError
 
 
 def one_line(error: Exception) -> str:
@@ -77,3 +79,20 @@ def warnings_in_lines() -> Iterator[None]:
         yield
     finally:
         warnings.showwarning = shown
+
+
+@contextlib.contextmanager
+def removed_if(folder: Path, empty: Callable[[], bool]) -> Iterator[None]:
+    """Remove a folder that this very command made where it fails and there is nothing in it to go on from.
+
+    Neither a full disk is to blame on the work, nor a lost cluster, nor another process that goes on with it: then the
+    folder is kept, with all that it has.
+    """
+    try:
+        yield
+    except (ExecutorError, OSError):
+        raise
+    except Exception:
+        if empty():
+            shutil.rmtree(folder)
+        raise

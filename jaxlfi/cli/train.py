@@ -5,7 +5,6 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 
 import argparse
 import contextlib
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ from jaxlfi import flags
 from jaxlfi.cli import multi_process
 from jaxlfi.cli.command import Command
 from jaxlfi.cli.domains import DOMAINS, domains_of
-from jaxlfi.cli.exit_status import resuming
+from jaxlfi.cli.exit_status import removed_if, resuming
 from jaxlfi.cli.own_fields import FIELDS, POLICIES
 from jaxlfi.io.formats import TRAINING, recorded
 from jaxlfi.registry import ENVIRONMENTS
@@ -93,16 +92,11 @@ def _train(arguments: argparse.Namespace) -> None:
         return
     plan = _plan(arguments)
     training.begin(plan, arguments.out, processes)
-    try:
+    empty = lambda: not (training.updates_done(arguments.out) or training.finished(arguments.out))
+    with removed_if(arguments.out, empty):
         with locked(arguments.out):
             run(arguments.out, plan.environment, tables.Output.of(), not arguments.no_figures, processes)
         processes.leave()
-    except OSError:
-        raise  # as of a full disk, or of another process that goes on with it: the folder is not to be lost
-    except Exception:
-        if not (training.updates_done(arguments.out) or training.finished(arguments.out)):
-            shutil.rmtree(arguments.out)  # made by this very command, and there is nothing in it to go on from
-        raise
 
 
 def run(

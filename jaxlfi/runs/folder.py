@@ -10,7 +10,6 @@ While a command runs its folder also holds `checkpoint/` (`jaxlfi.runs.checkpoin
 
 import contextlib
 import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,7 +23,7 @@ from jaxlfi.bayessim.record import FINAL, ledger_line
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.io import files as atomic
-from jaxlfi.io import formats, provenance, run_summary, trees, workfolder
+from jaxlfi.io import formats, provenance, run_summary, text_table, trees, workfolder
 from jaxlfi.io.formats import COMPARE, RUN, RUNS
 from jaxlfi.io.locks import locked
 from jaxlfi.io.workfolder import StoreError
@@ -163,12 +162,8 @@ def _require_replaceable(folder: Path) -> None:
 
 def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     """Write the table of a comparison, one line a configuration and seed; what is unknown stays empty."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, TABLE_COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    for line in lines:
-        writer.writerow({name: "" if value != value else value for name, value in line.items()})
-    atomic.write_bytes(path, text.getvalue().encode(), durable=True)
+    rows = (["" if line[name] != line[name] else line[name] for name in TABLE_COLUMNS] for line in lines)
+    atomic.write_bytes(path, text_table.as_csv(TABLE_COLUMNS, rows).encode(), durable=True)
 
 
 def run_config(task: Task, origin: Origin, spec: RunSpec, settings: Settings) -> dict[str, Any]:

@@ -10,9 +10,7 @@ Where several processes were joined (`jaxlfi.io.processes`) they share the runs 
 first writes.
 """
 
-import csv
 import hashlib
-import io
 import itertools
 import json
 from collections.abc import Mapping
@@ -25,7 +23,7 @@ from rich.console import Console
 
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.io import files as atomic
-from jaxlfi.io import provenance, serialise, workfolder
+from jaxlfi.io import provenance, serialise, text_table, workfolder
 from jaxlfi.io.formats import GRID
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.io.progress import RoundProgress
@@ -195,12 +193,11 @@ def finish(folder: Path, grid: Grid, arrays: Mapping[str, np.ndarray], seconds: 
 
 def table(grid: Grid, arrays: Mapping[str, np.ndarray]) -> str:
     """The results as CSV, one line a combination and seed; what is unknown stays empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     measures = ("theta_error", "trajectory_error", "success_rate")
-    writer.writerow([*(axis.name for axis in grid.axes), "seed", *measures])
     columns = [np.ravel(arrays[name]).tolist() for name in measures]
     places = itertools.product(combinations(grid.axes), grid.seeds)
-    for (values, seed), *results in zip(places, *columns, strict=True):
-        writer.writerow([*values.values(), seed, *("" if value != value else value for value in results)])
-    return text.getvalue()
+    rows = (
+        [*values.values(), seed, *("" if value != value else value for value in found)]
+        for (values, seed), *found in zip(places, *columns, strict=True)
+    )
+    return text_table.as_csv([*(axis.name for axis in grid.axes), "seed", *measures], rows)
