@@ -27,7 +27,11 @@ from jaxlfi.figures.style import (
     or_labels,
 )
 
-_OUTLINE = [patheffects.withStroke(linewidth=1.5, foreground="white")]
+_ARROW = {
+    **{"arrowstyle": "-|>,head_length=2.2,head_width=1.0", "mutation_scale": 1, "shrinkA": 0, "shrinkB": 0},
+    **{"linewidth": 0.6, "color": "black", "zorder": 5},
+    "path_effects": [patheffects.withStroke(linewidth=1.5, foreground="white")],
+}
 
 
 def pairs(dim: int) -> list[tuple[int, ...]]:
@@ -114,27 +118,19 @@ def draw_proposals(
     iteration = np.broadcast_to(np.arange(1, history.rounds + 1)[:, None], history.counted.shape)
     points = _plane(history.theta, pair, iteration)
     failed = history.counted & (history.failure != 0)
+    by_iteration = {"cmap": colours, "norm": norm}
     for chosen, style in (
         (failed, {"marker": "x", "s": 5, "linewidths": 0.45}),
         (history.kept, {"s": 3.5, "linewidths": 0}),
     ):
         chosen = chosen & np.isfinite(points).all(-1)
-        axes.scatter(*points[chosen].T, c=iteration[chosen], cmap=colours, norm=norm, alpha=0.75, zorder=2, **style)
+        axes.scatter(*points[chosen].T, c=iteration[chosen], alpha=0.75, zorder=2, **by_iteration, **style)
     for i in range(history.rounds):
         low, high = history.proposal_low[i], history.proposal_high[i]
         _add_box(axes, low, high, pair, i + 1, edgecolor=colours(norm(i + 1)), linewidth=0.9, zorder=3)
     mean = _plane(history.accumulated_means, pair, iteration[:, 0])
-    axes.scatter(
-        *mean.T,
-        c=iteration[:, 0],
-        cmap=colours,
-        norm=norm,
-        s=22,
-        edgecolors="white",
-        linewidths=0.6,
-        zorder=4,
-        gid="accumulated mean",
-    )
+    marked = {"s": 22, "edgecolors": "white", "linewidths": 0.6, "gid": "accumulated mean"}
+    axes.scatter(*mean.T, c=iteration[:, 0], zorder=4, **by_iteration, **marked)
     _mark_truth(axes, history, pair)
     _frame(axes, history, pair, window)
     if len(pair) == 1:
@@ -209,21 +205,8 @@ def _draw_path(axes: Axes, history: History, pair: tuple[int, ...]) -> None:
         *path.T, "o", color="black", markersize=1.6, markeredgecolor="white", markeredgewidth=0.3, gid="weighted mean"
     )
     for start, end in itertools.pairwise(path):
-        if np.array_equal(start, end):
-            continue
-        arrow = FancyArrowPatch(
-            start,
-            end,
-            arrowstyle="-|>,head_length=2.2,head_width=1.0",
-            mutation_scale=1,
-            shrinkA=0,
-            shrinkB=0,
-            linewidth=0.6,
-            color="black",
-            zorder=5,
-            path_effects=_OUTLINE,
-        )
-        axes.add_patch(arrow)
+        if not np.array_equal(start, end):
+            axes.add_patch(FancyArrowPatch(start, end, **_ARROW))
 
 
 def _plane(theta: np.ndarray, pair: tuple[int, ...], iteration: np.ndarray) -> np.ndarray:
