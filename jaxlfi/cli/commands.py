@@ -16,6 +16,7 @@ from rich.table import Table
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.keys import key_of
 from jaxlfi.bayessim.presets import all_rounds
+from jaxlfi.bayessim.settings import Settings
 from jaxlfi.cli import choices, interrupts, summaries, tables, train
 from jaxlfi.cli.exit_status import removed_if, resuming
 from jaxlfi.cli.tables import Output
@@ -107,9 +108,7 @@ def infer(arguments: argparse.Namespace, output: Output) -> Prepared:
     rule = choices.build_heuristic(arguments, arguments.heuristic, kinds, settings, task)
     configuration = support_name if arguments.heuristic == "none" else f"{support_name}+{arguments.heuristic}"
     specs = tuple(RunSpec(configuration, support_name, support, rule, seed) for seed in choices.seeds_of(arguments))
-    kind = RUN if len(specs) == 1 else RUNS
-    plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
-    return _begun(arguments, plan, output, first)
+    return _begun(arguments, RUN if len(specs) == 1 else RUNS, task, settings, specs, output, first)
 
 
 def compare(arguments: argparse.Namespace, output: Output) -> Prepared:
@@ -128,19 +127,19 @@ def compare(arguments: argparse.Namespace, output: Output) -> Prepared:
         for seed in choices.seeds_of(arguments)
         for name, (support, heuristic) in zip(configurations, parts, strict=True)
     )
-    kind = COMPARE
-    plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
-    return _begun(arguments, plan, output, None)
+    return _begun(arguments, COMPARE, task, settings, specs, output)
 
 
-def _begun(arguments: argparse.Namespace, plan: BatchPlan, output: Output, first: Any) -> Prepared:
-    """The folder of a plan, after everything was checked."""
+def _begun(
+    arguments: argparse.Namespace, kind: str, task: Task, settings: Settings, specs: tuple, output: Output, first=None
+) -> Prepared:
+    """The folder of runs, after everything was checked."""
     processes = arguments.joined
     if processes.writes:
         workfolder.refuse_occupied(arguments.out)
-    observation = choices.observation_of(arguments, plan.task, lambda line: _say(output.notes, line))
-    task = with_gaps_of(plan.task, observation, plan.settings.estimator.embedding != "none")
-    plan = dataclasses.replace(plan, task=task)
+    observation = choices.observation_of(arguments, task, lambda line: _say(output.notes, line))
+    task = with_gaps_of(task, observation, settings.estimator.embedding != "none")
+    plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
     observed = executing.prepare(plan, observation, first, processes)
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
         if (mass := priors.require_mass(plan.task.inference.prior, box, name)) < priors.LOW_INSIDE:
