@@ -48,6 +48,16 @@ class Collection:
         return {name: np.array(values, float) for name, values in found.items() if values}
 
 
+def all_of(runs: Runs) -> list[History]:
+    """The runs of all configurations."""
+    return [history for histories in runs.values() for history in histories]
+
+
+def first_of(runs: Runs) -> History:
+    """One of them, for what all have in common."""
+    return next(iter(runs.values()))[0]
+
+
 def seed_count(runs: Runs) -> int:
     """The largest number of seeds of any configuration."""
     return max(len(histories) for histories in runs.values())
@@ -144,7 +154,7 @@ def _ordered(names: Mapping[str, Path], config: Mapping[str, Any]) -> list[str]:
 
 def _alike(folder: Path, runs: Mapping[str, list[History]], unfinished: list[str]) -> dict[str, list[History]]:
     """The runs that can be compared: of the same parameters, and with as many rounds as the longest."""
-    every = [history for histories in runs.values() for history in histories]
+    every = all_of(runs)
     for history in every[1:]:
         if history.names != every[0].names:
             raise ValueError(

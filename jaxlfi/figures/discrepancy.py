@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxlfi.figures.collection import Runs, seed_count
+from jaxlfi.figures.collection import Runs, first_of, seed_count
 from jaxlfi.figures.curves import drawable
 from jaxlfi.figures.legends import above, balanced
 from jaxlfi.figures.natural import logarithmic
@@ -57,7 +57,7 @@ class Panel(NamedTuple):
 
 def panels(runs: Runs) -> list[Panel]:
     """One panel per parameter, if the truth is known, and one for the trajectory."""
-    first = next(iter(runs.values()))[0]
+    first = first_of(runs)
     errors = {name: final_errors(runs, name) for name in runs}
     known, simulated = (any(np.isfinite(error[i]).any() for error in errors.values()) for i in (0, 1))
     logs = [is_log(name) for name in first.names]

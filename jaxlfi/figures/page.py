@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxlfi.figures import statistics, style
-from jaxlfi.figures.collection import Collection
+from jaxlfi.figures.collection import Collection, all_of, first_of
 from jaxlfi.figures.history import heuristic_name
 from jaxlfi.figures.style import looks, natural, unit_label
 from jaxlfi.io import files, web_page
@@ -63,7 +63,7 @@ UNMEASURED = "not measured"
 def render(collection: Collection, pictures: Sequence[Picture]) -> str:
     """The page as text."""
     config = collection.config
-    first = next(iter(collection.runs.values()))[0]
+    first = first_of(collection.runs)
     task = _short(
         config.get("task") or first.config.get("task") or first.config.get("task_name") or collection.folder.name
     )
@@ -221,7 +221,7 @@ def _widths(collection: Collection) -> str:
 
 def _facts(collection: Collection) -> str:
     """Parameters and provenance of the runs, from the folder's config.json or the first run's."""
-    first = next(iter(collection.runs.values()))[0]
+    first = first_of(collection.runs)
     configs = (collection.config, first.config)
 
     def get(*names: str) -> Any:
@@ -265,7 +265,7 @@ def _notes(collection: Collection) -> str:
     if collection.unfinished:
         names = ", ".join(str(Path(p).relative_to(collection.folder)) for p in collection.unfinished)
         notes.append(f"Not finished, and left out of the pictures: {names}.")
-    if all(h.trajectory_error is None for histories in collection.runs.values() for h in histories):
+    if all(history.trajectory_error is None for history in all_of(collection.runs)):
         notes.append(
             "There are no simulated trajectories of posterior samples: none were simulated, or all simulations failed. "
             "Trajectory errors and the posterior predictive are left out."

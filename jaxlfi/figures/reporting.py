@@ -21,7 +21,7 @@ from jaxlfi.figures import (
     style,
     supports,
 )
-from jaxlfi.figures.collection import Collection, Runs, open_collection, representative, seed_count
+from jaxlfi.figures.collection import Collection, Runs, all_of, first_of, open_collection, representative, seed_count
 from jaxlfi.figures.history import History, read_config
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
 
@@ -91,7 +91,7 @@ def _samples(collection: Collection) -> Made:
 
 
 def _efficiency(collection: Collection) -> Made:
-    every = [history for histories in collection.runs.values() for history in histories]
+    every = all_of(collection.runs)
     if len(every) == 1 and (every[0].rounds == 1 or not every[0].failed.any()):
         return None  # a constant line says no more than the summary
     figure = style.new_figure(TEXT_WIDTH, 2.1 + _legend_height(collection.runs))
@@ -104,10 +104,10 @@ def _efficiency(collection: Collection) -> Made:
 
 
 def _curves(collection: Collection) -> Made:
-    if not curves.drawable(collection.runs) or _first(collection).rounds == 1:
+    if not curves.drawable(collection.runs) or first_of(collection.runs).rounds == 1:
         return None
     known, simulated = _measured(collection.runs)
-    dim = _first(collection).dim
+    dim = first_of(collection.runs).dim
     wide = dim > 4
     rows = -(-dim // (3 if wide else 2))
     figure = style.new_figure(TEXT_WIDTH if wide and known else COLUMN_WIDTH, 2.3 + (1.2 * rows if known else 0.2))
@@ -143,8 +143,8 @@ def _discrepancy(collection: Collection) -> Made:
 def _supports(collection: Collection) -> Made:
     if len(collection.runs) == 1 and not any(history.adapts for history in next(iter(collection.runs.values()))):
         return None
-    width = COLUMN_WIDTH if _first(collection).dim == 1 else TEXT_WIDTH
-    figure = style.new_figure(width, 0.6 + 1.6 * -(-_first(collection).dim // 4))
+    width = COLUMN_WIDTH if first_of(collection.runs).dim == 1 else TEXT_WIDTH
+    figure = style.new_figure(width, 0.6 + 1.6 * -(-first_of(collection.runs).dim // 4))
     supports.draw(figure, collection.runs)
     left_out = len(supports.adapting(collection.runs)) < len(collection.runs)
     caption = (
@@ -290,13 +290,9 @@ GRID_PICTURES: dict[str, Callable[[sensitivity.Grid], Made]] = {
 """The function that draws each picture of a sensitivity grid, by file name."""
 
 
-def _first(collection: Collection) -> History:
-    return next(iter(collection.runs.values()))[0]
-
-
 def _measured(runs: Runs) -> tuple[bool, bool]:
     """Whether any run has parameter errors, and whether any has trajectory errors."""
-    every = [history for histories in runs.values() for history in histories]
+    every = all_of(runs)
     return any(h.theta_error is not None for h in every), any(h.trajectory_error is not None for h in every)
 
 

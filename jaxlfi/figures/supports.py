@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.collection import Runs, seed_count
+from jaxlfi.figures.collection import Runs, first_of, seed_count
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import above, balanced
 from jaxlfi.figures.natural import scales
@@ -40,7 +40,7 @@ def draw(figure: Figure, runs: Runs) -> None:
     """One panel per parameter, with the configurations that adapt, the truth and the feasible limits Phi."""
     shown = adapting(runs)
     look = {name: own for name, own in looks(list(runs)).items() if name in shown}
-    first = next(iter(shown.values()))[0]
+    first = first_of(shown)
     rows, columns = grid_shape(first.dim, 4)
     scale = scales(first.names, first.units)
     every = figure.subplots(rows, columns, squeeze=False).ravel()
