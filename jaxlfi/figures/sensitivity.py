@@ -94,12 +94,7 @@ def load(folder: Path) -> Grid:
 
 
 def marginal(values: np.ndarray, *axes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation over all axes but the given ones, in the order given.
-
-    Args:
-        values: shape [axis..., seed]; NaN is left out.
-        axes: one or two of the leading axes.
-    """
+    """Mean and standard deviation over all axes but the given ones, in the order given; NaN is left out."""
     front = np.moveaxis(values, axes, range(len(axes)))
     pooled = front.reshape(*front.shape[: len(axes)], -1)
     return statistics.mean(pooled, -1), statistics.sd(pooled, -1)
@@ -112,12 +107,7 @@ def errors(grid: Grid) -> tuple[Measure, ...]:
 
 
 def size(grid: Grid, bars: int) -> tuple[float, float]:
-    """Width and height in inches of a figure with colour bars: one column where the cells stay readable, or two.
-
-    Args:
-        grid: the results.
-        bars: number of colour bars, one for each measure.
-    """
+    """Width and height in inches of a figure with colour bars: one column where the cells stay readable, or two."""
     cells = sum(len(values) for values in grid.values)
     width = COLUMN_WIDTH if cells <= 10 else TEXT_WIDTH
     square = width * (0.93 if len(grid.names) > 1 else 0.25 * bars)
