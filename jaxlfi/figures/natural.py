@@ -129,6 +129,6 @@ class Scale:
 
 
 def scales(names: Sequence[str], units: Sequence[str], width: int = 26) -> list[Scale]:
-    """The scales of parameters in inference space, labelled with their symbols and names in lines of a width in letters."""
+    """The scales of parameters in inference space, labelled with their symbols and names, broken into lines."""
     each = zip(names, units, strict=True)
     return [Scale(parameter_name(names, d, width), plain_unit(u), is_log(n)) for d, (n, u) in enumerate(each)]
