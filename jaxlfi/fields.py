@@ -125,17 +125,8 @@ def option(
 ) -> Any:
     """A value that sets shapes or structure, and so is part of what is compiled: no leaf of the pytree.
 
-    Its type is that of its default. The elements of a tuple are checked one by one.
-
-    Args:
-        default: its value where none is given.
-        help: what it is, in one line.
-        symbol: the paper's, spelt out.
-        choices: the values it can take, where they are few.
-        low: least value of a number.
-        high: greatest value.
-        above: exclusive lower limit, in place of `low`.
-        below: exclusive upper limit, in place of `high`.
+    Its type is that of its default. The elements of a tuple are checked one by one. Arguments are those of
+    `hyperparameter`, and `choices`: the values it can take, where they are few.
     """
     choices = None if choices is None else tuple(choices)
     return _field(default, False, FieldInfo(help, symbol, low, high, above, below, choices))

@@ -15,6 +15,7 @@ from jaxlfi.estimators.base import Estimator
 from jaxlfi.rl.settings import PPO
 from jaxlfi.rl.settings import PRESETS as POLICIES
 
+WIDTH = 120
 PLACE = Path(jaxlfi.__file__).parent / "cli" / "own_fields.py"
 HEAD = '''"""What `--help` says of our classes and commands, none of which it imports; by tests/own_fields.py."""
 
@@ -32,11 +33,11 @@ FIELDS: dict[str, dict[str, Declared]] = {{
 \"\"\"Fields by the class that declares them, as "module:Class", and by their own name.\"\"\"
 PRESETS: dict[str, dict[str, Any]] = {{
 {presets}
-}}
+}}  # fmt: skip
 \"\"\"Settings of a run by the preset and the name, its estimator's among them.\"\"\"
 POLICIES: dict[str, dict[str, Any]] = {{
 {policies}
-}}
+}}  # fmt: skip
 \"\"\"Settings of a training of policies, likewise.\"\"\"
 HELP = {{
 {commands}
@@ -60,19 +61,32 @@ def commands() -> dict[str, str]:
     return {place: registry.named("command", place).help for place in ours}
 
 
-def call(field: fields.Declared) -> str:
-    """The call that declares a field."""
+def filled(first: str, parts: list[str], last: str) -> str:
+    """Parts with commas between them in lines of the greatest length, of which the first begins with `first`."""
+    lines = [f"    {first}"]
+    for place, part in enumerate(parts, 1):
+        part += last if place == len(parts) else ", "
+        if len(lines[-1] + part.rstrip()) > WIDTH:
+            lines.append(" " * 8)
+        lines[-1] += part
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def entry(name: str, field: fields.Declared) -> str:
+    """The line that declares a field, or two."""
     given = {"help": field.info.help} | {
         name: value
         for name, value in vars(field.info).items()
         if name != "help" and value != getattr(fields.FieldInfo(""), name)
     }
     arguments = [f"default={shown(field.default)}", *(f"{name}={shown(value)}" for name, value in given.items())]
-    return f"{'option' if field.static else 'hyperparameter'}({', '.join(arguments)})"
+    return filled(f'"{name}": {"option" if field.static else "hyperparameter"}(', arguments, "),")
 
 
 def shown(value: Any) -> str:
     """A value in the source."""
+    if isinstance(value, tuple):
+        return f"({', '.join(map(shown, value))}{',' * (len(value) == 1)})"
     text = str(value) if isinstance(value, float) and math.isinf(value) else repr(value)
     return text if not text.startswith("'") or '"' in text else f'"{text[1:-1]}"'
 
@@ -86,7 +100,8 @@ def source() -> str:
         new = {name: one for name, one in fields.declared(kind).items() if inherited.get(name) != one}
         names[kind] = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", kind.__name__).upper()
         text += f"{names[kind]}: dict[str, Field[Any]] = {f'{names[base]} | ' if base else ''}{{\n"
-        text += "".join(f'    "{name}": {call(one)},\n' for name, one in new.items()) + "}\n"
+        lines = [f"{entry(name, one)}\n" for name, one in new.items()]
+        text += "".join(lines) + ("}  # fmt: skip\n" if lines else "}\n")
         entries.append(f'    "{kind.__module__}:{kind.__qualname__}": described({names[kind]}),')
     helps = "\n".join(f"    {shown(place)}: {shown(text)}," for place, text in commands().items())
     presets = entries_of({name: (one, one.estimator) for name, one in PRESETS.items()})
@@ -99,8 +114,8 @@ def entries_of(presets: dict[str, tuple[Any, ...]]) -> str:
     lines = []
     for preset, parts in presets.items():
         values = {name: getattr(part, name) for part in parts for name in fields.declared(part)}
-        listed = ", ".join(f"{shown(name)}: {shown(value)}" for name, value in values.items())
-        lines.append(f"    {shown(preset)}: {{{listed}}},")
+        listed = [f"{shown(name)}: {shown(value)}" for name, value in values.items()]
+        lines.append(filled(f"{shown(preset)}: {{", listed, "},"))
     return "\n".join(lines)
 
 

@@ -228,7 +228,7 @@ def test_help_is_shown_whatever_is_named(words):
 
 def test_jax_is_started_once_where_a_package_is_imported_for_its_flags(swelling, monkeypatch):
     joins = []
-    monkeypatch.setattr(cli.joined, "join", lambda arguments: joins.append(arguments) or ALONE)
+    monkeypatch.setattr(cli.multi_process, "join", lambda arguments: joins.append(arguments) or ALONE)
     arguments = cli.parse("infer x --heuristic swell --gain 0.25 --no-cache --out x".split())
     cli.prepare_jax(arguments)
     assert len(joins) == 1 and arguments.joined is ALONE

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine
-from jaxlfi.bayessim.shared import SharedEngine
+from jaxlfi.bayessim.multi_process import SharedEngine
 from jaxlfi.tasks.host import SimulatorError
 from jaxlfi.tasks.task import Task
 
@@ -57,13 +57,7 @@ def drive(
 
 
 def require_success(succeeded: np.ndarray, failed: np.ndarray, task: Task, known: str = "") -> None:
-    """Stop if no simulation of the first round succeeded in any run.
-
-    Args:
-        succeeded: number of successes of each run.
-        failed: failures by reason, of all runs or of one.
-        task: for the reasons' names.
-        known: what is known of failures.
+    """Stop if no simulation of the first round succeeded in any run; `known` says what is known of failures.
 
     Raises:
         SimulatorError: with the counts by reason.

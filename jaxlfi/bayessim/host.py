@@ -13,10 +13,10 @@ import numpy as np
 
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_draws, propose_one, update_one
+from jaxlfi.bayessim.multi_process import SharedEngine
 from jaxlfi.bayessim.programs import compiled, program
 from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
 from jaxlfi.distributions.precision import single
 from jaxlfi.io.processes import ALONE, Processes
@@ -36,14 +36,6 @@ def engine_for(
     processes: Processes = ALONE,
 ) -> BatchEngine | SharedEngine:
     """The engine that steps a batch: one compiled program, in several processes too, or rounds around a host simulator.
-
-    Args:
-        task: the task.
-        settings: the same for all runs.
-        inputs: stacked.
-        first: simulations that take the place of the first round's, the same for all runs.
-        journal: of simulations that are made one by one.
-        processes: that share the runs out among them.
 
     Raises:
         ValueError: for a host simulator in several processes.

@@ -118,14 +118,7 @@ def npe(settings: Settings) -> Settings:
     )
 
 
-LIKELIHOOD = MixtureLikelihood(
-    hidden=(50, 50),
-    components=2,
-    epochs=0,
-    steps=1000,
-    learning_rate=1e-3,
-    **ENSEMBLE,
-)
+LIKELIHOOD = MixtureLikelihood(hidden=(50, 50), components=2, epochs=0, steps=1000, learning_rate=1e-3, **ENSEMBLE)
 """Four networks of two Gaussians over the summaries; hardly tuned."""
 
 
@@ -174,10 +167,6 @@ def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") ->
 
 def with_fields(settings: Settings, given: Mapping[str, Any]) -> Settings:
     """Settings with the named numbers replaced, be they the run's or its estimator's.
-
-    Args:
-        settings: to begin with.
-        given: by name.
 
     Raises:
         ValueError: for a name that neither has.

@@ -36,10 +36,7 @@ def _program(function, bound: tuple, mesh: Mesh, in_axes: tuple[int | None, ...]
 def side_by_side(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...]) -> Callable[..., Any]:
     """A function of one run as a function of a batch: `vmap` over the runs, which are divided over devices.
 
-    Args:
-        one: the function, with its static arguments bound.
-        mesh: of the devices, of one axis; their number divides that of the runs.
-        in_axes: of the other arguments: 0 for one value a run, None for a value that all share.
+    Arguments are as of `program`; the number of devices divides that of the runs.
     """
     mapped = jax.vmap(one, in_axes=in_axes)
 

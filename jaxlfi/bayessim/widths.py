@@ -14,10 +14,6 @@ def widths_note(settings: Settings, heuristic: Heuristic) -> str:
     learns L(theta) p~(theta) in place of L(theta) p(theta), unless something corrects for it (docs: calibration). By
     how much widths are off depends on the simulator and on how well the network has learnt: only a measurement tells.
 
-    Args:
-        settings: of the run.
-        heuristic: of the run.
-
     Example:
         >>> from jaxlfi.bayessim.presets import QUICK
         >>> from jaxlfi.heuristics import Edge

@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from jaxlfi.cli import joined
+from jaxlfi.cli import multi_process
 from jaxlfi.cli.exit_status import exit_status
 
 
@@ -79,9 +79,6 @@ class Command:
     def __call__(self, words: Sequence[str] | None = None) -> int:
         """Do its work.
 
-        Args:
-            words: those after its name; by default those of the process.
-
         Returns:
             0, or what its work returned; 2 for bad input; 130 where it was interrupted.
         """
@@ -91,4 +88,4 @@ class Command:
         work = lambda: exit_status(parser.prog, lambda: self.run(arguments), debug, begun)
         if getattr(arguments, "coordinator", None) is None:
             return work()
-        return joined.work(work, begun, parser.prog, debug)
+        return multi_process.work(work, begun, parser.prog, debug)

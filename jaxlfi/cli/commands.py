@@ -1,11 +1,8 @@
 """What the command line's commands do; `jaxlfi.cli.parser` parses, this module works."""
 
 import argparse
-import csv
 import dataclasses
-import io
 import json
-import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,12 +16,13 @@ from rich.table import Table
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.bayessim.keys import key_of
 from jaxlfi.bayessim.presets import all_rounds
-from jaxlfi.cli import asked, interrupts, summaries, tables, train
-from jaxlfi.cli.exit_status import resuming
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.cli import choices, interrupts, summaries, tables, train
+from jaxlfi.cli.exit_status import removed_if, resuming
 from jaxlfi.cli.tables import Output
 from jaxlfi.distributions.truncation import TRIES
 from jaxlfi.io import files as atomic
-from jaxlfi.io import host_devices, run_summary, workfolder
+from jaxlfi.io import host_devices, run_summary, text_table, workfolder
 from jaxlfi.io.formats import COMPARE, GRID, RUN, RUNS, TRAINING
 from jaxlfi.io.locks import locked
 from jaxlfi.io.progress import RoundProgress
@@ -97,53 +95,51 @@ def _describe_task(task: Task, console: Console) -> None:
 
 def infer(arguments: argparse.Namespace, output: Output) -> Prepared:
     """Prepare `jaxlfi infer`."""
-    task = asked.task_of(arguments)
-    settings = asked.build_settings(arguments, task)
+    task = choices.task_of(arguments)
+    settings = choices.build_settings(arguments, task)
     first = None
     if arguments.simulations is None:
-        support_name, support = asked.support_of(arguments, task)
+        support_name, support = choices.support_of(arguments, task)
     else:
         own = arguments.support is not None or arguments.support_low is not None or arguments.support_high is not None
-        support_name, support = asked.support_of(arguments, task) if own else ("own", None)
+        support_name, support = choices.support_of(arguments, task) if own else ("own", None)
         first, support = presimulated(task, read_simulations(arguments.simulations), support)
-    kinds = asked.heuristics_of(arguments, [arguments.heuristic])
-    rule = asked.build_heuristic(arguments, arguments.heuristic, kinds, settings, task)
+    kinds = choices.heuristics_of(arguments, [arguments.heuristic])
+    rule = choices.build_heuristic(arguments, arguments.heuristic, kinds, settings, task)
     configuration = support_name if arguments.heuristic == "none" else f"{support_name}+{arguments.heuristic}"
-    specs = tuple(RunSpec(configuration, support_name, support, rule, seed) for seed in asked.seeds_of(arguments))
-    kind = RUN if len(specs) == 1 else RUNS
-    plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
-    return _begun(arguments, plan, output, first)
+    specs = tuple(RunSpec(configuration, support_name, support, rule, seed) for seed in choices.seeds_of(arguments))
+    return _begun(arguments, RUN if len(specs) == 1 else RUNS, task, settings, specs, output, first)
 
 
 def compare(arguments: argparse.Namespace, output: Output) -> Prepared:
     """Prepare `jaxlfi compare`."""
-    task = asked.task_of(arguments)
-    settings = asked.build_settings(arguments, task, all_rounds)
-    configurations = arguments.configurations or asked.default_configurations(task)
+    task = choices.task_of(arguments)
+    settings = choices.build_settings(arguments, task, all_rounds)
+    configurations = arguments.configurations or choices.default_configurations(task)
     if len(set(configurations)) < len(configurations):
         raise ValueError(f"configurations: expected distinct ones, got {configurations}")
-    parts = [asked.configuration_parts(name) for name in configurations]
-    kinds = asked.heuristics_of(arguments, [heuristic for _, heuristic in parts])
-    build = lambda heuristic: asked.build_heuristic(arguments, heuristic, kinds, settings, task)
+    parts = [choices.configuration_parts(name) for name in configurations]
+    kinds = choices.heuristics_of(arguments, [heuristic for _, heuristic in parts])
+    build = lambda heuristic: choices.build_heuristic(arguments, heuristic, kinds, settings, task)
     # Seeds are the slow index, so that every device gets all configurations, fast and slow ones.
     specs = tuple(
         RunSpec(name, support, task.support(support), build(heuristic), seed)
-        for seed in asked.seeds_of(arguments)
+        for seed in choices.seeds_of(arguments)
         for name, (support, heuristic) in zip(configurations, parts, strict=True)
     )
-    kind = COMPARE
-    plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
-    return _begun(arguments, plan, output, None)
+    return _begun(arguments, COMPARE, task, settings, specs, output)
 
 
-def _begun(arguments: argparse.Namespace, plan: BatchPlan, output: Output, first: Any) -> Prepared:
-    """The folder of a plan, after everything was checked."""
+def _begun(
+    arguments: argparse.Namespace, kind: str, task: Task, settings: Settings, specs: tuple, output: Output, first=None
+) -> Prepared:
+    """The folder of runs, after everything was checked."""
     processes = arguments.joined
     if processes.writes:
         workfolder.refuse_occupied(arguments.out)
-    observation = asked.observation_of(arguments, plan.task, lambda line: _say(output.notes, line))
-    task = with_gaps_of(plan.task, observation, plan.settings.estimator.embedding != "none")
-    plan = dataclasses.replace(plan, task=task)
+    observation = choices.observation_of(arguments, task, lambda line: _say(output.notes, line))
+    task = with_gaps_of(task, observation, settings.estimator.embedding != "none")
+    plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
     observed = executing.prepare(plan, observation, first, processes)
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
         if (mass := priors.require_mass(plan.task.inference.prior, box, name)) < priors.LOW_INSIDE:
@@ -168,9 +164,9 @@ def _hold(arguments: argparse.Namespace, folder: Path) -> None:
 def grid_command(arguments: argparse.Namespace, output: Output) -> Prepared:
     """Prepare `jaxlfi grid`."""
     task = TASKS.load(arguments.task)
-    settings = asked.build_settings(arguments, task, all_rounds)
+    settings = choices.build_settings(arguments, task, all_rounds)
     axes = grid.parse_axes(arguments.vary)
-    kinds = asked.heuristics_of(arguments, [arguments.heuristic])
+    kinds = choices.heuristics_of(arguments, [arguments.heuristic])
     for axis in axes:
         if axis.name in arguments.hyperparameters:
             raise ValueError(f"{axis.name}: expected it on an axis or as a flag of its own, got both")
@@ -178,15 +174,15 @@ def grid_command(arguments: argparse.Namespace, output: Output) -> Prepared:
     plan = grid.Grid(
         task=task,
         support=task.support(name),
-        rule=asked.build_heuristic(arguments, arguments.heuristic, kinds, settings, task),
+        rule=choices.build_heuristic(arguments, arguments.heuristic, kinds, settings, task),
         axes=axes,
-        seeds=tuple(asked.seeds_of(arguments)),
+        seeds=tuple(choices.seeds_of(arguments)),
         settings=settings,
         reference=arguments.task,
         preset=arguments.preset,
         support_name=name,
     )
-    observation = asked.observation_of(arguments, task, lambda line: _say(output.notes, line))
+    observation = choices.observation_of(arguments, task, lambda line: _say(output.notes, line))
     if arguments.joined.writes:
         workfolder.refuse_occupied(arguments.out)
     _say(output.notes, f"{task.name}: compiling for {plan.size} runs")
@@ -229,7 +225,7 @@ def resume(arguments: argparse.Namespace, output: Output) -> Prepared | None:
         if config.get("executor", False) and (arguments.workers, arguments.scheduler) == (None, None):
             arguments.workers = host_devices.processors()
             _say(output.notes, f"simulations: in {arguments.workers} processes on this machine")
-        work = dataclasses.replace(plan, task=asked.simulated_again(arguments, folder, plan.task)), observed
+        work = dataclasses.replace(plan, task=choices.simulated_again(arguments, folder, plan.task)), observed
         what = "the result may differ in rounding from an uninterrupted one"
     if changed := executing.changed_machine(config, arguments.joined):
         _warn(output, f"begun with {', '.join(changed)}: {what}")
@@ -261,13 +257,11 @@ def sample(arguments: argparse.Namespace, output: Output) -> None:
         if out.suffix == ".npz":
             atomic.write_arrays(out, {"theta": draws, "names": np.asarray(names)})
         else:
-            text = io.StringIO()
-            writer = csv.writer(text, lineterminator="\n")
-            writer.writerows([names, *([f"{value:.8g}" for value in row] for row in draws)])
+            text = text_table.as_csv(names, ([f"{value:.8g}" for value in row] for row in draws))
             if printed:
-                sys.stdout.write(text.getvalue())
+                sys.stdout.write(text)
             else:
-                atomic.write_bytes(out, text.getvalue().encode())
+                atomic.write_bytes(out, text.encode())
     _say(output.notes, f"samples: {out}")
     if posterior.mass_inside < LOW_MASS:
         _warn(
@@ -281,7 +275,7 @@ def diagnose(arguments: argparse.Namespace, output: Output) -> None:
     """`jaxlfi diagnose DIR`."""
     task = None if arguments.task is None else TASKS.load(arguments.task)
     run = calibration.read_run(arguments.folder, task)
-    run = run.replace(task=asked.simulated_again(arguments, arguments.folder, run.task))
+    run = run.replace(task=choices.simulated_again(arguments, arguments.folder, run.task))
     references = arguments.reference
     if references is None:
         references = f"{calibration.POSTERIOR},{next(iter(run.task.supports))}"
@@ -316,17 +310,12 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     processes, count = arguments.joined, len(plan.specs)
     label = f"{plan.task.name}: {count} {'run' if count == 1 else 'runs in a batch'}"
     done = executing.rounds_done(folder) if processes.writes else 0
-    try:
-        orderly = interrupts.orderly(plan.task.on_host)
-        with orderly, RoundProgress(output.notes, plan.settings.rounds, done, label) as progress:
-            on_round = lambda index, row: progress.advance()
-            runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated, processes)
-    except (ExecutorError, OSError):
-        raise  # the simulator is not to blame: the folder can be gone on from, with the simulations it has
-    except Exception:
-        if processes.writes and arguments.command != "resume" and not executing.rounds_done(folder):
-            shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from
-        raise
+    made_here = processes.writes and arguments.command != "resume"
+    removing = removed_if(folder, lambda: made_here and not executing.rounds_done(folder))
+    progress = RoundProgress(output.notes, plan.settings.rounds, done, label)
+    with removing, interrupts.orderly(plan.task.on_host), progress:
+        on_round = lambda index, row: progress.advance()
+        runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated, processes)
     if not processes.writes:
         return
     executing.finish(folder, plan, runs)
@@ -374,15 +363,9 @@ def advice(error: Exception, prepared: Prepared) -> str:
 
 
 def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, output: Output) -> None:
-    try:
+    made_here = arguments.joined.writes and arguments.command != "resume"
+    with removed_if(folder, lambda: made_here and not (folder / "chunks").exists()):
         arrays = grid.advance(folder, work, output.notes, arguments.joined)
-    except OSError:
-        raise  # as of a full disk: the folder can be gone on from
-    except Exception:
-        made = arguments.joined.writes and arguments.command != "resume"
-        if made and not (folder / "chunks").exists():
-            shutil.rmtree(folder)  # made by this very command, and there is nothing in it to go on from
-        raise
     if not arguments.joined.writes:
         return
     tables.show(summaries.marginal_table(work.grid, arrays), output.results)

@@ -4,8 +4,6 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 """
 
 import argparse
-import csv
-import io
 from pathlib import Path
 
 from jaxlfi import flags
@@ -38,7 +36,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from jaxlfi.io import compile_cache, files
+    from jaxlfi.io import compile_cache, files, text_table
 
     compile_cache.enable()
     from rich.markup import escape
@@ -61,11 +59,8 @@ def _run(arguments: argparse.Namespace) -> None:
         table.add_row(*(escape(value) if isinstance(value, str) else f"{value:.2f}" for value in row.values()))
     tables.show(table)
     if arguments.out is not None:
-        text = io.StringIO()
-        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        files.write_bytes(arguments.out, text.getvalue().encode())
+        text = text_table.as_csv(list(rows[0]), (list(row.values()) for row in rows))
+        files.write_bytes(arguments.out, text.encode())
 
 
 main = Command(

@@ -1,13 +1,17 @@
-"""How a command ends: its exit status, and one line on stderr for bad input and interruptions."""
+"""How a command ends: its exit status, and one line on stderr for bad input, interruptions and warnings."""
 
+import contextlib
 import re
+import shutil
 import sys
 import traceback
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from jaxlfi.cli import interrupts
 from jaxlfi.io.shell import quoted
+from jaxlfi.tasks.errors import ExecutorError
 
 
 def one_line(error: Exception) -> str:
@@ -57,3 +61,38 @@ def refuse(program: str, error: Exception, debug: bool = False, advice: str = ""
 def resuming(folder: Path) -> str:
     """How to go on with a folder, for the end of a line."""
     return f"; continue with: {quoted('jaxlfi', 'resume', folder)}"
+
+
+@contextlib.contextmanager
+def warnings_in_lines() -> Iterator[None]:
+    """Print the package's own warnings as one line on stderr, without the place in the source; others as ever."""
+    shown = warnings.showwarning
+
+    def show(message, category, filename, lineno, file=None, line=None) -> None:
+        if category.__module__.partition(".")[0] == "jaxlfi":
+            print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+        else:
+            shown(message, category, filename, lineno, file, line)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = shown
+
+
+@contextlib.contextmanager
+def removed_if(folder: Path, empty: Callable[[], bool]) -> Iterator[None]:
+    """Remove a folder that this very command made where it fails and there is nothing in it to go on from.
+
+    Neither a full disk is to blame on the work, nor a lost cluster, nor another process that goes on with it: then the
+    folder is kept, with all that it has.
+    """
+    try:
+        yield
+    except (ExecutorError, OSError):
+        raise
+    except Exception:
+        if empty():
+            shutil.rmtree(folder)
+        raise

@@ -15,12 +15,13 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jaxlfi
 from jaxlfi import flags, references
-from jaxlfi.cli import help_texts, interrupts, joined, warned
+from jaxlfi.cli import help_texts, interrupts, multi_process
 from jaxlfi.cli.command import Command, OneLineParser
-from jaxlfi.cli.exit_status import refuse, resuming
+from jaxlfi.cli.exit_status import refuse, resuming, warnings_in_lines
 from jaxlfi.cli.own_fields import FIELDS, HELP
 from jaxlfi.cli.own_fields import PRESETS as VALUES
 from jaxlfi.fields import declared
@@ -36,15 +37,10 @@ SETTINGS = "jaxlfi.bayessim.settings:Settings"
 
 @dataclasses.dataclass(frozen=True)
 class Families:
-    """Classes whose fields have flags: by name what they declare, which is nothing of packages not imported.
+    """Classes whose fields have flags: by name what they declare, which is nothing of packages not imported."""
 
-    Attributes:
-        rules: the heuristics.
-        networks: the estimators.
-    """
-
-    rules: flags.Families = dataclasses.field(default_factory=lambda: _own(HEURISTICS))
-    networks: flags.Families = dataclasses.field(default_factory=lambda: _own(ESTIMATORS))
+    rules: flags.Families = dataclasses.field(default_factory=lambda: _own(HEURISTICS))  # the heuristics
+    networks: flags.Families = dataclasses.field(default_factory=lambda: _own(ESTIMATORS))  # the estimators
 
     def __add__(self, others: "Families") -> "Families":
         """Both, and where both have a class what the others say of it."""
@@ -78,11 +74,7 @@ def _imported(foreign: Mapping[Classes, Sequence[str]]) -> Families:
 
 
 def parser(families: Families | None = None) -> argparse.ArgumentParser:
-    """The whole command line.
-
-    Args:
-        families: classes whose fields have flags; by default all that are installed.
-    """
+    """The whole command line, with flags for the fields of classes: by default of all that are installed."""
     families = families or Families()
     top = OneLineParser(
         prog="jaxlfi",
@@ -169,30 +161,24 @@ def _tasks(command: argparse.ArgumentParser) -> None:
 
 
 def _infer(command: argparse.ArgumentParser, families: Families) -> None:
-    command.add_argument(
-        "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
-    )
-    command.add_argument(
+    add = command.add_argument
+    _add_support(add)
+    add(
         "--support-low",
         nargs="+",
         type=float,
         metavar="X",
         help="lower bounds of a support of your own, one per parameter, in natural units",
     )
-    command.add_argument("--support-high", nargs="+", type=float, metavar="X", help="upper bounds of that support")
-    command.add_argument(
+    add("--support-high", nargs="+", type=float, metavar="X", help="upper bounds of that support")
+    add(
         "--simulations",
         type=Path,
         metavar="FILE",
         help="an .npz of simulations made before, in place of the first round's: theta [N, D] in natural units, "
         "trajectory [N, ...] or summaries x [N, S], and where they were not drawn uniformly log_density [N]",
     )
-    command.add_argument(
-        "--heuristic",
-        default="edge",
-        metavar="NAME",
-        help=_registered("how the support is adapted", families.rules, "edge"),
-    )
+    _add_heuristic(add, "how the support is adapted", families)
     _add_json(command)
     _add_shared(command, families, seeds=1)
 
@@ -209,7 +195,8 @@ def _compare(command: argparse.ArgumentParser, families: Families) -> None:
 
 
 def _grid(command: argparse.ArgumentParser, families: Families) -> None:
-    command.add_argument(
+    add = command.add_argument
+    add(
         "--vary",
         nargs="+",
         action="extend",
@@ -217,16 +204,9 @@ def _grid(command: argparse.ArgumentParser, families: Families) -> None:
         metavar="NAME=V,V,...",
         help="a hyperparameter and its values, as in expansion=0.1,0.2,0.4; several, or the flag again",
     )
-    command.add_argument(
-        "--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)"
-    )
-    command.add_argument(
-        "--heuristic",
-        default="edge",
-        metavar="NAME",
-        help=_registered("whose hyperparameters vary", families.rules, "edge"),
-    )
-    command.add_argument(
+    _add_support(add)
+    _add_heuristic(add, "whose hyperparameters vary", families)
+    add(
         "--runs-per-chunk",
         type=int,
         metavar="N",
@@ -236,24 +216,26 @@ def _grid(command: argparse.ArgumentParser, families: Families) -> None:
 
 
 def _resume(command: argparse.ArgumentParser) -> None:
-    command.add_argument("folder", type=Path, metavar="DIR", help="the folder the command was given")
-    command.add_argument(
+    add = command.add_argument
+    add("folder", type=Path, metavar="DIR", help="the folder the command was given")
+    add(
         "--rounds",
         type=int,
         metavar="N",
         help="go on to so many rounds in all, also with a run that is finished (default: those it was begun with)",
     )
     _add_executor(command)
-    joined.add_flags(command)
+    multi_process.add_flags(command)
     _add_json(command)
     _add_machine(command)
 
 
 def _sample(command: argparse.ArgumentParser) -> None:
-    command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
-    command.add_argument("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
-    command.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="seed of the draws (default: 0)")
-    command.add_argument(
+    add = command.add_argument
+    add("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
+    add("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
+    add("--seed", type=flags.seed, default=0, metavar="N", help="seed of the draws (default: 0)")
+    add(
         "--out",
         type=flags.output,
         metavar="FILE",
@@ -263,31 +245,30 @@ def _sample(command: argparse.ArgumentParser) -> None:
 
 
 def _diagnose(command: argparse.ArgumentParser) -> None:
-    command.add_argument("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
-    command.add_argument(
+    add = command.add_argument
+    add("folder", type=Path, metavar="DIR", help="the folder of one finished run (of one seed)")
+    add(
         "--reference",
         metavar="NAME[,NAME]",
         help="where truths are drawn: posterior, the name of a support, or one of each (default: posterior, and the "
         "task's first support)",
     )
-    command.add_argument("--truths", type=int, default=100, metavar="N", help="of each reference (default: 100)")
-    command.add_argument(
-        "--draws", type=int, default=200, metavar="L", help="draws from the posterior of each (default: 200)"
-    )
-    command.add_argument("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
-    command.add_argument(
+    add("--truths", type=int, default=100, metavar="N", help="of each reference (default: 100)")
+    add("--draws", type=int, default=200, metavar="L", help="draws from the posterior of each (default: 200)")
+    add("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
+    add(
         "--task",
         metavar="TASK",
         help="what was inferred, for a run that was made in Python (default: the task recorded with the run)",
     )
-    command.add_argument(
+    add(
         "--against",
         type=Path,
         metavar="FILE",
         help="samples to compare the run's posterior with, in natural units: a .csv with the parameters' names as "
         'headings, or an .npz with an array "theta"',
     )
-    command.add_argument(
+    add(
         "--out",
         type=flags.output,
         metavar="DIR",
@@ -348,12 +329,19 @@ def _registered(what: str, families: flags.Families, default: str) -> str:
     return f"{what}: {names}, or your own as module:Class (default: {default})"
 
 
+def _add_support(add: Callable[..., Any]) -> None:
+    add("--support", metavar="NAME", help="the support to begin with, by name (default: the task's first)")
+
+
+def _add_heuristic(add: Callable[..., Any], what: str, families: Families) -> None:
+    add("--heuristic", default="edge", metavar="NAME", help=_registered(what, families.rules, "edge"))
+
+
 def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int, networks: bool = True) -> None:
     """Arguments that `infer`, `compare` and `grid` have in common; `grid` saves no networks."""
-    command.add_argument(
-        "task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory; NAME,key=value sets options"
-    )
-    command.add_argument(
+    add = command.add_argument
+    add("task", metavar="TASK", help="a task's name (see jaxlfi tasks), or module:factory; NAME,key=value sets options")
+    add(
         "--object",
         nargs="+",
         action="extend",
@@ -362,22 +350,18 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         "names or files are recordings of one object, each under its own actions, and are combined into one posterior "
         "(short for TASK,object=NAME;NAME)",
     )
-    command.add_argument(
-        "--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results"
-    )
-    command.add_argument(
+    add("--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results")
+    add(
         "--method",
         choices=METHODS,
         default="bayessim",
         help="bayessim; apt: sequential, flows, atomic loss (SNPE-C); npe: flows, one round; snle: sequential, "
         "likelihoods (default: bayessim)",
     )
-    command.add_argument(
-        "--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)"
-    )
-    command.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})")
-    command.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first run's seed (default: 0)")
-    command.add_argument(
+    add("--preset", choices=PRESETS, default="quick", help="the settings to start from (default: quick)")
+    add("--seeds", type=int, default=seeds, metavar="N", help=f"number of runs (default: {seeds})")
+    add("--first-seed", type=int, default=0, metavar="N", help="the first run's seed (default: 0)")
+    add(
         "--observation",
         type=Path,
         nargs="+",
@@ -387,10 +371,10 @@ def _add_shared(command: argparse.ArgumentParser, families: Families, seeds: int
         "(default: the task's own, or one simulated at the known truth)",
     )
     _add_machine(command)
-    joined.add_flags(command)
+    multi_process.add_flags(command)
     if networks:
         _add_executor(command)
-        command.add_argument("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
+        add("--keep-network", action="store_true", help="also save the trained networks (network.npz)")
 
     rounds = command.add_argument_group(
         "rounds (default: the preset's, shown for bayessim; a task or method may have its own)"
@@ -419,10 +403,11 @@ def _add_json(command: argparse.ArgumentParser) -> None:
 
 def _add_machine(command: argparse.ArgumentParser) -> None:
     """Arguments about how, not what."""
-    command.add_argument("--no-figures", action="store_true", help="draw no figures at the end")
-    command.add_argument("--quiet", action="store_true", help="print results and warnings only")
-    command.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    command.add_argument("--no-cache", action="store_true", help="compile without the cache of compiled programs")
+    add = command.add_argument
+    add("--no-figures", action="store_true", help="draw no figures at the end")
+    add("--quiet", action="store_true", help="print results and warnings only")
+    add("--debug", action="store_true", help="show the traceback of an error")
+    add("--no-cache", action="store_true", help="compile without the cache of compiled programs")
 
 
 def _add_executor(command: argparse.ArgumentParser) -> None:
@@ -455,7 +440,7 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
         os.environ[compile_cache.SWITCH] = "0"
     else:
         compile_cache.enable()
-    arguments.joined = joined.join(arguments)
+    arguments.joined = multi_process.join(arguments)
     runs, processes = _runs(arguments), arguments.joined.count
     if runs > 1:
         # The same batch on the same number of devices repeats bit for bit.
@@ -508,7 +493,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     if argv is None:
         return interrupts.watched(lambda: main(sys.argv[1:]))
-    with warned.in_lines():
+    with warnings_in_lines():
         return _run(list(argv))
 
 
@@ -520,8 +505,8 @@ def _run(words: list[str]) -> int:
     if foreign:
         with interrupts.orderly(not getattr(foreign, "run", foreign).__module__.startswith("jaxlfi.")):
             return foreign(words[1:])
-    if joined.asked(words):
-        return joined.work(lambda: _main(words), lambda: _advice(words), "jaxlfi", "--debug" in words)
+    if multi_process.asked(words):
+        return multi_process.work(lambda: _main(words), lambda: _advice(words), "jaxlfi", "--debug" in words)
     return _main(words)
 
 

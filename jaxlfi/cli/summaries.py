@@ -15,12 +15,19 @@ from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs.execute import BatchPlan
 from jaxlfi.runs.run import Run
-from jaxlfi.runs.unlike import observation_summary
 from jaxlfi.studies import calibration, grid
 from jaxlfi.tasks import failures
 
 COMMONEST = 3
 """Reasons of failed simulations that are printed, at most."""
+
+
+def by_configuration(plan: BatchPlan, runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """The runs of each configuration, in the plan's order."""
+    found: dict[str, list[Run]] = {}
+    for spec, run in zip(plan.specs, runs, strict=True):
+        found.setdefault(spec.configuration, []).append(run)
+    return found
 
 
 def parameter_table(found: RunSummary) -> Table:
@@ -34,23 +41,22 @@ def parameter_table(found: RunSummary) -> Table:
 
 def summary_table(plan: BatchPlan, runs: Sequence[Run]) -> Table:
     """What came out: one line a configuration, over its seeds."""
-    lines = executing.results(plan, runs)
     table = Table("configuration", "seeds", "theta error [95 %]", "median", "traj. error", "success", "final support")
-    natural = [run.final_support() for run in runs]
-    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
-        own = [i for i, spec in enumerate(plan.specs) if spec.configuration == configuration]
-        column = lambda name, own=own: np.array([lines[i][name] for i in own])
-        error = column("theta_error")
-        trajectory = column("trajectory_error")
-        low = np.median([np.asarray(natural[i].low) for i in own], axis=0)
-        high = np.median([np.asarray(natural[i].high) for i in own], axis=0)
+    lines = executing.results(plan, runs)
+    for configuration, own in by_configuration(plan, runs).items():
+        error, trajectory, success = (
+            np.array([line[name] for line in lines if line["configuration"] == configuration])
+            for name in ("theta_error", "trajectory_error", "success_rate")
+        )
+        boxes = [run.final_support() for run in own]
+        low, high = (np.median([np.asarray(getattr(box, end)) for box in boxes], axis=0) for end in ("low", "high"))
         table.add_row(
             escape(configuration),
             str(len(own)),
             _with_interval(error),
             "-" if np.isnan(error).any() else f"{np.median(error):.2f}",
             "-" if np.isnan(trajectory).all() else f"{np.nanmean(trajectory):.2f}",
-            f"{np.mean(column('success_rate')):.0%}",
+            f"{np.mean(success):.0%}",
             escape(" ".join(f"[{a:.2g}, {b:.2g}]" for a, b in zip(low, high, strict=True))),
         )
     return table
@@ -82,8 +88,7 @@ def rounds_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
     lines: list[str] = []
     if not 0 < plan.settings.min_rounds <= plan.settings.rounds:
         return lines
-    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
-        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+    for configuration, own in by_configuration(plan, runs).items():
         made = [np.count_nonzero(~np.asarray(run.history["settled"][:-1])) + 1 for run in own]
         restless = [run.history for run in own if not run.history["settled"][-1]]
         extent = f"{made[0]}" if len(set(made)) == 1 else f"{min(made)} to {max(made)}"
@@ -145,8 +150,7 @@ def warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 def failure_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
     """In words, where some runs had no simulation to begin with, while others of the batch had."""
     found = []
-    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
-        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+    for configuration, own in by_configuration(plan, runs).items():
         if empty := sum(int(run.history["succeeded"][0]) == 0 for run in own):
             found.append(
                 f"{configuration}: all simulations of the first round failed in {empty} of {len(own)} runs, whose "
@@ -159,8 +163,7 @@ def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
     """In words, where the networks of some runs did not learn: gradients that were not finite."""
     warnings = []
     settings = plan.settings.estimator
-    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
-        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+    for configuration, own in by_configuration(plan, runs).items():
         broken = sum(bool(np.any(np.asarray(run.history["nonfinite"]) > 0)) for run in own)
         if broken:
             steps = int(np.max([np.max(run.history["nonfinite"]) for run in own]))
@@ -175,8 +178,7 @@ def training_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 def support_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
     """In words, where runs ended with a bound that looks wrong and that their heuristic cannot move."""
     warnings = []
-    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
-        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
+    for configuration, own in by_configuration(plan, runs).items():
         evidence, grows = [run.bound_evidence for run in own], own[0].heuristic.grows
         found = bound_warnings(plan.task.space, plan.task.units, evidence, own[0].feasible, grows)
         warnings += [f"{configuration}: {text}" for text in found]
@@ -189,11 +191,14 @@ def summary_warnings(runs: Sequence[Run]) -> list[str]:
 
 
 def observation_warnings(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
-    """In words, where the observation of runs is unlike all of their simulations."""
+    """In words, where the observation of runs is unlike all of their simulations: in the first, and in how many."""
     warnings = []
-    for configuration in dict.fromkeys(spec.configuration for spec in plan.specs):
-        own = [run for spec, run in zip(plan.specs, runs, strict=True) if spec.configuration == configuration]
-        warnings += [f"{configuration}: {text}" for text in observation_summary(own)]
+    for configuration, own in by_configuration(plan, runs).items():
+        found = [texts for run in own if (texts := run.misspecification)]
+        shown = [text for texts in found for text in texts]
+        if len(own) > 1:
+            shown = [f"{text} (in {len(found)} of {len(own)} runs, this is the first)" for text in shown[:1]]
+        warnings += [f"{configuration}: {text}" for text in shown]
     return warnings
 
 

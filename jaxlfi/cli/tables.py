@@ -26,17 +26,11 @@ def console(quiet: bool = False) -> Console:
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """Where a command prints what; one and the same console unless the command is to be read by a program.
+    """Where a command prints what; one and the same console unless the command is to be read by a program."""
 
-    Attributes:
-        results: what was found.
-        notes: progress, and the files that were written.
-        warnings: what looks wrong.
-    """
-
-    results: Console
-    notes: Console
-    warnings: Console
+    results: Console  # what was found
+    notes: Console  # progress, and the files that were written
+    warnings: Console  # what looks wrong
 
     @classmethod
     def of(cls, quiet: bool = False, json: bool = False, silent: bool = False) -> "Output":
@@ -55,12 +49,7 @@ class Output:
 
 
 def show(table: Table, on: Console | None = None) -> None:
-    """Print a table in whole words: where they do not fit side by side, one cell a line.
-
-    Args:
-        table: of texts, each with a heading.
-        on: where to; standard output by default.
-    """
+    """Print a table in whole words: where they do not fit side by side, one cell a line."""
     on = on or console()
     wide = on.options.update(width=10_000, max_width=10_000)
     sizes = [[Measurement.get(on, wide, cell) for cell in (column.header, *column.cells)] for column in table.columns]

@@ -5,16 +5,15 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 
 import argparse
 import contextlib
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxlfi import flags
-from jaxlfi.cli import joined
+from jaxlfi.cli import multi_process
 from jaxlfi.cli.command import Command
 from jaxlfi.cli.domains import DOMAINS, domains_of
-from jaxlfi.cli.exit_status import resuming
+from jaxlfi.cli.exit_status import removed_if, resuming
 from jaxlfi.cli.own_fields import FIELDS, POLICIES
 from jaxlfi.io.formats import TRAINING, recorded
 from jaxlfi.registry import ENVIRONMENTS
@@ -70,7 +69,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
-    joined.add_flags(parser)
+    multi_process.add_flags(parser)
     group = parser.add_argument_group("PPO (default: the preset's)")
     flags.add(group, {"PPO": FIELDS[SETTINGS]}, into="settings", presets=POLICIES)
     parser.set_defaults(settings={})
@@ -82,7 +81,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from jaxlfi.io.locks import locked
 
     compile_cache.enable()
-    processes = joined.join(arguments)
+    processes = multi_process.join(arguments)
     from jaxlfi.rl import training
 
     if not processes.writes:
@@ -93,29 +92,19 @@ def _train(arguments: argparse.Namespace) -> None:
         return
     plan = _plan(arguments)
     training.begin(plan, arguments.out, processes)
-    try:
+    empty = lambda: not (training.updates_done(arguments.out) or training.finished(arguments.out))
+    with removed_if(arguments.out, empty):
         with locked(arguments.out):
             run(arguments.out, plan.environment, tables.Output.of(), not arguments.no_figures, processes)
         processes.leave()
-    except OSError:
-        raise  # as of a full disk, or of another process that goes on with it: the folder is not to be lost
-    except Exception:
-        if not (training.updates_done(arguments.out) or training.finished(arguments.out)):
-            shutil.rmtree(arguments.out)  # made by this very command, and there is nothing in it to go on from
-        raise
 
 
 def run(
     out: Path, environment: "Environment", output: "Output", figures: bool, processes: "Processes | None" = None
 ) -> None:
-    """Train what a folder asks for, print how the policies fare, and draw the learning curves.
+    """Train what this process's folder asks for, print how the policies fare, and draw the learning curves.
 
-    Args:
-        out: the folder, which this process writes.
-        environment: that of the folder.
-        output: to print on.
-        figures: whether to draw.
-        processes: that share the trainings out among them; None for this one alone.
+    The trainings are shared out among `processes`; by default this one alone.
     """
     import numpy as np
     from rich.markup import escape
@@ -198,12 +187,7 @@ def resume(out: Path, output: "Output", figures: bool, processes: "Processes") -
 
 
 def check_seeds(first: int, count: int, name: str) -> None:
-    """Refuse seeds that make no key.
-
-    Args:
-        first: the first of them.
-        count: how many follow each other.
-        name: of the first one's argument.
+    """Refuse `count` seeds from `first` on that make no key; `name` is that of the first one's argument.
 
     Raises:
         ValueError: for seeds below 0 or of more than 32 bits.

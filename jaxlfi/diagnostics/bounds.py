@@ -76,11 +76,8 @@ class BoundEvidence:
 def edge_mass(belief: Belief, zone_fraction: float = 0.1) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
     """Marginal posterior mass in or beyond the zone along each lower and each upper bound, shape [D] each.
 
-    What EDGE adapts by. It is no evidence that a bound is wrong: a posterior may lie wholly in the zone and not beyond.
-
-    Args:
-        belief: one belief.
-        zone_fraction: width of the zone as a fraction of the support's.
+    The zone is as wide as a fraction of the support. What EDGE adapts by: it is no evidence that a bound is wrong, as a
+    posterior may lie wholly in the zone and not beyond.
     """
     box = jax.tree.map(jnp.asarray, belief.support)
     zone = zone_fraction * box.width
@@ -95,9 +92,6 @@ def mass_beyond(belief: Belief) -> tuple[Float[Array, " dim"], Float[Array, " di
     """Marginal mass of the untruncated posterior beyond each lower and each upper bound, shape [D] each.
 
     Above 1/2, the marginal's median lies beyond the bound. In closed form; `jit`, `vmap` and `grad` apply.
-
-    Args:
-        belief: one belief.
 
     Example:
         >>> from jaxlfi.distributions.mixture import GaussianMixture
@@ -191,11 +185,7 @@ def _usual(degrees: int, z: float) -> float:
 
 
 def bound_warnings(
-    space: Space,
-    units: Sequence[str] | None,
-    evidence: Sequence[BoundEvidence],
-    feasible: Support,
-    grows: bool = False,
+    space: Space, units: Sequence[str] | None, evidence: Sequence[BoundEvidence], feasible: Support, grows: bool = False
 ) -> list[str]:
     """Say in words which bounds of a support look wrong, and what to do.
 

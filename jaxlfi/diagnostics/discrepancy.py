@@ -83,14 +83,7 @@ def compared(
 def not_simulated(
     task: Task, theta: Float[Array, "samples dim"], observed: Array | np.ndarray, obs: int
 ) -> Discrepancy:
-    """A discrepancy from the truth alone: nothing is simulated, and what simulations would tell is NaN.
-
-    Args:
-        task: for the truth.
-        theta: draws of the posterior, in inference space, shape [N, D].
-        observed: the real trajectory, for its shape.
-        obs: length S of a summary.
-    """
+    """A discrepancy from the truth alone: nothing is simulated, and what simulations would tell is NaN."""
     unknown = lambda *shape: jnp.full((len(theta), *shape), jnp.nan)
     return Discrepancy(
         theta, _theta_error(task, theta), unknown(), unknown(*observed.shape), unknown(obs), jnp.asarray(0)

@@ -131,13 +131,7 @@ def not_separate(names: Sequence[str], known: Sequence[str], unknown: Sequence[s
 
 
 def trade_off_sentence(names: Sequence[str], one: TradeOff, each_known: bool = True) -> str:
-    """What a trade-off means, in words.
-
-    Args:
-        names: of all parameters.
-        one: the trade-off.
-        each_known: whether each of its parameters is known by itself as well.
-    """
+    """What a trade-off means, in words, where each of its parameters is known by itself as well, or is not."""
     several = [names[d] for d in one.places]
     note = "" if np.isnan(one.correlation) else f" (correlation {one.correlation:.2f})"
     if not each_known:

@@ -12,6 +12,7 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import bdtr, bdtri
 
 from jaxlfi.diagnostics.arguments import Draws, Truths, checked_ranks, truths_and_draws
 from jaxlfi.diagnostics.calibration import SIGNIFICANCE
@@ -166,18 +167,8 @@ def binomial_interval(count: int, trials: int, error: float) -> tuple[float, flo
         trials: of so many.
         error: probability that it misses, at most, half of it on either side.
     """
-    return 1 - _upper_end(trials - count, trials, error / 2), _upper_end(count, trials, error / 2)
-
-
-def _upper_end(count: int, trials: int, error: float) -> float:
-    """The probability at which so few successes have a probability of `error`, by bisection."""
-    if count == trials:
-        return 1.0
-    low, high = 0.0, 1.0
-    for _ in range(50):
-        middle = (low + high) / 2
-        low, high = (low, middle) if _cumulative(trials, middle)[count] <= error else (middle, high)
-    return high
+    ends = [1.0 if k == trials else float(bdtri(k, trials, error / 2)) for k in (trials - count, count)]
+    return 1 - ends[0], ends[1]
 
 
 def quantile_interval(values: Float[np.ndarray, " n"], level: float, error: float) -> tuple[float, float]:
@@ -192,7 +183,7 @@ def quantile_interval(values: Float[np.ndarray, " n"], level: float, error: floa
         Lower end, 0 where no value is that low, and upper end, infinite where none is that high.
     """
     ordered = np.concatenate([[0.0], np.sort(values), [np.inf]])
-    cumulative = _cumulative(len(values), level)
+    cumulative = bdtr(np.arange(len(values) + 1), len(values), level)
     low = int(np.sum(cumulative <= error / 2))
     high = 1 + int(np.sum(1 - cumulative[:-1] > error / 2))
     return float(ordered[low]), float(ordered[high])
@@ -231,11 +222,3 @@ def _held(inside: list[np.ndarray], error: float) -> tuple[Estimate, ...]:
 def _fraction(true: np.ndarray, error: float) -> Estimate:
     count = int(np.sum(true))
     return Estimate(count / len(true), *binomial_interval(count, len(true), error))
-
-
-def _cumulative(trials: int, probability: float) -> Float[np.ndarray, " counts"]:
-    """P(at most k successes) for k from 0 to the number of trials."""
-    log_factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, trials + 1)))])
-    k = np.arange(trials + 1)
-    log_choose = log_factorial[-1] - log_factorial - log_factorial[::-1]
-    return np.cumsum(np.exp(log_choose + k * np.log(probability) + (trials - k) * np.log1p(-probability)))

@@ -145,35 +145,7 @@ def bounded_least_squares(
     low: Float[np.ndarray, " dim"],
     high: Float[np.ndarray, " dim"],
 ) -> Float[np.ndarray, " dim"]:
-    """The step within bounds that leaves least of the residual, by the active-set method of Stark and Parker.
+    """The step s within bounds that leaves least of ||r - A s||^2, by the active-set method of Stark and Parker."""
+    from scipy.optimize import lsq_linear  # takes a while, which a program that asks for no local model need not wait
 
-    Args:
-        slopes: A of ||r - A s||^2.
-        residual: r.
-        low: bounds of s, shape [D].
-        high: shape [D].
-    """
-    dim = len(low)
-    step = np.clip(np.linalg.lstsq(slopes, residual, rcond=None)[0], low, high)
-    side = np.where(step >= high, 1, np.where(step <= low, -1, 0))
-    for _ in range(10 * dim + 10):
-        free = side == 0
-        while free.any():  # as far as the best of the free ones, or the first bound on the way
-            left = residual - slopes[:, ~free] @ step[~free]
-            towards = np.linalg.lstsq(slopes[:, free], left, rcond=None)[0] - step[free]
-            room = np.where(towards > 0, high[free] - step[free], step[free] - low[free])
-            reach = np.divide(room, np.abs(towards), out=np.full(len(room), np.inf), where=towards != 0)
-            first = np.argmin(reach)
-            step[free] += min(reach[first], 1.0) * towards
-            if reach[first] >= 1:
-                break
-            hit = np.flatnonzero(free)[first]
-            side[hit] = np.sign(towards[first])
-            step[hit] = high[hit] if side[hit] > 0 else low[hit]
-            free = side == 0
-        pull = -side * (slopes.T @ (residual - slopes @ step))  # of what is at a bound, inwards
-        worst = np.argmax(pull)
-        if pull[worst] <= 1e-9 * np.sum(np.abs(slopes.T @ residual)):
-            break
-        side[worst] = 0
-    return step
+    return lsq_linear(slopes, residual, (low, high), method="bvls").x

@@ -68,28 +68,17 @@ class Finding:
 
 @dataclasses.dataclass(frozen=True)
 class _Column:
-    """A number that observation and simulations are compared by: a summary, a record, or a feature of a channel.
+    """A number that observation and simulations are compared by: a summary, a record, or a feature of a channel."""
 
-    Attributes:
-        name: as it is called in a sentence.
-        channel: that it belongs to; None for a summary.
-        record: whether it is one record of that channel.
-        log: whether it is compared as its logarithm.
-        advice: what may be the cause, as a question.
-    """
-
-    name: str
-    channel: int | None = None
-    record: bool = False
-    log: bool = False
-    advice: str = UNITS
+    name: str  # as it is called in a sentence
+    channel: int | None = None  # that it belongs to; None for a summary
+    record: bool = False  # whether it is one record of that channel
+    log: bool = False  # whether it is compared as its logarithm
+    advice: str = UNITS  # what may be the cause, as a question
 
 
 def unlike(
-    x: ArrayLike,
-    simulations: ArrayLike,
-    names: Sequence[str] | None = None,
-    channels: Sequence[str] = (),
+    x: ArrayLike, simulations: ArrayLike, names: Sequence[str] | None = None, channels: Sequence[str] = ()
 ) -> list[Finding]:
     """Find how an observation is unlike all simulations; nothing if the model could have produced it.
 

@@ -120,11 +120,7 @@ def mixed(
 
 
 def _weighted(
-    key: jax.Array,
-    sample: Callable[[jax.Array, int], Array],
-    log_weight: LogWeight,
-    inside: Support | Region,
-    n: int,
+    key: jax.Array, sample: Callable[[jax.Array, int], Array], log_weight: LogWeight, inside: Support | Region, n: int
 ) -> Array:
     """`n` of many more draws, chosen by weight among those inside."""
     key_candidates, key_choice = jax.random.split(key)

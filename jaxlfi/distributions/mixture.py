@@ -66,8 +66,7 @@ class GaussianMixture(struct.PyTreeNode):
         import distrax  # takes a second, which no run needs
 
         return distrax.MixtureSameFamily(
-            distrax.Categorical(logits=self.logits),
-            distrax.MultivariateNormalTri(self.means, self.scale_tril),
+            distrax.Categorical(logits=self.logits), distrax.MultivariateNormalTri(self.means, self.scale_tril)
         )
 
     def log_prob(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
@@ -187,9 +186,7 @@ class GaussianMixture(struct.PyTreeNode):
     def affine(self, scale: Float[Array, " dim"], shift: Float[Array, " dim"]) -> "GaussianMixture":
         """The mixture of scale * theta + shift, dimension by dimension; scale must be positive."""
         return GaussianMixture(
-            logits=self.logits,
-            means=scale * self.means + shift,
-            scale_tril=scale[:, None] * self.scale_tril,
+            logits=self.logits, means=scale * self.means + shift, scale_tril=scale[:, None] * self.scale_tril
         )
 
     def inflated(self, factor: Float[Array, ""] | float) -> "GaussianMixture":

@@ -31,12 +31,6 @@ def truncated_mixture_draws(key: jax.Array, mixture: GaussianMixture, support: S
     """`n` draws of a mixture truncated to the support, by importance resampling; rejection has no part in it.
 
     Each draw is one of `CANDIDATES` picked by weight: as good as exact where few dimensions are truncated.
-
-    Args:
-        key: consumed.
-        mixture: of Gaussians.
-        support: the box.
-        n: number of draws.
     """
     key_candidates, key_pick = jax.random.split(key)
     theta, log_weight = candidates(key_candidates, mixture, support, (n, CANDIDATES))
@@ -79,10 +73,6 @@ def log_mass(mixture: GaussianMixture, support: Support) -> Float[Array, ""]:
     """Logarithm of the mass of a mixture in a box, however little it is; in one dimension in closed form.
 
     The points of each component are those of a lattice, so that the result is the same each time.
-
-    Args:
-        mixture: of Gaussians.
-        support: the box.
 
     Example:
         >>> normal = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 1)), jnp.ones((1, 1, 1)))

@@ -408,11 +408,6 @@ class Network(struct.PyTreeNode):
 def converted(estimator: Estimator, kind: type[Estimator], values: Mapping[str, Any]) -> Estimator:
     """An estimator of another family, with the settings that both have, and some of them replaced.
 
-    Args:
-        estimator: whose settings are kept.
-        kind: the family.
-        values: settings to replace, by name.
-
     Raises:
         ValueError: for settings the family does not have or does not accept.
 
@@ -444,16 +439,7 @@ def untrained(
         regression = unfitted(scale.dim, obs, estimator.record_size)
         log_weights = estimator.equal_weights
     normalisers = _normalisers(estimator, nothing, scale)
-    return Network(
-        estimator,
-        params,
-        *normalisers,
-        scale,
-        space,
-        prior,
-        regression=regression,
-        log_weights=log_weights,
-    )
+    return Network(estimator, params, *normalisers, scale, space, prior, regression=regression, log_weights=log_weights)
 
 
 def _normalisers(estimator: Estimator, dataset: Dataset, scale: Support) -> tuple[Normaliser, Normaliser | None]:

@@ -82,7 +82,7 @@ def fit_normaliser(
     x = jnp.where(valid[:, None], x, x[jnp.argmax(valid)])
     some = some_rows(x, valid)
     origin, unit = middle(some)
-    unit = jnp.where(unit > 0, LINEAR * unit, _range(x))
+    unit = jnp.where(unit > 0, LINEAR * unit, jnp.ptp(x, axis=0))
     unit = jnp.where(varies(x), unit, 1.0)
     mean, deviation = _moments(TRANSFORMS[name]((x - origin) / unit), valid)
     fitted = Normaliser(mean, jnp.where(varies(x), deviation, jnp.inf), name, origin, unit)
@@ -104,7 +104,7 @@ def standardiser(values: Float[Array, "cap dim"], valid: Bool[Array, " cap"]) ->
 def varies(x: Float[Array, "n obs"]) -> Bool[Array, " obs"]:
     """Which summaries vary by more than the rounding of their values; the others tell nothing of the parameters."""
     last_place = jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x), axis=0)
-    return jnp.max(x, axis=0) - jnp.min(x, axis=0) > RESOLVED * last_place
+    return jnp.ptp(x, axis=0) > RESOLVED * last_place
 
 
 def some_rows(x: Float[Array, "cap obs"], valid: Bool[Array, " cap"]) -> Float[Array, "rows obs"]:
@@ -129,11 +129,6 @@ def middle(x: Float[Array, "n obs"]) -> tuple[Float[Array, " obs"], Float[Array,
 def _quantile(x: Float[Array, "n obs"], place: float) -> Float[Array, " obs"]:
     """A quantile of each column, one of its values: what is counted from it is free of rounding."""
     return jnp.quantile(x, place, axis=0, method="lower")
-
-
-def _range(x: Float[Array, "n obs"]) -> Float[Array, " obs"]:
-    """The range of each column."""
-    return jnp.max(x, axis=0) - jnp.min(x, axis=0)
 
 
 def _moments(values: Float[Array, "n obs"], valid: Bool[Array, " n"]) -> tuple[Array, Array]:

@@ -450,10 +450,13 @@ def truncated(
 # Compiled as wholes: operation by operation, a flow's density alone would be hundreds of small programs.
 
 
-@functools.partial(jax.jit, static_argnums=2)
-@single
-def _sample(key: jax.Array, posterior: Posterior, n: int) -> Array:
-    return posterior.inner_draws(key, n)
+_sample = jax.jit(single(lambda key, posterior, n: posterior.inner_draws(key, n)), static_argnums=2)
+_without_prior = jax.jit(single(lambda posterior: posterior.replace(prior=None).on(posterior.support)))
+_draws_moments = jax.jit(single(lambda draws: _weighted_moments(draws, jnp.full(len(draws), 1 / len(draws)))))
+_draws_quantiles = jax.jit(single(lambda draws, levels: jnp.quantile(draws, levels, axis=0)))
+_mixture_quantiles = jax.jit(
+    single(lambda posterior, levels: truncated_quantiles(_mixture_of(posterior), posterior.support, levels))
+)
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
@@ -463,12 +466,6 @@ def _conditional(posterior: Posterior, given: tuple[int, ...], others: tuple[int
     return truncated(mixture, mixture, Support(box.low[rows], box.high[rows]), _sub_space(posterior.space, others))
 
 
-@jax.jit
-@single
-def _without_prior(posterior: Posterior) -> Posterior:
-    return posterior.replace(prior=None).on(posterior.support)
-
-
 @functools.partial(jax.jit, static_argnums=1)
 @single
 def _mixture_moments(posterior: Posterior, natural: bool) -> tuple[Array, Array]:
@@ -476,29 +473,11 @@ def _mixture_moments(posterior: Posterior, natural: bool) -> tuple[Array, Array]
     return _weighted_moments(posterior.space.to_natural(points) if natural else points, jnp.exp(log_weight))
 
 
-@jax.jit
-@single
-def _draws_moments(draws: Array) -> tuple[Array, Array]:
-    return _weighted_moments(draws, jnp.full(len(draws), 1 / len(draws)))
-
-
 def _weighted_moments(points: Array, weights: Array) -> tuple[Array, Array]:
     start = points[0]  # counted from it, a large offset costs no precision
     offset = weights @ (points - start)
     centred = points - start - offset
     return start + offset, (weights[:, None] * centred).T @ centred
-
-
-@jax.jit
-@single
-def _mixture_quantiles(posterior: Posterior, levels: Array) -> Array:
-    return truncated_quantiles(_mixture_of(posterior), posterior.support, levels)
-
-
-@jax.jit
-@single
-def _draws_quantiles(draws: Array, levels: Array) -> Array:
-    return jnp.quantile(draws, levels, axis=0)
 
 
 @functools.partial(jax.jit, static_argnums=2)

@@ -176,7 +176,9 @@ def _fit_one(key_epochs, estimator, params, data, rows, size, expected_size):
         validation = jnp.where(nothing_held_out, jnp.nan, validation)
         # With too few simulations to hold any out, the last weights are as good as any.
         better = (validation < best.loss) | nothing_held_out
-        return (state, _where(better, _Best(state.params, validation, index), best)), (loss, validation)
+        now = _Best(state.params, validation, index)
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), now, best)
+        return (state, best), (loss, validation)
 
     def running(carry):
         index, (_, best), _ = carry
@@ -197,8 +199,3 @@ def _fit_one(key_epochs, estimator, params, data, rows, size, expected_size):
     if best is None:
         best = _Best(state.params, jnp.asarray(jnp.inf), jnp.asarray(epochs - 1))
     return best.params, FitInfo(training_losses, validation_losses, best.at, state.nonfinite)
-
-
-def _where(condition, new, old):
-    """One of two pytrees."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)

@@ -1,7 +1,11 @@
 """Figures: from the saved arrays of runs to pictures and a page; the only package that imports matplotlib.
 
 `report(folder)` draws all pictures that apply to a run folder. Each picture is a module with a function `draw`
-from loaded runs to a matplotlib figure, for use on its own:
+from loaded runs to a matplotlib figure, for use on its own. What is said here is not repeated there: `figure` is empty,
+`axes` are those to draw on, `runs` are configurations with their seeds, `histories` one run for each column, all of the
+same parameters, with `titles` that are the configurations' names by default, `look` is that of a configuration, `d` the
+index of a parameter, `pair` those of two or one, with a `window` of axis limits each, and `arrays` are those of
+diagnostics.npz.
 
     from jaxlfi.figures import curves, open_collection, style
 

@@ -31,12 +31,7 @@ def rows(arrays: Arrays) -> int:
 
 
 def draw_ranks(figure: Figure, arrays: Arrays) -> None:
-    """For each parameter a histogram of ranks, and below it their cumulative fraction minus the expected one.
-
-    Args:
-        figure: empty.
-        arrays: of diagnostics.npz.
-    """
+    """For each parameter a histogram of ranks, and below it their cumulative fraction minus the expected one."""
     names = [str(name) for name in arrays["names"]]
     columns = min(len(names), COLUMNS)
     heights = [1.0, 0.7] * rows(arrays)
@@ -62,13 +57,7 @@ def draw_ranks(figure: Figure, arrays: Arrays) -> None:
 
 
 def draw_histogram(axes: Axes, arrays: Arrays, d: int) -> None:
-    """Number of truths in each bin of ranks, with the binomial band of each bin.
-
-    Args:
-        axes: to draw on.
-        arrays: of diagnostics.npz.
-        d: index of the parameter.
-    """
+    """Number of truths in each bin of ranks, with the binomial band of each bin."""
     edges = arrays["bin_edges"] / arrays["bin_edges"][-1]
     low, high = (np.append(side, side[-1]) for side in arrays["bin_band"])
     axes.fill_between(edges, low, high, step="post", color=BAND, alpha=NARROW, linewidth=0)
@@ -78,13 +67,7 @@ def draw_histogram(axes: Axes, arrays: Arrays, d: int) -> None:
 
 
 def draw_difference(axes: Axes, arrays: Arrays, d: int) -> None:
-    """The cumulative fraction of ranks minus the level, with its simultaneous band.
-
-    Args:
-        axes: to draw on.
-        arrays: of diagnostics.npz.
-        d: index of the parameter.
-    """
+    """The cumulative fraction of ranks minus the level, with its simultaneous band."""
     level = _with_ends(arrays["level"])
     low, high = (_with_ends(side) - level for side in arrays["ranks_simultaneous"])
     axes.fill_between(level, low, high, color=BAND, alpha=WIDE, linewidth=0)
@@ -94,22 +77,12 @@ def draw_difference(axes: Axes, arrays: Arrays, d: int) -> None:
 
 
 def draw_coverage(figure: Figure, arrays: Arrays) -> None:
-    """Expected coverage: the fraction of truths in the highest-density region of each level.
-
-    Args:
-        figure: empty.
-        arrays: of diagnostics.npz.
-    """
+    """Expected coverage: the fraction of truths in the highest-density region of each level."""
     _draw_curve(figure, arrays, COVERAGE, "level of the highest-density region", "fraction of truths inside")
 
 
 def draw_tarp(figure: Figure, arrays: Arrays) -> None:
-    """TARP: the fraction of truths in the region of each level around random points.
-
-    Args:
-        figure: empty.
-        arrays: of diagnostics.npz.
-    """
+    """TARP: the fraction of truths in the region of each level around random points."""
     _draw_curve(figure, arrays, DISTANCE, "level of the region around a random point", "fraction of truths inside")
 
 

@@ -1,6 +1,6 @@
 """Checks: the observation among simulations from the posterior; all pictures of diagnostics, and a page of them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ from jaxlfi.figures import calibration, intervals, page, style
 from jaxlfi.figures.calibration import BAND, COLOUR, COVERAGE, DISTANCE, Arrays
 from jaxlfi.figures.extent import extent
 from jaxlfi.figures.history import read_arrays, robust_sd
-from jaxlfi.figures.page import Picture
 from jaxlfi.figures.predictive import QUANTILES
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
 from jaxlfi.io import files
@@ -39,21 +38,18 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
     path = folder / "diagnostics.npz"
     arrays = read_arrays(path, ("names", "units"), [name for needed, *_ in PICTURES.values() for name in needed])
     found = _read(folder / "diagnostics.json")
-    pictures = []
     drawable = {name: maker for name, maker in PICTURES.items() if maker[0][0] in arrays}
     for needed, *_ in drawable.values():
         if missing := [name for name in needed if name not in arrays]:
             raise ValueError(f"{path}: expected {', '.join(needed)}; missing {', '.join(missing)}")
-    with style.context():
+
+    def drawings() -> Iterator[page.Drawing]:
         for name, (_, size, draw, title, caption) in drawable.items():
             figure = style.new_figure(*size(arrays))
             draw(figure, arrays)
-            path = style.save(figure, folder / "figures" / f"{name}.png", dpi)
-            pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
-    text = page.render_diagnostics(found, pictures)
-    index = folder / "report.html"
-    files.write_bytes(index, text.encode(errors="replace"))
-    return [index, *(picture.path for picture in pictures)]
+            yield name, figure, title, caption
+
+    return page.write(folder, drawings(), lambda pictures: page.render_diagnostics(found, pictures), dpi)
 
 
 def _read(path: Path) -> Mapping[str, Any]:
@@ -78,12 +74,7 @@ def standardised(arrays: Arrays) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw(figure: Figure, arrays: Arrays) -> None:
-    """Left: each observed summary among the simulated ones. Right: their joint distance from the simulations' centre.
-
-    Args:
-        figure: empty.
-        arrays: of diagnostics.npz.
-    """
+    """Left: each observed summary among simulated ones. Right: their joint distance from the simulations' centre."""
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [2.2, 1.0]})
     simulated, observed = standardised(arrays)
     place = np.arange(1, len(observed) + 1)
@@ -110,24 +101,15 @@ def _ranks_size(arrays: Arrays) -> tuple[float, float]:
     return TEXT_WIDTH if wide else COLUMN_WIDTH, (0.6 if wide else 0.9) + 2.2 * calibration.rows(arrays)
 
 
-def _square(arrays: Arrays) -> tuple[float, float]:
-    return COLUMN_WIDTH, 3.9
-
-
-def _predictive_size(arrays: Arrays) -> tuple[float, float]:
-    return TEXT_WIDTH, 2.3
-
-
-def _widths_size(arrays: Arrays) -> tuple[float, float]:
-    return TEXT_WIDTH, intervals.height(arrays)
-
+COLUMN = lambda arrays: (COLUMN_WIDTH, 3.9)
+"""Size of a square picture with its legend, whatever it shows."""
 
 Maker = tuple[tuple[str, ...], Callable[[Arrays], tuple[float, float]], Callable[[Figure, Arrays], None], str, str]
 
 PICTURES: dict[str, Maker] = {
     "widths": (
         ("widths_held", "widths_regions_held", "widths_level", "widths_factor"),
-        _widths_size, intervals.draw, "Intervals",
+        lambda arrays: (TEXT_WIDTH, intervals.height(arrays)), intervals.draw, "Intervals",
         "Left: the fraction of truths that intervals of each parameter, and densest regions of all parameters together "
         "(last row), held; they should hold 50 % and 90 % (lines). Right: the factor by which the width of 90 % "
         "intervals would have to be multiplied for them to hold 90 %. Bars are confidence intervals, of 95 % for all "
@@ -140,16 +122,16 @@ PICTURES: dict[str, Maker] = {
         "hill: too wide; a slope: biased.",
     ),
     "coverage": (
-        (COVERAGE, *CURVE), _square, calibration.draw_coverage, "Coverage of densest regions",
+        (COVERAGE, *CURVE), COLUMN, calibration.draw_coverage, "Coverage of densest regions",
         "For truths over the support. Below the diagonal: over-confident.",
     ),
     "tarp": (
-        (DISTANCE, *CURVE), _square, calibration.draw_tarp, "Coverage from random points (TARP)",
+        (DISTANCE, *CURVE), COLUMN, calibration.draw_tarp, "Coverage from random points (TARP)",
         "The same with regions around random points, which sees what densities do not.",
     ),
     "predictive": (
         ("predictive_x", "observed_x", "predictive_distances", "observed_distance", "predictive_p_value"),
-        _predictive_size, draw, "Posterior predictive",
+        lambda arrays: (TEXT_WIDTH, 2.3), draw, "Posterior predictive",
         "The run's own observation among simulations of its own posterior.",
     ),
 }  # fmt: skip

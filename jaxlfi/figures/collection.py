@@ -21,48 +21,41 @@ MEASURES = ("theta_error", "trajectory_error", "success_rate", "seconds")
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One run in the table of results.
+    """One run in the table of results."""
 
-    Attributes:
-        configuration: name of the configuration.
-        seed: the run's seed.
-        theta_error: |theta - theta_gt| summed over parameters, mean over posterior samples.
-        trajectory_error: distance from the observed trajectory, mean over posterior samples.
-        success_rate: fraction of the simulations that did not fail.
-        seconds: time the run took.
-    """
-
-    configuration: str
-    seed: int
-    theta_error: float
-    trajectory_error: float
-    success_rate: float
-    seconds: float
+    configuration: str  # name of the configuration
+    seed: int  # the run's seed
+    theta_error: float  # |theta - theta_gt| summed over parameters, mean over posterior samples
+    trajectory_error: float  # distance from the observed trajectory, mean over posterior samples
+    success_rate: float  # fraction of the simulations that did not fail
+    seconds: float  # time the run took
 
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """The content of a folder that figures are drawn from.
+    """The content of a folder that figures are drawn from."""
 
-    Attributes:
-        folder: where it was read from.
-        config: its config.json.
-        runs: histories by configuration.
-        table: one row a run.
-        unfinished: folders of runs with fewer rounds than the others; they are left out.
-    """
-
-    folder: Path
-    config: Mapping[str, Any]
-    runs: Runs
-    table: tuple[Row, ...]
-    unfinished: tuple[str, ...]
+    folder: Path  # where it was read from
+    config: Mapping[str, Any]  # its config.json
+    runs: Runs  # histories by configuration
+    table: tuple[Row, ...]  # one row a run
+    unfinished: tuple[str, ...]  # folders of runs with fewer rounds than the others; they are left out
 
     def values(self, measure: str) -> dict[str, np.ndarray]:
         """One measure of the table's rows, by configuration in the runs' order."""
         order = [*self.runs, *(row.configuration for row in self.table if row.configuration not in self.runs)]
         found = {name: [getattr(r, measure) for r in self.table if r.configuration == name] for name in order}
         return {name: np.array(values, float) for name, values in found.items() if values}
+
+
+def all_of(runs: Runs) -> list[History]:
+    """The runs of all configurations."""
+    return [history for histories in runs.values() for history in histories]
+
+
+def first_of(runs: Runs) -> History:
+    """One of them, for what all have in common."""
+    return next(iter(runs.values()))[0]
 
 
 def seed_count(runs: Runs) -> int:
@@ -125,11 +118,7 @@ def read_table(path: Path) -> tuple[Row, ...]:
             if missing := [name for name in columns if name not in (reader.fieldnames or ())]:
                 raise ValueError(f"expected the columns {', '.join(columns)}; missing {', '.join(missing)}")
             return tuple(
-                Row(
-                    line["configuration"],
-                    int(line["seed"]),
-                    *(float(line[name] or "nan") for name in MEASURES),
-                )
+                Row(line["configuration"], int(line["seed"]), *(float(line[name] or "nan") for name in MEASURES))
                 for line in reader
             )
     except (OSError, ValueError, TypeError) as error:
@@ -165,7 +154,7 @@ def _ordered(names: Mapping[str, Path], config: Mapping[str, Any]) -> list[str]:
 
 def _alike(folder: Path, runs: Mapping[str, list[History]], unfinished: list[str]) -> dict[str, list[History]]:
     """The runs that can be compared: of the same parameters, and with as many rounds as the longest."""
-    every = [history for histories in runs.values() for history in histories]
+    every = all_of(runs)
     for history in every[1:]:
         if history.names != every[0].names:
             raise ValueError(

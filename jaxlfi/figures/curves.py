@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from jaxlfi.figures import statistics
 from jaxlfi.figures.bands import draw_band
-from jaxlfi.figures.collection import Runs, seed_count
+from jaxlfi.figures.collection import Runs, all_of, first_of, seed_count
 from jaxlfi.figures.legends import of_configurations
 from jaxlfi.figures.style import iterations_axis, looks, parameter_name
 
@@ -34,19 +34,13 @@ def middle_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def drawable(runs: Runs) -> bool:
     """Whether there is a discrepancy to show."""
-    return any(h.trajectory_error is not None or h.theta_error is not None for hs in runs.values() for h in hs)
+    return any(h.trajectory_error is not None or h.theta_error is not None for h in all_of(runs))
 
 
 def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:
-    """A panel for the trajectory, if trajectories were simulated, and one per parameter, if the truth is known.
-
-    Args:
-        figure: empty.
-        runs: configurations with their seeds.
-        alpha: factor of the loss in exp(-alpha loss).
-    """
+    """Panels of exp(-alpha loss): of trajectories, if there are any, and of each parameter, if the truth is known."""
     look = looks(list(runs))
-    first = next(iter(runs.values()))[0]
+    first = first_of(runs)
     trajectories = {name: trajectory_curve(runs, name, alpha) for name in runs}
     thetas = {name: theta_curve(runs, name, alpha) for name in runs}
     columns = 2 if first.dim <= 4 else 3

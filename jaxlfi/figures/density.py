@@ -24,13 +24,9 @@ def marginal(means: np.ndarray, scale_tril: np.ndarray, dims: tuple[int, ...]) -
 
 
 def density(points: np.ndarray, weight: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Density of the mixture at points [..., m], in closed form; a component without volume is left out.
+    """Density of the mixture at points [..., m], in closed form; components without volume are left out.
 
-    Args:
-        points: where to evaluate, shape [..., m].
-        weight: w_k, shape [K].
-        mean: mu_k, shape [K, m].
-        covariance: Sigma_k, shape [K, m, m].
+    Weights are of shape [K], means [K, m], covariances [K, m, m].
     """
     total = np.zeros(points.shape[:-1])
     for w, mu, sigma in zip(weight, mean, covariance, strict=True):
@@ -46,12 +42,7 @@ def density(points: np.ndarray, weight: np.ndarray, mean: np.ndarray, covariance
 def grid(low: float, high: float, mean: np.ndarray, scale: np.ndarray, points: int = 180) -> np.ndarray:
     """Points over an interval, closer around the components, so that narrow peaks are resolved.
 
-    Args:
-        low: lower end of the interval.
-        high: upper end.
-        mean: the components' means along this axis, shape [K].
-        scale: their standard deviations, shape [K].
-        points: how many are evenly spaced.
+    So many points are evenly spaced; the components' means and standard deviations are those along this axis, [K].
     """
     around = mean[:, None] + scale[:, None] * np.linspace(-3, 3, 13)
     every = np.concatenate([np.linspace(low, high, points), around[(around >= low) & (around <= high)]])

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxlfi.figures.collection import Runs, seed_count
+from jaxlfi.figures.collection import Runs, first_of, seed_count
 from jaxlfi.figures.curves import drawable
 from jaxlfi.figures.legends import above, balanced
 from jaxlfi.figures.natural import logarithmic
@@ -29,13 +29,7 @@ def final_errors(runs: Runs, configuration: str) -> tuple[np.ndarray, np.ndarray
 
 
 def draw_dots(axes: Axes, errors: dict[str, np.ndarray], look: dict[str, Look]) -> None:
-    """A dot for each seed of each configuration, and a line at their median.
-
-    Args:
-        axes: to draw on.
-        errors: by configuration, each [seeds]; NaN is left out.
-        look: of the configurations.
-    """
+    """A dot for each seed of each configuration, and a line at their median; NaN is left out."""
     for place, (name, own) in enumerate(look.items()):
         values = errors[name][np.isfinite(errors[name])]
         if not values.size:
@@ -53,24 +47,17 @@ def draw_dots(axes: Axes, errors: dict[str, np.ndarray], look: dict[str, Look]) 
 
 
 class Panel(NamedTuple):
-    """The content of one panel.
+    """The content of one panel."""
 
-    Attributes:
-        title: a parameter, or "trajectory".
-        unit: of the errors, in brackets.
-        errors: by configuration, each [seeds].
-        log: whether they are of a logarithm.
-    """
-
-    title: str
-    unit: str
-    errors: dict[str, np.ndarray]
-    log: bool = False
+    title: str  # a parameter, or "trajectory"
+    unit: str  # of the errors, in brackets
+    errors: dict[str, np.ndarray]  # by configuration, each [seeds]
+    log: bool = False  # whether they are of a logarithm
 
 
 def panels(runs: Runs) -> list[Panel]:
     """One panel per parameter, if the truth is known, and one for the trajectory."""
-    first = next(iter(runs.values()))[0]
+    first = first_of(runs)
     errors = {name: final_errors(runs, name) for name in runs}
     known, simulated = (any(np.isfinite(error[i]).any() for error in errors.values()) for i in (0, 1))
     logs = [is_log(name) for name in first.names]
@@ -85,12 +72,7 @@ def panels(runs: Runs) -> list[Panel]:
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """A panel for each parameter (on one scale where they have one unit) and one for the trajectory.
-
-    Args:
-        figure: empty.
-        runs: configurations with their seeds.
-    """
+    """A panel for each parameter (on one scale where they have one unit) and one for the trajectory."""
     look = looks(list(runs))
     shown = panels(runs)
     parameters = [place for place, panel in enumerate(shown) if panel.title != "trajectory"]

@@ -5,15 +5,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.collection import Runs, seed_count
+from jaxlfi.figures.collection import Runs, first_of, seed_count
 from jaxlfi.figures.legends import of_configurations
 from jaxlfi.figures.style import iterations_axis, looks
 
-PANELS = {
-    "attempted": "simulations",
-    "success_rate": "success rate [%]",
-    "cumulative": "cumulative failures",
-}
+PANELS = {"attempted": "simulations", "success_rate": "success rate [%]", "cumulative": "cumulative failures"}
 
 
 def quantities(runs: Runs, configuration: str) -> dict[str, np.ndarray]:
@@ -25,15 +21,10 @@ def quantities(runs: Runs, configuration: str) -> dict[str, np.ndarray]:
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Simulations, success rate and cumulative failures over iterations: means over seeds, and each seed.
-
-    Args:
-        figure: empty.
-        runs: configurations with their seeds.
-    """
+    """Simulations, success rate and cumulative failures over iterations: means over seeds, and each seed."""
     look = looks(list(runs))
     axes = dict(zip(PANELS, figure.subplots(1, len(PANELS)), strict=True))
-    rounds = next(iter(runs.values()))[0].rounds
+    rounds = first_of(runs).rounds
     for name in runs:
         for panel, values in quantities(runs, name).items():
             iteration = np.arange(1, rounds + 1)

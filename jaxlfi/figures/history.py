@@ -10,40 +10,32 @@ import numpy as np
 from jaxlfi.figures import density, statistics
 from jaxlfi.io import files
 
-REQUIRED = (
-    "theta",
-    "counted",
-    "kept",
-    "failure",
-    "proposal_low",
-    "proposal_high",
-    "support_low",
-    "support_high",
-    "logits",
-    "means",
-    "scale_tril",
-)
-"""Arrays of history.npz that a run must have to be drawn."""
-
+AXES = {
+    "theta": ("rounds", "simulations", "parameters"),
+    "logits": ("rounds", "components"),
+    "counted": ("rounds", "simulations"),
+    "kept": ("rounds", "simulations"),
+    "failure": ("rounds", "simulations"),
+    "proposal_low": ("rounds", "parameters"),
+    "proposal_high": ("rounds", "parameters"),
+    "support_low": ("rounds", "parameters"),
+    "support_high": ("rounds", "parameters"),
+    "means": ("rounds", "components", "parameters"),
+    "scale_tril": ("rounds", "components", "parameters", "parameters"),
+}
+"""Arrays of history.npz that a run must have to be drawn, and their axes."""
+OPTIONAL_AXES = {
+    "sample_theta_error": ("rounds", "samples", "parameters"),
+    "sample_trajectory_error": ("rounds", "samples"),
+    "attempted": ("rounds",),
+    "failed": ("rounds", "reasons"),
+    "seconds": ("rounds",),
+}
+"""Arrays that a run may lack, likewise; the numbers of samples and of reasons are free."""
 NUMBERS = (
-    *REQUIRED,
-    "loss",
-    "validation_loss",
-    "sample_theta_error",
-    "sample_trajectory_error",
-    "attempted",
-    "failed",
-    "seconds",
-    "final_trajectory",
-    "final_x",
-    "trajectory",
-    "times",
-    "x",
-    "truth",
-    "round",
-    "draws",
-    "log",
-)
+    *AXES, *OPTIONAL_AXES, "loss", "validation_loss", "final_trajectory", "final_x", "trajectory", "times", "x",
+    "truth", "round", "draws", "log",
+)  # fmt: skip
 """Arrays of a run's files that figures calculate with. What else a file holds, texts among it, they leave alone."""
 
 
@@ -52,83 +44,44 @@ class History:
     """One run; R rounds of A simulations, D parameters, K components, E networks, P epochs, N posterior samples.
 
     Parameters are in inference space. What a run does not have (a truth, simulations of the posterior) is NaN or None.
-
-    Attributes:
-        folder: where it was read from.
-        configuration: the run's name among others, "misspecified+edge".
-        seed: the run's seed.
-        config: config.json.
-        names: of the parameters in inference space, "ln k" for a logarithm.
-        units: of the parameters.
-        theta: proposals, shape [R, A, D].
-        counted: simulations up to the last one needed, shape [R, A].
-        kept: which were added to the dataset, shape [R, A].
-        failure: 0 or the code of the reason, shape [R, A].
-        proposal_low: lower bounds of the support each round drew from, shape [R, D].
-        proposal_high: its upper bounds.
-        support_low: lower bounds after each round's adaptation, shape [R, D].
-        support_high: the upper bounds.
-        logits: posterior mixture of each round, shape [R, K].
-        means: its means, shape [R, K, D].
-        scale_tril: its Cholesky factors, shape [R, K, D, D].
-        loss: training loss of each epoch, shape [R, E, P], or None.
-        validation_loss: the same on held-out simulations, or None.
-        theta_error: |theta - theta_gt| of posterior samples after each round, shape [R, N, D], or None.
-        trajectory_error: distance of their trajectories from the observed one, shape [R, N], NaN: failed; or None.
-        attempted: simulations of each round, shape [R].
-        failed: failures of each round, shape [R].
-        seconds: duration of each round, shape [R].
-        final_trajectory: simulations of the last posterior's samples, shape [N, T, C], or None.
-        final_x: their summaries, shape [N, S], NaN: failed; or None.
-        draws: of the last posterior in inference space, shape [n, D], or None.
-        observed: the observed trajectory, shape [T, C], or None.
-        x: its summary, shape [S], or None.
-        x_scale: standard deviations of the first round's summaries, shape [S], or None (`robust_sd`).
-        summaries: names of the summary's numbers.
-        truth: theta_gt, shape [D], NaN where unknown.
-        times: shape [T], or None.
-        record_label: name of the trajectory's row axis, "time".
-        channels: names of the trajectory's columns.
-        feasible_low: lower limits Phi, shape [D], or None.
-        feasible_high: upper limits Phi, or None.
     """
 
-    folder: Path
-    configuration: str
+    folder: Path  # where it was read from
+    configuration: str  # the run's name among others, "misspecified+edge"
     seed: int
-    config: Mapping[str, Any]
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    theta: np.ndarray
-    counted: np.ndarray
-    kept: np.ndarray
-    failure: np.ndarray
-    proposal_low: np.ndarray
+    config: Mapping[str, Any]  # config.json
+    names: tuple[str, ...]  # of the parameters in inference space, "ln k" for a logarithm
+    units: tuple[str, ...]  # of the parameters
+    theta: np.ndarray  # proposals, [R, A, D]
+    counted: np.ndarray  # simulations up to the last one needed, [R, A]
+    kept: np.ndarray  # which were added to the dataset, [R, A]
+    failure: np.ndarray  # 0 or the code of the reason, [R, A]
+    proposal_low: np.ndarray  # bounds of the support that each round drew from, [R, D]
     proposal_high: np.ndarray
-    support_low: np.ndarray
+    support_low: np.ndarray  # bounds after each round's adaptation, [R, D]
     support_high: np.ndarray
-    logits: np.ndarray
-    means: np.ndarray
-    scale_tril: np.ndarray
-    loss: np.ndarray | None
-    validation_loss: np.ndarray | None
-    theta_error: np.ndarray | None
-    trajectory_error: np.ndarray | None
-    attempted: np.ndarray
-    failed: np.ndarray
-    seconds: np.ndarray
-    final_trajectory: np.ndarray | None
-    final_x: np.ndarray | None
-    draws: np.ndarray | None
-    observed: np.ndarray | None
-    x: np.ndarray | None
-    x_scale: np.ndarray | None
-    summaries: tuple[str, ...]
-    truth: np.ndarray
-    times: np.ndarray | None
-    record_label: str
-    channels: tuple[str, ...]
-    feasible_low: np.ndarray | None
+    logits: np.ndarray  # posterior mixture of each round, [R, K]
+    means: np.ndarray  # its means, [R, K, D]
+    scale_tril: np.ndarray  # its Cholesky factors, [R, K, D, D]
+    loss: np.ndarray | None  # training loss of each epoch, [R, E, P]
+    validation_loss: np.ndarray | None  # the same on held-out simulations
+    theta_error: np.ndarray | None  # |theta - theta_gt| of posterior samples after each round, [R, N, D]
+    trajectory_error: np.ndarray | None  # distance of their trajectories from the observed one, [R, N]; NaN: failed
+    attempted: np.ndarray  # simulations of each round, [R]
+    failed: np.ndarray  # failures of each round, [R]
+    seconds: np.ndarray  # duration of each round, [R]
+    final_trajectory: np.ndarray | None  # simulations of the last posterior's samples, [N, T, C]
+    final_x: np.ndarray | None  # their summaries, [N, S]; NaN: failed
+    draws: np.ndarray | None  # of the last posterior, [n, D]
+    observed: np.ndarray | None  # the observed trajectory, [T, C]
+    x: np.ndarray | None  # its summary, [S]
+    x_scale: np.ndarray | None  # standard deviations of the first round's summaries, [S] (`robust_sd`)
+    summaries: tuple[str, ...]  # names of the summary's numbers
+    truth: np.ndarray  # theta_gt, [D], NaN where unknown
+    times: np.ndarray | None  # [T]
+    record_label: str  # name of the trajectory's row axis, "time"
+    channels: tuple[str, ...]  # names of the trajectory's columns
+    feasible_low: np.ndarray | None  # limits Phi, [D]
     feasible_high: np.ndarray | None
 
     @property
@@ -215,15 +168,14 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     config = read_config(folder)
     if config["format"] != "jaxlfi-run":
         raise ValueError(f"{folder}: expected config.json of format 'jaxlfi-run', got {config['format']!r}")
-    arrays = read_arrays(folder / "history.npz", REQUIRED, NUMBERS)
-    observation, posterior, dataset = (
-        _arrays_if_there(folder / f"{name}.npz") for name in ("observation", "posterior", "dataset")
-    )
+    arrays = read_arrays(folder / "history.npz", tuple(AXES), NUMBERS)
+    others = [folder / f"{name}.npz" for name in ("observation", "posterior", "dataset")]
+    observation, posterior, dataset = (read_arrays(path, numbers=NUMBERS) if path.exists() else {} for path in others)
     _check_shapes(folder / "history.npz", arrays)
     rounds, _, dim = arrays["theta"].shape
     trajectory = _trajectory(observation.get("trajectory"))
     times = _times(observation.get("times"), trajectory)
-    x = observation.get("x")
+    x, truth = observation.get("x"), observation.get("truth")
     if x is not None and x.ndim != 1:
         raise ValueError(f"{folder / 'observation.npz'}: expected x of one dimension, got shape {x.shape}")
     obs = 0 if x is None else len(x)
@@ -252,13 +204,13 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
         x=x,
         x_scale=_x_scale(dataset, obs),
         summaries=_texts(observation.get("summaries"), None, obs, "x_{}"),
-        truth=_vector(observation.get("truth"), dim),
+        truth=np.asarray(truth if truth is not None and truth.shape == (dim,) else np.full(dim, np.nan), float),
         times=times,
         record_label=_record_label(observation, times),
         channels=_texts(observation.get("channels"), None, 0 if trajectory is None else trajectory.shape[1], "x{}"),
         feasible_low=_limits(config, "low", dim),
         feasible_high=_limits(config, "high", dim),
-        **{name: arrays[name] for name in REQUIRED if name not in ("counted", "kept", "failure")},
+        **{name: arrays[name] for name in AXES if name not in ("counted", "kept", "failure")},
     )
 
 
@@ -308,10 +260,6 @@ def robust_sd(x: np.ndarray) -> np.ndarray:
     return (high - low) / 2
 
 
-def _arrays_if_there(path: Path) -> dict[str, np.ndarray]:
-    return read_arrays(path, numbers=NUMBERS) if path.exists() else {}
-
-
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Refuse arrays that do not agree in the numbers of rounds, simulations, parameters or components."""
     if arrays["theta"].ndim != 3 or arrays["logits"].ndim != 2 or arrays["theta"].shape[0] < 1:
@@ -319,31 +267,16 @@ def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
             f"{path}: expected theta [rounds, simulations, parameters] and logits [rounds, components] of at "
             f"least one round, got {arrays['theta'].shape} and {arrays['logits'].shape}"
         )
-    (rounds, simulations, dim), components = arrays["theta"].shape, arrays["logits"].shape[1]
-    expected: dict[str, tuple[int, ...]] = dict.fromkeys(("counted", "kept", "failure"), (rounds, simulations))
-    expected |= {name: (rounds, dim) for name in REQUIRED if name.endswith(("_low", "_high"))}
-    expected |= {
-        "logits": (rounds, components),
-        "means": (rounds, components, dim),
-        "scale_tril": (rounds, components, dim, dim),
-    }
-    for name, shape in expected.items():
-        if arrays[name].shape != shape:
-            raise ValueError(f"{path}: expected {name} of shape {shape}, got {arrays[name].shape}")
+    lengths = dict(zip(AXES["theta"], arrays["theta"].shape, strict=True)) | {"components": arrays["logits"].shape[1]}
+    for name, axes in (AXES | OPTIONAL_AXES).items():
+        expected = tuple(lengths.get(axis, axis) for axis in axes)
+        got = arrays[name].shape if name in arrays else expected
+        if len(got) != len(axes) or any(lengths.get(axis, own) != own for axis, own in zip(axes, got, strict=True)):
+            raise ValueError(f"{path}: expected {name} of shape {expected}, got {got}".replace("'", ""))
     for name in ("proposal", "support"):
         low, high = arrays[f"{name}_low"], arrays[f"{name}_high"]
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
             raise ValueError(f"{path}: expected finite bounds with {name}_low below {name}_high, got others")
-    for name, shape in {
-        "sample_theta_error": (rounds, "samples", dim),
-        "sample_trajectory_error": (rounds, "samples"),
-        "attempted": (rounds,),
-        "failed": (rounds, "reasons"),
-        "seconds": (rounds,),
-    }.items():
-        got = arrays[name].shape if name in arrays else shape
-        if len(got) != len(shape) or any(s != g for s, g in zip(shape, got, strict=True) if isinstance(s, int)):
-            raise ValueError(f"{path}: expected {name} of shape {shape}, got {got}".replace("'", ""))
 
 
 def _optional(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
@@ -398,10 +331,6 @@ def _record_label(observation: Mapping[str, np.ndarray], times: np.ndarray | Non
     if "record_label" in observation:
         return str(observation["record_label"])
     return "record" if times is None or np.array_equal(times, np.arange(len(times))) else "time"
-
-
-def _vector(array: np.ndarray | None, dim: int) -> np.ndarray:
-    return np.full(dim, np.nan) if array is None or array.shape != (dim,) else np.asarray(array, float)
 
 
 def _times(array: np.ndarray | None, trajectory: np.ndarray | None) -> np.ndarray | None:

@@ -25,12 +25,7 @@ def height(arrays: Mapping[str, np.ndarray]) -> float:
 
 
 def draw(figure: Figure, arrays: Mapping[str, np.ndarray]) -> None:
-    """Left: fraction of the truths inside intervals of each level. Right: factor by which the widths are off.
-
-    Args:
-        figure: empty.
-        arrays: of diagnostics.npz.
-    """
+    """Left: fraction of the truths inside intervals of each level. Right: factor by which the widths are off."""
     left, right = figure.subplots(1, 2, sharey=True)
     names = [str(name) for name in arrays["names"]]
     references = [str(reference) for reference in arrays["widths_reference"]]

@@ -10,28 +10,14 @@ from jaxlfi.figures.style import Look, grid_shape, is_wide
 
 
 def above(figure: Figure, handles: Sequence[Artist], title: str | None = None, columns: int | None = None) -> None:
-    """A legend above the panels.
-
-    Args:
-        figure: to add it to.
-        handles: its entries.
-        title: a line above the entries.
-        columns: of entries; by default all in one row.
-    """
+    """A legend above the panels, by default in one row."""
     figure.legend(
         handles=handles, loc="outside upper center", ncols=columns or len(handles), title=title, title_fontsize=7
     )
 
 
 def below(figure: Figure, handles: Sequence[Artist], at_most: int | None = None, **options) -> None:
-    """A legend below the panels.
-
-    Args:
-        figure: to add it to.
-        handles: its entries.
-        at_most: columns of entries; by default all in one row where the figure is wide, else 3.
-        options: of `Figure.legend`.
-    """
+    """A legend below the panels, by default in one row where the figure is wide, or else in 3 columns."""
     columns = min(at_most or (len(handles) if is_wide(figure) else 3), len(handles))
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, **{"title_fontsize": 7} | options)
 

@@ -7,7 +7,7 @@ from matplotlib.ticker import NullFormatter
 
 from jaxlfi.figures import statistics
 from jaxlfi.figures.bands import draw_band
-from jaxlfi.figures.collection import Runs, seed_count
+from jaxlfi.figures.collection import Runs, all_of, seed_count
 from jaxlfi.figures.extent import extent
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import of_configurations
@@ -35,17 +35,12 @@ def by_round(history: History, panel: str) -> np.ndarray | None:
 
 def drawable(runs: Runs) -> bool:
     """Whether losses were saved."""
-    return any(getattr(h, panel) is not None for hs in runs.values() for h in hs for panel in PANELS)
+    return any(getattr(h, panel) is not None for h in all_of(runs) for panel in PANELS)
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Losses of one run epoch by epoch, or of several runs round by round.
-
-    Args:
-        figure: empty.
-        runs: configurations with their seeds.
-    """
-    every = [history for histories in runs.values() for history in histories]
+    """Losses of one run epoch by epoch, or of several runs round by round."""
+    every = all_of(runs)
     shown = [panel for panel in PANELS if any(getattr(h, panel) is not None for h in every)]
     axes = dict(zip(shown, figure.subplots(1, len(shown), squeeze=False, sharey=True)[0], strict=True))
     if len(every) == 1:
@@ -72,13 +67,7 @@ def draw(figure: Figure, runs: Runs) -> None:
 
 
 def draw_epochs(axes: Axes, history: History, panel: str) -> None:
-    """One line per round over the epochs of its training, coloured by iteration.
-
-    Args:
-        axes: to draw on.
-        history: the run.
-        panel: "loss" or "validation_loss".
-    """
+    """One line per round over the epochs of its training, coloured by iteration."""
     values = by_epoch(history, panel)
     colours, norm = iteration_colours(history.rounds)
     single = "o" if values.shape[1] == 1 else None

@@ -89,14 +89,7 @@ class LogNumbers(Formatter):
 
 
 def logarithmic(axis: Axis, count: int, scale: float = 1.0, before: str = "") -> None:
-    """Let an axis of natural logarithms show round numbers of what they are logarithms of.
-
-    Args:
-        axis: whose data are logarithms.
-        count: at most `count` + 1 ticks.
-        scale: of one unit of the numbers on the axis.
-        before: each number.
-    """
+    """Let an axis of natural logarithms show at most `count` + 1 round numbers of what they are logarithms of."""
     axis.set_major_locator(LogTicks(count, scale))
     axis.set_major_formatter(LogNumbers(scale, before))
     axis.set_minor_formatter(NullFormatter())
@@ -115,25 +108,14 @@ def prefix(unit: str, magnitude: float) -> tuple[float, str]:
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """How the axis of a parameter is read: in its natural unit, and logarithmically where its logarithm is inferred.
+    """How the axis of a parameter is read: in its natural unit, and logarithmically where its logarithm is inferred."""
 
-    Attributes:
-        label: of the axis, without unit.
-        unit: natural, "" for none.
-        log: whether the data are natural logarithms.
-    """
-
-    label: str
-    unit: str = ""
-    log: bool = False
+    label: str  # of the axis, without unit
+    unit: str = ""  # natural, "" for none
+    log: bool = False  # whether the data are natural logarithms
 
     def show(self, axis: Axis, count: int) -> None:
-        """Set ticks and label of an axis whose limits are set.
-
-        Args:
-            axis: whose data are the parameter in inference space.
-            count: at most `count` + 1 ticks.
-        """
+        """Set at most `count` + 1 ticks, and the label, of an axis whose limits are set."""
         low, high = sorted(axis.get_view_interval())
         if self.log:
             size, unit = prefix(self.unit, math.exp(max(-LARGEST, min((low + high) / 2, LARGEST))))
@@ -147,12 +129,6 @@ class Scale:
 
 
 def scales(names: Sequence[str], units: Sequence[str], width: int = 26) -> list[Scale]:
-    """The scales of parameters in inference space, labelled with their symbols and names.
-
-    Args:
-        names: of the parameters in inference space, "ln k" for a logarithm.
-        units: of the parameters.
-        width: of a label, in letters, beyond which it is broken.
-    """
+    """The scales of parameters in inference space, labelled with their symbols and names, broken into lines."""
     each = zip(names, units, strict=True)
     return [Scale(parameter_name(names, d, width), plain_unit(u), is_log(n)) for d, (n, u) in enumerate(each)]

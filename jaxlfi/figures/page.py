@@ -4,36 +4,48 @@ import base64
 import dataclasses
 import html
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from jaxlfi.figures import statistics
-from jaxlfi.figures.collection import Collection
+from jaxlfi.figures import statistics, style
+from jaxlfi.figures.collection import Collection, all_of, first_of
 from jaxlfi.figures.history import heuristic_name
-from jaxlfi.figures.style import Look, looks, natural, unit_label
-from jaxlfi.io import web_page
+from jaxlfi.figures.style import looks, natural, unit_label
+from jaxlfi.io import files, web_page
 from jaxlfi.io.run_summary import RunSummary
 from jaxlfi.io.web_page import prose, wide
 
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A picture on the page.
+    """A picture on the page."""
 
-    Attributes:
-        path: the png.
-        title: its heading.
-        caption: the text below it.
-        width: in inches, as in a paper.
-    """
+    path: Path  # the png
+    title: str  # its heading
+    caption: str  # the text below it
+    width: float  # in inches, as in a paper
 
-    path: Path
-    title: str
-    caption: str
-    width: float
+
+Drawing = tuple[str, Figure, str, str]
+"""A figure between its file's name and its title and caption."""
+
+
+def write(
+    folder: Path, drawings: Iterable[Drawing], render: Callable[[Sequence[Picture]], str], dpi: float
+) -> list[Path]:
+    """Save pictures in this package's style as they are drawn, then the page that shows them; returns it and them."""
+    pictures = []
+    with style.context():
+        for name, figure, title, caption in drawings:
+            path = style.save(figure, folder / "figures" / f"{name}.png", dpi)
+            pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
+    index = folder / "report.html"
+    files.write_bytes(index, render(pictures).encode(errors="replace"))
+    return [index, *(picture.path for picture in pictures)]
 
 
 _COLUMNS = {
@@ -49,14 +61,9 @@ UNMEASURED = "not measured"
 
 
 def render(collection: Collection, pictures: Sequence[Picture]) -> str:
-    """The page as text.
-
-    Args:
-        collection: the runs.
-        pictures: in their order on the page.
-    """
+    """The page as text."""
     config = collection.config
-    first = next(iter(collection.runs.values()))[0]
+    first = first_of(collection.runs)
     task = _short(
         config.get("task") or first.config.get("task") or first.config.get("task_name") or collection.folder.name
     )
@@ -76,12 +83,7 @@ def render(collection: Collection, pictures: Sequence[Picture]) -> str:
 
 
 def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
-    """The page of a sensitivity grid as text.
-
-    Args:
-        config: the grid's config.json.
-        pictures: in their order on the page.
-    """
+    """The page of a sensitivity grid as text, from its config.json."""
     heuristic = heuristic_name(config["heuristic"])
     task = _short(config["task"] or config["task_name"])
     title = f"{task}: sensitivity of {heuristic} in {config['runs']} runs of jaxlfi"
@@ -98,12 +100,7 @@ def render_grid(config: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
 
 
 def render_diagnostics(found: Mapping[str, Any], pictures: Sequence[Picture]) -> str:
-    """The page of a run's diagnostics as text: first how far its widths can be trusted, in plain words.
-
-    Args:
-        found: diagnostics.json.
-        pictures: in their order on the page.
-    """
+    """The page of a diagnostics.json as text: first how far its widths can be trusted, in plain words."""
     run = found["run"]
     title = f"{_short(run['task'] or run['configuration'])}: can its widths be trusted?"
     way = {
@@ -188,6 +185,7 @@ def _document(
 ) -> str:
     """A whole page: a heading, its first parts, the pictures with links to them, and config.json."""
     shown = [(f"picture-{i}", picture) for i, picture in enumerate(pictures, 1)]
+    shown_config = html.escape(json.dumps(config, indent=2, ensure_ascii=False))
     links = "".join(f'<a href="#{name}">{html.escape(picture.title)}</a>' for name, picture in shown)
     return web_page.document(
         title,
@@ -195,7 +193,7 @@ def _document(
             *parts,
             f"<nav>{links}</nav>",
             *(_figure(name, picture) for name, picture in shown),
-            f"<h2>Configuration</h2><details><summary>{name_of_config}</summary><pre>{_json(config)}</pre></details>",
+            f"<h2>Configuration</h2><details><summary>{name_of_config}</summary><pre>{shown_config}</pre></details>",
         ],
     )
 
@@ -223,7 +221,7 @@ def _widths(collection: Collection) -> str:
 
 def _facts(collection: Collection) -> str:
     """Parameters and provenance of the runs, from the folder's config.json or the first run's."""
-    first = next(iter(collection.runs.values()))[0]
+    first = first_of(collection.runs)
     configs = (collection.config, first.config)
 
     def get(*names: str) -> Any:
@@ -267,7 +265,7 @@ def _notes(collection: Collection) -> str:
     if collection.unfinished:
         names = ", ".join(str(Path(p).relative_to(collection.folder)) for p in collection.unfinished)
         notes.append(f"Not finished, and left out of the pictures: {names}.")
-    if all(h.trajectory_error is None for histories in collection.runs.values() for h in histories):
+    if all(history.trajectory_error is None for history in all_of(collection.runs)):
         notes.append(
             "There are no simulated trajectories of posterior samples: none were simulated, or all simulations failed. "
             "Trajectory errors and the posterior predictive are left out."
@@ -289,8 +287,9 @@ def _table(collection: Collection) -> str:
             deviation = float(statistics.sd(scaled)) if len(scaled) > 1 else float("nan")
             three = [_number(x) for x in (float(statistics.mean(scaled)), statistics.median(scaled), deviation)]
             cells.append('<td class="first">{}</td><td>{}</td><td>{}</td>'.format(*three))
-        seeds = len(values[name])
-        lines.append(f"<tr><td>{_swatch(own)}</td><td>{seeds}</td>{''.join(cells)}</tr>")
+        seeds, label = len(values[name]), html.escape(_without_escapes(own.label))
+        swatch = f'<i class="swatch" style="background:{own.colour}"></i>{label}'
+        lines.append(f"<tr><td>{swatch}</td><td>{seeds}</td>{''.join(cells)}</tr>")
     return wide(
         f"<table><thead><tr><th></th><th></th>{head}</tr>"
         f"<tr><th>configuration</th><th>seeds</th>{below}</tr></thead><tbody>{''.join(lines)}</tbody>"
@@ -299,10 +298,6 @@ def _table(collection: Collection) -> str:
         "posterior samples whose simulation succeeded. Success rate: percentage of all simulations that succeeded. "
         "Mean, median and standard deviation (sd) are over seeds.</caption></table>"
     )
-
-
-def _swatch(own: Look) -> str:
-    return f'<i class="swatch" style="background:{own.colour}"></i>{html.escape(_without_escapes(own.label))}'
 
 
 def _labels(names: Sequence[str], units: Sequence[str]) -> list[str]:
@@ -335,7 +330,3 @@ def _number(x: float) -> str:
 
 def _short(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-
-
-def _json(config: Mapping[str, Any]) -> str:
-    return html.escape(json.dumps(config, indent=2, ensure_ascii=False))

@@ -49,21 +49,13 @@ Box = tuple[np.ndarray, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Cloud:
-    """Draws of one distribution over D parameters, with their support and true parameters.
+    """Draws of one distribution over D parameters, with their support and true parameters."""
 
-    Attributes:
-        draws: shape [n, D].
-        look: how they are drawn.
-        truth: shape [D], NaN where unknown.
-        support: the box that holds all draws, or None; densities do not fade towards its bounds.
-        first_support: the support before adaptation, or None where it is the same.
-    """
-
-    draws: np.ndarray
-    look: Look
-    truth: np.ndarray
-    support: Box | None = None
-    first_support: Box | None = None
+    draws: np.ndarray  # shape [n, D]
+    look: Look  # how they are drawn
+    truth: np.ndarray  # shape [D], NaN where unknown
+    support: Box | None = None  # the box that holds all draws, or None; densities do not fade towards its bounds
+    first_support: Box | None = None  # the support before adaptation, or None where it is the same
 
     @property
     def dim(self) -> int:
@@ -79,17 +71,11 @@ class Cloud:
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """An estimate of D parameters.
+    """An estimate of D parameters."""
 
-    Attributes:
-        value: shape [D].
-        interval: of each parameter, shape [D, 2]; NaN where there is none.
-        look: how it is drawn.
-    """
-
-    value: np.ndarray
-    interval: np.ndarray
-    look: Look
+    value: np.ndarray  # shape [D]
+    interval: np.ndarray  # of each parameter, shape [D, 2]; NaN where there is none
+    look: Look  # how it is drawn
 
 
 def drawable(history: History) -> bool:
@@ -174,14 +160,7 @@ def histogram(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int, points: Sequence[Point] = ()) -> None:
-    """Histograms of one parameter's draws, with the supports' bounds and the truth; above them points.
-
-    Args:
-        axes: to draw on.
-        clouds: to draw over one another.
-        d: index of the parameter.
-        points: with their intervals, one above the other.
-    """
+    """Histograms of one parameter's draws, with the supports' bounds and the truth; above them points."""
     found = [histogram(cloud.draws[:, d]) for cloud in clouds]
     highest = max(heights.max() for heights, _ in found)
     for cloud, (heights, edges) in zip(clouds, found, strict=True):
@@ -208,13 +187,7 @@ def draw_marginal(axes: Axes, clouds: Sequence[Cloud], d: int, points: Sequence[
 def draw_pair(axes: Axes, clouds: Sequence[Cloud], pair: tuple[int, int], points: Sequence[Point] = ()) -> None:
     """Contours around fractions of the draws of two parameters, with the supports, the truth and points.
 
-    One cloud has filled contours; several have lines over a light fill.
-
-    Args:
-        axes: to draw on.
-        clouds: to draw over one another.
-        pair: indices of the parameters, the horizontal one first.
-        points: with their intervals, as crosses.
+    The first of the pair is the horizontal one. One cloud has filled contours; several have lines over a light fill.
     """
     chosen = list(pair)
     for cloud in clouds:
@@ -269,13 +242,7 @@ def _draw_contours(axes: Axes, cloud: Cloud, chosen: list[int], filled: bool) ->
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """A pair plot for each run, side by side, all on the same axes.
-
-    Args:
-        figure: empty.
-        histories: runs of the same parameters, of which draws were saved.
-        titles: of the plots; by default the configurations' names.
-    """
+    """A pair plot for each run, side by side, all on the same axes."""
     look = looks([h.configuration for h in histories])
     clouds = [cloud_of(history, look[history.configuration]) for history in histories]
     titles = or_labels(titles, [cloud.look for cloud in clouds])
@@ -289,14 +256,7 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
 
 
 def draw_overlay(figure: Figure, clouds: Sequence[Cloud], scale: Sequence[Scale], points: Sequence[Point] = ()) -> None:
-    """One pair plot with all clouds drawn over one another.
-
-    Args:
-        figure: empty.
-        clouds: draws of the same parameters.
-        scale: of each parameter.
-        points: estimates of the same parameters; one that is labelled as a cloud shares its entry in the legend.
-    """
+    """One pair plot of all clouds over one another; a point labelled as a cloud shares its entry in the legend."""
     draw_groups(figure, [clouds], scale, points=points)
     own = _cloud_handles(clouds) if len(clouds) > 1 else _fraction_handles(clouds, _colour(clouds))
     shared = {handle.get_label(): handle for handle in own if isinstance(handle, Line2D)}
@@ -317,15 +277,7 @@ def draw_groups(
     titles: Sequence[str] | None = None,
     points: Sequence[Point] = (),
 ) -> None:
-    """A pair plot for each group of clouds; the clouds of a group are drawn over one another.
-
-    Args:
-        figure: empty.
-        groups: clouds over the same parameters.
-        scale: of each parameter.
-        titles: of the groups, in the colour of their first cloud; or None.
-        points: drawn over every group.
-    """
+    """A pair plot for each group of clouds, drawn over one another; its title has the colour of the first."""
     dim = groups[0][0].dim
     rows, columns = arrangement(len(groups), dim)
     windows = [window([cloud for group in groups for cloud in group], d, points) for d in range(dim)]

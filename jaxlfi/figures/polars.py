@@ -62,14 +62,7 @@ def panels(histories: Sequence[History]) -> dict[str, list[np.ndarray]]:
 
 
 def draw_radar(axes: PolarAxes, errors: np.ndarray, names: Sequence[str], look: Look) -> None:
-    """The mean over samples, and a band of one standard deviation to either side, a spoke for each name.
-
-    Args:
-        axes: polar ones.
-        errors: shape [N, spokes]; NaN is left out.
-        names: of the spokes.
-        look: of the configuration.
-    """
+    """The mean over samples, and a band of one standard deviation to either side; errors [N, spokes], NaN left out."""
     mean, sd = statistics.mean(errors, 0), statistics.sd(errors, 0)
     angle = np.linspace(0, 2 * np.pi, len(mean), endpoint=False)
     known = np.flatnonzero(np.isfinite(mean))
@@ -94,13 +87,7 @@ def draw_radar(axes: PolarAxes, errors: np.ndarray, names: Sequence[str], look: 
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """One column per run: errors by parameter above and by summary below, each row on one scale.
-
-    Args:
-        figure: empty.
-        histories: runs of the same task, for which `panels` has something.
-        titles: of the columns; by default the configurations' names.
-    """
+    """One column per run: errors by parameter above and by summary below, each row on one scale."""
     look = looks([h.configuration for h in histories])
     first = histories[0]
     rows = panels(histories)

@@ -33,14 +33,7 @@ def drawable(history: History) -> bool:
 
 
 def draw_channel(axes: Axes, history: History, channel: int, look: Look) -> None:
-    """Bands of 5-95 % and 25-75 %, the median, and the observation of one channel.
-
-    Args:
-        axes: to draw on.
-        history: the run.
-        channel: index of the trajectory's column.
-        look: of the configuration.
-    """
+    """Bands of 5-95 % and 25-75 %, the median, and the observation of one channel."""
     bands = quantiles(history)[..., channel]
     axes.fill_between(history.times, bands[0], bands[4], color=look.colour, alpha=0.18, linewidth=0)
     axes.fill_between(history.times, bands[1], bands[3], color=look.colour, alpha=0.32, linewidth=0)
@@ -50,11 +43,7 @@ def draw_channel(axes: Axes, history: History, channel: int, look: Look) -> None
 
 
 def shown(histories: Sequence[History]) -> list[int]:
-    """Indices of the channels that are drawn: all, or as many as there is room for, of the largest observed ranges.
-
-    Args:
-        histories: the runs to draw.
-    """
+    """Indices of the channels that are drawn: all, or as many as there is room for, of the largest observed ranges."""
     observed = histories[0].observed
     ranges = np.nan_to_num(np.nanmax(observed, axis=0) - np.nanmin(observed, axis=0))
     room = ROWS * (2 if len(histories) == 1 else 1)
@@ -68,13 +57,7 @@ def grid(histories: Sequence[History]) -> tuple[int, int]:
 
 
 def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | None = None) -> None:
-    """A column for each run, a row for each channel; many channels of a single run in two columns.
-
-    Args:
-        figure: empty.
-        histories: one run for each column, of the same task.
-        titles: of the columns; by default the configurations' names.
-    """
+    """A column for each run, a row for each channel; many channels of a single run in two columns."""
     look = looks([h.configuration for h in histories])
     titles = or_labels(titles, [look[h.configuration] for h in histories])
     first, channels = histories[0], shown(histories)

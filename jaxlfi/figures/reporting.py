@@ -1,6 +1,6 @@
 """Report: all pictures of a run folder, and a page with them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +21,9 @@ from jaxlfi.figures import (
     style,
     supports,
 )
-from jaxlfi.figures.collection import Collection, Runs, open_collection, representative, seed_count
+from jaxlfi.figures.collection import Collection, Runs, all_of, first_of, open_collection, representative, seed_count
 from jaxlfi.figures.history import History, read_config
-from jaxlfi.figures.page import Picture
 from jaxlfi.figures.style import COLUMN_WIDTH, TEXT_WIDTH
-from jaxlfi.io import files
 
 COLUMNS = ("ok", "misspecified", "broad", "misspecified+edge")
 """The configurations to show side by side, where there are more than `MAX_COLUMNS`."""
@@ -49,26 +47,14 @@ def report(folder: Path | str, dpi: float = 300.0) -> list[Path]:
     folder = Path(folder)
     if sensitivity.is_grid(folder):
         grid, config = sensitivity.load(folder), read_config(folder)
-        return _written(folder, GRID_PICTURES, grid, lambda pictures: page.render_grid(config, pictures), dpi)
+        return page.write(folder, _drawings(GRID_PICTURES, grid), lambda drawn: page.render_grid(config, drawn), dpi)
     collection = open_collection(folder)
-    return _written(folder, PICTURES, collection, lambda pictures: page.render(collection, pictures), dpi)
+    return page.write(folder, _drawings(PICTURES, collection), lambda drawn: page.render(collection, drawn), dpi)
 
 
-def _written(folder: Path, makers: Mapping[str, Callable], loaded, render: Callable, dpi: float) -> list[Path]:
-    """Draw the pictures that apply to a collection or grid, and write the page."""
-    pictures: list[Picture] = []
-    with style.context():
-        for name, make in makers.items():
-            made = make(loaded)
-            if made is None:
-                continue
-            figure, title, caption = made
-            path = style.save(figure, folder / "figures" / f"{name}.png", dpi)
-            pictures.append(Picture(path, title, caption, float(figure.get_size_inches()[0])))
-    text = render(pictures)
-    index = folder / "report.html"
-    files.write_bytes(index, text.encode(errors="replace"))
-    return [index, *(picture.path for picture in pictures)]
+def _drawings(makers: Mapping[str, Callable], loaded) -> Iterator[page.Drawing]:
+    """The pictures that apply to a collection or grid."""
+    return ((name, *made) for name, make in makers.items() if (made := make(loaded)) is not None)
 
 
 Made = tuple[Figure, str, str] | None
@@ -105,7 +91,7 @@ def _samples(collection: Collection) -> Made:
 
 
 def _efficiency(collection: Collection) -> Made:
-    every = [history for histories in collection.runs.values() for history in histories]
+    every = all_of(collection.runs)
     if len(every) == 1 and (every[0].rounds == 1 or not every[0].failed.any()):
         return None  # a constant line says no more than the summary
     figure = style.new_figure(TEXT_WIDTH, 2.1 + _legend_height(collection.runs))
@@ -118,10 +104,10 @@ def _efficiency(collection: Collection) -> Made:
 
 
 def _curves(collection: Collection) -> Made:
-    if not curves.drawable(collection.runs) or _first(collection).rounds == 1:
+    if not curves.drawable(collection.runs) or first_of(collection.runs).rounds == 1:
         return None
     known, simulated = _measured(collection.runs)
-    dim = _first(collection).dim
+    dim = first_of(collection.runs).dim
     wide = dim > 4
     rows = -(-dim // (3 if wide else 2))
     figure = style.new_figure(TEXT_WIDTH if wide and known else COLUMN_WIDTH, 2.3 + (1.2 * rows if known else 0.2))
@@ -157,8 +143,8 @@ def _discrepancy(collection: Collection) -> Made:
 def _supports(collection: Collection) -> Made:
     if len(collection.runs) == 1 and not any(history.adapts for history in next(iter(collection.runs.values()))):
         return None
-    width = COLUMN_WIDTH if _first(collection).dim == 1 else TEXT_WIDTH
-    figure = style.new_figure(width, 0.6 + 1.6 * -(-_first(collection).dim // 4))
+    width = COLUMN_WIDTH if first_of(collection.runs).dim == 1 else TEXT_WIDTH
+    figure = style.new_figure(width, 0.6 + 1.6 * -(-first_of(collection.runs).dim // 4))
     supports.draw(figure, collection.runs)
     left_out = len(supports.adapting(collection.runs)) < len(collection.runs)
     caption = (
@@ -177,7 +163,7 @@ def _losses(collection: Collection) -> Made:
     caption = (
         "Negative log-density of the parameters, scaled to [-1, 1], under the network, mean over the ensemble's "
         "networks: " + ("after each epoch of training." if one else "after the training of each iteration.")
-    ) + _lines(collection.runs, "standard deviations")
+    ) + " Lines are means over seeds, bands standard deviations." * (seed_count(collection.runs) > 1)
     return figure, "Training", caption
 
 
@@ -304,13 +290,9 @@ GRID_PICTURES: dict[str, Callable[[sensitivity.Grid], Made]] = {
 """The function that draws each picture of a sensitivity grid, by file name."""
 
 
-def _first(collection: Collection) -> History:
-    return next(iter(collection.runs.values()))[0]
-
-
 def _measured(runs: Runs) -> tuple[bool, bool]:
     """Whether any run has parameter errors, and whether any has trajectory errors."""
-    every = [history for histories in runs.values() for history in histories]
+    every = all_of(runs)
     return any(h.theta_error is not None for h in every), any(h.trajectory_error is not None for h in every)
 
 
@@ -322,10 +304,6 @@ def _those(runs: Runs, drawable: Callable[[History], bool]) -> Runs:
 
 def _which_seed(runs: Runs) -> str:
     return " Of several seeds, the one of median parameter error is shown." if seed_count(runs) > 1 else ""
-
-
-def _lines(runs: Runs, bands: str) -> str:
-    return f" Lines are means over seeds, bands {bands}." if seed_count(runs) > 1 else ""
 
 
 def _legend_height(runs: Runs) -> float:

@@ -27,7 +27,11 @@ from jaxlfi.figures.style import (
     or_labels,
 )
 
-_OUTLINE = [patheffects.withStroke(linewidth=1.5, foreground="white")]
+_ARROW = {
+    **{"arrowstyle": "-|>,head_length=2.2,head_width=1.0", "mutation_scale": 1, "shrinkA": 0, "shrinkB": 0},
+    **{"linewidth": 0.6, "color": "black", "zorder": 5},
+    "path_effects": [patheffects.withStroke(linewidth=1.5, foreground="white")],
+}
 
 
 def pairs(dim: int) -> list[tuple[int, ...]]:
@@ -72,11 +76,6 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
     """One column per run: proposals by iteration above, the last mixture below, for each pair of parameters.
 
     A single run has them side by side.
-
-    Args:
-        figure: empty.
-        histories: one run for each column, of the same parameters.
-        titles: of the columns; by default the configurations' names.
     """
     look = looks([h.configuration for h in histories])
     titles = or_labels(titles, [look[h.configuration] for h in histories])
@@ -113,40 +112,25 @@ def _panels(figure: Figure, rows: int, columns: int) -> tuple[np.ndarray, np.nda
 def draw_proposals(
     axes: Axes, history: History, pair: tuple[int, ...], window: Sequence[tuple[float, float]] | None = None
 ) -> None:
-    """Proposals of all iterations over a pair of parameters (or one), with the supports they were drawn from.
-
-    Args:
-        axes: to draw on.
-        history: the run.
-        pair: indices of one or two parameters.
-        window: axis limits for each of them.
-    """
+    """Proposals of all iterations over a pair of parameters (or one), with the supports they were drawn from."""
     window = window or [limits([history], d) for d in pair]
     colours, norm = iteration_colours(history.rounds)
     iteration = np.broadcast_to(np.arange(1, history.rounds + 1)[:, None], history.counted.shape)
     points = _plane(history.theta, pair, iteration)
     failed = history.counted & (history.failure != 0)
+    by_iteration = {"cmap": colours, "norm": norm}
     for chosen, style in (
         (failed, {"marker": "x", "s": 5, "linewidths": 0.45}),
         (history.kept, {"s": 3.5, "linewidths": 0}),
     ):
         chosen = chosen & np.isfinite(points).all(-1)
-        axes.scatter(*points[chosen].T, c=iteration[chosen], cmap=colours, norm=norm, alpha=0.75, zorder=2, **style)
+        axes.scatter(*points[chosen].T, c=iteration[chosen], alpha=0.75, zorder=2, **by_iteration, **style)
     for i in range(history.rounds):
         low, high = history.proposal_low[i], history.proposal_high[i]
         _add_box(axes, low, high, pair, i + 1, edgecolor=colours(norm(i + 1)), linewidth=0.9, zorder=3)
     mean = _plane(history.accumulated_means, pair, iteration[:, 0])
-    axes.scatter(
-        *mean.T,
-        c=iteration[:, 0],
-        cmap=colours,
-        norm=norm,
-        s=22,
-        edgecolors="white",
-        linewidths=0.6,
-        zorder=4,
-        gid="accumulated mean",
-    )
+    marked = {"s": 22, "edgecolors": "white", "linewidths": 0.6, "gid": "accumulated mean"}
+    axes.scatter(*mean.T, c=iteration[:, 0], zorder=4, **by_iteration, **marked)
     _mark_truth(axes, history, pair)
     _frame(axes, history, pair, window)
     if len(pair) == 1:
@@ -162,15 +146,7 @@ def draw_mixture(
     window: Sequence[tuple[float, float]] | None = None,
     look: Look | None = None,
 ) -> None:
-    """The last mixture's marginal over a pair of parameters (or one), and the path of the weighted means.
-
-    Args:
-        axes: to draw on.
-        history: the run.
-        pair: indices of one or two parameters.
-        window: axis limits for each of them.
-        look: its colour is the density's.
-    """
+    """The last mixture's marginal over a pair of parameters (or one), and the path of the weighted means."""
     window = window or [closer_limits([history], d) for d in pair]
     look = look or looks([history.configuration])[history.configuration]
     weight = density.weights(history.logits[-1])
@@ -226,30 +202,11 @@ def _draw_path(axes: Axes, history: History, pair: tuple[int, ...]) -> None:
         path = history.weighted_means[:, list(pair)]
     path = path[np.isfinite(path).all(-1)]
     axes.plot(
-        *path.T,
-        "o",
-        color="black",
-        markersize=1.6,
-        markeredgecolor="white",
-        markeredgewidth=0.3,
-        gid="weighted mean",
+        *path.T, "o", color="black", markersize=1.6, markeredgecolor="white", markeredgewidth=0.3, gid="weighted mean"
     )
     for start, end in itertools.pairwise(path):
-        if np.array_equal(start, end):
-            continue
-        arrow = FancyArrowPatch(
-            start,
-            end,
-            arrowstyle="-|>,head_length=2.2,head_width=1.0",
-            mutation_scale=1,
-            shrinkA=0,
-            shrinkB=0,
-            linewidth=0.6,
-            color="black",
-            zorder=5,
-            path_effects=_OUTLINE,
-        )
-        axes.add_patch(arrow)
+        if not np.array_equal(start, end):
+            axes.add_patch(FancyArrowPatch(start, end, **_ARROW))
 
 
 def _plane(theta: np.ndarray, pair: tuple[int, ...], iteration: np.ndarray) -> np.ndarray:

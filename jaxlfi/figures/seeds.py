@@ -13,13 +13,7 @@ from jaxlfi.figures.style import GREY, looks
 
 
 def draw(figure: Figure, values: Mapping[str, np.ndarray], label: str) -> None:
-    """Strips of points with boxes on a logarithmic scale; mean and median are marked.
-
-    Args:
-        figure: empty.
-        values: one value a seed, by configuration; NaN is left out.
-        label: of the axis, with unit.
-    """
+    """Strips of points with boxes on a logarithmic scale; mean and median are marked."""
     axes = figure.subplots()
     draw_strips(axes, values)
     axes.set_ylabel(label)
@@ -32,12 +26,7 @@ def draw(figure: Figure, values: Mapping[str, np.ndarray], label: str) -> None:
 
 
 def draw_strips(axes: Axes, values: Mapping[str, np.ndarray]) -> None:
-    """A strip of points, a box of quartiles, and mean and median for each configuration.
-
-    Args:
-        axes: to draw on.
-        values: one value a seed, by configuration.
-    """
+    """A strip of points, a box of quartiles, and mean and median for each configuration."""
     look = looks(list(values))
     for place, (name, every) in enumerate(values.items()):
         every = np.asarray(every, float)
@@ -73,10 +62,4 @@ def draw_strips(axes: Axes, values: Mapping[str, np.ndarray]) -> None:
     axes.grid(True, axis="y")
 
 
-_MEAN = {
-    "marker": "D",
-    "markersize": 3.6,
-    "color": "white",
-    "markeredgecolor": "black",
-    "markeredgewidth": 0.8,
-}
+_MEAN = {"marker": "D", "markersize": 3.6, "color": "white", "markeredgecolor": "black", "markeredgewidth": 0.8}

@@ -36,21 +36,13 @@ SYMBOLS = {
 
 @dataclasses.dataclass(frozen=True)
 class Measure:
-    """A result of each run, and how it is drawn.
+    """A result of each run, and how it is drawn."""
 
-    Attributes:
-        name: of the array.
-        label: of the colour bar.
-        colours: colour map whose bright end is the better one.
-        scale: factor of the values shown.
-        smaller_is_better: true for errors.
-    """
-
-    name: str
-    label: str
-    colours: str
-    scale: float = 1.0
-    smaller_is_better: bool = True
+    name: str  # of the array
+    label: str  # of the colour bar
+    colours: str  # colour map whose bright end is the better one
+    scale: float = 1.0  # factor of the values shown
+    smaller_is_better: bool = True  # true for errors
 
 
 TRAJECTORY = Measure("trajectory_error", "trajectory error [observed sd]", "viridis_r")
@@ -60,21 +52,13 @@ SUCCESS = Measure("success_rate", "simulation success rate [%]", "cividis", scal
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """The results of a sensitivity grid.
+    """The results of a sensitivity grid."""
 
-    Attributes:
-        names: hyperparameters, in the order of the arrays' leading axes.
-        values: of each hyperparameter.
-        defaults: the heuristic's default of each, the paper's value.
-        arrays: measures, shape [axis..., seed].
-        heuristic: its name.
-    """
-
-    names: tuple[str, ...]
-    values: tuple[tuple[float, ...], ...]
-    defaults: tuple[float, ...]
-    arrays: Mapping[str, np.ndarray]
-    heuristic: str = ""
+    names: tuple[str, ...]  # hyperparameters, in the order of the arrays' leading axes
+    values: tuple[tuple[float, ...], ...]  # of each hyperparameter
+    defaults: tuple[float, ...]  # the heuristic's default of each, the paper's value
+    arrays: Mapping[str, np.ndarray]  # measures, shape [axis..., seed]
+    heuristic: str = ""  # its name
 
 
 def is_grid(folder: Path) -> bool:
@@ -110,12 +94,7 @@ def load(folder: Path) -> Grid:
 
 
 def marginal(values: np.ndarray, *axes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation over all axes but the given ones, in the order given.
-
-    Args:
-        values: shape [axis..., seed]; NaN is left out.
-        axes: one or two of the leading axes.
-    """
+    """Mean and standard deviation over all axes but the given ones, in the order given; NaN is left out."""
     front = np.moveaxis(values, axes, range(len(axes)))
     pooled = front.reshape(*front.shape[: len(axes)], -1)
     return statistics.mean(pooled, -1), statistics.sd(pooled, -1)
@@ -128,12 +107,7 @@ def errors(grid: Grid) -> tuple[Measure, ...]:
 
 
 def size(grid: Grid, bars: int) -> tuple[float, float]:
-    """Width and height in inches of a figure with colour bars: one column where the cells stay readable, or two.
-
-    Args:
-        grid: the results.
-        bars: number of colour bars, one for each measure.
-    """
+    """Width and height in inches of a figure with colour bars: one column where the cells stay readable, or two."""
     cells = sum(len(values) for values in grid.values)
     width = COLUMN_WIDTH if cells <= 10 else TEXT_WIDTH
     square = width * (0.93 if len(grid.names) > 1 else 0.25 * bars)
@@ -141,23 +115,13 @@ def size(grid: Grid, bars: int) -> tuple[float, float]:
 
 
 def draw(figure: Figure, grid: Grid) -> None:
-    """Trajectory error above the diagonal, where trajectories were simulated, and parameter error below it.
-
-    Args:
-        figure: empty, of `size(grid, len(errors(grid)))`.
-        grid: the results.
-    """
+    """Trajectory error, where there is one, above the diagonal, and parameter error below it; `size` says how large."""
     *above, below = errors(grid)
     _matrix(figure, grid, above=above[0] if above else None, below=below)
 
 
 def draw_success(figure: Figure, grid: Grid) -> None:
-    """Simulation success rate over all rounds, below the diagonal only, as the matrix is symmetric.
-
-    Args:
-        figure: empty, of `size(grid, bars=1)`.
-        grid: the results.
-    """
+    """Simulation success rate over all rounds, below the diagonal only, as the matrix is symmetric."""
     _matrix(figure, grid, above=None, below=SUCCESS)
 
 

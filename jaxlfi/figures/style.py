@@ -27,6 +27,8 @@ TEXT_WIDTH = 7.16
 NOTEBOOK_DPI = 150
 """Resolution of a figure that shows itself in a notebook."""
 
+_TICKS = {"labelsize": 7.0, "color": "#333333", "major.size": 2.0, "major.width": 0.6, "major.pad": 2.0,
+          "minor.size": 1.2, "minor.width": 0.4}  # fmt: skip
 STYLE = {
     "font.family": "DejaVu Sans",
     "font.size": 7.0,
@@ -40,20 +42,7 @@ STYLE = {
     "axes.formatter.useoffset": False,
     "grid.color": "#E4E4E4",
     "grid.linewidth": 0.5,
-    "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0,
-    "xtick.major.size": 2.0,
-    "ytick.major.size": 2.0,
-    "xtick.minor.size": 1.2,
-    "ytick.minor.size": 1.2,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.minor.width": 0.4,
-    "ytick.minor.width": 0.4,
-    "xtick.major.pad": 2.0,
-    "ytick.major.pad": 2.0,
-    "xtick.color": "#333333",
-    "ytick.color": "#333333",
+    **{f"{axis}tick.{name}": value for axis in "xy" for name, value in _TICKS.items()},
     "legend.fontsize": 7.0,
     "legend.frameon": False,
     "legend.handlelength": 2.2,
@@ -118,19 +107,12 @@ TRUTH_LINE = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 0.9}
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """How one configuration is drawn.
+    """How one configuration is drawn."""
 
-    Attributes:
-        label: its name for a reader.
-        colour: of lines, boxes and titles.
-        marker: matplotlib marker.
-        linestyle: matplotlib line style.
-    """
-
-    label: str
-    colour: str
-    marker: str
-    linestyle: str | tuple
+    label: str  # its name for a reader
+    colour: str  # of lines, boxes and titles
+    marker: str  # matplotlib marker
+    linestyle: str | tuple  # matplotlib line style
 
     @property
     def line(self) -> dict:
@@ -175,10 +157,7 @@ def looks(configurations: Sequence[str]) -> dict[str, Look]:
             colour, (marker, line) = HEURISTIC_COLOURS[heuristic], _MARKERS[heuristic]
             colour = shade(colour, amount) if amount else colour
         else:
-            colour, marker = (
-                OTHER_COLOURS[spare % len(OTHER_COLOURS)],
-                _OTHER_MARKERS[spare % len(_OTHER_MARKERS)],
-            )
+            colour, marker = OTHER_COLOURS[spare % len(OTHER_COLOURS)], _OTHER_MARKERS[spare % len(_OTHER_MARKERS)]
             line, spare = "-", spare + 1
         result[name] = Look(configuration_label(name), colour, marker, line)
     return result

@@ -9,18 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.collection import Runs, seed_count
+from jaxlfi.figures.collection import Runs, first_of, seed_count
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import above, balanced
 from jaxlfi.figures.natural import scales
-from jaxlfi.figures.style import (
-    TRUTH_LINE,
-    Look,
-    grid_shape,
-    iterations_axis,
-    looks,
-    parameter_name,
-)
+from jaxlfi.figures.style import TRUTH_LINE, Look, grid_shape, iterations_axis, looks, parameter_name
 
 _LIMIT = {"color": "#777777", "linestyle": (0, (1, 1.5)), "linewidth": 0.9}
 
@@ -32,14 +25,7 @@ def adapting(runs: Runs) -> dict[str, Sequence[History]]:
 
 
 def draw_bounds(axes: Axes, histories: Sequence[History], d: int, look: Look) -> None:
-    """Mean bounds of a parameter over seeds from Theta_0 (iteration 0) on, and each seed's as a thin line.
-
-    Args:
-        axes: to draw on.
-        histories: the seeds of one configuration.
-        d: index of the parameter.
-        look: of the configuration.
-    """
+    """Mean bounds of a parameter over seeds from Theta_0 (iteration 0) on, and each seed's as a thin line."""
     bounds = np.stack([np.stack(h.supports)[..., d] for h in histories])
     low, high = statistics.mean(bounds, 0)
     iteration = np.arange(bounds.shape[-1])
@@ -51,15 +37,10 @@ def draw_bounds(axes: Axes, histories: Sequence[History], d: int, look: Look) ->
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """One panel per parameter, with the configurations that adapt, the truth and the feasible limits Phi.
-
-    Args:
-        figure: empty.
-        runs: configurations with their seeds.
-    """
+    """One panel per parameter, with the configurations that adapt, the truth and the feasible limits Phi."""
     shown = adapting(runs)
     look = {name: own for name, own in looks(list(runs)).items() if name in shown}
-    first = next(iter(shown.values()))[0]
+    first = first_of(shown)
     rows, columns = grid_shape(first.dim, 4)
     scale = scales(first.names, first.units)
     every = figure.subplots(rows, columns, squeeze=False).ravel()

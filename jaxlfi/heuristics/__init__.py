@@ -10,16 +10,6 @@ from jaxlfi.heuristics.mode import Mode
 from jaxlfi.heuristics.truncate import Truncate
 
 __all__ = [
-    "Adaptation",
-    "Centre",
-    "Choice",
-    "Edge",
-    "Fixed",
-    "Heuristic",
-    "Matched",
-    "Mode",
-    "Truncate",
-    "adapted",
-    "paired",
-    "stretch",
-]
+    "Adaptation", "Centre", "Choice", "Edge", "Fixed", "Heuristic", "Matched", "Mode", "Truncate", "adapted",
+    "paired", "stretch",
+]  # fmt: skip

@@ -320,13 +320,9 @@ def _table(path: Path, columns: Sequence[str] | None = None, filters: Any = None
         table.validate()
     except Exception as error:  # pyarrow and the operating system each have their own for a damaged file
         raise ValueError(
-            f"expected a whole Parquet file {path.name} with {columns}, got {_first_line(error)}"
+            f"expected a whole Parquet file {path.name} with {columns}, got {files.first_line(error)}"
         ) from error
     return table
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _episodes(path: Path) -> dict[int, dict[str, Any]]:
@@ -338,7 +334,7 @@ def _episodes(path: Path) -> dict[int, dict[str, Any]]:
         try:
             names = parquet.read_schema(file).names
         except Exception as error:
-            raise ValueError(f"expected a whole Parquet file {file.name}, got {_first_line(error)}") from error
+            raise ValueError(f"expected a whole Parquet file {file.name}, got {files.first_line(error)}") from error
         needed += [name for name in ("tasks", COLUMN) if name in names]
         found |= {row["episode_index"]: row for row in _table(file, needed).to_pylist()}
     if not found:

@@ -171,9 +171,7 @@ def join(coordinator: str, index: int | None = None, count: int | None = None) -
         by_hand["cluster_detection_method"] = "deactivate"
     try:
         jax.distributed.initialize(
-            **({} if coordinator == AUTO else by_hand),
-            initialization_timeout=CONNECT,
-            heartbeat_timeout_seconds=LOST,
+            **({} if coordinator == AUTO else by_hand), initialization_timeout=CONNECT, heartbeat_timeout_seconds=LOST
         )
     except (RuntimeError, ValueError) as error:
         raise ValueError(f"coordinator: expected to join the other processes at {coordinator}, got: {error}") from error

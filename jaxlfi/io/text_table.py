@@ -1,7 +1,10 @@
-"""Small tables as aligned text and as HTML, for what is printed and what a notebook shows."""
+"""Small tables as aligned text, as HTML and as CSV: for what is printed, what a notebook shows, and files."""
 
+import csv
 import html
-from collections.abc import Sequence
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 
 def as_text(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -27,3 +30,17 @@ def as_html(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     cells = lambda row, tag: "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row)
     body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
     return f"<table><thead><tr>{cells(headings, 'th')}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def as_csv(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table as CSV.
+
+    Example:
+        >>> as_csv(["a", "b"], [[1, "x, y"]]).splitlines()
+        ['a,b', '1,"x, y"']
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(headings)
+    writer.writerows(rows)
+    return text.getvalue()

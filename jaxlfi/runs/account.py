@@ -3,20 +3,18 @@
 As in `jaxlfi.runs.summarise`, nothing is said that was not measured on this run.
 """
 
-from typing import TYPE_CHECKING
-
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxlfi.bayessim.convergence import LAG, changes
 from jaxlfi.diagnostics.identifiability import listed
 from jaxlfi.diagnostics.misspecification import RECORDS
 from jaxlfi.diagnostics.predictive import MIN_RESIDUALS, Residual, residuals
 from jaxlfi.io.run_summary import RunSummary
+from jaxlfi.runs.result import Result
+from jaxlfi.runs.summarise import summarised
 from jaxlfi.runs.unlike import names_of, observation_findings
-
-if TYPE_CHECKING:  # runs know their account
-    from jaxlfi.runs.run import Run
 
 COMMONEST = 3
 """Reasons of failed simulations that are named, at most."""
@@ -29,13 +27,22 @@ DIAGNOSE_OWN = f"{DIAGNOSE[:-2]} --task MODULE:TASK`, where TASK is the task's n
 """Of a task made in Python, which the command line has to be told of."""
 
 
-def account(run: "Run", found: RunSummary) -> RunSummary:
-    """The summary of a run's parameters with sentences on the run as a whole, and all that there is to do next.
+def summary(run: Result, draws: Float[Array | np.ndarray, "n dim"]) -> RunSummary:
+    """All that a run says of its parameters, by draws of its posterior in natural units, and of itself."""
+    rule = getattr(run.heuristic, "rule", run.heuristic)
+    found = summarised(
+        np.asarray(draws),
+        run.space,
+        run.units,
+        (run.support, run.belief.support, run.feasible),
+        None if run.task is None else run.task.truth,
+        type(rule).__name__.upper(),
+    )
+    return account(run, found)
 
-    Args:
-        run: one run, concrete.
-        found: of its parameters.
-    """
+
+def account(run: Result, found: RunSummary) -> RunSummary:
+    """The summary of a run's parameters with sentences on the run as a whole, and all that there is to do next."""
     strange, (fit, fits) = _observation(run), _fit(run)
     settled, more = _settled(run)
     steps = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more + list(found.next_steps)
@@ -47,7 +54,7 @@ def _diagnose(run: "Run") -> str:
     return DIAGNOSE_OWN if run.origin.reference is None else DIAGNOSE
 
 
-def _held_back(run: "Run", found: RunSummary) -> bool:
+def _held_back(run: Result, found: RunSummary) -> bool:
     """Whether a posterior leans on a bound that its heuristic cannot move, and that is not Phi's."""
     box, phi = jax.device_get((run.belief.support, run.feasible))
     inside = {"lower": box.low > phi.low + 1e-5 * phi.width, "upper": box.high < phi.high - 1e-5 * phi.width}
@@ -55,7 +62,7 @@ def _held_back(run: "Run", found: RunSummary) -> bool:
     return not run.heuristic.grows and any(leans)
 
 
-def _observation(run: "Run") -> str:
+def _observation(run: Result) -> str:
     """In what the observation is unlike everything that was simulated."""
     found = [one.name for one in observation_findings(run)]
     if not found:
@@ -63,7 +70,7 @@ def _observation(run: "Run") -> str:
     return f"The observation is unlike all simulations in {listed(found)}: its posterior cannot be relied on."
 
 
-def _fit(run: "Run") -> tuple[str, bool]:
+def _fit(run: Result) -> tuple[str, bool]:
     """Whether simulations of the posterior look like the observation: in words, and as far as is known."""
     count = int(np.asarray(run.history.get("predictive_simulations", [0]))[-1])
     if not count:
@@ -78,7 +85,7 @@ def _fit(run: "Run") -> tuple[str, bool]:
     return fit_sentence(names, residuals(valid, observed))
 
 
-def channels(run: "Run") -> tuple[list[str], np.ndarray, np.ndarray]:
+def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
     """What simulations of the posterior are compared by: channels of a series, or numbers of the summary.
 
     Returns:
@@ -142,7 +149,7 @@ def _listed(pairs: list[tuple[Residual, str]], unit: str = " times their scatter
     return listed(texts)
 
 
-def _failures(run: "Run") -> str:
+def _failures(run: Result) -> str:
     """How many simulations failed, and the commonest reasons."""
     found = run.failures
     if not found:
@@ -157,7 +164,7 @@ def _failures(run: "Run") -> str:
     )
 
 
-def _settled(run: "Run") -> tuple[str, list[str]]:
+def _settled(run: Result) -> tuple[str, list[str]]:
     """Whether the posterior still changed from round to round, and that more rounds are wanted."""
     history = {
         name: np.asarray(run.history[name])

@@ -17,9 +17,9 @@ from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.memory import budget, state_bytes
+from jaxlfi.bayessim.multi_process import SharedEngine
 from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
 from jaxlfi.io import provenance, workfolder
@@ -30,7 +30,8 @@ from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import EXTENDED, Checkpoint
-from jaxlfi.runs.run import Origin, Run
+from jaxlfi.runs.result import Origin
+from jaxlfi.runs.run import Run
 from jaxlfi.tasks import failures, priors
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.failures import FailureLog, Message
@@ -49,25 +50,15 @@ VERSIONS = ("jax", "jaxlib", "jaxlfi")
 
 @dataclasses.dataclass(frozen=True)
 class BatchPlan:
-    """What is going to be run.
+    """What is going to be run."""
 
-    Attributes:
-        kind: the format of its folder (`jaxlfi.io.formats.RUN`, `RUNS` or `COMPARE`).
-        reference: by which the task was found; None for one made in Python.
-        task: the task.
-        preset: the settings were made from; None for others.
-        settings: all of them.
-        specs: the runs.
-        keep_network: leave the trained networks in the folder.
-    """
-
-    kind: str
-    reference: str | None
-    task: Task
-    preset: str | None
-    settings: Settings
-    specs: tuple[RunSpec, ...]
-    keep_network: bool = False
+    kind: str  # the format of its folder (`jaxlfi.io.formats.RUN`, `RUNS` or `COMPARE`)
+    reference: str | None  # by which the task was found; None for one made in Python
+    task: Task  # the task
+    preset: str | None  # the settings were made from; None for others
+    settings: Settings  # all of them
+    specs: tuple[RunSpec, ...]  # the runs
+    keep_network: bool = False  # leave the trained networks in the folder
 
     def folders(self) -> list[str]:
         """Each run's folder, relative to the plan's."""
@@ -86,17 +77,11 @@ class BatchPlan:
 
 @dataclasses.dataclass(frozen=True)
 class Observed:
-    """What the runs of a plan observe, and simulations given for their first round.
+    """What the runs of a plan observe, and simulations given for their first round."""
 
-    Attributes:
-        trajectory: of each run, shape [L, T, C] or [L, T].
-        x: their summaries, shape [L, S].
-        first: the same for all runs, or None.
-    """
-
-    trajectory: np.ndarray
-    x: np.ndarray
-    first: Simulations | None = None
+    trajectory: np.ndarray  # of each run, shape [L, T, C] or [L, T]
+    x: np.ndarray  # their summaries, shape [L, S]
+    first: Simulations | None = None  # the same for all runs, or None
 
 
 def prepare(

@@ -10,11 +10,10 @@ While a command runs its folder also holds `checkpoint/` (`jaxlfi.runs.checkpoin
 
 import contextlib
 import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -24,16 +23,14 @@ from jaxlfi.bayessim.record import FINAL, ledger_line
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.widths import widths_note
 from jaxlfi.io import files as atomic
-from jaxlfi.io import formats, provenance, run_summary, trees, workfolder
+from jaxlfi.io import formats, provenance, run_summary, text_table, trees, workfolder
 from jaxlfi.io.formats import COMPARE, RUN, RUNS
 from jaxlfi.io.locks import locked
 from jaxlfi.io.workfolder import StoreError
-from jaxlfi.runs import describe
+from jaxlfi.runs import account, describe
+from jaxlfi.runs.result import Origin, Result
 from jaxlfi.tasks import failures, priors, summaries
 from jaxlfi.tasks.task import Task
-
-if TYPE_CHECKING:  # runs know how to save themselves
-    from jaxlfi.runs.run import Origin, Run
 
 OF_RUN = (
     "config.json", "ledger.jsonl", "posterior.npz", "dataset.npz", "history.npz", "observation.npz", "network.npz",
@@ -58,19 +55,16 @@ def append_ledger(folder: Path, index: int, row: Mapping[str, np.ndarray], reaso
     atomic.append_line(folder / "ledger.jsonl", line)
 
 
-def _task_of(run: "Run") -> Task:
+def _task_of(run: Result) -> Task:
     if run.task is None:
         raise StoreError("save: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
     return run.task
 
 
-def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
+def write_run(folder: Path, run: Result, keep_network: bool = False) -> None:
     """Write the arrays of one finished run into its folder, which exists and has its ledger.
 
-    Args:
-        folder: of the run.
-        run: one run, with the task.
-        keep_network: save the network also where the posterior can do without.
+    The network is kept where the posterior cannot do without, or on request.
     """
     task, history = _task_of(run), jax.device_get(run.history)
     belief, labels = jax.device_get(run.belief), np.asarray(run.space.labels)
@@ -90,7 +84,7 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
         },
         durable=True,
     )
-    atomic.write_json(folder / run_summary.NAME, run.summary(draws).to_dict())
+    atomic.write_json(folder / run_summary.NAME, account.summary(run, draws).to_dict())
     dataset = jax.device_get(run.dataset)
     rows = slice(int(dataset.size))
     columns = {name: getattr(dataset, name)[rows] for name in ("theta", "x", "round", "weight")}
@@ -118,7 +112,7 @@ def write_run(folder: Path, run: "Run", keep_network: bool = False) -> None:
         atomic.write_arrays(folder / "network.npz", trees.named_leaves(run.network), durable=True)
 
 
-def save(run: "Run", folder: Path, exist_ok: bool = False) -> Path:
+def save(run: Result, folder: Path, exist_ok: bool = False) -> Path:
     """Write one run into a folder, complete or not at all.
 
     Args:
@@ -168,15 +162,11 @@ def _require_replaceable(folder: Path) -> None:
 
 def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     """Write the table of a comparison, one line a configuration and seed; what is unknown stays empty."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, TABLE_COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    for line in lines:
-        writer.writerow({name: "" if value != value else value for name, value in line.items()})
-    atomic.write_bytes(path, text.getvalue().encode(), durable=True)
+    rows = (["" if line[name] != line[name] else line[name] for name in TABLE_COLUMNS] for line in lines)
+    atomic.write_bytes(path, text_table.as_csv(TABLE_COLUMNS, rows).encode(), durable=True)
 
 
-def run_config(task: Task, origin: "Origin", spec: RunSpec, settings: Settings) -> dict[str, Any]:
+def run_config(task: Task, origin: Origin, spec: RunSpec, settings: Settings) -> dict[str, Any]:
     """The config.json of one run."""
     feasible = task.inference.feasible
     return {

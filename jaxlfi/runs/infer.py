@@ -36,7 +36,8 @@ from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import EXTENDED
 from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
-from jaxlfi.runs.run import Origin, Run
+from jaxlfi.runs.result import Origin
+from jaxlfi.runs.run import Run
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.failures import FailureLog
 from jaxlfi.tasks.observation import observe, trials_of, with_gaps_of
@@ -165,14 +166,14 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
         if workfolder.is_finished(config):
             executing.clean(out)
             run = load(out, plan.task)
-            _require_observation(out, run.observed, observed.trajectory[0])
+            _require(out, "observation", run.observed, observed.trajectory[0])
             if observed.first is not None or run.origin.given_simulations:
                 began = np.zeros(0) if run.origin.given_simulations == 0 else _first_round(run.dataset)
-                _require_simulations(out, began, _kept(observed.first))
+                _require(out, "first round (simulations)", began, _kept(observed.first))
             return run
         _, recorded = executing.reopen(out, plan.task)
-        _require_observation(out, recorded.trajectory[0], observed.trajectory[0])
-        _require_simulations(out, _kept(recorded.first), _kept(observed.first))
+        _require(out, "observation", recorded.trajectory[0], observed.trajectory[0])
+        _require(out, "first round (simulations)", _kept(recorded.first), _kept(observed.first))
         run = _executed(plan, recorded, progress, callback, out)
         executing.finish(out, plan, [run])
         return run
@@ -226,16 +227,10 @@ def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> BatchPl
     return plan
 
 
-def _require_observation(out: Path, recorded: Any, observed: Any) -> None:
-    """Refuse to go on in the folder of a run with another observation; one that was simulated may be rounded anew."""
-    if not _same(recorded, observed):
-        raise _of_another_run(out, ["observation"])
-
-
-def _require_simulations(out: Path, recorded: np.ndarray, given: np.ndarray) -> None:
-    """Refuse to go on in the folder of a run that began with other simulations."""
+def _require(out: Path, what: str, recorded: Any, given: Any) -> None:
+    """Refuse to go on in the folder of a run with another observation or other simulations, but for rounding."""
     if not _same(recorded, given):
-        raise _of_another_run(out, ["first round (simulations)"])
+        raise _of_another_run(out, [what])
 
 
 def _same(first: Any, second: Any) -> bool:

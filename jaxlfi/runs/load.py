@@ -27,7 +27,8 @@ from jaxlfi.io.workfolder import StoreError
 from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
-from jaxlfi.runs.run import Origin, Run
+from jaxlfi.runs.result import Origin
+from jaxlfi.runs.run import Run
 from jaxlfi.tasks import failures
 from jaxlfi.tasks.executors import one_by_one
 from jaxlfi.tasks.observation import with_gaps_of

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxlfi.diagnostics.identifiability import TradeOff, listed, trade_off_sentence, trade_offs, unconstrained
+from jaxlfi.diagnostics.identifiability import listed, trade_off_sentence, trade_offs, unconstrained
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.io.run_summary import ParameterSummary, RunSummary
@@ -61,7 +61,7 @@ def summarised(
     guess, last, feasible = (space.box_to_natural(box) for box in boxes)
     sentences, steps = [], []
     for d, one in enumerate(parameters):
-        first, now, limits = (_bounds(box, d) for box in (guess, last, feasible))
+        first, now, limits = ((float(box.low[d]), float(box.high[d])) for box in (guess, last, feasible))
         sentences += [
             _of_the_guess(one, draws[:, d], first, now, heuristic),
             _of_its_bounds(one, now, limits),
@@ -73,12 +73,12 @@ def summarised(
         sentences.append(trade_off_sentence(space.names, trade_off, all(known[d] for d in trade_off.places)))
     unclear = [one.name for d, one in enumerate(parameters) if one.verdict == "not at all" and d not in shared]
     steps += [ANOTHER.format(f"{listed(unclear)} {'changes' if len(unclear) == 1 else 'change'}")] * bool(unclear)
-    steps += [_apart(space, one) for one in together if not all(known[d] for d in one.places)]
+    for trade_off in together:
+        if not all(known[d] for d in trade_off.places):
+            steps.append(
+                ANOTHER.format(f"{listed([space.names[d] for d in trade_off.places])} change in different ways")
+            )
     return RunSummary(parameters, tuple(filter(None, sentences)), tuple(steps))
-
-
-def _apart(space: Space, one: TradeOff) -> str:
-    return ANOTHER.format(f"{listed([space.names[d] for d in one.places])} change in different ways")
 
 
 def _wider(one: ParameterSummary, last, feasible) -> list[str]:
@@ -130,10 +130,6 @@ def _decimals(draws: np.ndarray) -> int:
     """The place of the digit that is as large as the Monte Carlo error of 5 % quantiles, 2.1 sd / sqrt(n)."""
     error = max(2.1 * draws.std() / math.sqrt(len(draws)), 1e-7 * np.abs(draws).max())  # or that of float32
     return -round(math.log10(error)) if 0 < error < math.inf else 6
-
-
-def _bounds(box: Support, d: int) -> tuple[float, float]:
-    return float(box.low[d]), float(box.high[d])
 
 
 def _value(value: float, one: ParameterSummary) -> str:

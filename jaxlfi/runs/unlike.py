@@ -1,24 +1,17 @@
 """In what the observation of a finished run is unlike its simulations."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxlfi.diagnostics.misspecification import RECORDS, Finding, unlike
+from jaxlfi.runs.result import Result
 from jaxlfi.tasks import summaries
 from jaxlfi.tasks.task import Task
 
-if TYPE_CHECKING:  # runs know their findings
-    from jaxlfi.runs.run import Run
 
-
-def observation_findings(run: "Run") -> list[Finding]:
-    """The findings of `jaxlfi.diagnostics.unlike` on the observation and all simulations of one run.
-
-    Args:
-        run: one run, concrete.
-    """
+def observation_findings(run: Result) -> list[Finding]:
+    """The findings of `jaxlfi.diagnostics.unlike` on the observation and all simulations of one run."""
     rows = slice(int(run.dataset.size))
     names: tuple[str, ...] | None = None
     channels: tuple[str, ...] = ()
@@ -27,21 +20,10 @@ def observation_findings(run: "Run") -> list[Finding]:
     return unlike(np.asarray(run.x), np.asarray(run.dataset.x)[rows], names, channels)
 
 
-def observation_summary(runs: Sequence["Run"]) -> list[str]:
-    """The warnings of several runs of a configuration: what the first of them finds, and how many find something."""
-    found = [texts for run in runs if (texts := run.misspecification)]
-    if not found or len(runs) == 1:
-        return [text for texts in found for text in texts]
-    return [f"{found[0][0]} (in {len(found)} of {len(runs)} runs, this is the first)"]
-
-
 def names_of(task: Task, trajectory: Sequence[int], size: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of a summary's numbers, and those of its channels where it is a series of records as they are.
 
-    Args:
-        task: whose summary it is.
-        trajectory: shape of what is summarised.
-        size: length S of the summary.
+    The summary is of a trajectory of this shape, and of this size S.
 
     Returns:
         S names; and C names, or none where it is no series.

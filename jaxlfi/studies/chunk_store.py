@@ -78,9 +78,7 @@ class ChunkStore:
         return arrays
 
     def compute(
-        self,
-        one: Callable[[range], tuple[Mapping[str, np.ndarray], float]],
-        processes: Processes = ALONE,
+        self, one: Callable[[range], tuple[Mapping[str, np.ndarray], float]], processes: Processes = ALONE
     ) -> None:
         """Compute the chunks that are not there yet, in their order.
 

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 
 from jaxlfi.distributions.arguments import is_concrete
-from jaxlfi.tasks import owned
-from jaxlfi.tasks.each import alive, here, simulate_each, stacked, through
+from jaxlfi.tasks import own_arrays
+from jaxlfi.tasks.dispatch import alive, here, simulate_each, stacked, through
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.worker import REASONS, Answer, Request, simulated
@@ -166,7 +166,7 @@ class HostSimulator:
             result = self.function(rng, np.array(theta))
             paired = isinstance(result, tuple) and len(result) == 2
             given, outcome = result if paired else (result, np.zeros(rows, int))
-            trajectory = owned.array(given)
+            trajectory = own_arrays.array(given)
         except Exception as error:
             raise SimulatorError(f"simulate: {type(error).__name__}: {error}") from error
         wanted = f"of shape {[rows, *shape]}" if shape is not None else f"of shape [{rows}, ...]"
@@ -182,15 +182,15 @@ class HostSimulator:
         if shape is not None:
             trajectory = trajectory.reshape(rows, *shape)
         try:
-            outcome = owned.outcomes(outcome)
+            outcome = own_arrays.outcomes(outcome)
         except ValueError as error:
             raise SimulatorError(
-                f"simulate: expected an outcome for each of {rows} simulations, got {owned.described(outcome)}: "
+                f"simulate: expected an outcome for each of {rows} simulations, got {own_arrays.described(outcome)}: "
                 "outcomes are booleans (true: valid) or whole numbers (0: valid)"
             ) from error
         if outcome.shape != (rows,):
             raise SimulatorError(
-                f"simulate: expected an outcome for each of {rows} simulations, got {owned.described(outcome)}"
+                f"simulate: expected an outcome for each of {rows} simulations, got {own_arrays.described(outcome)}"
             )
         outcome = np.where(outcome, 0, 1) if outcome.dtype == bool else outcome
         _require_own(given, theta, trajectory, outcome)
@@ -206,11 +206,11 @@ def _require_own(given: Any, theta: np.ndarray, trajectory: np.ndarray, outcome:
         SimulatorError: that says to copy.
     """
     rows: dict[Any, int] = {}
-    for row, place in enumerate(owned.places(given)):
+    for row, place in enumerate(own_arrays.places(given)):
         if outcome[row] != 0 or not np.isfinite(trajectory[row]).all():
             continue
         try:
-            owned.require_own_rows(given[row])
+            own_arrays.require_own_rows(given[row])
         except ValueError as error:
             raise SimulatorError(f"simulate: {error}") from error
         first = rows.setdefault(place, row) if place is not None else row

@@ -15,7 +15,7 @@ import numpy as np
 from jaxlfi.distributions.arguments import is_concrete
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import files
-from jaxlfi.tasks import owned, purity
+from jaxlfi.tasks import own_arrays, purity
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.gaps import gaps_of, with_gaps
 from jaxlfi.tasks.journal import Journal
@@ -212,7 +212,7 @@ def _numbers(observation: Any) -> np.ndarray:
     """A copy of what was given, of real numbers, NaN where they are missing."""
     shown = lambda: textwrap.shorten(repr(observation), 200)
     try:
-        array = owned.array(observation)
+        array = own_arrays.array(observation)
     except ValueError as error:
         raise ValueError(f"observation: expected an array, got rows of several shapes in {shown()}") from error
     if array.dtype.kind not in "biuf":
@@ -257,9 +257,9 @@ def _of_frame(frame: Any, columns: "Columns") -> np.ndarray:
     named = all(isinstance(name, str) for name in frame.columns)
     headings = list(frame.columns) if named else []
     if columns.names and set(columns.names) <= set(headings) and len(set(headings)) == len(headings):
-        return owned.array(frame[list(columns.names)])  # others may be dates
+        return own_arrays.array(frame[list(columns.names)])  # others may be dates
     try:
-        table = _channels(headings, owned.array(frame), columns, lambda line: None)
+        table = _channels(headings, own_arrays.array(frame), columns, lambda line: None)
     except ValueError as error:
         raise ValueError(f"observation: {error}") from error
     if headings and len(columns.names) > 1:

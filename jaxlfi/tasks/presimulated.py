@@ -11,7 +11,7 @@ import numpy as np
 from jaxlfi.distributions.region import region
 from jaxlfi.distributions.support import Support
 from jaxlfi.io import files
-from jaxlfi.tasks import owned
+from jaxlfi.tasks import own_arrays
 from jaxlfi.tasks.observation import simulator_shapes
 from jaxlfi.tasks.simulation import Simulations, summarised_batch
 from jaxlfi.tasks.task import Task
@@ -130,7 +130,7 @@ def _array(arrays: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) 
 
 def _numbers(value: Any, name: str) -> np.ndarray:
     try:
-        array = owned.array(value)
+        array = own_arrays.array(value)
     except ValueError:  # rows of several lengths
         array = np.zeros(0, object)
     if array.dtype.kind not in "biuf":

@@ -90,14 +90,7 @@ def _values_of(distribution: Any) -> Any:
 
 
 def prior_draws(key: jax.Array, prior: Any, support: Support, n: int) -> Float[Array, "n dim"]:
-    """`n` draws of the prior inside the support: uniform for None, else by rejection (`jaxlfi.distributions.region`).
-
-    Args:
-        key: consumed.
-        prior: `Task.inference.prior`.
-        support: in inference space.
-        n: number of draws.
-    """
+    """Draws of the prior in a support: uniform ones for None, else by rejection (`jaxlfi.distributions.region`)."""
     return region(support, prior).sample(key, n)
 
 
@@ -131,14 +124,10 @@ def require_mass(prior: Any, support: Support, label: str) -> float:
     Raises:
         ValueError: for a mass below `MIN_INSIDE`.
     """
-    mass = float(_prior_mass(prior, support)) if prior is not None else 1.0
+    mass = float(jax.jit(single(functools.partial(prior_mass, prior)))(support)) if prior is not None else 1.0
     if mass < MIN_INSIDE:
         raise ValueError(
             f"prior: expected some of its mass inside the support {label}, got {mass:.2g} of it ({MASS_DRAWS} draws): "
             "are both in the same units (Task's prior_space)?"
         )
     return mass
-
-
-def _prior_mass(prior: Any, support: Support) -> Array:
-    return jax.jit(single(functools.partial(prior_mass, prior)))(support)

@@ -11,8 +11,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlfi.distributions.precision import own, single
-from jaxlfi.tasks import owned
-from jaxlfi.tasks.each import stacked
+from jaxlfi.tasks import own_arrays
+from jaxlfi.tasks.dispatch import stacked
 from jaxlfi.tasks.host import numpy_generator
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.reference import counted_from, summaries_in_double
@@ -70,7 +70,8 @@ def _code(outcome: Array) -> Array:
     """An outcome in 32 bits, in which no large number becomes a small one."""
     if outcome.dtype.itemsize < 8:
         return outcome
-    return jnp.clip(outcome, -1 if jnp.issubdtype(outcome.dtype, jnp.signedinteger) else 0, owned.CODES).astype("int32")
+    least = -1 if jnp.issubdtype(outcome.dtype, jnp.signedinteger) else 0
+    return jnp.clip(outcome, least, own_arrays.CODES).astype("int32")
 
 
 def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, Int[Array, ""]]:
@@ -82,11 +83,7 @@ def with_outcome(task: Task, trajectory: Array, outcome: Array) -> tuple[Array, 
 def failure_code(task: Task, finite: Any, outcome: Any, numpy: Any = jnp) -> Any:
     """The code of the reason for which a simulation failed, 0 for success.
 
-    Args:
-        task: for the reasons.
-        finite: whether its trajectory is.
-        outcome: what the simulator says of it.
-        numpy: the module to calculate with.
+    By the outcome that the simulator gives and whether its trajectory is finite, with `numpy` or JAX's.
     """
     failure = numpy.where(outcome, 0, 1) if outcome.dtype == bool else outcome
     # The simulator's own reasons, from -1 downwards, come after the task's (`HostSimulator.reasons`).
@@ -184,7 +181,11 @@ def _on_host(task: Task, key: jax.Array, natural: np.ndarray, shape: Sequence[in
 @functools.partial(jax.jit, static_argnums=0)
 @single
 def _simulate_batch(task: Task, keys: jax.Array, theta: Array):
-    return jax.vmap(lambda key, theta: _with_summary(task, *trajectory_and_outcome(task, key, theta)))(keys, theta)
+    def one(key, theta):
+        trajectory, failure = trajectory_and_outcome(task, key, theta)
+        return trajectory, *summarised(task, trajectory, failure)
+
+    return jax.vmap(one)(keys, theta)
 
 
 def summarised_batch(task: Task, trajectories: np.ndarray, outcomes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -203,10 +204,6 @@ def summarised_batch(task: Task, trajectories: np.ndarray, outcomes: np.ndarray)
 def _rounded(values: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
-
-
-def _with_summary(task: Task, trajectory: Array, failure: Array):
-    return trajectory, *summarised(task, trajectory, failure)
 
 
 def simulate_in_waves(

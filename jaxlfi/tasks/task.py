@@ -13,7 +13,7 @@ import numpy as np
 from jaxlfi.distributions.arguments import require_texts
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support, check_within
-from jaxlfi.tasks import owned, prior_checks, priors, summaries
+from jaxlfi.tasks import own_arrays, prior_checks, priors, summaries
 from jaxlfi.tasks.command import Command
 from jaxlfi.tasks.equality import same
 from jaxlfi.tasks.host import HostSimulator
@@ -152,7 +152,7 @@ class Task:
             store("summary", summaries.named(self.summary))
         is_natural(self.prior_space)
         for field in ("observation", "times"):  # who made them may go on to change them
-            store(field, owned.copied(getattr(self, field)))
+            store(field, own_arrays.copied(getattr(self, field)))
         if self.prior is not None:
             prior_checks.check_prior(self.prior, len(names))
             view = self.inference
@@ -296,7 +296,7 @@ class Task:
 
 def _vector(value: Any, length: int, name: str) -> np.ndarray:
     try:
-        vector = np.array(owned.array(value), np.float32)
+        vector = np.array(own_arrays.array(value), np.float32)
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"{name}: expected {length} finite numbers, got {value!r}") from error
     if vector.shape != (length,) or not np.isfinite(vector).all():

@@ -20,7 +20,7 @@ import cloudpickle
 import numpy as np
 
 from jaxlfi.io import records
-from jaxlfi.tasks import owned
+from jaxlfi.tasks import own_arrays
 
 REASONS = ("error", "wrong_shape", "timeout", "crash")
 """Why a simulation that is made by itself can fail, besides the task's own reasons."""
@@ -85,8 +85,8 @@ def simulated(function: Callable[..., Any], request: Request) -> Answer:
     try:
         result = function(generator(request.words, request.index), np.asarray(request.theta, np.float32))
         trajectory, outcome = with_outcome(result)
-        owned.require_own_rows(trajectory)
-        trajectory = owned.array(trajectory)
+        own_arrays.require_own_rows(trajectory)
+        trajectory = own_arrays.array(trajectory)
     except CrashError as error:
         return failed("crash", str(error))
     except (Exception, SystemExit) as error:
@@ -123,8 +123,8 @@ def code_of(outcome: Any) -> int:
         ValueError: for anything but one boolean or whole number.
     """
     if np.ndim(outcome) > 0:
-        raise ValueError(f"expected a scalar outcome, got {owned.described(outcome)}")
-    outcome = owned.outcomes(outcome)
+        raise ValueError(f"expected a scalar outcome, got {own_arrays.described(outcome)}")
+    outcome = own_arrays.outcomes(outcome)
     code = int(not outcome) if outcome.dtype == bool else int(outcome)
     return max(code, 0) or int(code < 0)
 
@@ -162,8 +162,8 @@ class Trials:
         trajectories, codes = [], []
         for _ in range(self.trials):
             trajectory, outcome = with_outcome(self.function(rng, theta.copy()))
-            owned.require_own_rows(trajectory)
-            trajectories.append(owned.array(trajectory))  # at once: the next trial may use the same memory
+            own_arrays.require_own_rows(trajectory)
+            trajectories.append(own_arrays.array(trajectory))  # at once: the next trial may use the same memory
             codes.append(code_of(outcome))
         return np.concatenate(trajectories), next(filter(None, codes), 0)
 

@@ -21,7 +21,7 @@ from jaxlfi import flags, registry
 from jaxlfi.bayessim import memory
 from jaxlfi.bayessim.presets import HYPERPARAMETERS, METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.cli import asked, summaries
+from jaxlfi.cli import choices, summaries
 from jaxlfi.cli import parser as cli
 from jaxlfi.envs.gaussian_linear import MIXING, NOISE
 from jaxlfi.fields import declared
@@ -522,24 +522,24 @@ def test_a_pooling_is_the_tasks_own_unless_there_are_trials():
 def test_what_a_task_asks_for_comes_before_the_preset_and_after_the_command_line(tmp_path):
     task = oven()
     parse = lambda *words: cli.parser().parse_args(["infer", TASK, "--out", str(tmp_path), *words])
-    settings = asked.build_settings(parse(), task)
+    settings = choices.build_settings(parse(), task)
     assert (settings.rounds, settings.estimator.learning_rate) == (3, 0.25)
     assert settings.estimator.hidden == PRESETS["quick"].estimator.hidden
-    given = asked.build_settings(parse("--rounds", "7"), task)
+    given = choices.build_settings(parse("--rounds", "7"), task)
     assert (given.rounds, given.estimator.learning_rate) == (7, 0.25)
-    assert asked.build_settings(parse("--method", "npe"), task).rounds == 1  # of all simulations of the three
+    assert choices.build_settings(parse("--method", "npe"), task).rounds == 1  # of all simulations of the three
     kinds = {"edge": Edge, "mode": Mode}
-    edge = asked.build_heuristic(parse("--expansion", "0.1"), "edge", kinds, settings, task)
+    edge = choices.build_heuristic(parse("--expansion", "0.1"), "edge", kinds, settings, task)
     np.testing.assert_array_equal(edge.mass_threshold, [0.125, 0.5])
     assert edge.expansion == 0.1
-    mode = asked.build_heuristic(parse(), "mode", kinds, PRESETS["paper"], task)
+    mode = choices.build_heuristic(parse(), "mode", kinds, PRESETS["paper"], task)
     assert mode == Mode()
     assert jaxlfi.settings_for(task) == settings  # the same in Python
 
 
 def test_the_paper_s_threshold_comes_with_its_preset(tmp_path):
     parse = lambda *words: cli.parser().parse_args(["infer", TASK, "--out", str(tmp_path), *words])
-    build = lambda task, *words: asked.build_heuristic(parse(*words), "edge", {"edge": Edge}, PRESETS["paper"], task)
+    build = lambda task, *words: choices.build_heuristic(parse(*words), "edge", {"edge": Edge}, PRESETS["paper"], task)
     edge = lambda task, *words: build(task, *words).mass_threshold
     assert edge(gaussian()) == Edge().mass_threshold == 0.12  # more than a uniform posterior has along a bound
     assert edge(gaussian(), "--preset", "paper") == 0.005
@@ -574,7 +574,7 @@ def test_one_task_is_described(registered, capsys):
 
 
 def test_default_configurations_are_the_matrix_of_the_paper():
-    assert asked.default_configurations(gaussian()) == [
+    assert choices.default_configurations(gaussian()) == [
         "ok", "misspecified", "broad", "misspecified+edge", "misspecified+mode", "misspecified+centre",
     ]  # fmt: skip
 

@@ -106,7 +106,7 @@ def test_widths_near_bounds():
 def test_flags_of_the_settings_before():
     """What is printed for `clipped` on the command line gives those settings."""
     from experiments.ablation import CLIPPED
-    from jaxlfi.cli.asked import build_settings
+    from jaxlfi.cli.choices import build_settings
     from jaxlfi.cli.parser import parser
     from jaxlfi.registry import TASKS
 

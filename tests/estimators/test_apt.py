@@ -25,7 +25,7 @@ from jaxlfi.estimators.density import EnsembleDensity
 from jaxlfi.estimators.flow_estimators import FlowEstimator, MaskedFlow
 from jaxlfi.heuristics import Fixed
 from jaxlfi.runs import folder as run_store
-from jaxlfi.runs.run import DRAWS
+from jaxlfi.runs.result import DRAWS
 from jaxlfi.tasks.task import Task
 from tests.bayessim.test_algorithm import EXACT, MODEST, TASK, X, infer, run_of, whitened
 

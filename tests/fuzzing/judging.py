@@ -137,7 +137,7 @@ def stubs(work: bool = False, drawn: bool = False, resumed: bool = False) -> Ite
             for name in (*WORK, *["jaxlfi.bayessim.batch.BatchEngine.start"] * (not resumed)):
                 stack.enter_context(mock.patch(name, accepted))
         stack.enter_context(mock.patch("jaxlfi.studies.grid.chunks.program_bytes", lambda engine: 0))
-        stack.enter_context(mock.patch("jaxlfi.cli.joined.work", lambda command, *_: command()))
+        stack.enter_context(mock.patch("jaxlfi.cli.multi_process.work", lambda command, *_: command()))
         stack.enter_context(mock.patch("jaxlfi.io.processes.join", accepted))  # there are no others
         if not drawn:
             stack.enter_context(mock.patch.object(Figure, "savefig", sketched))

@@ -14,7 +14,7 @@ from jaxlfi.io.processes import ALONE
 SCRIPT = """
 import sys, time
 from pathlib import Path
-from jaxlfi.cli import joined
+from jaxlfi.cli import multi_process
 
 index, count, address, folder = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3], Path(sys.argv[4])
 
@@ -42,7 +42,7 @@ def command():
     found.leave()
     return 0
 
-sys.exit(joined.work(command, lambda: "; ADVICE", "jaxlfi"))
+sys.exit(multi_process.work(command, lambda: "; ADVICE", "jaxlfi"))
 """
 
 

@@ -28,7 +28,7 @@ from jaxlfi.heuristics import Edge, Fixed
 from jaxlfi.io import files as atomic
 from jaxlfi.io import formats, trees, workfolder
 from jaxlfi.runs import folder as run_store
-from jaxlfi.runs.run import Origin
+from jaxlfi.runs.result import Origin
 from jaxlfi.studies import calibration as study
 from jaxlfi.studies.calibration import CalibrationPlan, plan
 from jaxlfi.studies.calibration.repeat import cost

@@ -170,18 +170,12 @@ def at_import(tree: ast.AST) -> list[ast.AST]:
     return found
 
 
-SELVES = {(f"jaxlfi.runs.{module}", "jaxlfi.runs.run") for module in ("account", "folder", "unlike")}
-"""Modules that name, for readers only, the class of the module that calls them: a run saves and checks itself."""
-
-
 def test_modules_do_not_import_one_another_in_a_circle():
     """Neither while they are loaded nor later, in a function."""
     modules = {name_of(path): path for path in files(*PACKAGES)}
     graph = {
         # A package's names come from its modules, which do not need those names.
-        name: {other for other in imported(path) & set(modules) - {name} if (name, other) not in SELVES}
-        if path.name != "__init__.py"
-        else set()
+        name: imported(path) & modules.keys() - {name} if path.name != "__init__.py" else set()
         for name, path in modules.items()
     }
     graphlib.TopologicalSorter(graph).prepare()

@@ -26,14 +26,6 @@ from jaxlfi.studies.calibration.truths import draw_truths
 from jaxlfi.studies.calibration.widths import Widths
 
 __all__ = [
-    "POSTERIOR",
-    "CalibrationPlan",
-    "Check",
-    "Diagnosis",
-    "Widths",
-    "diagnose",
-    "draw_truths",
-    "plans_of",
-    "read_reference",
-    "read_run",
-]
+    "POSTERIOR", "CalibrationPlan", "Check", "Diagnosis", "Widths", "diagnose", "draw_truths", "plans_of",
+    "read_reference", "read_run",
+]  # fmt: skip

@@ -75,16 +75,12 @@ def calibration(
         "ranks": rank,
         "density_ranks": density,
         "distance_ranks": distance,
-        "level": coverage.level,
-        "pointwise": coverage.pointwise,
-        "simultaneous": coverage.simultaneous,
+        **{name: getattr(coverage, name) for name in ("level", "pointwise", "simultaneous")},
         "ranks_simultaneous": by_parameter[0].simultaneous,
         "ranks_fraction": np.stack([result.fraction for result in by_parameter]),
         "coverage_fraction": coverage.fraction,
         "distance_fraction": tarp.fraction,
-        "bin_edges": bars[0].edges,
-        "bin_expected": bars[0].expected,
-        "bin_band": bars[0].band,
+        **{f"bin_{name}": getattr(bars[0], name) for name in ("edges", "expected", "band")},
         "bin_count": np.stack([bar.count for bar in bars]),
     }
     return lines, arrays

@@ -102,11 +102,7 @@ def plans_of(references: str, task: Task, truths: int, draws: int, seed: int) ->
 
 
 def read_run(folder: Path, task: Task | None = None) -> Run:
-    """A finished run with its task.
-
-    Args:
-        folder: of the run.
-        task: where it was made in Python and cannot be found by name.
+    """A finished run with its task, which is given where it was made in Python and cannot be found by name.
 
     Raises:
         ValueError: for a folder that holds no finished run of one seed, a run of several rounds that began with given

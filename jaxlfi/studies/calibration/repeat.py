@@ -49,14 +49,9 @@ def chunk_length(run: Run, plan: CalibrationPlan) -> int:
 
 
 def run_inputs(run: Run, plan: CalibrationPlan, observed: jax.Array, x: jax.Array, first: int = 0) -> RunInputs:
-    """Inputs of a batch that repeats the run for observations stacked along the first axis.
+    """Inputs of a batch that repeats the run for observations [n, ...] with summaries [n, S].
 
-    Args:
-        run: the run under test.
-        plan: for keys.
-        observed: shape [n, ...].
-        x: shape [n, S].
-        first: place of the first among all truths; each place has a key of its own.
+    `first` is the place of the first among all truths; each place has a key of its own.
     """
     support = jax.tree.map(jnp.asarray, run.support)
     support, heuristic = (stack([tree] * len(x)) for tree in (support, run.heuristic))
@@ -162,16 +157,10 @@ def posteriors(
     fingerprint: str,
     console: Console,
 ) -> dict[str, np.ndarray]:
-    """The posteriors of all truths, chunk by chunk; those that are there already are read.
+    """The posteriors of all truths, in chunks of a length; those that are there already are read.
 
-    Args:
-        out: the folder of the diagnostics.
-        run: the run under test.
-        plan: what is asked of it.
-        truths: of `draw_truths`.
-        length: of a chunk. The last one is filled up by its last truth, so that one program serves them all.
-        fingerprint: of all that the results depend on.
-        console: for progress.
+    The last chunk is filled up by its last truth, so that one program serves them all. The fingerprint is of all that
+    the results depend on.
 
     Raises:
         StoreError: for a damaged chunk, before anything is computed.

@@ -38,13 +38,6 @@ def simulated_truths(key: jax.Array, task: Task, box: Support, count: int, shape
     A truth whose simulation fails is drawn again: inference learns from simulations that succeeded, so its posterior
     is that under the prior given success, and so must the truths be.
 
-    Args:
-        key: consumed.
-        task: the task.
-        box: in inference space.
-        count: number N of truths.
-        shapes: of a trajectory and its summary.
-
     Returns:
         `theta` [N, D], `observed` [N, ...], `x` [N, S], and `failed`, the failures by reason.
 
@@ -52,7 +45,8 @@ def simulated_truths(key: jax.Array, task: Task, box: Support, count: int, shape
         SimulatorError: where a truth was drawn `TRIES` times in vain.
     """
     draw = lambda key, count: prior_draws(key, task.inference.prior, box, count)
-    return _simulated(key, task, draw, count, shapes, f"over {_words(box)}")
+    sides = (f"[{low:g}, {high:g}]" for low, high in zip(box.low.tolist(), box.high.tolist(), strict=True))
+    return _simulated(key, task, draw, count, shapes, f"over {' x '.join(sides)}")
 
 
 def _simulated(
@@ -88,7 +82,3 @@ def _simulated(
         f"simulate: expected a valid simulation of each truth drawn {where}, got none in {TRIES} "
         f"tries for {missing.sum()} of {count}"
     )
-
-
-def _words(box: Support) -> str:
-    return " x ".join(f"[{low:g}, {high:g}]" for low, high in zip(box.low.tolist(), box.high.tolist(), strict=True))

@@ -10,20 +10,6 @@ from jaxlfi.studies.grid.folder import advance, begin, create, reopen
 from jaxlfi.studies.grid.grid import Axis, Grid, combinations, grid_runs, heuristics, parse_axes
 
 __all__ = [
-    "MEASURES",
-    "Axis",
-    "Grid",
-    "Work",
-    "advance",
-    "arranged",
-    "begin",
-    "combinations",
-    "create",
-    "grid_runs",
-    "heuristics",
-    "measure",
-    "parse_axes",
-    "prepare",
-    "reopen",
-    "run_chunk",
-]
+    "MEASURES", "Axis", "Grid", "Work", "advance", "arranged", "begin", "combinations", "create", "grid_runs",
+    "heuristics", "measure", "parse_axes", "prepare", "reopen", "run_chunk",
+]  # fmt: skip

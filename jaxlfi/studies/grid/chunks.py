@@ -13,8 +13,8 @@ from jaxlfi.bayessim.batch import BatchEngine, RunInputs, stack_inputs, start_on
 from jaxlfi.bayessim.drive import drive
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.memory import FRACTION, PROGRAM_PER_STATE, budget, even_length, state_bytes
+from jaxlfi.bayessim.multi_process import SharedEngine
 from jaxlfi.bayessim.record import theta_error, trajectory_error
-from jaxlfi.bayessim.shared import SharedEngine
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.studies.grid.grid import Grid, grid_runs, observations
 

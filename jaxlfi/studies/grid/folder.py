@@ -10,9 +10,7 @@ Where several processes were joined (`jaxlfi.io.processes`) they share the runs 
 first writes.
 """
 
-import csv
 import hashlib
-import io
 import itertools
 import json
 from collections.abc import Mapping
@@ -25,7 +23,7 @@ from rich.console import Console
 
 from jaxlfi.bayessim.batch import RunSpec
 from jaxlfi.io import files as atomic
-from jaxlfi.io import provenance, serialise, workfolder
+from jaxlfi.io import provenance, serialise, text_table, workfolder
 from jaxlfi.io.formats import GRID
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.io.progress import RoundProgress
@@ -33,7 +31,7 @@ from jaxlfi.io.workfolder import StoreError
 from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as run_store
-from jaxlfi.runs.run import Origin
+from jaxlfi.runs.result import Origin
 from jaxlfi.studies.chunk_store import ChunkStore
 from jaxlfi.studies.grid.chunks import MEASURES, Work, arranged, prepare, run_chunk
 from jaxlfi.studies.grid.grid import Axis, Grid, combinations, hyperparameters, observations
@@ -47,28 +45,16 @@ def description(work: Work) -> dict[str, Any]:
     run = run_store.run_config(grid.task, origin, spec, grid.settings)
     left_out = ("configuration", "seed", "versions", "platform", "command_line", "started")
     defaults = hyperparameters(grid.rule)
+    truth = np.asarray(np.nan if grid.task.truth is None else grid.task.truth, np.float32)
     return {name: value for name, value in run.items() if name not in left_out} | {
         "format": GRID,
         "axes": [
-            {
-                "name": axis.name,
-                "values": list(axis.values),
-                "default": serialise.plain_value(defaults[axis.name]),
-            }
+            {"name": axis.name, "values": list(axis.values), "default": serialise.plain_value(defaults[axis.name])}
             for axis in grid.axes
         ],
         "seeds": list(grid.seeds),
         "runs_per_chunk": work.length,
-        "observation": _digest(
-            *(
-                np.ascontiguousarray(a)
-                for a in (
-                    work.observed,
-                    work.x,
-                    np.asarray(np.nan if grid.task.truth is None else grid.task.truth, np.float32),
-                )
-            )
-        ),
+        "observation": _digest(*map(np.ascontiguousarray, (work.observed, work.x, truth))),
     }
 
 
@@ -85,11 +71,7 @@ def _digest(*parts) -> str:
 
 
 def begin(
-    folder: Path,
-    grid: Grid,
-    observation: Any = None,
-    runs_per_chunk: int | None = None,
-    processes: Processes = ALONE,
+    folder: Path, grid: Grid, observation: Any = None, runs_per_chunk: int | None = None, processes: Processes = ALONE
 ) -> Work:
     """Check all there is to check, compile, then bring the folder into being; nothing is written before.
 
@@ -211,12 +193,11 @@ def finish(folder: Path, grid: Grid, arrays: Mapping[str, np.ndarray], seconds: 
 
 def table(grid: Grid, arrays: Mapping[str, np.ndarray]) -> str:
     """The results as CSV, one line a combination and seed; what is unknown stays empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     measures = ("theta_error", "trajectory_error", "success_rate")
-    writer.writerow([*(axis.name for axis in grid.axes), "seed", *measures])
     columns = [np.ravel(arrays[name]).tolist() for name in measures]
     places = itertools.product(combinations(grid.axes), grid.seeds)
-    for (values, seed), *results in zip(places, *columns, strict=True):
-        writer.writerow([*values.values(), seed, *("" if value != value else value for value in results)])
-    return text.getvalue()
+    rows = (
+        [*values.values(), seed, *("" if value != value else value for value in found)]
+        for (values, seed), *found in zip(places, *columns, strict=True)
+    )
+    return text_table.as_csv([*(axis.name for axis in grid.axes), "seed", *measures], rows)

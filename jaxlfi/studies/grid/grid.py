@@ -86,15 +86,14 @@ def parse_axes(texts: Iterable[str]) -> tuple[Axis, ...]:
         >>> parse_axes(["expansion=0.1,0.2"])
         (Axis(name='expansion', values=(0.1, 0.2)),)
     """
-    return tuple(_parse_axis(text) for text in texts)
-
-
-def _parse_axis(text: str) -> Axis:
-    name, _, values = text.partition("=")
-    try:
-        return Axis(name, tuple(float(value) for value in values.split(",")))
-    except ValueError:
-        raise ValueError(f"vary: expected NAME=V,V,... with numbers, got {text!r}") from None
+    axes = []
+    for text in texts:
+        name, _, values = text.partition("=")
+        try:
+            axes.append(Axis(name, tuple(float(value) for value in values.split(","))))
+        except ValueError:
+            raise ValueError(f"vary: expected NAME=V,V,... with numbers, got {text!r}") from None
+    return tuple(axes)
 
 
 def hyperparameters(rule: Heuristic) -> dict[str, Any]:
@@ -153,11 +152,7 @@ def grid_runs(grid: Grid) -> list[RunSpec]:
     named = zip(combinations(grid.axes), heuristics(grid.rule, grid.axes), strict=True)
     return [
         RunSpec(
-            " ".join(f"{name}={value:g}" for name, value in values.items()),
-            grid.support_name,
-            grid.support,
-            rule,
-            seed,
+            " ".join(f"{name}={value:g}" for name, value in values.items()), grid.support_name, grid.support, rule, seed
         )
         for values, rule in named
         for seed in grid.seeds
@@ -165,12 +160,7 @@ def grid_runs(grid: Grid) -> list[RunSpec]:
 
 
 def observations(grid: Grid, observation: Any = None) -> tuple[np.ndarray, np.ndarray]:
-    """Each seed's observed trajectory and its summary, stacked.
-
-    Args:
-        grid: for the task and the seeds.
-        observation: one for all seeds; by default the task's, or one simulated at the truth for each.
-    """
+    """Each seed's observed trajectory and its summary, stacked: one for all, the task's, or one simulated for each."""
     keys = [run_keys(key_of(seed)).observe for seed in grid.seeds]
     pairs = [observe(key, grid.task, observation) for key in keys]
     return tuple(np.stack([np.asarray(pair[i]) for pair in pairs]) for i in range(2))

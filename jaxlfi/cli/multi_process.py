@@ -79,13 +79,9 @@ def join(arguments: argparse.Namespace) -> "Processes":
 
 
 def work(command: Callable[[], int], advice: Callable[[], str], program: str, debug: bool = False) -> int:
-    """Do a command's work in a child.
+    """Do a command's work in a child; `debug` shows the native log, too.
 
-    Args:
-        command: its work, which returns its exit status.
-        advice: what to do where a process was lost, for the end of the line.
-        program: its name, for errors.
-        debug: show the native log, too.
+    Where a process was lost, `advice` ends the line that says so.
 
     Returns:
         The exit status: the child's own; 2 where it was ended.

@@ -26,12 +26,7 @@ class SharedEngine:
     references: np.ndarray | None = None
 
     def __init__(
-        self,
-        task: Task,
-        settings: Settings,
-        inputs: RunInputs,
-        processes: Processes,
-        first: Simulations | None = None,
+        self, task: Task, settings: Settings, inputs: RunInputs, processes: Processes, first: Simulations | None = None
     ):
         """Prepare, without compiling; see `BatchEngine`.
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.tasks import owned
+from jaxlfi.tasks import own_arrays
 from jaxlfi.tasks.command import Command
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.host import HostSimulator
@@ -256,8 +256,8 @@ MASKED = np.ma.array([1.0, 99.0], mask=[False, True])
     "row", [MASKED, MASKED.astype(int), [1.0, np.ma.masked], [MASKED[:1], MASKED[1:]], [[1.0], [np.ma.masked]]]
 )
 def test_what_is_masked_is_missing(row):
-    np.testing.assert_array_equal(np.ravel(owned.array(row)), [1.0, np.nan])
-    assert owned.missing(row) == 1
+    np.testing.assert_array_equal(np.ravel(own_arrays.array(row)), [1.0, np.nan])
+    assert own_arrays.missing(row) == 1
     each = HostSimulator(lambda rng, theta: row, each=True)
     many = HostSimulator(lambda rng, theta: [row, *theta[1:, :]] if np.ndim(row) == 1 else [np.reshape(row, 2)] * 4)
     task = Task(each, ("a", "b"), {"box": BOX}, BOX)
@@ -283,7 +283,7 @@ def test_tables_of_pandas():
     column = pandas.Series([1, None], dtype="Int64")
     task = Task(HostSimulator(lambda rng, theta: theta), ("a", "b"), {"box": BOX}, BOX)
     for table in (column, pandas.DataFrame({"a": column, "b": [1.0, 2.0]})):
-        assert np.isnan(owned.array(table)).sum() == 1
+        assert np.isnan(own_arrays.array(table)).sum() == 1
         with pytest.raises(ValueError, match=r"^observation: expected "):
             observe(KEY, task, table)
     assert observe(KEY, task, pandas.Series([1, 2], dtype="Int64"))[0].tolist() == [1.0, 2.0]
