@@ -22,8 +22,7 @@ N = 4096  # as many as the posterior mean takes
 SEED = 3
 FLAGS = (
     "--heuristic none --learning-rate 3e-3 --steps 100 --batch-size 50 --ensemble-size 1 --components 2 "
-    "--reduction none --correction none --restriction clip --inflation 1 --validation 0 --prune 0 "
-    "--no-predictive --rounds 1 --simulations-per-round 100 --simulation-budget 100 --no-figures"
+    "--reduction none --no-predictive --rounds 1 --simulations-per-round 100 --simulation-budget 100 --no-figures"
 ).split()
 ESTIMATORS = {
     "mdn": ("--hidden", "16"),
