@@ -59,12 +59,11 @@ MAX_MEMORY = 1700 * 2**20
 
 
 LONG = (
-    "test_default_widths", "test_examples", "test_cli", "test_outside_package", "test_draws", "test_infer",
-    "test_grid", "test_apt", "test_resume", "test_readme", "test_calibration_study", "test_lynx_hare", "test_load",
-    "test_real2sim", "test_algorithm", "test_engines", "test_estimators", "test_training", "test_from_brax",
-    "test_fuzzing",
+    "test_fuzzing", "test_cli", "test_estimators", "test_infer", "test_resume", "test_sharpness", "test_engines",
+    "test_algorithm", "test_default_widths", "test_real2sim", "test_apt", "test_training", "test_draws", "test_grid",
+    "test_load", "test_from_brax",
 )  # fmt: skip
-"""Files of half a minute and more, in the order in which they begin: the longest first."""
+"""Files of twenty seconds of a processor and more, in the order in which they begin: the longest first."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -185,7 +185,7 @@ def inferring(*words: str) -> subprocess.Popen:
     return process
 
 
-@pytest.mark.parametrize("seconds", [0.4, 1.5, 3.0])
+@pytest.mark.parametrize("seconds", [0.4, pytest.param(1.5, marks=pytest.mark.slow), 3.0])
 def test_a_run_is_interrupted_at_any_moment(seconds, tmp_path):
     process = inferring("--no-cache", "--out", str(tmp_path / "out"))
     time.sleep(seconds)

@@ -16,6 +16,7 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import dataset as datasets
 from jaxlfi.estimators.base import Estimator, Network, converted, untrained
+from jaxlfi.estimators.flow_estimators import SplineFlow
 from jaxlfi.estimators.posterior import MAP_DRAWS, Posterior
 from jaxlfi.estimators.training import fit
 from jaxlfi.fields import declared, option
@@ -173,6 +174,9 @@ def test_families_are_found_by_their_names_and_written_to_json(case):
 
 
 def test_conditioning_is_the_same_compiled_and_not(case):
+    """Of one flow, as hundreds of operations are compiled one by one, and flows differ in their layers alone."""
+    if isinstance(case.estimator, SplineFlow):
+        pytest.skip("its conditioning is that of the other flow")
     eager = case.network.condition(X, BOX)
     theta = np.stack([BOX.centre, BOX.low, BOX.high])
     np.testing.assert_allclose(

@@ -15,6 +15,7 @@ import pytest
 import jaxlfi
 from jaxlfi.heuristics import Choice, Edge, Fixed, Matched, Mode
 from jaxlfi.io import files as atomic
+from jaxlfi.io import formats
 from jaxlfi.io.workfolder import StoreError
 from jaxlfi.runs.describe import settings_to_json
 from jaxlfi.runs.load import load
@@ -160,11 +161,6 @@ def test_a_fresh_process_loads_a_run_of_a_comparison(compared, tmp_path):
     assert str(fresh["task"]) == "gaussian_linear" and bool(fresh["amortised"])
 
 
-def test_the_folder_of_several_runs_is_refused_with_advice(compared):
-    with pytest.raises(StoreError, match=r"expected the folder of one run, such as .*misspecified/seed_000$"):
-        load(compared)
-
-
 # ------------------------------------------------------------------------------------------------- damaged folders
 
 
@@ -204,6 +200,10 @@ def replaced(name, **arrays):
     return lambda folder: atomic.write_arrays(folder / name, arrays)
 
 
+COMPARED = {"format": formats.COMPARE, "runs": [{"folder": "misspecified/seed_000"}]}
+"""What a folder of several runs says of itself."""
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -212,6 +212,7 @@ def replaced(name, **arrays):
         (cut("config.json"), "without a readable config.json"),
         (config_with(format="other"), "config.json is not of jaxlfi"),
         (config_with(format="jaxlfi-grid"), "config.json is of format 'jaxlfi-grid'"),
+        (config_with(**COMPARED), "expected the folder of one run, such as .*misspecified/seed_000$"),
         (
             config_with(version=1),
             r"expected jaxlfi-run of version 4, got version 1, which jaxlfi 0.* reads; or run its command again",

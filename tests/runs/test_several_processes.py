@@ -9,6 +9,8 @@ import time
 import numpy as np
 import pytest
 
+from jaxlfi.cli import joined
+from jaxlfi.cli import parser as cli
 from jaxlfi.io import files as atomic
 from tests.hosts import done, started
 from tests.small import FLAGS, TASK, command, whole_runs  # noqa: F401
@@ -89,16 +91,23 @@ def test_four_processes_give_what_one_gives(tmp_path):
             np.testing.assert_allclose(four[name], value, rtol=5e-3, atol=5e-3, err_msg=name)
 
 
-@pytest.mark.parametrize(
-    ("flags", "line"),
-    [
-        (["--coordinator", "127.0.0.1:1"], "coordinator: expected --coordinator auto, or"),
-        (["--coordinator", "here", "--processes", "2", "--process-id", "0"], "coordinator: expected HOST:PORT, got"),
-        (["--coordinator", "a:1", "--processes", "2", "--process-id", "2"], "process_id: expected a number from 0 to"),
-        (["--coordinator", "auto", "--processes", "2"], "coordinator: expected --coordinator auto, or"),
-    ],
-)
-def test_flags_that_do_not_fit_are_refused(tmp_path, flags, line):
+REFUSED = [
+    (["--coordinator", "127.0.0.1:1"], "coordinator: expected --coordinator auto, or"),
+    (["--coordinator", "here", "--processes", "2", "--process-id", "0"], "coordinator: expected HOST:PORT, got"),
+    (["--coordinator", "a:1", "--processes", "2", "--process-id", "2"], "process_id: expected a number from 0 to"),
+    (["--coordinator", "auto", "--processes", "2"], "coordinator: expected --coordinator auto, or"),
+]
+
+
+@pytest.mark.parametrize(("flags", "line"), REFUSED)
+def test_flags_that_do_not_fit_are_refused(flags, line):
+    arguments = cli.parse(["infer", TASK, *flags, "--out", "out"])
+    with pytest.raises(ValueError, match=f"^{line}"):
+        joined.wanted(arguments)
+
+
+def test_a_command_refuses_them_in_one_line(tmp_path):
+    flags, line = REFUSED[0]
     words = ["infer", TASK, *flags, "--out", str(tmp_path / "out")]
     ended = subprocess.run([sys.executable, "-m", "jaxlfi", *words], capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr.count("\n")) == (2, 1) and line in ended.stderr

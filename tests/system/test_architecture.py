@@ -8,6 +8,7 @@ import importlib
 import pathlib
 import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
 
@@ -83,7 +84,26 @@ def identify(path: pathlib.Path) -> str:
     return str(path.relative_to(ROOT))
 
 
-everywhere = pytest.mark.parametrize("path", files(*PACKAGES), ids=identify)
+def of_each(paths: list[pathlib.Path]) -> Callable:
+    """Make a check of one file a test of many, which names those that fail: thousands of tests would take longer."""
+
+    def decorate(check: Callable[[pathlib.Path], None]) -> Callable[[], None]:
+        def test():
+            wrong = {}
+            for path in paths:
+                try:
+                    check(path)
+                except AssertionError as error:
+                    wrong[identify(path)] = str(error)
+            assert paths and not wrong
+
+        test.__name__, test.__doc__ = check.__name__, check.__doc__
+        return test
+
+    return decorate
+
+
+everywhere = of_each(files(*PACKAGES))
 
 
 def test_there_is_something_to_check():
@@ -126,7 +146,7 @@ def test_every_part_of_the_library_has_its_place():
     assert parts == {*(name for layer in LAYERS for name in layer), *LEAVES, *BESIDE}
 
 
-@pytest.mark.parametrize("path", files("jaxlfi"), ids=identify)
+@of_each(files("jaxlfi"))
 def test_layers_import_what_is_below_them(path):
     used, own = parts_used(path), part(name_of(path))
     if own in LEAVES:
@@ -181,12 +201,12 @@ def test_modules_do_not_import_one_another_in_a_circle():
     graphlib.TopologicalSorter(graph).prepare()
 
 
-@pytest.mark.parametrize("path", files("jaxlfi/heuristics"), ids=identify)
+@of_each(files("jaxlfi/heuristics"))
 def test_heuristics_see_beliefs_and_no_network(path):
     assert not {name for name in imported(path) for network in NETWORKS if within(name, network)}
 
 
-@pytest.mark.parametrize("path", files("jaxlfi/figures"), ids=identify)
+@of_each(files("jaxlfi/figures"))
 def test_figures_know_no_task(path):
     """A figure is a function of saved arrays: no task, simulator or network, and no JAX to bring one in."""
     plain = ("jaxlfi.figures", "jaxlfi.io.files", "jaxlfi.io.shell", "jaxlfi.io.run_summary", "jaxlfi.io.web_page")
@@ -199,7 +219,7 @@ ON_ROBOTS = {"jaxlfi.robots", "jaxlfi.rl.policy", "jaxlfi.rl.deployment", "numpy
 """Modules of ours and others that a robot's computer needs, besides Python's own."""
 
 
-@pytest.mark.parametrize("path", files("jaxlfi/robots"), ids=identify)
+@of_each(files("jaxlfi/robots"))
 def test_robots_need_numpy_and_no_jax(path):
     """What they import imports no more at run time: tests/robots run where there is no JAX."""
     modules = {name for node in at_import(tree_of(path)) for name in imported_by(node, path)}
@@ -267,9 +287,7 @@ SPLITTING = {"jaxlfi.bayessim.keys", "jaxlfi.bayessim.algorithm"}
 """Where keys are split: by purpose, and for the three draws that one batch of proposals is made of."""
 
 
-@pytest.mark.parametrize(
-    "path", [*files("jaxlfi/bayessim", "jaxlfi/runs", "jaxlfi/cli", "jaxlfi/studies/grid")], ids=identify
-)
+@of_each(files("jaxlfi/bayessim", "jaxlfi/runs", "jaxlfi/cli", "jaxlfi/studies/grid"))
 def test_the_keys_of_a_run_are_split_in_one_module(path):
     nodes = ast.walk(tree_of(path))
     calls = [node.lineno for node in nodes if isinstance(node, ast.Attribute) and node.attr in ("split", "fold_in")
@@ -306,7 +324,7 @@ def test_nothing_is_unpickled(path):
             assert isinstance(node.value, ast.Constant) and node.value.value is False, f"line {node.value.lineno}"
 
 
-@pytest.mark.parametrize("path", [*files(*PACKAGES), *files("tests")], ids=identify)
+@of_each(files(*PACKAGES, "tests"))
 def test_keys_are_typed(path):
     old = [
         node.lineno
@@ -331,7 +349,7 @@ def undocumented(node: ast.AST, prefix: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("path", files("jaxlfi", "envs"), ids=identify)
+@of_each(files("jaxlfi", "envs"))
 def test_everything_public_is_documented(path):
     tree = tree_of(path)
     assert ast.get_docstring(tree), "module"
