@@ -234,6 +234,9 @@ class BatchEngine:
         start = program(functools.partial(start_one, self.task, first), self.mesh, (None, 0))
         return start(self.settings, self.inputs)
 
+    def begin(self, state: State) -> None:
+        """What comes before the first round is compiled: nothing, where a round is one program."""
+
     def compile(self, state: State, index: int = 0) -> Any:
         """Compile a round ahead of its first use, so that it can be timed by itself; returns the program."""
         one, more = self._one(index)

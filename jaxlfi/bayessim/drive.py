@@ -9,8 +9,7 @@ import numpy as np
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine
 from jaxlfi.bayessim.multi_process import SharedEngine
-from jaxlfi.tasks.host import SimulatorError
-from jaxlfi.tasks.task import Task
+from jaxlfi.tasks.host import require_success
 
 OnRound = Callable[[int, State, dict[str, np.ndarray], float], Any]
 """Called as a round ends: its index, the state after it, its record, and the seconds it took."""
@@ -38,6 +37,10 @@ def drive(
     Raises:
         SimulatorError: for a simulator that breaks its contract, or whose simulations all fail in the first round.
     """
+    begun = time.perf_counter()
+    if rounds.start == 0:
+        engine.begin(state)
+    begun = time.perf_counter() - begun
     if rounds:
         began = time.perf_counter()
         engine.compile(state, rounds.start)
@@ -46,24 +49,11 @@ def drive(
         began = time.perf_counter()
         state, row = engine.round(state, index)
         if index == 0:
-            require_success(row["succeeded"], row["failed"], engine.task, engine.known_failures)
+            require_success(row["succeeded"], row["failed"], engine.task.reasons, engine.known_failures)
         try:
-            on_round(index, state, row, time.perf_counter() - began)
+            on_round(index, state, row, time.perf_counter() - began + (begun if index == 0 else 0.0))
         except StopIteration:
             break
         if np.all(row["settled"]):
             break
     return state
-
-
-def require_success(succeeded: np.ndarray, failed: np.ndarray, task: Task, known: str = "") -> None:
-    """Stop if no simulation of the first round succeeded in any run; `known` says what is known of failures.
-
-    Raises:
-        SimulatorError: with the counts by reason.
-    """
-    if np.sum(succeeded) > 0:
-        return
-    counts = np.sum(np.atleast_2d(failed), axis=0)
-    listed = ", ".join(f"{reason}: {count}" for reason, count in zip(task.reasons, counts, strict=True))
-    raise SimulatorError(f"simulate: expected some valid simulations in the first round, got none ({listed}){known}")

@@ -20,6 +20,7 @@ from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
 from jaxlfi.distributions.precision import single
 from jaxlfi.io.processes import ALONE, Processes
+from jaxlfi.tasks.host import require_success
 from jaxlfi.tasks.journal import Journal
 from jaxlfi.tasks.reference import counted_from, reference_of
 from jaxlfi.tasks.simulation import Simulations, simulate_batch, simulate_in_waves
@@ -66,6 +67,7 @@ class HostEngine(BatchEngine):
     ):
         """Prepare, without compiling; see `BatchEngine` and `engine_for`."""
         self.journal = journal or Journal()
+        self._begun: Simulations | None = None
         part = lambda one, *axes: program(functools.partial(one, task), self.mesh, (None, 0, 0, None, *axes))
         super().__init__(task, settings, inputs, devices=jax.local_devices()[:1], first=first)
         self._propose_many, self._update_many = part(propose_one), part(update_one, 0)
@@ -99,6 +101,17 @@ class HostEngine(BatchEngine):
         """The first message of each reason for which simulations failed."""
         return self.journal.known
 
+    def begin(self, state: State) -> None:
+        """Simulate the first round before the rest is compiled: a simulator that does not work stops the run at once.
+
+        Raises:
+            SimulatorError: where no simulation succeeds.
+        """
+        if self.first is None:
+            self._begun = made = self._simulated(*self._propose(state, jnp.asarray(0)), np.zeros(self.runs, bool))
+            reasons = self.task.reasons
+            require_success(made.kept.sum(axis=-1), made.failed(len(reasons)), reasons, self.known_failures)
+
     def compile(self, state: State, index: int = 0) -> None:
         """Compile the parts of a round ahead of their first use, while no simulator waits."""
         place = jnp.asarray(index)
@@ -115,6 +128,8 @@ class HostEngine(BatchEngine):
         place, settled = jnp.asarray(index), np.asarray(state.progress.settled)
         if index == 0 and self.first is not None:
             simulations = self.first_round()
+        elif index == 0 and self._begun is not None:
+            simulations, self._begun = self._begun, None
         else:
             simulations = self._simulated(*self._propose(state, place), settled)
         state, info = _call(self._update_many, self.settings, self.inputs, state, place, simulations)

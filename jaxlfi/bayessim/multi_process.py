@@ -42,6 +42,10 @@ class SharedEngine:
         """The state of this process's runs before the first round."""
         return self._own.start()
 
+    def begin(self, state: State) -> None:
+        """See `BatchEngine.begin`."""
+        self._own.begin(state)
+
     def compile(self, state: State, index: int = 0) -> Any:
         """See `BatchEngine.compile`."""
         return self._own.compile(state, index)

@@ -50,7 +50,7 @@ def account(run: Result, found: RunSummary) -> RunSummary:
     return RunSummary(found.parameters, tuple(filter(None, sentences)), tuple(steps) or (_diagnose(run),))
 
 
-def _diagnose(run: "Run") -> str:
+def _diagnose(run: Result) -> str:
     return DIAGNOSE_OWN if run.origin.reference is None else DIAGNOSE
 
 

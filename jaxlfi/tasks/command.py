@@ -35,8 +35,9 @@ class Command:
             "{seed}" a whole number from 0 to 2^31 - 1, another one for each simulation.
         names: of the parameters.
 
-    The program writes a trajectory to its standard output and ends with exit status 0: an array as .npy, or JSON, a
-    list of numbers (of lists of numbers) or {"trajectory": [...], "outcome": 0}, with an outcome as in `jaxlfi.Task`.
+    The program writes a trajectory to its standard output and ends with exit status 0: numbers as text, a record on
+    each line, with spaces or commas between them; an array as .npy; or JSON, a list of numbers (of lists of numbers) or
+    {"trajectory": [...], "outcome": 0}, with an outcome as in `jaxlfi.Task`.
 
     Raises:
         ValueError: for a program that is not found, an unknown field, or a parameter that is not passed on.
@@ -88,7 +89,7 @@ class Command:
         Raises:
             CrashError: where a signal ends it.
             RuntimeError: where its exit status is not 0.
-            ValueError: for an output that is neither .npy nor JSON.
+            ValueError: for an output that cannot be read.
         """
         words = self.words(theta, int(rng.integers(SEEDS)))
         done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, check=False)
@@ -101,14 +102,14 @@ class Command:
 
 
 def read(output: bytes) -> Any:
-    """A trajectory, or a trajectory and its outcome, from what a program wrote.
+    r"""A trajectory, or a trajectory and its outcome, from what a program wrote.
 
     Raises:
-        ValueError: for anything but .npy and JSON.
+        ValueError: for anything but .npy, JSON and lines of as many numbers each.
 
     Example:
-        >>> read(b"[[0.5, 1.0], [0.6, 1.1]]").shape
-        (2, 2)
+        >>> read(b"[[0.5, 1.0], [0.6, 1.1]]").shape, read(b"0.5\n0.6\n0.8\n").shape
+        ((2, 2), (3,))
     """
     if output.startswith(_NPY):
         return np.load(io.BytesIO(output), allow_pickle=False)
@@ -118,11 +119,23 @@ def read(output: bytes) -> Any:
             return np.asarray(value["trajectory"]), value.get("outcome", 0)
         return np.asarray(value)
     except (ValueError, KeyError) as error:
+        if (table := _table(output)) is not None:
+            return table
         start = output[:60].decode(errors="replace")
         raise ValueError(
-            'standard output: expected .npy, or JSON: a list of numbers, or {"trajectory": [...], "outcome": 0}, '
-            f"got {start!r}"
+            "standard output: expected lines of as many numbers each, .npy, or JSON: a list of numbers, or "
+            f'{{"trajectory": [...], "outcome": 0}}, got {start!r}'
         ) from error
+
+
+def _table(output: bytes) -> np.ndarray | None:
+    """Lines of numbers, [T, C], or [T] where it is one line or one column; None for anything else."""
+    try:
+        lines = [line.replace(",", " ").split() for line in output.decode().splitlines() if line.strip()]
+        rows = np.array([[float(word) for word in line] for line in lines])
+    except ValueError:  # words, or rows of different lengths
+        return None
+    return rows.reshape(-1) if rows.ndim == 2 and 1 in rows.shape else rows if rows.ndim == 2 else None
 
 
 def _signal(number: int) -> str:

@@ -224,3 +224,22 @@ def _require_own(given: Any, theta: np.ndarray, trajectory: np.ndarray, outcome:
 def numpy_generator(key: jax.Array) -> np.random.Generator:
     """A NumPy generator seeded by a JAX key."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
+
+
+def require_success(succeeded: np.ndarray, failed: np.ndarray, reasons: Sequence[str], known: str = "") -> None:
+    """Stop if no simulation of the first round succeeded in any run.
+
+    Args:
+        succeeded: how many did, of each run.
+        failed: how many did not, of each run and reason.
+        reasons: their names.
+        known: what is known of failures.
+
+    Raises:
+        SimulatorError: with the counts by reason.
+    """
+    if np.sum(succeeded) > 0:
+        return
+    counts = np.sum(np.atleast_2d(failed), axis=0)
+    listed = ", ".join(f"{reason}: {count}" for reason, count in zip(reasons, counts, strict=True))
+    raise SimulatorError(f"simulate: expected some valid simulations in the first round, got none ({listed}){known}")

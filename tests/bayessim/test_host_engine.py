@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
+from jaxlfi.bayessim.host import HostEngine
 from jaxlfi.envs.gaussian_linear import posterior
 from jaxlfi.runs.folder import read_ledger
 from jaxlfi.tasks.host import HostSimulator, SimulatorError
@@ -88,6 +89,16 @@ def test_a_broken_contract_ends_the_run_in_one_line(simulate, message, monkeypat
     with pytest.raises(SimulatorError, match=message) as refused:
         jaxlfi.infer(jax.random.key(0), task(), OBSERVED, heuristic=jaxlfi.Edge(), settings=SETTINGS)
     assert "\n" not in str(refused.value)
+
+
+def test_a_simulator_that_does_not_work_ends_the_run_before_anything_is_compiled(monkeypatch):
+    def fail(rng, theta):
+        raise ValueError("no mesh")
+
+    monkeypatch.setattr(HostEngine, "compile", lambda *_: pytest.fail("compiled"))
+    one_by_one = dataclasses.replace(gaussian(), simulate=HostSimulator(fail, each=True))
+    with pytest.raises(SimulatorError, match=r"expected some valid simulations in the first round.*no mesh"):
+        jaxlfi.infer(jax.random.key(3), one_by_one, OBSERVED, support="ok", settings=SETTINGS)
 
 
 def test_it_cannot_be_vmapped():

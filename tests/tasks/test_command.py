@@ -70,7 +70,26 @@ def test_outputs_are_npy_or_json_and_nothing_is_unpickled():
     with pytest.raises(ValueError, match="allow_pickle=False"):
         read(pickled.getvalue())
     for output in (b"", b"hello", b'{"x": 1}', b"[[1], [1, 2]]", b"\xff\x00"):
-        with pytest.raises(ValueError, match=r"^standard output: expected .npy, or JSON"):
+        with pytest.raises(ValueError, match=r"^standard output: expected lines of as many numbers each, \.npy"):
+            read(output)
+
+
+@pytest.mark.parametrize(
+    ("output", "expected"),
+    [
+        (b"0.5\n-1e-3\nnan\n", [0.5, -1e-3, np.nan]),
+        (b"0.5 1 2\n", [0.5, 1.0, 2.0]),
+        (b"0,0.5\r\n0.1,0.7\r\n\r\n", [[0.0, 0.5], [0.1, 0.7]]),
+        (b"1\t2\n3\t4\n5\t6", [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]),
+    ],
+)
+def test_outputs_may_be_lines_of_numbers(output, expected):
+    np.testing.assert_array_equal(read(output), expected)
+
+
+def test_lines_of_different_lengths_and_headings_are_refused():
+    for output in (b"1 2\n3\n", b"time,x\n0,1\n"):
+        with pytest.raises(ValueError, match="lines of as many numbers each"):
             read(output)
 
 
@@ -80,7 +99,7 @@ def test_outputs_are_npy_or_json_and_nothing_is_unpickled():
         ("print('[1, 2]')", None, ""),
         ("print('[1, 2, 3]')", "wrong_shape", "expected numbers of shape [2], got int64 of shape [3]"),
         ("""print('["a", "b"]')""", "wrong_shape", "expected numbers of shape [2], got <U1 of shape [2]"),
-        ("print('hello')", "error", "ValueError: standard output: expected .npy, or JSON"),
+        ("print('hello')", "error", "ValueError: standard output: expected lines of as many numbers each"),
         ("import sys; sys.exit('no mesh')", "error", "exit status 1: no mesh"),
         ("import os; os.kill(os.getpid(), 11)", "crash", "ended by SIGSEGV: nothing on standard error"),
     ],
