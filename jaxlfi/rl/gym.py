@@ -60,7 +60,8 @@ class GymEnvironment(gymnasium.Env):
             raise ValueError(f"render_mode: expected {names}, got {render_mode!r}")
         self.render_mode, self._course, self._given = render_mode, course, course.points(theta)
         self.action_space, self.observation_space = _spaces(course.environment)
-        self._key = self._episode = None
+        self._key: jax.Array | None = None
+        self._episode: Episode | None = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         """Begin an episode, with other parameters if they are drawn; there are no options."""
@@ -69,9 +70,9 @@ class GymEnvironment(gymnasium.Env):
             self._key = jax.random.key(seed)
         elif self._key is None:
             self._key = jax.random.key(_entropy(self.np_random))
-        self._episode = _begin(self._course, self._key, self._given)
-        self._key = self._episode.key
-        return np.array(self._episode.state.observation), self._info()
+        self._episode = episode = _begin(self._course, self._key, self._given)
+        self._key = episode.key
+        return np.array(episode.state.observation), self._info(episode)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Apply an action.
@@ -81,19 +82,19 @@ class GymEnvironment(gymnasium.Env):
             ResetNeeded: before the first `reset`.
         """
         action = _action(action, self.action_space)
-        self._episode = _step(self._course, self._required("step"), action)
-        self._key, state = self._episode.key, self._episode.state
-        terminated, truncated = self._course.ends(self._episode)
-        return np.array(state.observation), float(state.reward), bool(terminated), bool(truncated), self._info()
+        self._episode = episode = _step(self._course, self._required("step"), action)
+        self._key, state = episode.key, episode.state
+        terminated, truncated = self._course.ends(episode)
+        return np.array(state.observation), float(state.reward), bool(terminated), bool(truncated), self._info(episode)
 
     def _required(self, method: str) -> Episode:
         if self._episode is None:
             raise gymnasium.error.ResetNeeded(f"{method}: expected a reset before it, got none")
         return self._episode
 
-    def _info(self) -> dict[str, Any]:
+    def _info(self, episode: Episode) -> dict[str, Any]:
         """Facts, with Python's scalars."""
-        facts = {name: np.array(value) for name, value in self._course.facts(self._episode).items()}
+        facts = {name: np.array(value) for name, value in self._course.facts(episode).items()}
         return {name: value if value.ndim else value.item() for name, value in facts.items()}
 
 
@@ -139,7 +140,8 @@ class GymVector(VectorEnv):
         self.action_space, self.observation_space = (batch_space(space, num_envs) for space in single)
         self._same_step = mode is AutoresetMode.SAME_STEP
         self._course, self._given = course, course.points(theta, (num_envs,))
-        self._keys = self._episodes = None
+        self._keys: jax.Array | None = None
+        self._episodes: Episode | None = None
         self._over = np.zeros(num_envs, bool)
 
     def reset(
@@ -154,7 +156,10 @@ class GymVector(VectorEnv):
         Raises:
             ValueError: for a wrong number of seeds.
         """
-        seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if np.ndim(seed) == 0 else [*seed]
+        given: Any = seed
+        seeds = (
+            [given if given is None else given + i for i in range(self.num_envs)] if np.ndim(given) == 0 else [*given]
+        )
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed: expected {self.num_envs} of them, got {len(seeds)}")
         super().reset(seed=seeds[0])
@@ -181,7 +186,7 @@ class GymVector(VectorEnv):
         self._episodes, self._keys = now, now.key
         ended = last if self._same_step else now
         terminated, truncated = (np.array(ends) for ends in self._course.ends(ended))
-        over, info = terminated | truncated, self._infos(now)
+        over, info = terminated | truncated, dict[str, Any](self._infos(now))
         if not self._same_step:
             self._over = over
         elif over.any():
@@ -198,19 +203,8 @@ class GymVector(VectorEnv):
 
 
 # Programs are compiled for a course, not for each environment of it.
-@functools.partial(jax.jit, static_argnums=0)
-def _begin(course: Course, key: jax.Array, given: Any) -> Episode:
-    return course.begin(key, given)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _begin_many(course: Course, keys: jax.Array, given: Any) -> Episode:
-    return jax.vmap(course.begin)(keys, given)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _step(course: Course, episode: Episode, action: Array) -> Episode:
-    return course.step(episode, action)
+_begin, _step = (jax.jit(method, static_argnums=0) for method in (Course.begin, Course.step))
+_begin_many = jax.jit(lambda course, keys, given: jax.vmap(course.begin)(keys, given), static_argnums=0)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -220,9 +214,10 @@ def _step_many(course: Course, same_step: bool, episodes: Episode, given: Any, a
 
 def _spaces(environment: Environment) -> tuple[spaces.Box, spaces.Box]:
     """Of actions, and of observations: an environment's own attribute `bounds` [2, O], or all numbers."""
+    box = lambda low, high: spaces.Box(np.asarray(low, np.float32), np.asarray(high, np.float32))
     centre, scale = (np.asarray(numbers) for numbers in (environment.actions.centre, environment.actions.scale))
-    low, high = getattr(environment, "bounds", np.outer([-np.inf, np.inf], np.ones(environment.observations.size)))
-    return spaces.Box(*np.float32([centre - scale, centre + scale])), spaces.Box(*np.float32([low, high]))
+    everything = np.outer([-np.inf, np.inf], np.ones(environment.observations.size))
+    return box(centre - scale, centre + scale), box(*getattr(environment, "bounds", everything))
 
 
 def _action(action: Any, space: spaces.Box) -> np.ndarray:

@@ -51,8 +51,9 @@ def save(policy: Policy, path: str | Path) -> None:
     """Write a policy's program for any batch size."""
     size = len(policy.observed["names"])
     rows = jax.ShapeDtypeStruct((export.symbolic_shape("batch")[0], size), jnp.float32)
+    single = lambda arrays: [np.asarray(array, np.float32) for array in arrays]
+    act = acting((single(policy.weights), single(policy.biases), policy.scaling))
     with jax.default_matmul_precision("highest"):  # accelerators otherwise multiply matrices with 10 bits
-        act = acting((policy.weights, policy.biases, policy.scaling))
         write(path, act, rows, {"format": FORMAT, "version": VERSION, **policy.schema})
 
 

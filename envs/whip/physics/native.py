@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -155,8 +156,10 @@ class _ModelCache:
 
 def _hashable(parameters: WhipParameters) -> WhipParameters:
     """The same in Python's numbers."""
-    plain = lambda leaf: tuple(leaf.tolist()) if leaf.ndim else leaf.item()
-    return WhipParameters(**{name: plain(leaf) for name, leaf in vars(parameters).items()})
+    plain: dict[str, Any] = {
+        name: tuple(leaf.tolist()) if leaf.ndim else leaf.item() for name, leaf in vars(parameters).items()
+    }
+    return WhipParameters(**plain)
 
 
 @dataclasses.dataclass
