@@ -1,6 +1,7 @@
 """How an environment's episodes go for other people's learners: what theta they have, and which keys."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -107,8 +108,8 @@ class Course:
             terminated, truncated = self.ends(last)
             over = terminated | truncated
             later, key_start, _ = jax.random.split(key, 3)
-            key = jax.random.wrap_key_data(jnp.where(over, jax.random.key_data(later), jax.random.key_data(key)))
-        now = jax.tree.map(lambda new, old: jnp.where(over, new, old), self._begun(None, key_start, given), last)
+            key = _chosen(over, later, key)
+        now = jax.tree.map(functools.partial(_chosen, over), self._begun(None, key_start, given), last)
         return now.replace(key=key), last.replace(state=state.replace(inner=None))
 
     def ends(self, episode: Episode) -> tuple[Any, Any]:
@@ -120,3 +121,10 @@ class Course:
         key_theta, key_reset = jax.random.split(key_start)
         theta = self.theta(key_theta, given)
         return Episode(key, theta, self.reset(key_reset, theta), jnp.asarray(0))
+
+
+def _chosen(over: Bool[Array, ""], new: Array, old: Array) -> Array:
+    """The new one where an episode is over; keys as raw data: jax's key-reuse checker counts their choice as a use."""
+    if jnp.issubdtype(jnp.asarray(new).dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(jnp.where(over, jax.random.key_data(new), jax.random.key_data(old)))
+    return jnp.where(over, new, old)

@@ -87,6 +87,30 @@ def test_many_are_single_ones_which_begin_anew(mode):
     assert ended > 6
 
 
+class Noisy(Line):
+    """Draws its rewards with a key of its own in each step."""
+
+    def reset(self, key, theta):
+        key, key_start = jax.random.split(key)
+        state = super().reset(key_start, theta)
+        return state.replace(inner=(state.inner, key))
+
+    def step(self, state, action):
+        point, key = state.inner
+        key, key_reward = jax.random.split(key)
+        after = super().step(state.replace(inner=point), action)
+        return after.replace(inner=(after.inner, key), reward=jax.random.normal(key_reward))
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_an_environments_own_keys_are_used_once(mode):
+    """More than an episode, of which all rewards differ but those of resets."""
+    many = GymVector(2, Noisy(), autoreset_mode=mode)
+    many.reset(seed=0)
+    rewards = np.stack([many.step(np.zeros((2, 1), np.float32))[1] for _ in range(LINE.steps + 3)])
+    assert len(np.unique(rewards[rewards != 0])) == np.sum(rewards != 0) > 2 * LINE.steps
+
+
 def test_environments_keep_points_of_their_own():
     points = np.array([[1.0, -1.0], [2.0, 1.0]])
     many = GymVector(2, NAME, points, "SameStep")
