@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 import jaxlfi
 from jaxlfi.cli import parser as cli
 from jaxlfi.envs.whip import cli as whip
-from jaxlfi.envs.whip.episode import OBSERVATION
+from jaxlfi.envs.whip.observer import OBSERVATION
 from jaxlfi.figures import History, open_collection, samples, style
 from jaxlfi.io import files as atomic
 from jaxlfi.io import provenance

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,8 +13,6 @@ from jaxlfi.envs.mujoco.parameters import Edit, near
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """Time, positions, velocities and activations."""
-_SIZES = {int(mujoco.mjtJoint.mjJNT_FREE): (7, 6), int(mujoco.mjtJoint.mjJNT_BALL): (4, 3)}
-"""Numbers of the positions and velocities of joints that have more than one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +32,15 @@ class Effects:
     biases: tuple[tuple[int, int], ...] = ()
     deviations: tuple[tuple[int, int], ...] = ()
     delay: int | None = None
+
+    def started(
+        self, start: Float[np.ndarray, " state"], theta: Float[np.ndarray, "*n dim"]
+    ) -> Float[np.ndarray, "*n state"]:
+        """The states that the models of parameter vectors begin in, by the model's own."""
+        state = np.tile(start, (*theta.shape[:-1], 1)) if theta.ndim > 1 else start.copy()
+        for place, d in self.starts:
+            state[..., place] = theta[..., d]
+        return state
 
 
 def effects(
@@ -115,8 +123,14 @@ def state_place(model: mujoco.MjModel, rest: str, name: str) -> int:
         raise ValueError(f"parameters: {name!r}: expected a joint {near(match['element'], joints)}")
     joint, velocity = model.joint(match["element"]), match["attribute"] == "qvel"
     index = None if match["index"] is None else int(match["index"])
-    place = parameters.place(np.zeros(_SIZES.get(int(joint.type[0]), (1, 1))[velocity]), index, name)
+    place = parameters.place(np.zeros(sizes(joint)[velocity]), index, name)
     return 1 + place + (model.nq + int(joint.dofadr[0]) if velocity else int(joint.qposadr[0]))
+
+
+def sizes(joint: Any) -> tuple[int, int]:
+    """How many positions and velocities a joint has; of several positions the last four are a quaternion."""
+    several = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+    return several.get(mujoco.mjtJoint(joint.type[0]), (1, 1))
 
 
 def _of_sensor(rest: str, name: str, signals: Sequence[str]) -> tuple[str, int]:

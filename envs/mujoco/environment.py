@@ -25,7 +25,7 @@ from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, started
 from jaxlfi.envs.mujoco.mjx_models import Models, mjx
 from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable, state_of
-from jaxlfi.envs.mujoco.model_task import compile_spec, specification
+from jaxlfi.envs.mujoco.model_task import box, compile_spec, specification
 from jaxlfi.envs.mujoco.parameters import Parameter
 from jaxlfi.rl.environment import EnvState
 
@@ -86,8 +86,8 @@ class MujocoEnvironment:
         self.name = name or spec.modelname or "mujoco"
         self.space = Space(tuple(one.name for one in parameters), tuple(one.log for one in parameters))
         self.units = tuple(one.unit for one in parameters)
-        support = _box([one.support for one in parameters])
-        self.feasible = _box([one.feasible or one.support for one in parameters])
+        support = box([one.support for one in parameters])
+        self.feasible = box([one.feasible or one.support for one in parameters])
         self.supports: Mapping[str, Support] = {"initial": support, "feasible": self.feasible}
         centre = self.space.box_to_inference(support).centre
         self.nominal = tuple(float(number) for number in np.asarray(self.space.to_natural(np.asarray(centre))))
@@ -213,8 +213,3 @@ def _only_inferred(names: Sequence[str], signals: Sequence[str]) -> list[str]:
     """Signals whose sensors' offset or noise was inferred, which policies do not see."""
     own = [name.partition("/")[2].rpartition("/")[0] for name in names if name.startswith("sensor/")]
     return list(dict.fromkeys(signal for signal in own if signal not in signals))
-
-
-def _box(bounds: Sequence[tuple[float, float]]) -> Support:
-    low, high = np.asarray(bounds, np.float32).T
-    return Support(low, high)

@@ -10,9 +10,9 @@ more implementation of MuJoCo's compiler: inverse weights alone are rational fun
 
 import contextlib
 import dataclasses
+import functools
 import io
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -102,7 +102,7 @@ class Models:
         self._shapes = [np.shape(self._leaves[place]) for place in self._places]
         self._sizes = [int(np.prod(shape)) for shape in self._shapes]
         self._nominal = self._numbers(compiled)
-        self._known: OrderedDict[bytes, tuple[np.ndarray, bool]] = OrderedDict()
+        self._known = functools.lru_cache(CACHED)(self._of_one)
         self._lock = threading.Lock()
 
     def numbers(self, theta: Float[Array, " dim"]) -> tuple[Float[Array, " numbers"], Bool[Array, ""]]:
@@ -163,23 +163,15 @@ class Models:
         """Numbers and refusals of a batch of any number of axes; NumPy in, NumPy out."""
         theta = np.asarray(theta, np.float32)
         with self._lock:
-            rows = [self._of_one(row) for row in theta.reshape(-1, self._dim)]
+            rows = [self._known(row.tobytes()) for row in theta.reshape(-1, self._dim)]
         numbers = np.stack([row for row, _ in rows]).reshape(*theta.shape[:-1], -1)
         return numbers, np.array([refused for _, refused in rows]).reshape(theta.shape[:-1])
 
-    def _of_one(self, theta: np.ndarray) -> tuple[np.ndarray, bool]:
-        key = theta.tobytes()
-        if key in self._known:
-            self._known.move_to_end(key)
-            return self._known[key]
+    def _of_one(self, theta: bytes) -> tuple[np.ndarray, bool]:
         try:
-            found = self._numbers(self._build(theta)), False
+            return self._numbers(self._build(np.frombuffer(theta, np.float32))), False
         except ValueError:
-            found = self._nominal, True
-        self._known[key] = found
-        if len(self._known) > CACHED:
-            self._known.popitem(last=False)
-        return found
+            return self._nominal, True
 
 
 def _probes(names: Sequence[str], nominal: np.ndarray, feasible: Support) -> list[tuple[np.ndarray, str]]:

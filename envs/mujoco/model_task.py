@@ -13,7 +13,7 @@ import numpy as np
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import columns, logs, noise, plausible, recordings, summaries
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
-from jaxlfi.envs.mujoco.effects import Effects, built, effects, initial_state
+from jaxlfi.envs.mujoco.effects import built, effects, initial_state
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -97,7 +97,7 @@ def mujoco_task(
     compiled = compile_spec(spec)
     does = effects(spec, compiled, names, [one.support for one in parameters], measured)
     start = initial_state(compiled, initial or {})
-    begins = _started(does, start, np.array([_centre(one) for one in parameters]))
+    begins = does.started(start, np.array([_centre(one) for one in parameters]))
     episodes = [recordings.prepared(compiled, log, measured, begins) for log in episodes]
     deviations = _deviations(episodes[0], measured, noises, inferred)
 
@@ -135,9 +135,9 @@ def task_of(
         columns.warn_of_clamped(log, simulator.model, [one.name for one in parameters])
     seen = summaries.fields(summary, simulator)
     others["settings"] = seen.pop("settings", {}) | dict(others.get("settings", {}))
-    supports = {"initial": _box([one.support for one in parameters])}
+    supports = {"initial": box([one.support for one in parameters])}
     for label, bounds in (guesses or {}).items():
-        supports[label] = _box([one.support for one in _guessed(parameters, label, bounds)])
+        supports[label] = box([one.support for one in _guessed(parameters, label, bounds)])
     feasible = [one.feasible or one.support for one in parameters]
     truth = [one.truth for one in parameters]
     return Task(
@@ -145,8 +145,8 @@ def task_of(
         names=[one.name for one in parameters],
         units=[one.unit for one in parameters],
         log=[one.name for one in parameters if one.log],
-        supports=supports | {"feasible": _box(feasible)},
-        feasible=_box(feasible),
+        supports=supports | {"feasible": box(feasible)},
+        feasible=box(feasible),
         truth=None if None in truth else np.asarray(truth, np.float32),
         observation=simulator.observation,
         failures=FAILURES,
@@ -229,14 +229,6 @@ def _deviations(log: Log, measured: Sequence[str], given: Mapping[str, float], i
     return found
 
 
-def _started(does: Effects, start: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """The state that the model of a parameter vector begins in."""
-    state = start.copy()
-    for place, d in does.starts:
-        state[place] = theta[d]
-    return state
-
-
 def _check_starts(simulator: Simulator, parameters: Sequence[Parameter], noises: Mapping[str, float]) -> None:
     """Say where recordings begin elsewhere than the model does for all parameters that are possible."""
     does, begins = simulator.does, []
@@ -246,13 +238,13 @@ def _check_starts(simulator: Simulator, parameters: Sequence[Parameter], noises:
             model = simulator.build(theta) if does.edits else simulator.model
         except ValueError:
             continue  # such simulations fail, and are counted
-        begins.append(plausible.sensed(model, _started(does, simulator.starts[0], theta)))
+        begins.append(plausible.sensed(model, does.started(simulator.starts[0], theta)))
     biased = {signal for signal, _ in does.biases}
     compared = [name for number, name in enumerate(simulator.signals) if number not in biased]
     for log in simulator.logs if begins else ():
         plausible.check_start(simulator.model, log, compared, noises, begins)
 
 
-def _box(bounds: Sequence[tuple[float, float]]) -> Support:
-    low, high = np.asarray(bounds, np.float32).T
-    return Support(low, high)
+def box(bounds: Sequence[tuple[float, float]]) -> Support:
+    """The support of these bounds."""
+    return Support(*np.asarray(bounds, np.float32).T)

@@ -6,11 +6,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from jaxlfi.envs.mujoco.effects import sizes
 from jaxlfi.envs.mujoco.measured import places
 from jaxlfi.envs.mujoco.orientations import continuous
 
-_SIZES = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}
-"""Numbers of the positions of joints that have more than one; the last four are a quaternion."""
 _OF_JOINTS = (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_BALLQUAT)
 _OF_BODIES = {mujoco.mjtSensor.mjSENS_FRAMEPOS: 0, mujoco.mjtSensor.mjSENS_FRAMEQUAT: 3}
 """Where a free joint has what sensors of its body's frame measure."""
@@ -78,7 +77,7 @@ def recorded_positions(
 def _positions(joint) -> range:
     """Places of a joint in `qpos`."""
     first = int(joint.qposadr[0])
-    return range(first, first + _SIZES.get(mujoco.mjtJoint(joint.type[0]), 1))
+    return range(first, first + sizes(joint)[0])
 
 
 def _first_position(model: mujoco.MjModel, sensor: int) -> int | None:

@@ -1,5 +1,6 @@
 """Pictures of a model's recorded motion and of simulations of it as ghosts, by MuJoCo's renderer."""
 
+import contextlib
 import copy
 from collections.abc import Sequence
 
@@ -27,7 +28,7 @@ _DEFAULT = (90.0, -45.0)
 _STILL, _ALL = mujoco.mjtCatBit.mjCAT_STATIC.value, mujoco.mjtCatBit.mjCAT_ALL.value
 
 
-class Stage:
+class Stage(contextlib.AbstractContextManager):
     """A view that holds a whole motion; use it in `with`, or close it."""
 
     def __init__(
@@ -65,10 +66,6 @@ class Stage:
         self._gl.make_current()
         self._made = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._made)
-
-    def __enter__(self) -> "Stage":
-        """Itself."""
-        return self
 
     def __exit__(self, *_) -> None:
         """Close it."""

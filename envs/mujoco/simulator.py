@@ -241,7 +241,8 @@ class Simulator:
         """
         theta = np.asarray(theta, float)
         models, grid = [self.build(row) for row in theta], self.grid(self.times[episode])
-        start, controls = self._start(episode, theta), self.controls(self.logs[episode], theta, grid)
+        start = self.does.started(self.starts[episode], theta)
+        controls = self.controls(self.logs[episode], theta, grid)
         with _LOCK, quietly():
             states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self.model), start, controls)
         return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
@@ -258,7 +259,7 @@ class Simulator:
         data = [mujoco.MjData(self.model) for _ in range(self._threads)]
         begin = 0
         for episode, (log, times) in enumerate(zip(self.logs, self.times, strict=True)):
-            start, grid = self._start(episode, theta[good]), self.grid(times)
+            start, grid = self.does.started(self.starts[episode], theta[good]), self.grid(times)
             states, sensors = self._pool.rollout(
                 [models[row] for row in good], data, start, self.controls(log, theta[good], grid)
             )
@@ -271,13 +272,6 @@ class Simulator:
             rows[good, begin : begin + len(times)] = between(grid, values, times)
             begin += len(times)
         return rows, outcome
-
-    def _start(self, episode: int, theta: np.ndarray) -> np.ndarray:
-        """States that an episode begins in, one for each parameter vector."""
-        start = np.tile(self.starts[episode], (len(theta), 1))
-        for place, d in self.does.starts:
-            start[:, place] = theta[:, d]
-        return start
 
     def grid(self, times: np.ndarray) -> np.ndarray:
         """Times of the model's steps that reach beyond an episode's last measurement."""

@@ -193,16 +193,12 @@ def _spectrum(simulator: Simulator) -> dict[str, Any]:
     return {"summary": functools.partial(spectrum, episodes=episodes, floors=floors)}
 
 
-def _learnt(simulator: Simulator) -> dict[str, Any]:
-    """All rows, and the setting that has an embedding see them, which `--embedding` may still change."""
-    return {"summary": "identity", "settings": {"embedding": "series"}}
-
-
 OWN: Mapping[str, Callable[[Simulator], dict[str, Any]]] = {
     "samples": _samples,
     "cross-correlation": _cross_correlation,
     "spectrum": _spectrum,
-    "learnt": _learnt,
+    # All rows, and the setting that has an embedding see them, which `--embedding` may still change.
+    "learnt": lambda simulator: {"summary": "identity", "settings": {"embedding": "series"}},
 }
 """What a task is given for each name."""
 

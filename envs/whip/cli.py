@@ -7,7 +7,6 @@ import argparse
 import sys
 from pathlib import Path
 
-from jaxlfi import flags
 from jaxlfi.cli.command import Command
 from jaxlfi.envs.whip import require_mujoco
 from jaxlfi.envs.whip.vision import options
@@ -53,7 +52,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="a model of its errors: clean, mask, noisy, transporter, learnt or learnt-transporter (default: clean)",
     )
-    render.add_argument("--out", type=flags.output, required=True, metavar="DIR", help="a new folder")
+    options.add_out(render, "DIR", "a new folder")
 
     plan = commands.add_parser(
         "plan",
@@ -61,9 +60,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         description="Search for actions that hit the top cube only, by the cross-entropy method.",
     )
     _add_scene(plan)
-    plan.add_argument(
-        "--out", type=flags.output, required=True, metavar="FILE", help="a new .npz: actions, value, history"
-    )
+    options.add_out(plan, "FILE", "a new .npz: actions, value, history")
 
     deploy = commands.add_parser(
         "deploy",
@@ -84,8 +81,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     deploy.add_argument(
         "--repetitions", type=int, default=16, metavar="N", help="number of places of stack and camera (default: 16)"
     )
-    deploy.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="seed of places and noise (default: 0)")
-    deploy.add_argument("--out", type=flags.output, required=True, metavar="DIR", help="a new folder")
+    options.add_seed(deploy, "seed of places and noise (default: 0)")
+    options.add_out(deploy, "DIR", "a new folder")
 
     control = commands.add_parser(
         "control",
@@ -126,15 +123,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     options.add_detector(control)
     control.add_argument("--remote", action="store_true", help="allow a driver on another host")
-    control.add_argument(
-        "--seed", type=flags.seed, default=0, metavar="N", help="seed of a reference object's camera (default: 0)"
-    )
-    control.add_argument(
-        "--out",
-        type=flags.output,
-        required=True,
-        metavar="FILE",
-        help="the recording, a new .npz; its description is written to a .json of the same name",
+    options.add_seed(control, "seed of a reference object's camera (default: 0)")
+    options.add_out(
+        control, "FILE", "the recording, a new .npz; its description is written to a .json of the same name"
     )
 
     options.add(commands)
@@ -160,9 +151,7 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--young", type=float, default=2.5e4, metavar="PA", help="Young's modulus of the DLO in Pa, 500 to 5e5"
     )
-    command.add_argument(
-        "--seed", type=flags.seed, default=0, metavar="N", help="seed of all random numbers (default: 0)"
-    )
+    options.add_seed(command, "seed of all random numbers (default: 0)")
     command.add_argument(
         "--engine",
         default="auto",

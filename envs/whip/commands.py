@@ -191,17 +191,10 @@ def _actions(policy: str, key: jax.Array, engine: Engine, parameters: WhipParame
     if policy == "plan":
         return jnp.asarray(_search(key, engine, parameters).actions)
     if policy == "random":
-        method = planner.CrossEntropy()
-        first = planner.init(method)
-        return planner.draw(jax.random.normal(key, first.mean.shape), first.mean, first.deviation, method.correlation)
-    return jnp.asarray(_read_actions(policy))
-
-
-def _read_actions(path: str) -> np.ndarray:
-    """The array "actions" of an .npz, which may be a plan, a rollout or a recording."""
-    if not Path(path).exists():
-        raise ValueError(f"policy: expected {', '.join(POLICIES)} or an .npz file, got {path!r}")
-    return repetitions.actions_of(path).astype(np.float32)
+        return planner.random_walk(key)
+    if not Path(policy).exists():
+        raise ValueError(f"policy: expected {', '.join(POLICIES)} or an .npz file, got {policy!r}")
+    return jnp.asarray(repetitions.actions_of(policy), jnp.float32)
 
 
 def _search(key: jax.Array, engine: Engine, parameters: WhipParameters) -> planner.Plan:

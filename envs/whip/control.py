@@ -13,11 +13,11 @@ import numpy as np
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.environment import ACTIONS, LIMITS, OBSERVATIONS
 from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.observer import FLAGS
 from jaxlfi.envs.whip.parameters import median
 from jaxlfi.envs.whip.recording import Recording
-from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, KEYPOINTS
 from jaxlfi.envs.whip.vision.camera import Camera, side_camera
-from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS
 from jaxlfi.io.serialise import json_safe
 from jaxlfi.registry import ROBOTS
 from jaxlfi.rl import deployment
@@ -26,8 +26,6 @@ from jaxlfi.robots.client import SocketRobot
 from jaxlfi.robots.loop import Act, Log, Loop
 from jaxlfi.robots.robot import Robot
 
-FLAGS = 2 + 2 * KEYPOINTS
-"""Place of the first flag in an observation; before it come the gripper's x and z, and the keypoints."""
 ABOUT = {
     "camera": dict,
     "source": str,
@@ -42,9 +40,7 @@ ABOUT = {
 
 def is_over(observation: np.ndarray) -> bool:
     """Whether an episode ends: the top cube is hit, or the gripper has been measured outside of its workspace."""
-    gripper = np.asarray(observation[:2], np.float32)
-    outside = (gripper < rules.WORKSPACE[0]) | (gripper > rules.WORKSPACE[1])
-    return bool(observation[FLAGS + rules.TOP] > 0.5 or outside.any())
+    return bool(observation[FLAGS + rules.TOP] > 0.5 or rules.outside(np.asarray(observation[:2], np.float32)))
 
 
 LOOP = Loop(LIMITS, moved=(0, 1), size=OBSERVATIONS.size, rate=1 / CONTROL_INTERVAL, steps=rules.STEPS, over=is_over)

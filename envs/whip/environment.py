@@ -14,6 +14,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.episode import Episode, Whip
 from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.observer import FLAGS
 from jaxlfi.envs.whip.parameters import (
     FEASIBLE,
     INITIAL,
@@ -24,8 +25,8 @@ from jaxlfi.envs.whip.parameters import (
     randomised,
 )
 from jaxlfi.envs.whip.physics.engines import pick
-from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
-from jaxlfi.envs.whip.vision.keypoints import DETECTORS, ON_DLO
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, KEYPOINTS, ON_DLO
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.rl.deployment import Deployment, Limits
 from jaxlfi.rl.environment import EnvState, Signals
 
@@ -53,18 +54,38 @@ LIMITS = Limits(
 """Of the set-point: the actions' own limits, the speed that these come to, and the workspace."""
 
 
+BOUNDS = np.array([[-np.inf] * FLAGS + [0.0] * 6, [np.inf] * FLAGS + [1.0] * 6])
+"""Least and largest observations: the gripper and the keypoints may be anywhere."""
+
+
 class Scene(struct.PyTreeNode):
     """An episode, the scene it is in, and the key of what comes.
 
     Attributes:
         episode: of the whipping task.
         parameters: of its scene.
-        key: of the steps to come.
+        key: of the steps to come; None where each is given one.
     """
 
     episode: Episode
     parameters: WhipParameters
-    key: jax.Array
+    key: jax.Array | None = None
+
+
+def begun(whip: Whip, key: jax.Array, parameters: WhipParameters) -> EnvState:
+    """The DLO at rest in a scene; its facts are those of `episode.Step`."""
+    episode, observation = whip.reset(key, parameters)
+    no = jnp.asarray(False)
+    facts = {"hit": episode.hit, "outside": no, "failed": no, "seen": jnp.ones(KEYPOINTS, bool)}
+    return EnvState(Scene(episode, parameters), observation, jnp.asarray(0.0), no, no, facts)
+
+
+def stepped(whip: Whip, key: jax.Array, scene: Scene, action: Float[Array, "2"]) -> EnvState:
+    """The scene after an action (dx, dz), in m."""
+    episode, step = whip.step(key, scene.parameters, scene.episode, action)
+    facts = {name: getattr(step, name) for name in ("hit", "outside", "failed", "seen")}
+    after = scene.replace(episode=episode)
+    return EnvState(after, step.observation, step.reward, step.terminated, step.failed, facts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +104,7 @@ class WhipEnvironment:
     observations: Signals = OBSERVATIONS
     actions: Signals = ACTIONS
     steps: int = rules.STEPS
+    bounds = BOUNDS
 
     @property
     def supports(self) -> Mapping[str, Support]:
@@ -110,31 +132,12 @@ class WhipEnvironment:
     def reset(self, key: jax.Array, theta: Float[Array, "2"]) -> EnvState:
         """The DLO at rest in a scene of this length (mm) and modulus (Pa)."""
         key_scene, key_reset, key = jax.random.split(key, 3)
-        parameters = randomised(key_scene, *(theta / MILLIMETRES))
-        episode, observation = self.whip.reset(key_reset, parameters)
-        no = jnp.asarray(False)
-        return EnvState(
-            inner=Scene(episode, parameters, key),
-            observation=observation,
-            reward=jnp.asarray(0.0),
-            terminated=no,
-            truncated=no,
-            facts=_facts(episode.hit, no, no),
-        )
+        return _outlined(begun(self.whip, key_reset, randomised(key_scene, *(theta / MILLIMETRES))), key)
 
     def step(self, state: EnvState, action: Float[Array, "2"]) -> EnvState:
         """Apply an action (dx, dz), in m."""
-        scene = state.inner
-        key, key_step = jax.random.split(scene.key)
-        episode, step = self.whip.step(key_step, scene.parameters, scene.episode, action)
-        return EnvState(
-            inner=Scene(episode, scene.parameters, key),
-            observation=step.observation,
-            reward=step.reward,
-            terminated=step.terminated,
-            truncated=step.failed,
-            facts=_facts(step.hit, step.outside, step.failed),
-        )
+        key, key_step = jax.random.split(state.inner.key)
+        return _outlined(stepped(self.whip, key_step, state.inner, action), key)
 
 
 def make(detector: str = "mask", engine: str = "auto") -> WhipEnvironment:
@@ -152,6 +155,9 @@ def make(detector: str = "mask", engine: str = "auto") -> WhipEnvironment:
     return WhipEnvironment(Whip(pick(engine), DETECTORS[detector]))
 
 
-def _facts(hit: Array, outside: Array, failed: Array) -> dict[str, Array]:
-    top = hit[rules.TOP]
-    return {"hit": top, "clean_hit": top & ~jnp.any(hit[: rules.TOP]), "outside": outside, "failed": failed}
+def _outlined(state: EnvState, key: jax.Array) -> EnvState:
+    """The state with the key of what comes, and of its facts what policies are judged by."""
+    hit, outside, failed = (state.facts[name] for name in ("hit", "outside", "failed"))
+    clean = hit[rules.TOP] & ~jnp.any(hit[: rules.TOP])
+    facts = {"hit": hit[rules.TOP], "clean_hit": clean, "outside": outside, "failed": failed}
+    return state.replace(inner=state.inner.replace(key=key), facts=facts)

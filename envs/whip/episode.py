@@ -9,15 +9,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.frames import Frames
+from jaxlfi.envs.whip.observer import observation
 from jaxlfi.envs.whip.parameters import WhipParameters
 from jaxlfi.envs.whip.physics import engine as physics
 from jaxlfi.envs.whip.physics.engine import Engine, State
 from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS, ON_DLO, Detector, Tracking, begin, measured, track
-
-OBSERVATION = 28
-"""Length of an observation."""
 
 
 class Episode(struct.PyTreeNode):
@@ -122,11 +120,3 @@ class Whip:
     def _look(self, key, parameters, tracking, state):
         seen = frames(self.engine.scene, parameters, state.qpos)
         return track(key, self.detector, side_camera(parameters), tracking, seen)
-
-
-def observation(
-    gripper: Float[Array, "*batch 2"], keypoints: Float[Array, "*batch 10 2"], hit: Bool[Array, "*batch 6"]
-) -> Float[Array, "*batch 28"]:
-    """The observation of section VI-E: proprioception, keypoints and flags."""
-    flat = keypoints.reshape(*keypoints.shape[:-2], 20)
-    return jnp.concatenate([gripper, flat, hit.astype(jnp.float32)], axis=-1)

@@ -1,14 +1,43 @@
-"""Observations of the whipping task (section VI-E) from what a camera finds and the gripper measures, as on a robot.
+"""Observations of the whipping task (section VI-E): of simulations, of recordings, and of what a robot measures.
 
-Like `jaxlfi.robots`, this module needs NumPy only.
+Like `jaxlfi.robots`, this module needs NumPy only; its functions work on JAX's arrays, too.
 """
 
 import numpy as np
 
-from jaxlfi.envs.whip.rig import HIT_DISTANCE
+from jaxlfi.envs.whip.rig import HIT_DISTANCE, KEYPOINTS, ON_DLO
 
-CUBES = 4
-"""Place of the first cube's keypoint, after those of the DLO."""
+FLAGS = 2 + 2 * KEYPOINTS
+"""Place of the first flag in an observation; before it come the gripper's x and z, and the keypoints."""
+OBSERVATION = FLAGS + 6
+"""Length of an observation."""
+
+
+def observation(gripper, keypoints, hit):
+    """Proprioception, keypoints and flags.
+
+    Args:
+        gripper: its x and z, in m, shape [..., 2].
+        keypoints: four on the DLO and six cubes bottom-up, in normalised pixels, shape [..., 10, 2].
+        hit: cubes hit so far, shape [..., 6].
+
+    Returns:
+        Single precision, shape [..., 28].
+    """
+    xp = keypoints.__array_namespace__()
+    flat = keypoints.reshape(*keypoints.shape[:-2], 2 * KEYPOINTS)
+    return xp.concatenate([gripper, flat, hit.astype(xp.float32)], axis=-1)
+
+
+def moved(start, cubes):
+    """Which cubes count as hit, as their keypoints, shape [..., 6, 2], are so far from where they were at the start."""
+    return cubes.__array_namespace__().linalg.norm(cubes - start, axis=-1) > HIT_DISTANCE
+
+
+def hits_so_far(keypoints):
+    """Cubes hit in a whole trajectory of keypoints, shape [T, 10, 2], up to each time, shape [T, 6]."""
+    cubes = keypoints[:, ON_DLO:]
+    return moved(cubes[0], cubes).cumsum(axis=0) > 0
 
 
 class Observer:
@@ -31,7 +60,7 @@ class Observer:
     def __init__(self):
         """Nothing has been seen."""
         # What was never seen is taken to be in the middle of the image.
-        self.keypoints = np.full((10, 2), 0.5, np.float32)
+        self.keypoints = np.full((KEYPOINTS, 2), 0.5, np.float32)
         self.hit = np.zeros(6, bool)
         self._start = np.full((6, 2), np.nan)  # NaN is never far away
 
@@ -46,8 +75,8 @@ class Observer:
         """
         seen = np.asarray(seen, bool)
         self.keypoints = np.where(seen[:, None], np.asarray(keypoints, np.float32), self.keypoints)
-        cubes = self.keypoints[CUBES:]
-        first = seen[CUBES:] & np.isnan(self._start[:, 0])
+        cubes = self.keypoints[ON_DLO:]
+        first = seen[ON_DLO:] & np.isnan(self._start[:, 0])
         self._start[first] = cubes[first]
-        self.hit = self.hit | (np.linalg.norm(cubes - self._start, axis=-1) > HIT_DISTANCE)
-        return np.concatenate([np.asarray(gripper, np.float32), self.keypoints.ravel(), self.hit], dtype=np.float32)
+        self.hit = self.hit | moved(self._start, cubes)
+        return observation(np.asarray(gripper, np.float32), self.keypoints, self.hit)

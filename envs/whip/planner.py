@@ -190,6 +190,13 @@ def draw(
     return inside(mean + deviation * jnp.matmul(mixing, noise, precision="highest"))
 
 
+def random_walk(key: jax.Array) -> Float[Array, "16 2"]:
+    """Actions of the first distribution of a search: a random walk in the workspace."""
+    method = CrossEntropy()
+    first = init(method)
+    return draw(jax.random.normal(key, first.mean.shape), first.mean, first.deviation, method.correlation)
+
+
 def inside(actions: Float[Array, "16 2"]) -> Float[Array, "16 2"]:
     """Actions clipped to their limit, and shortened where they would move the set-point out of the workspace."""
 

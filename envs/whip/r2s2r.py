@@ -146,30 +146,21 @@ def _round_and_round(arguments: argparse.Namespace) -> list[Path]:
 
 def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
     if not (out / "curves.png").exists():  # the last of its files
-        steps = [] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)]
-        preset = ["--preset", arguments.preset, "--first-seed", str(arguments.seed)]
-        begun = _begun(out)
-        if not begun:
-            _remove_leftovers(out)
-        _command(
-            command_line.main if begun else train.main,
-            ["resume", str(out)]
-            if begun
-            else [_whip(arguments), "--domain", domain, "--out", str(out), *preset, *steps],
-            f"a policy on {domain}",
-        )
+        words = [_whip(arguments), "--domain", domain, "--out", str(out)]
+        words += ["--preset", arguments.preset, "--first-seed", str(arguments.seed)]
+        words += [] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)]
+        _begin_or_resume(train.main, words, out, f"a policy on {domain}")
     return next(out.glob("*/seed_*/policy.npz"))
 
 
-def _begun(out: Path) -> bool:
-    """Whether a stage has begun."""
-    return (out / "config.json").exists()
-
-
-def _remove_leftovers(out: Path) -> None:
-    """Remove the temporary folders of a stage that was killed while its folder was created."""
-    for left in out.parent.glob(f".{out.name}-*"):
-        shutil.rmtree(left)
+def _begin_or_resume(run: Callable[[list[str]], int], words: list[str], out: Path, what: str) -> None:
+    """A stage by a command of these words, or what is missing of it."""
+    if (out / CONFIG).exists():
+        run, words = command_line.main, ["resume", str(out)]
+    else:
+        for left in out.parent.glob(f".{out.name}-*"):  # of one that was killed while its folder was created
+            shutil.rmtree(left)
+    _command(run, words, what)
 
 
 def _whip(arguments: argparse.Namespace) -> str:
@@ -205,10 +196,7 @@ def _infer(arguments: argparse.Namespace, rollouts: Sequence[Path], out: Path) -
     if not (out / "report.html").exists():  # the last of its files
         words = ["infer", _whip(arguments), "--object", *map(str, rollouts), "--heuristic", arguments.heuristic]
         words += ["--preset", arguments.preset, "--first-seed", str(arguments.seed), "--out", str(out)]
-        begun = _begun(out)
-        if not begun:
-            _remove_leftovers(out)
-        _command(command_line.main, ["resume", str(out)] if begun else words, f"what {arguments.object} may be")
+        _begin_or_resume(command_line.main, words, out, f"what {arguments.object} may be")
         if not (out / "report.html").exists():  # it was stopped while it drew its pictures
             _command(command_line.main, ["report", str(out)], "its pictures")
     return out

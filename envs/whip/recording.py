@@ -42,10 +42,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxlfi.envs.whip.frames import COLOURS
-from jaxlfi.envs.whip.rig import CONTROL_INTERVAL
-from jaxlfi.envs.whip.rules import ACTION_LIMIT, HIT_DISTANCE, STEPS
+from jaxlfi.envs.whip.observer import hits_so_far
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, KEYPOINTS, ON_DLO
+from jaxlfi.envs.whip.rules import ACTION_LIMIT, STEPS
 from jaxlfi.envs.whip.vision.camera import Camera
-from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS, ON_DLO
 from jaxlfi.io import files as atomic
 from jaxlfi.io.formats import require_version
 
@@ -361,8 +361,7 @@ def hit_flags(recording: Recording) -> Bool[np.ndarray, "frames 6"]:
     """Cubes hit so far: as recorded, or else those whose keypoint has been further than 0.06 from its start."""
     if recording.hits is not None:
         return recording.hits
-    cubes = filled(recording)[:, ON_DLO:]
-    return np.logical_or.accumulate(np.linalg.norm(cubes - cubes[0], axis=-1) > HIT_DISTANCE, axis=0)
+    return hits_so_far(filled(recording))
 
 
 def resample(recording: Recording) -> Float[np.ndarray, "17 28"]:

@@ -12,6 +12,10 @@ HAND = (0.02, 0.015, 0.03)
 """Half the gripper's width, depth and height, in m; the DLO is held at the middle of its lower side."""
 CONTROL_INTERVAL = 0.16
 """Between two actions, in s."""
+ON_DLO = 4
+"""Number of keypoints of the DLO, which precede those of the cubes (section VI-C)."""
+KEYPOINTS = ON_DLO + 6
+"""Number of all keypoints."""
 HIT_DISTANCE = 0.06
 """Displacement of a cube's keypoint from its start above which the cube counts as hit, in normalised pixels."""
 RGBA = {

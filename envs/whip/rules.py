@@ -5,7 +5,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from jaxlfi.envs.whip.rig import HIT_DISTANCE
+from jaxlfi.envs.whip.observer import moved
 
 STEPS = 16
 """Number of control steps in an episode."""
@@ -26,7 +26,7 @@ def moved_target(target: Float[Array, "*batch 2"], action: Float[Array, "*batch 
 
 def outside(gripper: Float[Array, "*batch 2"]) -> Bool[Array, "*batch"]:
     """Whether the gripper has left its workspace, which ends the episode as a failure."""
-    return jnp.any((gripper < WORKSPACE[0]) | (gripper > WORKSPACE[1]), axis=-1)
+    return ((gripper < WORKSPACE[0]) | (gripper > WORKSPACE[1])).any(axis=-1)
 
 
 def hits(
@@ -39,7 +39,7 @@ def hits(
         start: the cubes' keypoints at the start of the episode, in normalised pixels.
         cubes: the cubes' keypoints now.
     """
-    return before | (jnp.linalg.norm(cubes - start, axis=-1) > HIT_DISTANCE)
+    return before | moved(start, cubes)
 
 
 def reward(hit: Bool[Array, "*batch 6"], out: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:

@@ -6,15 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxlfi.envs.whip import rules
-from jaxlfi.envs.whip.episode import observation
 from jaxlfi.envs.whip.frames import Frames
+from jaxlfi.envs.whip.observer import hits_so_far, observation
 from jaxlfi.envs.whip.parameters import WhipParameters
 from jaxlfi.envs.whip.physics import engine as physics
 from jaxlfi.envs.whip.physics.engine import Engine
 from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.vision.camera import Camera
-from jaxlfi.envs.whip.vision.keypoints import ON_DLO, Detector, detect, measured
+from jaxlfi.envs.whip.vision.keypoints import Detector, detect, measured
 
 
 def seen(engine: Engine, parameters: WhipParameters, actions: Float[Array, "time 2"]) -> tuple[Frames, Bool[Array, ""]]:
@@ -33,14 +32,7 @@ def seen(engine: Engine, parameters: WhipParameters, actions: Float[Array, "time
 
 def states_of(gripper: Float[Array, "time 2"], keypoints: Float[Array, "time 10 2"]) -> Float[Array, "time 28"]:
     """Observations of a trajectory, with the flags of the cubes that have been hit so far."""
-    cubes = keypoints[:, ON_DLO:]
-
-    def step(before, now):
-        hit = rules.hits(before, cubes[0], now)
-        return hit, hit
-
-    _, hit = jax.lax.scan(step, jnp.zeros(cubes.shape[1], bool), cubes)
-    return observation(gripper, keypoints, hit)
+    return observation(gripper, keypoints, hits_so_far(keypoints))
 
 
 def trajectory(

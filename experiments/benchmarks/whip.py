@@ -47,7 +47,7 @@ from jaxlfi.envs.whip.physics.engines import NAMES, pick
 from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.physics.native import NativeEngine
 from jaxlfi.envs.whip.physics.scene import CUBES, Scene
-from jaxlfi.envs.whip.rig import START
+from jaxlfi.envs.whip.rig import HIT_DISTANCE, START
 from jaxlfi.io import files as atomic
 from jaxlfi.io.provenance import command_line, environment
 
@@ -212,7 +212,7 @@ def knocked(states: State) -> np.ndarray:
     """Which cubes have moved by more than the distance of a hit in the plane of the picture, shape [..., 6]."""
     cubes = np.asarray(states.qpos)[..., SCENE.first_cube :].reshape(*states.qpos.shape[:-1], CUBES, 7)[..., [0, 2]]
     moved = np.linalg.norm(cubes - cubes[..., :1, :, :], axis=-1)
-    return (moved > 0.6 * rules.HIT_DISTANCE).any(axis=-2)  # the picture is 0.6 m wide there
+    return (moved > 0.6 * HIT_DISTANCE).any(axis=-2)  # the picture is 0.6 m wide there
 
 
 def agreement() -> dict[str, dict[str, float]]:

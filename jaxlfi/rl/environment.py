@@ -83,7 +83,8 @@ class Environment(Protocol):
     """An environment of unknown parameters: pure, for one episode, batched by `vmap`.
 
     One whose actions displace the set-points of a robot may have an attribute `deployment` besides
-    (`jaxlfi.rl.deployment.Deployment`), which its policies then carry.
+    (`jaxlfi.rl.deployment.Deployment`), which its policies then carry; one whose observations are bounded, an attribute
+    `bounds`, the least and the largest ones [2, O], for learners that ask for them (`jaxlfi.rl.gym`).
 
     Attributes:
         name: of the environment.

@@ -30,7 +30,8 @@ class Outcomes(struct.PyTreeNode):
     facts: dict[str, Array]
 
 
-Layers = tuple[Sequence[Array], Sequence[Array], tuple[tuple[Array, Array], tuple[Array, Array]]]
+Numbers = Array | np.ndarray
+Layers = tuple[Sequence[Numbers], Sequence[Numbers], tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers]]]
 """Weights, biases and scaling of a policy (`jaxlfi.rl.policy.Policy`); of several, each with a leading axis."""
 
 

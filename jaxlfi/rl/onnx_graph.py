@@ -1,7 +1,9 @@
 """Policies as ONNX: a graph of eight kinds of operations, for the runtimes that robots have."""
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,21 +46,26 @@ def graph(policy: Policy) -> onnx.ModelProto:
     nodes[-1].output[0] = "action"
 
     signal = lambda name, size: helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
-    made = helper.make_model(
-        helper.make_graph(
-            nodes,
-            "policy",
-            [signal("observation", len(policy.observed["names"]))],
-            [signal("action", len(policy.acted["names"]))],
-            constants,
-        ),
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
-        producer_name="jaxlfi",
-    )
-    helper.set_model_props(made, {"schema": json.dumps(dict(policy.schema))})
-    onnx.checker.check_model(made, full_check=True)
-    return made
+    given = signal("observation", len(policy.observed["names"]))
+    made = signal("action", len(policy.acted["names"]))
+    return finished("policy", nodes, constants, given, made, policy.schema)
+
+
+def finished(
+    name: str,
+    nodes: Sequence[onnx.NodeProto],
+    constants: Sequence[TensorProto],
+    given: onnx.ValueInfoProto,
+    made: onnx.ValueInfoProto,
+    schema: Mapping[str, Any],
+) -> onnx.ModelProto:
+    """A graph from one input to one output that is sound, with a schema in its `metadata_props`."""
+    graph = helper.make_graph(nodes, name, [given], [made], constants)
+    opset = helper.make_opsetid("", OPSET)
+    model = helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="jaxlfi")
+    helper.set_model_props(model, {"schema": json.dumps(dict(schema))})
+    onnx.checker.check_model(model, full_check=True)
+    return model
 
 
 def save(policy: Policy, path: str | Path) -> None:

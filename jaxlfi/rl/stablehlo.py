@@ -5,7 +5,7 @@ The file is an .npz without pickles: `program`, what `jax.export` serialised, as
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from jax import export
 from jaxtyping import Array, Float
 
 from jaxlfi.io import files
+from jaxlfi.rl.evaluation import acting
 from jaxlfi.rl.policy import Policy, read
 
 try:
@@ -50,8 +51,15 @@ def save(policy: Policy, path: str | Path) -> None:
     """Write a policy's program for any batch size."""
     size = len(policy.observed["names"])
     rows = jax.ShapeDtypeStruct((export.symbolic_shape("batch")[0], size), jnp.float32)
-    program = export.export(jax.jit(lambda observation: _act(policy, observation)), platforms=PLATFORMS)(rows)
-    schema = {"format": FORMAT, "version": VERSION, **policy.schema}
+    single = lambda arrays: [np.asarray(array, np.float32) for array in arrays]
+    act = acting((single(policy.weights), single(policy.biases), policy.scaling))
+    with jax.default_matmul_precision("highest"):  # accelerators otherwise multiply matrices with 10 bits
+        write(path, act, rows, {"format": FORMAT, "version": VERSION, **policy.schema})
+
+
+def write(path: str | Path, function: Callable, given: jax.ShapeDtypeStruct, schema: Mapping[str, Any]) -> None:
+    """Write a function of one array as a program for all platforms, with its schema."""
+    program = export.export(jax.jit(function), platforms=PLATFORMS)(given)
     arrays = {"schema": np.asarray(json.dumps(schema)), "program": np.frombuffer(program.serialize(), np.uint8)}
     files.write_arrays(Path(path), arrays, compress=False, durable=True)
 
@@ -67,14 +75,3 @@ def load(path: str | Path) -> Program:
         return Program(export.deserialize(bytearray(arrays["program"].tobytes())), schema)
     except Exception as error:  # flatbuffers has many for bytes that are none of its own
         raise ValueError(f"{path}: expected a program of jax.export, got {type(error).__name__}: {error}") from error
-
-
-def _act(policy: Policy, observation: Float[Array, "batch obs"]) -> Float[Array, "batch act"]:
-    scaling = lambda signals, name: jnp.asarray(signals[name], jnp.float32)
-    # Highest precision, as accelerators otherwise multiply matrices with 10 bits.
-    product = lambda layer, weight: jnp.matmul(layer, jnp.asarray(weight, jnp.float32), precision="highest")
-    layer = (observation - scaling(policy.observed, "centre")) / scaling(policy.observed, "scale")
-    for weight, bias in zip(policy.weights[:-1], policy.biases[:-1], strict=True):
-        layer = jnp.tanh(product(layer, weight) + jnp.asarray(bias, jnp.float32))
-    action = jnp.clip(product(layer, policy.weights[-1]) + jnp.asarray(policy.biases[-1], jnp.float32), -1.0, 1.0)
-    return action * scaling(policy.acted, "scale") + scaling(policy.acted, "centre")

@@ -5,6 +5,7 @@ DOMAIN/seed_000/events.out.tfevents...      scalars of one training against envi
 tensorboardX, which Brax brings, writes them; TensorBoard itself is not needed before they are looked at.
 """
 
+import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ TAGS = {"value": "return", "episodes": "count"}
 """What arrays of the learning curves are called there, where that is clearer."""
 
 
-class Scalars:
+class Scalars(contextlib.AbstractContextManager):
     """Writes the learning curves of trainings side by side while they grow; a context manager.
 
     The first call writes all updates so far and replaces what an earlier process wrote, which may end anywhere: a
@@ -44,10 +45,6 @@ class Scalars:
         self._folders = [out / domain / f"seed_{seed:03d}" for domain, seed in names]
         self._writers: list = []
         self._done = 0
-
-    def __enter__(self) -> "Scalars":
-        """As it is."""
-        return self
 
     def __exit__(self, *error) -> None:
         """Close the files."""

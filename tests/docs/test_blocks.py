@@ -72,6 +72,7 @@ FRAGMENTS = {
     "from mpi4py": "needs MPI",
     "from robot_driver": "serves until it is ended: tests/robots",
     'policy.load("runs/': "needs a trained policy: tests/rl/test_policy.py",
+    "gymnasium.make": "needs a table of policies, and compiles: tests/rl/test_gym.py",
     "WhipVector": "minutes of compiling: tests/envs/whip/test_gym.py",
     "from_brax": "minutes of compiling: tests/rl/test_from_brax.py",
     "export.deserialize": "needs an exported segmenter: tests/envs/whip/vision",

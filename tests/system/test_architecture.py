@@ -301,7 +301,7 @@ def test_who_may_import_which_library(path):
     allowed = {
         "matplotlib": ("jaxlfi.figures", f"{ENVS}.whip.figures", f"{ENVS}.mujoco.figures", "experiments"),
         "mujoco": (f"{ENVS}.whip", f"{ENVS}.mujoco", f"{ENVS}.opengl", "experiments"),
-        "gymnasium": (f"{ENVS}.whip", "experiments"),
+        "gymnasium": ("jaxlfi.rl.gym", "experiments"),
         "stable_baselines3": ("experiments",),
         "brax": ("jaxlfi.rl",),
         "onnx": ("jaxlfi.rl", f"{ENVS}.whip.vision.export"),

@@ -34,7 +34,7 @@ def edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
 
 def dlo_edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
     """The fields of the DLO that depend on parameters."""
-    chain, at = scene.chain, _indices(scene)
+    chain, at = scene.chain, indices(scene)
     bodies, geoms, joints = at.links, at.link_geoms, at.joints
     lengths = chain.fractions * parameters.length
     along, across = link_inertias(lengths, parameters.density)
@@ -54,7 +54,7 @@ def dlo_edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]
 def cube_edits(scene: Scene, parameters: WhipParameters, xp=np) -> Iterator[Edit]:
     """The fields of the cubes that depend on parameters."""
     side, density = parameters.cube_side, parameters.cube_density
-    at = _indices(scene)
+    at = indices(scene)
     bodies, geoms, places = at.cubes, at.cube_geoms, at.cube_places
     positions = cube_positions(parameters, xp)
     yield "body_pos", bodies, positions
@@ -88,7 +88,7 @@ class _Indices:
 
 
 @functools.lru_cache(maxsize=8)
-def _indices(scene: Scene) -> _Indices:
+def indices(scene: Scene) -> _Indices:
     """Looked up once, as names cost more than the edits."""
     model, chain = base_model(scene), scene.chain
     joints = np.array([model.joint(f"joint{i}").id for i in range(1, chain.links)])

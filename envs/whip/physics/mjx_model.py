@@ -9,8 +9,8 @@ from mujoco import mjx
 
 from jaxlfi.envs.whip.parameters import WhipParameters
 from jaxlfi.envs.whip.physics.chain import link_inertias, link_masses
-from jaxlfi.envs.whip.physics.edits import edits
-from jaxlfi.envs.whip.physics.scene import CUBES, Scene, base_model, cube_names, link_names
+from jaxlfi.envs.whip.physics.edits import edits, indices
+from jaxlfi.envs.whip.physics.scene import CUBES, Scene, base_model
 
 
 def apply_parameters(scene: Scene, model: mjx.Model, parameters: WhipParameters) -> mjx.Model:
@@ -45,7 +45,7 @@ def derived(scene: Scene, parameters: WhipParameters):
     compiled, chain = base_model(scene), scene.chain
     body = lambda name: compiled.body(name).id
     held = np.array([body("gripper"), body("grip"), body("link0")])
-    links = np.array([body(name) for name in link_names(chain)[1:]])
+    links = indices(scene).links[1:]
     hand = compiled.body_mass[held[:2]].sum()
 
     lengths = chain.fractions * parameters.length
@@ -81,7 +81,7 @@ def derived(scene: Scene, parameters: WhipParameters):
 
 def _of_cubes(scene: Scene, parameters: WhipParameters, total):
     compiled = base_model(scene)
-    cubes = np.array([compiled.body(name).id for name in cube_names()])
+    cubes = indices(scene).cubes
     places = np.arange(compiled.nv - 6 * CUBES, compiled.nv).reshape(CUBES, 6)
     side, mass = parameters.cube_side, parameters.cube_density * parameters.cube_side**3
     inertia = mass * side**2 / 6

@@ -7,8 +7,8 @@ the gripper or the DLO comes near them in an interval, that interval is simulate
 import dataclasses
 import functools
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -129,9 +129,9 @@ class _ModelCache:
     """The models of one kind that were built last, and the memory that threads simulate them in."""
 
     def __init__(self, scene: Scene, base: mujoco.MjModel, make: Callable, rollout, threads: int):
-        self._scene, self._base, self._make, self._rollout = scene, base, make, rollout
+        self._scene, self._base, self._rollout = scene, base, rollout
         self._data = [mujoco.MjData(base) for _ in range(threads)]
-        self._models: OrderedDict[tuple, mujoco.MjModel] = OrderedDict()
+        self._model = functools.lru_cache(CACHED_MODELS)(lambda parameters: make(scene, parameters, self._data[0]))
 
     def roll(self, parameters: Sequence[WhipParameters], qpos, qvel, control):
         """Simulate one control interval of each scene.
@@ -141,7 +141,7 @@ class _ModelCache:
         """
         if not parameters:
             return (qpos, qvel), np.zeros(0, bool), np.zeros((0, self._scene.substeps, self._base.nsensor, 3))
-        models = [self._model(scene) for scene in parameters]
+        models = [self._model(_hashable(scene)) for scene in parameters]
         start = np.concatenate([np.zeros((len(models), 1)), qpos, qvel], axis=1)
         with quietly():
             states, points = self._rollout.rollout(models, self._data, start, control)
@@ -153,15 +153,13 @@ class _ModelCache:
         points = points.reshape(*points.shape[:2], -1, 3)
         return np.split(after, [qpos.shape[1]], axis=1), failed, points
 
-    def _model(self, parameters: WhipParameters) -> mujoco.MjModel:
-        """The model of a scene; the least recently used one is dropped first."""
-        key = tuple(leaf.tobytes() for leaf in jax.tree.leaves(parameters))
-        if key not in self._models:
-            self._models[key] = self._make(self._scene, jax.tree.map(np.float64, parameters), self._data[0])
-            if len(self._models) > CACHED_MODELS:
-                self._models.popitem(last=False)
-        self._models.move_to_end(key)
-        return self._models[key]
+
+def _hashable(parameters: WhipParameters) -> WhipParameters:
+    """The same in Python's numbers."""
+    plain: dict[str, Any] = {
+        name: tuple(leaf.tolist()) if leaf.ndim else leaf.item() for name, leaf in vars(parameters).items()
+    }
+    return WhipParameters(**plain)
 
 
 @dataclasses.dataclass

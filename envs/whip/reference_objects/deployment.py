@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxlfi.envs.whip import rules
-from jaxlfi.envs.whip.control import FLAGS, LOOP, is_over, recording_of
+from jaxlfi.envs.whip.control import LOOP, is_over, recording_of
 from jaxlfi.envs.whip.frames import Frames
+from jaxlfi.envs.whip.observer import FLAGS
 from jaxlfi.envs.whip.parameters import HIGHEST, LOWEST
 from jaxlfi.envs.whip.recording import Recording
 from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject

@@ -1,7 +1,7 @@
 """Detectors: from a picture to ten keypoints and which of them were seen, by name."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -141,35 +141,25 @@ def _transported(module: Transporter, params: Any, labels: Array) -> Found:
     return jnp.where(seen[:, None], jnp.concatenate([dlo, cubes]), jnp.nan), seen
 
 
-def _learnt() -> Learnt:
-    return Learnt(weights.load(weights.SHIPPED["segmenter"], "segmenter"))
-
-
-def _learnt_transporter() -> Learnt:
-    return Learnt(*(weights.load(weights.SHIPPED[name], name) for name in ("segmenter", "transporter")))
-
-
-DETECTORS: Mapping[str, Callable[[], KeypointDetector]] = {
-    "centreline": Centreline,
-    "learnt": _learnt,
-    "learnt-transporter": _learnt_transporter,
+NETWORKS: Mapping[str, tuple[str, ...]] = {
+    "centreline": (),
+    "learnt": ("segmenter",),
+    "learnt-transporter": ("segmenter", "transporter"),
 }
-"""Detectors by name."""
+"""Detectors by name, and the networks that they need."""
 
 
 def pick(name: str, folder: Path | None = None) -> KeypointDetector:
     """A detector by its name, with the weights that come with the package, or those of a folder.
 
     Args:
-        name: in `DETECTORS`.
+        name: in `NETWORKS`.
         folder: that `jaxlfi whip train-vision` made.
 
     Raises:
         ValueError: for an unknown name, and weights that are missing or damaged.
     """
-    if name not in DETECTORS:
-        raise ValueError(f"detector: expected one of {', '.join(DETECTORS)}, got {name!r}")
-    if folder is None or name == "centreline":
-        return DETECTORS[name]()
-    kinds = ("segmenter", "transporter") if name == "learnt-transporter" else ("segmenter",)
-    return Learnt(*(weights.load(folder / f"{kind}.npz", kind) for kind in kinds))
+    if name not in NETWORKS:
+        raise ValueError(f"detector: expected one of {', '.join(NETWORKS)}, got {name!r}")
+    paths = {kind: weights.SHIPPED[kind] if folder is None else folder / f"{kind}.npz" for kind in NETWORKS[name]}
+    return Learnt(*(weights.load(path, kind) for kind, path in paths.items())) if paths else Centreline()

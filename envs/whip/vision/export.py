@@ -1,6 +1,5 @@
 """The segmenter for computers that do not run JAX, or not Python: as ONNX, and as StableHLO."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,6 @@ from jaxlfi.envs.whip.vision.weights import Weights
 from jaxlfi.io import files
 
 FORMAT, VERSION = "jaxlfi-whip-segmenter", 1
-PLATFORMS = ("cpu", "cuda", "tpu")
-OPSET, IR_VERSION = 17, 8
-"""Of 2022, so that older runtimes read the file, too."""
 
 
 def schema(weights: Weights) -> dict[str, Any]:
@@ -36,17 +32,10 @@ def save_stablehlo(weights: Weights, path: Path) -> None:
     Raises:
         ImportError: without the extra `stablehlo`.
     """
-    try:
-        import flatbuffers  # noqa: F401
-    except ImportError as error:
-        raise ImportError("a StableHLO file needs the package flatbuffers: pip install 'jaxlfi[stablehlo]'") from error
-    from jax import export
+    from jaxlfi.rl import stablehlo
 
-    program = jax.jit(lambda picture: segment(weights.module, weights.params, picture))
-    picture = jax.ShapeDtypeStruct((SIZE, SIZE, 3), jnp.uint8)
-    content = export.export(program, platforms=PLATFORMS)(picture).serialize()
-    arrays = {"schema": np.asarray(json.dumps(schema(weights))), "program": np.frombuffer(content, np.uint8)}
-    files.write_arrays(path, arrays, compress=False, durable=True)
+    program = lambda picture: segment(weights.module, weights.params, picture)
+    stablehlo.write(path, program, jax.ShapeDtypeStruct((SIZE, SIZE, 3), jnp.uint8), schema(weights))
 
 
 def save_onnx(weights: Weights, path: Path) -> None:
@@ -60,11 +49,7 @@ def save_onnx(weights: Weights, path: Path) -> None:
 
 def graph(weights: Weights, size: int = SIZE):
     """The segmenter as an `onnx.ModelProto`, for pictures of some size, a multiple of 16."""
-    try:
-        import onnx
-        from onnx import TensorProto, helper, numpy_helper
-    except ImportError as error:
-        raise ImportError("an ONNX file needs the package onnx: pip install 'jaxlfi[onnx]'") from error
+    from jaxlfi.rl.onnx_graph import TensorProto, finished, helper, numpy_helper
 
     params = jax.device_get(weights.params)["params"]
     nodes, constants = [], []
@@ -113,18 +98,6 @@ def graph(weights: Weights, size: int = SIZE):
     x = apply("Squeeze", apply("ArgMax", x, axis=1, keepdims=0), constant([0], np.int64))
     nodes[-1].output[0] = "labels"
 
-    made = helper.make_model(
-        helper.make_graph(
-            nodes,
-            "segmenter",
-            [helper.make_tensor_value_info("picture", TensorProto.UINT8, [size, size, 3])],
-            [helper.make_tensor_value_info("labels", TensorProto.INT64, [size, size])],
-            constants,
-        ),
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
-        producer_name="jaxlfi",
-    )
-    helper.set_model_props(made, {"schema": json.dumps(schema(weights))})
-    onnx.checker.check_model(made, full_check=True)
-    return made
+    given = helper.make_tensor_value_info("picture", TensorProto.UINT8, [size, size, 3])
+    made = helper.make_tensor_value_info("labels", TensorProto.INT64, [size, size])
+    return finished("segmenter", nodes, constants, given, made, schema(weights))

@@ -3,6 +3,7 @@
 It needs EGL or OSMesa, libraries of the system.
 """
 
+import contextlib
 import itertools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -49,7 +50,7 @@ XML = f"""
 </mujoco>"""
 
 
-class MuJoCoRenderer:
+class MuJoCoRenderer(contextlib.AbstractContextManager):
     """MuJoCo's renderer with its context of OpenGL, which is slow to make and is kept; use it in `with`, or close it.
 
     It can be used by several threads: what it draws, it draws in one of its own, as contexts are a thread's.
@@ -67,10 +68,6 @@ class MuJoCoRenderer:
         self.size = size
         self._thread = ThreadPoolExecutor(1)
         self._stage = self._thread.submit(_Stage, size).result()
-
-    def __enter__(self) -> "MuJoCoRenderer":
-        """Itself."""
-        return self
 
     def __exit__(self, *_) -> None:
         """Close it."""

@@ -9,12 +9,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.envs.whip.frames import Frames
+from jaxlfi.envs.whip.rig import KEYPOINTS, ON_DLO
 from jaxlfi.envs.whip.vision.camera import Camera, project
-
-ON_DLO = 4
-"""Number of keypoints of the DLO, which precede those of the cubes (section VI-C)."""
-KEYPOINTS = ON_DLO + 6
-"""Number of all keypoints."""
 
 
 class Detector(struct.PyTreeNode):

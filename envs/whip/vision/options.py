@@ -45,10 +45,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     pictures.add_argument(
         "--sharp", action="store_true", help="without blur and noise: for train-vision, which adds them anew each time"
     )
-    pictures.add_argument(
-        "--seed", type=flags.seed, default=0, metavar="N", help="of everything that is random (default: 0)"
-    )
-    pictures.add_argument("--out", type=flags.output, required=True, metavar="DIR", help="a new folder")
+    add_seed(pictures, "of everything that is random (default: 0)")
+    add_out(pictures, "DIR", "a new folder")
 
     imported = commands.add_parser(
         "import-pictures",
@@ -70,7 +68,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar="THEIRS=OURS",
         help="what their classes are called here: rope=dlo; background for those that are to be ignored",
     )
-    imported.add_argument("--out", type=flags.output, required=True, metavar="DIR", help="a new folder")
+    add_out(imported, "DIR", "a new folder")
 
     train = commands.add_parser(
         "train-vision",
@@ -97,12 +95,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="data sets that the segmenter learns from, one's own among them (default: sharp raycast ones are made)",
     )
     train.add_argument("--steps", type=int, metavar="N", help="of each training (default: the preset's)")
-    train.add_argument(
-        "--seed", type=flags.seed, default=0, metavar="N", help="of everything that is random (default: 0)"
-    )
-    train.add_argument(
-        "--out", type=flags.output, required=True, metavar="DIR", help="a new folder, or one to go on with"
-    )
+    add_seed(train, "of everything that is random (default: 0)")
+    add_out(train, "DIR", "a new folder, or one to go on with")
 
     export = commands.add_parser(
         "export-vision",
@@ -115,9 +109,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     export.add_argument(
         "--weights", type=Path, metavar="DIR", help="by train-vision (default: those that come with the package)"
     )
-    export.add_argument(
-        "--out", type=flags.output, required=True, metavar="FILE", help="a new .onnx, or .npz of StableHLO"
-    )
+    add_out(export, "FILE", "a new .onnx, or .npz of StableHLO")
 
     record = commands.add_parser(
         "record",
@@ -130,14 +122,18 @@ def add(commands: argparse._SubParsersAction) -> None:
     record.add_argument(
         "--actions", metavar="FILE", help='an .npz with an array "actions" [16, 2] in m (default: exploratory actions)'
     )
-    record.add_argument("--seed", type=flags.seed, default=0, metavar="N", help="of the camera and the scene's look")
-    record.add_argument(
-        "--out",
-        type=flags.output,
-        required=True,
-        metavar="FILE",
-        help="the recording, a new .npz; its description is written beside it as .json",
-    )
+    add_seed(record, "of the camera and the scene's look")
+    add_out(record, "FILE", "the recording, a new .npz; its description is written beside it as .json")
+
+
+def add_out(command: argparse.ArgumentParser, metavar: str, help: str) -> None:
+    """The option that says where results are written to."""
+    command.add_argument("--out", type=flags.output, required=True, metavar=metavar, help=help)
+
+
+def add_seed(command: argparse.ArgumentParser, help: str) -> None:
+    """The option of a seed."""
+    command.add_argument("--seed", type=flags.seed, default=0, metavar="N", help=help)
 
 
 def add_detector(command: argparse.ArgumentParser) -> None:

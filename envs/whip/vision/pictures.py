@@ -112,11 +112,7 @@ def read(folder: Path) -> Pictures:
         PicturesError: for a folder without one, of another version, or whose files are missing or damaged, naming the
             first of them.
     """
-    header = _header(folder)
-    if header["count"] is None:
-        raise PicturesError(
-            f"{folder}: expected a whole data set, got one that was interrupted: give its command again"
-        )
+    header = check(folder)
     try:
         lines = (folder / INDEX).read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:

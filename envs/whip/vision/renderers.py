@@ -1,5 +1,6 @@
 """Renderers: from a frame and a look to a picture and its labels, by name."""
 
+import contextlib
 import functools
 from collections.abc import Callable, Mapping
 from typing import Protocol
@@ -30,7 +31,7 @@ class Renderer(Protocol):
         """Close it."""
 
 
-class RayCaster:
+class RayCaster(contextlib.AbstractContextManager):
     """The renderer of `shading`: there is always one.
 
     Attributes:
@@ -40,10 +41,6 @@ class RayCaster:
     def __init__(self, size: int = 256):
         """Nothing is compiled yet."""
         self.size = size
-
-    def __enter__(self) -> "RayCaster":
-        """Itself."""
-        return self
 
     def __exit__(self, *_) -> None:
         """Nothing is held."""

@@ -50,9 +50,7 @@ def random_scene(key: jax.Array) -> WhipParameters:
 def random_actions(key: jax.Array) -> Float[Array, "16 2"]:
     """Actions of random policies: half of the time a random walk in the workspace, else whips in a random order."""
     key_kind, key_walk, key_order = jax.random.split(key, 3)
-    method = planner.CrossEntropy()
-    first = planner.init(method)
-    walk = planner.draw(jax.random.normal(key_walk, first.mean.shape), first.mean, first.deviation, method.correlation)
+    walk = planner.random_walk(key_walk)
     whips = jnp.asarray(exploratory_actions())
     whips = planner.inside(jnp.concatenate([whips[:2], jax.random.permutation(key_order, whips[2:])]))
     return jnp.where(jax.random.bernoulli(key_kind), walk, whips)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy import ndimage
 
 from jaxlfi.envs.whip.vision.masks import MIN_COUNT
 from jaxlfi.envs.whip.vision.pictures import LABELS
@@ -27,14 +28,11 @@ def overlaps(true: Int[np.ndarray, "n size size"], found: Int[np.ndarray, "n siz
 
 def centroids(labels: Int[np.ndarray, "n size size"]) -> Float[np.ndarray, "n 6 2"]:
     """Centroids of the cubes, in pixels; NaN for those of which there are too few pixels to count as seen."""
-    rows, columns = np.indices(labels.shape[1:])
     out = np.full((len(labels), DLO - 1, 2), np.nan)
-    for cube in range(1, DLO):
-        mask = labels == cube
-        count = mask.sum(axis=(1, 2))
-        seen = count >= MIN_COUNT
-        sums = np.stack([(mask * columns).sum(axis=(1, 2)), (mask * rows).sum(axis=(1, 2))], axis=-1)
-        out[seen, cube - 1] = sums[seen] / count[seen, None]
+    for places, picture in zip(out, labels, strict=True):
+        seen = np.flatnonzero(np.bincount(picture.ravel(), minlength=DLO)[1:DLO] >= MIN_COUNT)
+        middles = ndimage.center_of_mass(picture > 0, picture, 1 + seen)
+        places[seen] = np.reshape(middles, (-1, 2))[:, ::-1]
     return out
 
 

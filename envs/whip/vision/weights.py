@@ -54,13 +54,10 @@ def initial(module: Segmenter | Transporter, key: jax.Array) -> Any:
 def save(path: Path, weights: Weights) -> None:
     """Write weights, in place of what is there."""
     kind = next(name for name, module in MODULES.items() if isinstance(weights.module, module))
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "kind": kind,
-        "module": _settings(weights.module),
-        "about": dict(weights.about),
-    }
+    own = [field.name for field in dataclasses.fields(weights.module) if field.name not in ("parent", "name")]
+    settings = {name: getattr(weights.module, name) for name in own}
+    about = {"module": settings, "about": dict(weights.about)}
+    header = {"format": FORMAT, "version": VERSION, "kind": kind, **about}
     arrays = trees.to_arrays(weights.params)
     files.write_arrays(path, {_HEADER: np.asarray(json.dumps(header))} | arrays)
 
@@ -102,11 +99,3 @@ def load(path: Path, kind: str) -> Weights:
     if not all(np.isfinite(array).all() for array in arrays.values()):
         raise WeightsError(f"{path}: expected finite weights, got others")
     return Weights(module, params, header["about"])
-
-
-def _settings(module: Segmenter | Transporter) -> dict[str, Any]:
-    return {
-        field.name: getattr(module, field.name)
-        for field in dataclasses.fields(module)
-        if field.name not in ("parent", "name")
-    }

@@ -1,6 +1,7 @@
 """Environments of MuJoCo models, against MuJoCo's own steps of a model that was edited by hand."""
 
 import tomllib
+import warnings
 
 import numpy as np
 import pytest
@@ -169,6 +170,33 @@ def test_it_is_an_environment(arm):
 
 
 PLAIN = Goal(("angle",), INTERVAL, 0.1, {"angle": (0.4, 1.0)}, limits={"motor": (-1.0, 1.0)})
+
+
+@pytest.mark.slow
+def test_it_is_one_of_gymnasium_and_of_brax(arm):
+    """By the adapters of any environment; to Brax, the control of 2 at the end of its range is an action of 1."""
+    pytest.importorskip("gymnasium")
+    from gymnasium.utils.env_checker import check_env
+
+    from jaxlfi.rl.gym import GymEnvironment, GymVector
+    from jaxlfi.rl.to_brax import ToBrax
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*(infinity|render|normalized)")
+        check_env(GymEnvironment(arm, THETA[0]))
+    many = GymVector(3, arm, THETA, "SameStep")
+    _, info = many.reset(seed=0)
+    np.testing.assert_allclose(np.stack([info[name] for name in arm.space.names], axis=1), THETA)
+    over = [many.step(np.tile(ACTIONS[0], (3, 1)))[3].tolist() for _ in range(arm.steps)]
+    assert over == [[False] * 3] * (arm.steps - 1) + [[True] * 3]
+    brax = ToBrax(arm, THETA[0])
+    state = jax.jit(brax.step)(jax.jit(brax.reset)(jax.random.key(0)), jnp.ones(1))
+    single = GymEnvironment(arm, THETA[0])
+    single.reset(seed=0)
+    own, reward, *_ = single.step([2.0])
+    np.testing.assert_allclose(state.obs, arm.observations.to_unit(own), atol=1e-5)
+    np.testing.assert_allclose(state.reward, reward, rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -12,7 +12,8 @@ mujoco = pytest.importorskip("mujoco")
 
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip import trajectory as rollout
-from jaxlfi.envs.whip.episode import OBSERVATION, Whip
+from jaxlfi.envs.whip.episode import Whip
+from jaxlfi.envs.whip.observer import OBSERVATION
 from jaxlfi.envs.whip.parameters import median, randomised
 from jaxlfi.envs.whip.physics.engine import settled
 from jaxlfi.envs.whip.physics.kinematics import initial_positions

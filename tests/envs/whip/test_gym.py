@@ -1,7 +1,5 @@
 """The gymnasium environment of the whipping task: its checker, its episodes, and a vector against single ones."""
 
-import importlib.util
-import sys
 import warnings
 
 import jax
@@ -14,14 +12,11 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from jaxlfi.envs.whip import gym
 from jaxlfi.envs.whip.gym import WhipGym, WhipVector, initial_domain
 from jaxlfi.envs.whip.parameters import INITIAL, check, median
-from jaxlfi.envs.whip.physics.native import NativeEngine
-
-ENGINE = NativeEngine(threads=1)
-WHIP = np.array([[-0.06, 0.0]] * 2 + [[0.06, 0.0]] * 4 + [[0.0, 0.0]] * 10, np.float32)
-"""Back and forth: mu's DLO hits the top cube only, with the seventh."""
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS
+from tests.golden import make_whip_gym as golden
+from tests.golden.make_whip_gym import ENGINE, WHIP
 
 
 def play(environment, actions, seed=0):
@@ -235,8 +230,23 @@ def test_gymnasium_finds_both_by_name():
         WhipVector(0, engine=ENGINE)
 
 
-def test_without_gymnasium_it_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gymnasium", None)
-    spec = importlib.util.spec_from_file_location("whip_gym_without", gym.__file__)
-    with pytest.raises(ImportError, match=r"needs gymnasium: pip install 'jaxlfi\[whip\]'"):
-        spec.loader.exec_module(importlib.util.module_from_spec(spec))
+def same_numbers(found, name):
+    """Within what another processor rounds otherwise; moduli are in Pa."""
+    np.testing.assert_allclose(found, np.load(golden.PATH)[name], rtol=1e-5, atol=1e-3)
+
+
+def test_numbers_are_those_of_the_first_adapter():
+    same_numbers(golden.fixed(), "fixed")
+    same_numbers(golden.drawn(), "drawn")
+
+
+@pytest.mark.slow
+def test_those_of_vectors_too():
+    same_numbers(golden.in_the_next_step(), "next")
+    for found, name in zip(golden.in_the_same_step(), ("same", "final"), strict=True):
+        same_numbers(found, name)
+
+
+def test_a_detectors_numbers_may_be_arrays():
+    own = DETECTORS["learnt-transporter"].replace(noise=np.float32(0.01), places=np.array([0.1, 0.4, 0.7, 0.9]))
+    assert WhipGym(engine=ENGINE, detector=own)._course.environment.whip.detector.places == (0.1, 0.4, 0.7, 0.9)

@@ -250,11 +250,11 @@ def test_the_page_says_all_of_it(tmp_path, monkeypatch):
     assert "sheet.png" not in text
 
 
-def test_what_a_kill_left_of_the_making_of_a_stage_goes(tmp_path):
+def test_what_a_kill_left_of_the_making_of_a_stage_goes(stages, tmp_path):
     for name in (".policy-x1", ".policy_0-x2", "policy"):
         (tmp_path / name).mkdir()
-    assert not r2s2r._begun(tmp_path / "policy")
-    r2s2r._remove_leftovers(tmp_path / "policy")
+    out = tmp_path / "policy"
+    for _ in range(2):
+        r2s2r._begin_or_resume(r2s2r.train.main, ["whip", "--out", str(out)], out, "a policy")
     assert sorted(path.name for path in tmp_path.iterdir()) == [".policy_0-x2", "policy"]
-    (tmp_path / "policy" / "config.json").write_text("{}")
-    assert r2s2r._begun(tmp_path / "policy")
+    assert stages[0] == [["train", "whip", "--out", str(out)], ["infer or resume", "resume", str(out)]]

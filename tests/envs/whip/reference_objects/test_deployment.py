@@ -18,7 +18,7 @@ from jaxlfi.envs.whip.recording import trajectory
 from jaxlfi.envs.whip.reference_objects import deployment, objects, repetitions, robot
 from jaxlfi.envs.whip.reference_objects.scene import PLACE
 from jaxlfi.envs.whip.reference_objects.simulation import UnstableError
-from jaxlfi.envs.whip.rig import START
+from jaxlfi.envs.whip.rig import HIT_DISTANCE, START
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import along
 from jaxlfi.io import files
@@ -55,7 +55,7 @@ def test_an_episode_is_what_its_own_observations_say(whole):
     assert whole.steps == end and whole.value == pytest.approx(rewards[:end].sum(), abs=1e-5)
     np.testing.assert_array_equal(whole.hit, flags[end - 1])
     cubes = whole.observations[:, 10:22].reshape(-1, 6, 2)
-    moved = np.logical_or.accumulate(np.linalg.norm(cubes - cubes[0], axis=-1) > rules.HIT_DISTANCE, axis=0)
+    moved = np.logical_or.accumulate(np.linalg.norm(cubes - cubes[0], axis=-1) > HIT_DISTANCE, axis=0)
     np.testing.assert_array_equal(flags, moved[1:])
     np.testing.assert_allclose(whole.observations[0, :2], START, atol=2e-3)
     assert whole.observations.shape == (rules.STEPS + 1, 28) and whole.actions.shape == (rules.STEPS, 2)
