@@ -19,6 +19,7 @@ from jaxlfi.diagnostics.calibration import (
 from jaxlfi.diagnostics.discrepancy import (
     POSTERIOR_SAMPLES,
     Discrepancy,
+    channel_errors,
     compared,
     discrepancy,
     not_simulated,
@@ -46,6 +47,7 @@ __all__ = [
     "bound_evidence",
     "bound_warnings",
     "c2st",
+    "channel_errors",
     "check_intervals",
     "check_regions",
     "compared",

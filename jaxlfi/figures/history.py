@@ -89,6 +89,7 @@ class History:
         times: shape [T], or None.
         record_label: name of the trajectory's row axis, "time".
         channels: names of the trajectory's columns.
+        channel_noise: standard deviations of their measurement noise, shape [C]; 0 where it is not known.
         feasible_low: lower limits Phi, shape [D], or None.
         feasible_high: upper limits Phi, or None.
     """
@@ -128,6 +129,7 @@ class History:
     times: np.ndarray | None
     record_label: str
     channels: tuple[str, ...]
+    channel_noise: np.ndarray
     feasible_low: np.ndarray | None
     feasible_high: np.ndarray | None
 
@@ -223,6 +225,7 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     rounds, _, dim = arrays["theta"].shape
     trajectory = _trajectory(observation.get("trajectory"))
     times = _times(observation.get("times"), trajectory)
+    columns = 0 if trajectory is None else trajectory.shape[1]
     x = observation.get("x")
     if x is not None and x.ndim != 1:
         raise ValueError(f"{folder / 'observation.npz'}: expected x of one dimension, got shape {x.shape}")
@@ -255,7 +258,8 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
         truth=_vector(observation.get("truth"), dim),
         times=times,
         record_label=_record_label(observation, times),
-        channels=_texts(observation.get("channels"), None, 0 if trajectory is None else trajectory.shape[1], "x{}"),
+        channels=_texts(observation.get("channels"), None, columns, "x{}"),
+        channel_noise=np.nan_to_num(_vector(observation.get("channel_noise"), columns)),
         feasible_low=_limits(config, "low", dim),
         feasible_high=_limits(config, "high", dim),
         **{name: arrays[name] for name in REQUIRED if name not in ("counted", "kept", "failure")},
