@@ -1,21 +1,27 @@
-"""Lines with bands over iterations."""
+"""Lines with bands: the median of several seeds, and where the middle half of them lies."""
 
 import numpy as np
 from matplotlib.axes import Axes
 
+from jaxlfi.figures import statistics
 from jaxlfi.figures.style import Look
 
 
-def draw_band(axes: Axes, x: np.ndarray, middle: np.ndarray, deviation: np.ndarray, look: Look) -> None:
-    """A configuration's line, and a band of one `deviation` to either side of it where that is not zero.
+def draw_band(axes: Axes, x: np.ndarray, values: np.ndarray, look: Look) -> None:
+    """The median of seeds as a configuration's line, and a band of their quartiles where they differ.
 
     Args:
         axes: to draw on.
         x: shape [R].
-        middle: shape [R].
-        deviation: standard deviation or error, shape [R].
+        values: of each seed, or sample, shape [seeds, R]; NaN is left out.
         look: of the configuration.
     """
-    if np.any(deviation > 0):
-        axes.fill_between(x, middle - deviation, middle + deviation, color=look.colour, alpha=0.16, linewidth=0)
+    low, middle, high = statistics.quartiles(values)
+    if np.any(high > low):
+        axes.fill_between(x, low, high, color=look.colour, alpha=0.16, linewidth=0)
     axes.plot(x, middle, **look.line)
+
+
+def over(seeds: int, otherwise: str = "one seed") -> str:
+    """What bands show, for a legend's title: of several seeds, or of what there is of one."""
+    return f"median of {seeds} seeds, band: quartiles" if seeds > 1 else otherwise
