@@ -35,10 +35,10 @@ from jaxlfi.envs.whip.parameters import MILLIMETRES, median
 from jaxlfi.figures import style
 from jaxlfi.figures.learning import WINDOW, draw_curves
 from jaxlfi.io import compile_cache, files
+from jaxlfi.io.provenance import environment as environment_of
 from jaxlfi.rl import domains
 from jaxlfi.rl.evaluation import cross_evaluate
 from jaxlfi.rl.policy import Policy, load
-from jaxlfi.runs.folder import environment as environment_of
 
 ENVIRONMENTS, BATCH, DETECTOR = 12, 16, "mask"
 BIN = 192

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
+from jaxlfi.figures import predictive
 from jaxlfi.figures.collection import Runs, seed_count
 from jaxlfi.figures.history import History
 from jaxlfi.figures.legends import above, balanced
@@ -31,9 +32,8 @@ def errors(history: History) -> np.ndarray:
 
 def drawable(history: History) -> bool:
     """Whether there are simulations of the last posterior, and an observation of several channels in the same shape."""
-    simulated, observed = history.predictions, history.observed
-    same = simulated is not None and observed is not None and simulated.shape[1:] == observed.shape
-    return same and observed.shape[1] > 1 and np.isfinite(observed).any(axis=0).all()
+    known = predictive.drawable(history) and history.observed.shape[1] > 1
+    return known and bool(np.isfinite(history.observed).any(axis=0).all())
 
 
 def by_seed(histories: Sequence[History]) -> np.ndarray:

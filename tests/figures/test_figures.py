@@ -322,7 +322,7 @@ def test_channels_are_in_units_of_noise_where_they_hardly_move(tmp_path):
 
 def test_channels_shows_each_seed_and_the_median_of_what_can_differ(tmp_path, compared):
     history = load(write_thirty(tmp_path / "run"))
-    (axes, _) = drawn(channels.draw, {"ok": [history]}).axes
+    (axes,) = drawn(channels.draw, {"ok": [history]}).axes
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert labels == list(THIRTY[:-1])  # an action is that of the observation
     assert "sd" in axes.get_xlabel() and axes.get_xscale() == "log"
@@ -815,8 +815,8 @@ def test_report_of_one_run(tmp_path, options, missing):
 
 
 def test_legends_fit_into_figures_of_one_column(tmp_path):
-    collection = open_collection(write_run(tmp_path / "run", rounds=2, records=21))
-    for name in ("curves", "predictive", "polars"):
+    four, one = (open_collection(write_run(tmp_path / str(d), dim=d, rounds=2, records=21)) for d in (4, 1))
+    for name, collection in {"curves": one, "predictive": four, "polars": four}.items():
         with style.context():
             figure, _, _ = reporting.PICTURES[name](collection)
             figure.draw_without_rendering()
