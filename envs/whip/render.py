@@ -194,8 +194,8 @@ def save_predictive(path: Path, run: Run) -> Path:
     camera = side_camera(parameters)
     draw = lambda frame: segmentation(camera, frame, parameters.cube_side, size=SIZE).astype(jnp.uint8)
     shown = figures.Predictive(
-        observed=keypoints_of(observed[:steps]),
-        simulated=np.stack([keypoints_of(one[:steps]) for one in simulated]),
+        observed=keypoints_of(jnp.asarray(observed[:steps])),
+        simulated=np.stack([keypoints_of(jnp.asarray(one[:steps])) for one in simulated]),
         labels=np.asarray(jax.lax.map(draw, view, batch_size=8)),
         gripper=np.asarray(project(camera, _in_plane(view.gripper))),
         palette=PALETTE,

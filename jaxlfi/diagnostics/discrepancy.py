@@ -104,7 +104,7 @@ def _theta_error(task: Task, theta: Float[Array, "samples dim"]) -> Float[Array,
 
 
 def trajectory_distance(
-    trajectory: Array, observed: Array, noise: Float[Array, " channels"] | float = 0.0
+    trajectory: Array, observed: Array, noise: Float[Array | np.ndarray, " channels"] | float = 0.0
 ) -> Float[Array, ""]:
     """Euclidean distance of two trajectories in units of the observed one's standard deviation, per record.
 
@@ -119,7 +119,7 @@ def trajectory_distance(
 
 
 def channel_errors(
-    trajectory: Array, observed: Array, noise: Float[Array, " channels"] | float = 0.0
+    trajectory: Array, observed: Array, noise: Float[Array | np.ndarray, " channels"] | float = 0.0
 ) -> Float[Array, " channels"]:
     """Root mean square difference of two trajectories in each channel, shape [C].
 
@@ -137,7 +137,7 @@ def channel_errors(
 
     Example:
         >>> observed = jnp.stack([jnp.arange(4.0), jnp.zeros(4)], axis=1)
-        >>> channel_errors(observed + 0.1, observed, noise=jnp.array([0.1, 0.1])).round(2).tolist()
+        >>> [round(float(e), 2) for e in channel_errors(observed + 0.1, observed, noise=jnp.array([0.1, 0.1]))]
         [0.09, 1.0]
     """
     difference, spread = _compared(trajectory, observed)
@@ -150,8 +150,8 @@ def _compared(trajectory: Array, observed: Array) -> tuple[Array, Array]:
         raise ValueError(
             f"trajectory, observed: expected the same shapes, got {list(trajectory.shape)} and {list(observed.shape)}"
         )
-    difference = trajectory.reshape(observed.shape) - observed
-    return tuple(values.reshape(len(observed), -1) for values in (difference, observed - observed[:1]))
+    difference, spread = trajectory.reshape(observed.shape) - observed, observed - observed[:1]
+    return jnp.asarray(difference.reshape(len(observed), -1)), jnp.asarray(spread.reshape(len(observed), -1))
 
 
 def _scale(deviation: Array, noise: Array | np.ndarray | float) -> Array:

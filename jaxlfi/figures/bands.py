@@ -22,6 +22,7 @@ def draw_band(axes: Axes, x: np.ndarray, values: np.ndarray, look: Look) -> None
     axes.plot(x, middle, **look.line)
 
 
-def over(seeds: int, otherwise: str = "one seed") -> str:
-    """What bands show, for a legend's title: of several seeds, or of what there is of one."""
-    return f"median of {seeds} seeds, band: quartiles" if seeds > 1 else otherwise
+def over(seeds: int, otherwise: str = "one seed", fewest: int | None = None) -> str:
+    """What bands show, for a legend's title: of several seeds (of some, the fewest), or of what there is of one."""
+    count = f"{seeds}" if fewest in (None, seeds) else f"{fewest} to {seeds}"
+    return f"median of {count} seeds, band: quartiles" if seeds > 1 else otherwise

@@ -24,16 +24,18 @@ def errors(history: History) -> np.ndarray:
     In units of the channel's observed standard deviation, or of its noise where that is larger
     (`jaxlfi.diagnostics.channel_errors`); what is missing from the observation is left out.
     """
-    scale = np.maximum(np.nanstd(history.observed, axis=0), history.channel_noise)
-    return np.sqrt(
-        np.nanmean(((history.predictions - history.observed) / np.where(scale > 0, scale, 1.0)) ** 2, axis=1)
-    )
+    observed, simulated = history.observed, history.predictions
+    if observed is None or simulated is None:
+        raise ValueError(f"{history.folder}: expected an observation, and simulations of the last posterior")
+    scale = np.maximum(np.nanstd(observed, axis=0), history.channel_noise)
+    return np.sqrt(np.nanmean(((simulated - observed) / np.where(scale > 0, scale, 1.0)) ** 2, axis=1))
 
 
 def drawable(history: History) -> bool:
     """Whether there are simulations of the last posterior, and an observation of several channels in the same shape."""
-    known = predictive.drawable(history) and history.observed.shape[1] > 1
-    return known and bool(np.isfinite(history.observed).any(axis=0).all())
+    if history.observed is None or not predictive.drawable(history):
+        return False
+    return history.observed.shape[1] > 1 and bool(np.isfinite(history.observed).any(axis=0).all())
 
 
 def by_seed(histories: Sequence[History]) -> np.ndarray:

@@ -50,18 +50,19 @@ def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:
     first = next(iter(runs.values()))[0]
     trajectories = {name: trajectory_curve(runs, name, alpha) for name in runs}
     thetas = {name: theta_curve(runs, name, alpha) for name in runs}
-    panels = ["trajectory"] * any(v is not None for v in trajectories.values())
+    # The trajectory's, then a parameter's each.
+    panels: list[int | None] = [None] * any(v is not None for v in trajectories.values())
     panels += [*range(first.dim)] * any(v is not None for v in thetas.values())
     rows, columns = grid_shape(len(panels), COLUMNS)
     # Parameters are compared with one another, and with the trajectory: one scale for all of them.
     every = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-    for place, (panel, axes) in enumerate(zip(panels, every, strict=False)):
+    for place, (d, axes) in enumerate(zip(panels, every, strict=False)):
         for name in runs:
-            values = trajectories[name] if panel == "trajectory" else thetas[name]
+            values = trajectories[name] if d is None else thetas[name]
             if values is not None:
-                values = values if panel == "trajectory" else values[..., panel]
+                values = values if d is None else values[..., d]
                 draw_band(axes, np.arange(1, first.rounds + 1), by_seed(values), look[name])
-        axes.set_title("trajectory" if panel == "trajectory" else parameter_name(first.names, panel))
+        axes.set_title("trajectory" if d is None else parameter_name(first.names, d))
         axes.grid(True)
         iterations_axis(axes, first.rounds, label=place + columns >= len(panels))
     for axes in every[len(panels) :]:

@@ -45,13 +45,13 @@ def draw_curves(axes: Axes, curves: Mapping[str, tuple[Look, np.ndarray]], steps
         smooth = running_mean(returns, min(WINDOW, len(returns)))
         draw_band(axes, steps, smooth.T, dataclasses.replace(look, label=label))
         axes.lines[-1].set_markevery(max(1, len(returns) // 8))
-    seeds = max(returns.shape[1] for _, returns in curves.values())
+    counts = [returns.shape[1] for _, returns in curves.values()]
     axes.set_xlabel("environment steps")
     axes.set_ylabel("return of training episodes")
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     round_ticks(axes.xaxis, 5)
     axes.grid(True)
-    axes.legend(title=over(seeds), title_fontsize="medium", loc="lower right")
+    axes.legend(title=over(max(counts), fewest=min(counts)), title_fontsize="medium", loc="lower right")
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
