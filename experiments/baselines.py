@@ -184,7 +184,11 @@ def draw(rows: Mapping[str, Mapping[str, np.ndarray]], path: Path) -> None:
     """The summed errors as a strip a row."""
     with style.context():
         figure = style.new_figure(style.TEXT_WIDTH, 3.0)
-        strips.draw(figure, {name: arrays["theta_error"] for name, arrays in rows.items()}, "summed error of theta")
+        strips.draw(
+            figure,
+            {name: arrays["theta_error"] for name, arrays in rows.items()},
+            "parameter error (sum over four log-rates)",
+        )
         style.save(figure, path, dpi=200)
 
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 from jaxlfi.envs import mg1
-from jaxlfi.figures import History, density, open_collection, style
+from jaxlfi.figures import History, density, discrepancy, legends, open_collection, style
 from jaxlfi.io import files as atomic
 
 SEEDS = 3
@@ -34,6 +34,10 @@ MEASURES = {
     "entropy": "entropy [nats]",
 }
 """What is reported of every run, by its name in errors.npz."""
+PICTURED = {
+    "plain": "parameters", "sorted": "parameters, sorted service times", "trajectory": "trajectory"
+}  # fmt: skip
+"""What errors.png shows, and how it is called."""
 
 
 def ordered(theta: np.ndarray) -> np.ndarray:
@@ -113,15 +117,33 @@ def draw_samples(figure: Figure, trajectories: np.ndarray) -> None:
         by_job.plot(np.arange(1, jobs + 1), times, color=colour, linewidth=0.8, label=f"seed {seed}")
         by_rank.plot(np.arange(1, jobs + 1), np.sort(times), color=colour, linewidth=0.8)
         by_rank.plot(at, np.percentile(times, mg1.PERCENTILES), "o", color=colour, markersize=3.2)
-    by_job.set(xlabel="job", ylabel="inter-departure time")
+    by_job.set(xlabel="job", ylabel="inter-departure time\n[units of time]")
     by_rank.set(xlabel="rank (dots: percentiles)")
     for axes in (by_job, by_rank):
         axes.grid(True)
     figure.legend(loc="outside upper center", ncols=SEEDS)
 
 
+def draw_errors(figure: Figure, errors: dict[str, dict[str, np.ndarray]]) -> None:
+    """A dot for each seed and their median: errors as they are, with the service times sorted, and of trajectories.
+
+    Args:
+        figure: empty.
+        errors: by configuration and measure, one value a seed.
+    """
+    look = style.looks(list(errors))
+    for axes, (measure, title) in zip(figure.subplots(1, len(PICTURED)), PICTURED.items(), strict=True):
+        discrepancy.draw_dots(axes, {name: own[measure] for name, own in errors.items()}, look)
+        axes.set_title(title)
+    figure.axes[1].set_ylim(figure.axes[0].get_ylim())  # what is sorted is seen to be smaller
+    figure.axes[0].set_ylabel("sum of |θ − θ$_{gt}$|")
+    figure.axes[2].set_ylabel("error [observed sd]")
+    seeds = len(next(iter(errors.values()))["plain"])
+    legends.of_configurations(figure, look, f"one dot for each of {seeds} seeds, line: median")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write table.md, errors.npz, samples.npz and samples.png."""
+    """Write table.md, errors.npz, samples.npz, samples.png and errors.png."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, help="a finished folder of `jaxlfi compare mg1`")
     parser.add_argument("--out", type=Path, default=Path("experiments/results/mg1"))
@@ -146,6 +168,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         figure = style.new_figure(style.COLUMN_WIDTH, 1.9)
         draw_samples(figure, trajectories)
         style.save(figure, given.out / "samples.png", 300)
+        figure = style.new_figure(style.TEXT_WIDTH, 2.5)
+        draw_errors(figure, errors)
+        style.save(figure, given.out / "errors.png", 300)
     print(table(errors))
     print(f"wrote {given.out}")
 

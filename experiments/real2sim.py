@@ -11,25 +11,33 @@ of the first seed:
     progression.png   fig:mog-n-param-space-progr: samples by iteration with their boxes, and the last mixtures
     domains.png       fig:mog-posterior-for-dr: the last mixtures and the 12 domains that policies would be trained on
     gap.png           fig:sim2real-distance-progr: distance of each iteration's best samples from the observation
+    predictive-K.png  what simulations of the last posterior are seen to do, over what was observed
 """
 
 import argparse
 import csv
+import dataclasses
 import io
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 import jaxlfi
 from jaxlfi.cli import parser as cli
 from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip.observer import OBSERVATION
-from jaxlfi.figures import History, open_collection, samples, style
+from jaxlfi.envs.whip.parameters import MILLIMETRES
+from jaxlfi.envs.whip.reference_objects.objects import load as load_object
+from jaxlfi.envs.whip.render import save_predictive
+from jaxlfi.figures import History, legends, open_collection, samples, style
 from jaxlfi.io import files as atomic
 from jaxlfi.io import provenance
 from jaxlfi.runs import folder as run_store
@@ -41,6 +49,9 @@ DOMAINS = 12
 """Environments a policy is trained in at once, each with parameters of its own (section VI-H)."""
 BEST = 0.25
 """Fraction of an iteration's samples, the nearest, whose distance is reported."""
+GAPS = {"summary": "distance of summaries", "pixels": "Chamfer distance [px]"}
+"""Distances from the observation, and how they are called."""
+DOMAIN = {"marker": "o", "markersize": 3.2, "markerfacecolor": "none", "color": "black", "linestyle": "none"}
 PIXELS = 256
 KEYPOINTS = slice(2, 22)
 """Slice of an observation that holds the keypoints."""
@@ -95,49 +106,94 @@ def domains(history: History) -> np.ndarray:
     return np.asarray(jnp.clip(draws, belief.support.low, belief.support.high))
 
 
+def with_truth(name: str, history: History) -> History:
+    """The history with the truth of a reference object marked: the light DLO that hangs and swings alike."""
+    if name not in OBJECTS:
+        return history
+    known = load_object(name)
+    return dataclasses.replace(history, truth=np.array([known.length * MILLIMETRES[0], np.log(known.light_young)]))
+
+
 def draw_progression(figure: Figure, histories: Mapping[str, Mapping[str, History]]) -> None:
-    """One row per object: samples and last mixture of each configuration."""
+    """One row per object: samples and last mixture of each configuration, with the path of the means over it."""
     axes = figure.subplots(len(histories), 2 * len(next(iter(histories.values()))), squeeze=False)
     for row, (name, own) in enumerate(histories.items()):
         for column, (configuration, history) in enumerate(own.items()):
             left, right = axes[row, 2 * column : 2 * column + 2]
-            window = [samples.limits(list(own.values()), d) for d in (0, 1)]
-            samples.draw_proposals(left, history, (0, 1), window)
-            samples.draw_mixture(right, history, (0, 1))
-            left.set_title(f"{name}, {CONFIGURATIONS[configuration]}")
-    style.iteration_bar(figure, axes, max(history.rounds for own in histories.values() for history in own.values()))
+            shown = with_truth(name, history)
+            samples.draw_proposals(left, shown, (0, 1), [samples.limits([*own.values(), shown], d) for d in (0, 1)])
+            _draw_mixture(right, shown, [with_truth(name, other) for other in own.values()])
+            left.set_title(f"{name}, {CONFIGURATIONS[configuration]}: samples")
+            right.set_title("posterior, enlarged")
+    _outer_labels(axes)
+    iterations = max(history.rounds for own in histories.values() for history in own.values())
+    style.iteration_bar(figure, axes, iterations)
+    samples.legend(figure, [shown], at_most=4)
 
 
 def draw_domains(figure: Figure, histories: Mapping[str, Mapping[str, History]]) -> None:
     """One column per object, one row per configuration: the last mixture and twelve domains drawn from it."""
     axes = figure.subplots(len(next(iter(histories.values()))), len(histories), squeeze=False)
     for column, (name, own) in enumerate(histories.items()):
-        for row, (configuration, history) in enumerate(own.items()):
-            samples.draw_mixture(axes[row, column], history, (0, 1))
-            axes[row, column].plot(
-                *domains(history).T, "o", markersize=3, markerfacecolor="none", color="black", zorder=6
-            )
+        every = {label: with_truth(name, history) for label, history in own.items()}
+        for row, (configuration, history) in enumerate(every.items()):
+            _draw_mixture(axes[row, column], history, list(every.values()))
+            axes[row, column].plot(*domains(history).T, **DOMAIN, zorder=6)
             axes[row, column].set_title(f"{name}, {CONFIGURATIONS[configuration]}")
+    _outer_labels(axes)
+    domain = Line2D([], [], **DOMAIN, label=f"the {DOMAINS} domains of a policy")
+    samples.legend(figure, [history], at_most=4, others=[domain], proposals=False)
+
+
+def _draw_mixture(axes: Axes, history: History, others: Sequence[History]) -> None:
+    """The last mixture in the window of all configurations, without a bar for its density."""
+    samples.draw_mixture(axes, history, (0, 1), [samples.closer_limits(others, d) for d in (0, 1)], bar=False)
+
+
+def _outer_labels(axes: np.ndarray) -> None:
+    for panel in axes[:-1].ravel():
+        panel.set_xlabel("")
+    for panel in axes[:, 1:].ravel():
+        panel.set_ylabel("")
 
 
 def draw_gaps(figure: Figure, found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]) -> None:
-    """One column per object: distance by iteration, of summaries (bold) and of keypoints in pixels (faded)."""
-    axes = figure.subplots(1, len(found), squeeze=False)[0]
-    colours = {"initial": "tab:orange", "initial+edge": "tab:blue"}
+    """One column per object: distance by iteration, of summaries above and of keypoints in pixels below."""
+    axes = figure.subplots(len(GAPS), len(found), squeeze=False, sharex=True, sharey="row")
+    look = {
+        name: dataclasses.replace(own, label=CONFIGURATIONS[name])
+        for name, own in style.looks(list(CONFIGURATIONS)).items()
+    }
     for column, (name, own) in enumerate(found.items()):
-        left, right = axes[column], axes[column].twinx()
-        for configuration, gap in own.items():
-            steps = np.arange(1, len(gap["summary"]) + 1)
-            colour = colours[configuration]
-            left.errorbar(steps, *gap["summary"].T, color=colour, capsize=1.5, label=CONFIGURATIONS[configuration])
-            right.errorbar(steps, *gap["pixels"].T, color=colour, alpha=0.35, capsize=1.5)
-        left.set_title(name)
-        left.set_xlabel("iteration")
-        if column == 0:
-            left.set_ylabel("distance of summaries (bold)")
-            left.legend()
-        if column == len(found) - 1:
-            right.set_ylabel("Chamfer distance [px] (faded)")
+        for row, (kind, label) in enumerate(GAPS.items()):
+            panel = axes[row, column]
+            for configuration, gap in own.items():
+                steps, (middle, sd) = np.arange(1, len(gap[kind]) + 1), gap[kind].T
+                colour = look[configuration].colour
+                panel.fill_between(steps, middle - sd, middle + sd, color=colour, alpha=0.2, linewidth=0)
+                panel.plot(steps, middle, **look[configuration].line)
+            panel.grid(True)
+            if column == 0:
+                panel.set_ylabel(label)
+        axes[0, column].set_title(name)
+        axes[0, column].set_yscale("log")
+        axes[0, column].yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes[0, column].yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes[0, column].yaxis.set_minor_formatter(NullFormatter())
+        style.iterations_axis(axes[-1, column], len(steps))
+    shown = {name: look[name] for name in next(iter(found.values()))}
+    legends.of_configurations(
+        figure, shown, f"mean ± standard deviation of the nearest {100 * BEST:g} % of an iteration's samples"
+    )
+
+
+def saved_gaps(path: Path) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+    """The content of gaps.npz by object, configuration and kind."""
+    found: dict[str, dict[str, dict[str, np.ndarray]]] = {}
+    for key, gap in atomic.read_arrays(path).items():
+        name, label, kind = key.partition("_")[0], *key.partition("_")[2].rsplit("_", 1)
+        found.setdefault(name, {}).setdefault(label.replace("_", "+"), {})[kind] = gap
+    return found
 
 
 def table(runs: Mapping[str, Mapping[str, Sequence[History]]]) -> list[dict[str, object]]:
@@ -185,7 +241,9 @@ def main() -> None:
     """Run what is missing, then draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--runs", type=Path, required=True, help="folder of the runs, which are made if they are missing"
+        "--runs",
+        type=Path,
+        help="folder of the runs, made if they are missing; without it, gap.png alone is drawn",
     )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--objects", nargs="+", default=OBJECTS, help="names, or recorded rollouts' .npz")
@@ -193,6 +251,10 @@ def main() -> None:
     parser.add_argument("--configurations", nargs="+", choices=list(CONFIGURATIONS), default=list(CONFIGURATIONS))
     parser.add_argument("--detector", default="centreline", help="what sees the objects, as in `jaxlfi whip record`")
     arguments = parser.parse_args()
+    if arguments.runs is None:
+        found = saved_gaps(arguments.out / "gaps.npz")
+        save(arguments.out / "gap.png", GAP_SIZE, lambda figure: draw_gaps(figure, found))
+        return
     runs = {}
     for name in arguments.objects:
         folder, task, rollout = arguments.runs / Path(name).stem, "whip", name
@@ -225,15 +287,25 @@ def main() -> None:
     }
     atomic.write_arrays(arguments.out / "gaps.npz", arrays)
     rows, kinds = len(histories), len(arguments.configurations)
+    for name, size, paint in (
+        ("progression", (3.58 * kinds, 0.5 + 1.5 * rows), lambda f: draw_progression(f, histories)),
+        ("domains", (style.TEXT_WIDTH, 0.6 + 1.6 * kinds), lambda f: draw_domains(f, histories)),
+        ("gap", GAP_SIZE, lambda f: draw_gaps(f, found)),
+    ):
+        save(arguments.out / f"{name}.png", size, paint)
+    for name, own in histories.items():
+        save_predictive(arguments.out / f"predictive-{name}.png", jaxlfi.load(own[arguments.configurations[-1]].folder))
+
+
+GAP_SIZE = (style.TEXT_WIDTH, 3.4)
+
+
+def save(path: Path, size: tuple[float, float], paint: Callable[[Figure], None]) -> None:
+    """Draw a picture of a size in inches."""
     with style.context():
-        for name, size, paint in (
-            ("progression", (3.6 * kinds, 1.75 * rows), lambda f: draw_progression(f, histories)),
-            ("domains", (1.8 * rows, 1.9 * kinds), lambda f: draw_domains(f, histories)),
-            ("gap", (1.9 * rows, 1.9), lambda f: draw_gaps(f, found)),
-        ):
-            figure = style.new_figure(*size)
-            paint(figure)
-            style.save(figure, arguments.out / f"{name}.png", 200)
+        figure = style.new_figure(*size)
+        paint(figure)
+        style.save(figure, path, 200)
 
 
 if __name__ == "__main__":

@@ -33,12 +33,12 @@ from jaxlfi.envs.whip.environment import ACTIONS, OBSERVATIONS, make
 from jaxlfi.envs.whip.gym import WhipVector
 from jaxlfi.envs.whip.parameters import MILLIMETRES, median
 from jaxlfi.figures import style
-from jaxlfi.figures.learning import WINDOW, running_mean
+from jaxlfi.figures.learning import WINDOW, draw_curves
 from jaxlfi.io import compile_cache, files
+from jaxlfi.io.provenance import environment as environment_of
 from jaxlfi.rl import domains
 from jaxlfi.rl.evaluation import cross_evaluate
 from jaxlfi.rl.policy import Policy, load
-from jaxlfi.runs.folder import environment as environment_of
 
 ENVIRONMENTS, BATCH, DETECTOR = 12, 16, "mask"
 BIN = 192
@@ -193,20 +193,14 @@ def as_policy(model: PPO, seed: int) -> Policy:
 
 
 def draw(figure: Figure, curves: Mapping[str, np.ndarray]) -> None:
-    """Returns of training episodes against environment steps: a thin line a seed, a thick one for their mean.
+    """Returns of training episodes against environment steps: the median of seeds, and a band of their quartiles.
 
     Args:
         figure: empty.
         curves: mean returns in each `BIN` steps, shape [U, seeds], by what they are called.
     """
-    axes, look = figure.subplots(), style.looks(list(curves))
-    for name, returns in curves.items():
-        smooth = running_mean(returns, WINDOW)
-        steps = BIN * (1 + np.arange(len(returns)))
-        axes.plot(steps, smooth, color=look[name].colour, alpha=0.35, linewidth=0.7)
-        axes.plot(steps, smooth.mean(axis=1), **look[name].line, markevery=len(returns) // 8)
-    axes.set(xlabel="environment steps", ylabel="return of training episodes")
-    axes.legend(frameon=False)
+    look = style.looks(list(curves))
+    draw_curves(figure.subplots(), {name: (look[name], returns) for name, returns in curves.items()}, BIN)
 
 
 def labelled(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

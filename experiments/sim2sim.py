@@ -10,6 +10,7 @@ repeated.
 
 import argparse
 import csv
+import dataclasses
 import io
 import itertools
 import sys
@@ -19,6 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -29,7 +32,8 @@ from jaxlfi.distributions.belief import rejected
 from jaxlfi.envs.whip.parameters import MEDIAN
 from jaxlfi.envs.whip.physics.chain import elasto_gravity
 from jaxlfi.envs.whip.real2sim import task
-from jaxlfi.figures import style
+from jaxlfi.figures import legends, style
+from jaxlfi.figures.natural import Scale
 from jaxlfi.io import files as atomic
 from jaxlfi.io import provenance
 from jaxlfi.tasks.simulation import trajectory_and_outcome
@@ -100,6 +104,11 @@ def study(out: Path, detector: str, console: Console) -> dict[str, np.ndarray]:
     return found
 
 
+def saved(path: Path) -> dict[str, np.ndarray]:
+    """What `study` found, as `main` keeps it."""
+    return {name.replace("_", "/", 1): array for name, array in atomic.read_arrays(path).items()}
+
+
 def measures(found: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
     """Errors, standard deviations and coverage of every posterior, each [28, 2]: of length in mm, and of ln E."""
     draws, theta = found[f"{name}/draws"], found["theta"]
@@ -147,27 +156,36 @@ def lines(found: dict[str, np.ndarray], detector: str) -> list[dict[str, object]
 
 
 def draw(figure: Figure, found: dict[str, dict[str, np.ndarray]]) -> None:
-    """Inferred against true, with 90 % intervals: one column per detector and heuristic, length above, ln E below."""
+    """Inferred against true, with 90 % intervals: one column per detector and heuristic, length above modulus."""
     columns = list(itertools.product(found, HEURISTICS))
     axes = figure.subplots(2, len(columns), squeeze=False, sharex="row", sharey="row")
     box = ((195, 305), (np.log(1e3), np.log(5e4)))
-    colours = {"fixed": "tab:orange", "edge": "tab:blue"}
+    look = dict(zip(HEURISTICS, style.looks(["initial", "initial+edge"]).values(), strict=True))
     for column, (detector, name) in enumerate(columns):
-        own = found[detector]
+        own, colour = found[detector], look[name].colour
         draws, theta = own[f"{name}/draws"], own["theta"]
         low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95], axis=1)
-        axes[0, column].set_title(f"{detector} keypoints\n{name} support")
-        for row, label in enumerate(("length [mm]", "ln E [Pa]")):
+        axes[0, column].set_title(
+            f"{detector} keypoints\n{'EDGE' if name == 'edge' else 'fixed support'}", color=colour
+        )
+        for row, parameter in enumerate((Scale("length", "mm"), Scale("Young's modulus", "Pa", log=True))):
             panel = axes[row, column]
             panel.axvspan(*box[row], color="0.92", zorder=0)
-            panel.plot(theta[:, row], theta[:, row], color="0.5", linewidth=0.7, zorder=1)
+            panel.axline((theta[0, row],) * 2, slope=1, **style.TRUTH_LINE, zorder=1)
             panel.errorbar(
                 theta[:, row], middle[:, row], [middle[:, row] - low[:, row], high[:, row] - middle[:, row]],
-                fmt="o", markersize=2.5, linewidth=0.8, color=colours[name], zorder=2,
+                fmt=look[name].marker, markersize=2.8, linewidth=0.8, color=colour, zorder=2,
             )  # fmt: skip
-            panel.set_xlabel(f"true {label}")
-            if column == 0:
-                panel.set_ylabel(f"inferred {label}")
+            for axis, words in ((panel.xaxis, "true"), (panel.yaxis, "inferred")):
+                dataclasses.replace(parameter, label=f"{words} {parameter.label}").show(axis, 5)
+            if column:
+                panel.set_ylabel("")
+    handles = [
+        Line2D([], [], color=style.GREY, marker="o", markersize=3, label="median and 90 % interval, one for each DLO"),
+        Line2D([], [], **style.TRUTH_LINE, label="truth"),
+        Patch(color="0.92", label="first guess"),
+    ]
+    legends.below(figure, handles)
 
 
 def main() -> None:
@@ -178,7 +196,9 @@ def main() -> None:
     arguments = parser.parse_args()
     console = Console(width=160)
     arguments.out.joinpath("chunks").mkdir(parents=True, exist_ok=True)
-    found = {name: study(arguments.out, name, console) for name in arguments.detectors}
+    # What was kept is drawn, and not made again.
+    kept = {name: arguments.out / f"{name}.npz" for name in arguments.detectors}
+    found = {name: saved(path) if path.exists() else study(arguments.out, name, console) for name, path in kept.items()}
     table = [line for name, own in found.items() for line in lines(own, name)]
     stream = io.StringIO()
     writer = csv.DictWriter(stream, table[0])
@@ -194,7 +214,7 @@ def main() -> None:
         shown.add_row(*(f"{v:.3g}" if isinstance(v, float) else str(v) for v in line.values()))
     console.print(shown)
     with style.context():
-        figure = style.new_figure(1.6 * len(HEURISTICS) * len(found), 3.6)
+        figure = style.new_figure(min(1.8 * len(HEURISTICS) * len(found), style.TEXT_WIDTH), 4.2)
         draw(figure, found)
         style.save(figure, arguments.out / "recovery.png", 200)
 

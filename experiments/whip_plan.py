@@ -95,7 +95,7 @@ def draw(figure: Figure, lengths: Sequence[float], moduli: Sequence[float], foun
         left.text(l, e, text, ha="center", va="center", color=_ink(value > 1.9))
         text = "none" if np.isnan(first) else f"{first:.0f}"
         right.text(l, e, text, ha="center", va="center", color=_ink(not first > 60))
-    left.set(ylabel="Young's modulus [Pa]", yticks=range(len(moduli)), yticklabels=[f"{e:g}" for e in moduli])
+    left.set(ylabel="Young's modulus [kPa]", yticks=range(len(moduli)), yticklabels=[f"{e / 1e3:g}" for e in moduli])
     titles = (
         "best mean return and cubes hit, bottom-up (return elsewhere)",
         f"rollouts until the first return of {GOOD}",

@@ -9,9 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from PIL import Image
 
-from jaxlfi.figures import style
+from jaxlfi.figures import legends, style
 from jaxlfi.io import files
 
 COLUMNS = 6
@@ -20,6 +21,23 @@ OVER = 0.35
 """Opacity of frames after the end of the episode."""
 FOUND, REMEMBERED = "#FFFFFF", "#FF9C9C"
 """Colours of keypoints on the DLO: found in this frame, or kept from an earlier one."""
+PICTURES = 8
+"""Moments of a rollout at which a posterior predictive shows the camera's image."""
+LEAST = 0.06
+"""Height of a panel of places at least, in widths of the image, so that what rests is seen to rest."""
+FAINT = 0.4
+"""Opacity of an image under keypoints."""
+BANDS = {
+    "tip, to the right": (3, 0),
+    "tip, downwards": (3, 1),
+    "top cube, to the right": (9, 0),
+    "top cube, downwards": (9, 1),
+}
+"""What a posterior predictive shows over time: keypoint and axis."""
+SIMULATED = "#C2185B"
+_DOT = {"marker": "o", "linestyle": "none"}
+_SIMULATED = {**_DOT, "color": SIMULATED, "markersize": 1.8, "markeredgewidth": 0, "alpha": 0.5}
+_OBSERVED = {**_DOT, "color": "black", "markersize": 4.0, "markerfacecolor": "none", "markeredgewidth": 0.7}
 LINES = {
     "table": {"color": "#B5A48C", "linewidth": 1.0},
     "workspace of the gripper": {"color": "#999999", "linewidth": 0.6, "linestyle": (0, (3, 2))},
@@ -175,6 +193,86 @@ class _Picture:
             artist.set_alpha(strength)
         for artist in (self._cubes, self._dlo, *self._numbers):
             artist.set_alpha(strength * fresh)
+
+
+@dataclasses.dataclass(frozen=True)
+class Predictive:
+    """A rollout that was observed, and what simulations of a posterior are seen to do; places in normalised pixels.
+
+    Attributes:
+        observed: keypoints, four of the DLO and then the cubes', shape [T, 10, 2].
+        simulated: those of each simulation, shape [N, T, 10, 2].
+        labels: segmentation images of one simulation, indices into `palette`, shape [T, size, size].
+        gripper: where it is in these, shape [T, 2].
+        palette: colours of the labels, RGB from 0 to 1, shape [L, 3].
+        times: in s, shape [T].
+        lines: as of a `Film`.
+    """
+
+    observed: np.ndarray
+    simulated: np.ndarray
+    labels: np.ndarray
+    gripper: np.ndarray
+    palette: np.ndarray
+    times: np.ndarray
+    lines: Mapping[str, np.ndarray]
+
+
+def draw_predictive(figure: Figure, shown: Predictive) -> None:
+    """Keypoints over the camera's image at eight moments, and the DLO's tip and the top cube as bands over time.
+
+    Args:
+        figure: empty.
+        shown: what to draw.
+    """
+    above, below = figure.subfigures(2, 1, height_ratios=(2.1, 1))
+    moments = np.linspace(0, len(shown.times) - 1, PICTURES).round().astype(int)
+    # All that is seen of the DLO and the cubes, so that they fill the pictures.
+    every = np.concatenate([shown.observed.reshape(-1, 2), shown.simulated.reshape(-1, 2), shown.gripper]).clip(0, 1)
+    (left, top), (right, bottom) = every.min(0) - 0.07, every.max(0) + 0.07
+    for axes, t in zip(above.subplots(2, PICTURES // 2).ravel(), moments, strict=True):
+        for name, line in shown.lines.items():
+            axes.plot(*line.T, **LINES[name], zorder=1)
+        labels = shown.labels[t]
+        image = np.concatenate([shown.palette[labels], FAINT * (labels > 0)[..., None]], axis=-1)
+        axes.imshow(image, extent=(0, 1, 1, 0), zorder=2)
+        axes.plot(*shown.gripper[t], **_gripper(1.3), zorder=2)
+        axes.plot(*shown.simulated[:, t].reshape(-1, 2).T, **_SIMULATED, zorder=3)
+        axes.plot(*shown.observed[t].T, **_OBSERVED, zorder=4)
+        axes.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[], aspect="equal")
+        axes.set_title(f"{shown.times[t]:.2f} s")
+    panels = below.subplots(1, len(BANDS))
+    for axes, (title, (keypoint, axis)) in zip(panels, BANDS.items(), strict=True):
+        quantiles = np.quantile(shown.simulated[:, :, keypoint, axis], (0.05, 0.25, 0.5, 0.75, 0.95), axis=0)
+        for outer, opacity in ((0, 0.2), (1, 0.35)):
+            axes.fill_between(
+                shown.times, quantiles[outer], quantiles[4 - outer], color=SIMULATED, alpha=opacity, linewidth=0
+            )
+        axes.plot(shown.times, quantiles[2], color=SIMULATED, gid="median")
+        axes.plot(shown.times, shown.observed[:, keypoint, axis], **_OBSERVED, gid="observed")
+        axes.set(title=title, xlabel="time [s]")
+        axes.grid(True)
+        low, high = axes.get_ylim()
+        half = max(high - low, LEAST) / 2
+        axes.set_ylim(np.add((low + high) / 2, (half, -half) if axis else (-half, half)))
+    panels[0].set_ylabel("place [image widths]")
+    handles = [
+        Line2D([], [], label="observed keypoint", **_OBSERVED),
+        Line2D([], [], label="simulations of the posterior", **_SIMULATED | {"alpha": 1.0}),
+        Line2D([], [], color=SIMULATED, label="their median (bands: 50 %, 90 %)"),
+        Patch(facecolor=style.GREY, alpha=FAINT, label="simulation at the posterior median"),
+        Line2D([], [], label="gripper", **_gripper(1.0)),
+        *(Line2D([], [], label=name, **LINES[name]) for name in shown.lines),
+    ]
+    legends.below(figure, handles, at_most=4)
+
+
+def save_predictive(path: Path, shown: Predictive) -> Path:
+    """Write the posterior predictive of a rollout as png; see `draw_predictive`."""
+    with style.context():
+        figure = style.new_figure(style.TEXT_WIDTH, 5.6)
+        draw_predictive(figure, shown)
+        return style.save(figure, path, 200)
 
 
 def _gripper(scale: float) -> dict:

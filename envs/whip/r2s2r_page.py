@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from jaxlfi.envs.whip import render
 from jaxlfi.envs.whip.reference_objects import film
 from jaxlfi.envs.whip.reference_objects.deployment import deploy
 from jaxlfi.envs.whip.reference_objects.objects import load as load_object
@@ -20,6 +21,22 @@ from jaxlfi.runs.run import Run
 
 REPETITIONS = 16
 """Places at which policies are compared in the end."""
+
+SHOWN = {
+    "film": "Film of the last policy on the object, at half speed",
+    "sheet": "The last policy on the object, control step by control step, with the keypoints it saw",
+    "curves": "Return of training episodes over environment steps",
+    "predictive": "Keypoints of simulations of the posterior over the observed ones, at eight moments and over time",
+    "posterior/pairs": "Posterior of length and Young's modulus",
+    "posterior/samples": "Lengths and moduli simulated in each iteration, and the last posterior",
+    "posterior/efficiency": "Success rate of simulations over iterations",
+    "posterior/curves": "Accuracy of posterior samples over iterations",
+    "posterior/support": "Bounds of length and Young's modulus over iterations",
+    "posterior/losses": "Training and validation losses",
+    "posterior/predictive": "Channels of simulations of the posterior over time, as bands, and the observed ones",
+    "posterior/channels": "Trajectory error by channel",
+}
+"""What pictures show, for those who cannot see them, by file name."""
 
 
 def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
@@ -37,15 +54,17 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
             film.save_pictures(out, last, PLACE.cube_side, f"{arguments.object}: return {last.value:.2f}")
     runs = [arguments.posterior] if arguments.posterior else [out / "iteration_1/posterior"]
     runs += [out / f"iteration_{iteration}/posterior" for iteration in range(2, arguments.iterations + 1)]
+    posteriors = {folder: load(folder) for folder in runs}
     with (out / "deployed" / "table.csv").open(newline="") as file:
         fared = [{name: _short(value) for name, value in row.items()} for row in csv.DictReader(file)]
     pictures = [path for path in (out / "film.gif", out / "sheet.png") if path.exists()]
+    pictures += predicted(out, list(posteriors.values()))
     pictures += [*sorted(out.glob("**/policy*/curves.png")), *sorted(out.glob("iteration_*/posterior/figures/*.png"))]
     parts = (
         f"<p>Heuristic {html.escape(arguments.heuristic)}, preset {arguments.preset}, seed {arguments.seed}, "
         f"seen by the detector {arguments.detector}.</p>",
         "<h2>What was believed</h2>",
-        _table([row for folder in runs for row in believed(folder, load(folder))]),
+        _table([row for folder, run in posteriors.items() for row in believed(folder, run)]),
         "<h2>What was trained on</h2>",
         _table([{"policy": str(path), "domain": policy.load(path).schema.get("domain", "")} for path in policies]),
         f"<h2>How it fared on the object</h2><p>At {REPETITIONS} places; the first is nominal, at the others stack and "
@@ -56,6 +75,12 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
     page = web_page.document(f"{arguments.object}: from the object to a policy, and back", parts)
     files.write_bytes(out / "page.html", page.encode())
     return out / "page.html"
+
+
+def predicted(out: Path, runs: Sequence[Run]) -> list[Path]:
+    """Draw what simulations of each posterior are seen to do, over what was observed: predictive_1.png and so on."""
+    simulated = [run for run in runs if np.isfinite(run.history["sample_trajectory_error"][-1]).any()]
+    return [render.save_predictive(out / f"predictive_{i}.png", run) for i, run in enumerate(simulated, 1)]
 
 
 def believed(folder: Path, run: Run) -> list[dict[str, str]]:
@@ -90,4 +115,5 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 
 def _figure(path: Path) -> str:
     where = "" if path.parent == Path() else f", of {path.parent.as_posix()}"
-    return web_page.figure(path.as_posix(), f"{path.stem}{where}", path.as_posix())
+    kind = f"posterior/{path.stem}" if path.parent.name == "figures" else path.stem.partition("_")[0]
+    return web_page.figure(path.as_posix(), f"{SHOWN.get(kind, path.stem)}{where}", path.as_posix())

@@ -20,7 +20,7 @@ from jaxlfi.envs.whip.physics.engine import Engine
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.trajectory import trajectory
 from jaxlfi.envs.whip.vision.camera import side_camera
-from jaxlfi.envs.whip.vision.keypoints import DETECTORS, Detector
+from jaxlfi.envs.whip.vision.keypoints import DETECTORS, ON_DLO, Detector
 from jaxlfi.tasks.summaries import cross_correlation
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.trials import check_pooling, summarised_jointly, together
@@ -29,6 +29,8 @@ TRUTH = (0.23, 8e3)
 """Length (m) and Young's modulus (Pa) of the simulated DLO that is observed where no object is named."""
 DATA = Path(__file__).parent / "data"
 """Folder of the recorded rollouts of the FEM reference objects."""
+PIXEL = 1 / 256 / 12**0.5
+"""Standard deviation of a place that is known to a pixel of a camera's image of 256, in normalised pixels."""
 NUISANCES: dict[str, Callable[..., WhipParameters]] = {
     "fixed": lambda key, length, young: median(length, young),
     "random": randomised,
@@ -192,11 +194,19 @@ def whip_task(
         failures=("unstable",),
         summary_names=SUMMARY_NAMES,
         channels=CHANNELS,
+        channel_noise=channel_noise(detector),
         record_label="control step",
         settings={"rounds": 15, "min_rounds": 15, "batch_size": 10},
         hyperparameters={"edge": {"mass_threshold": (0.003, 0.005)}},
     )
     return made if actions.ndim == 2 else summarised_jointly(made, len(actions), pooling, "rollout")
+
+
+def channel_noise(detector: Detector) -> Float[np.ndarray, "30"]:
+    """Standard deviation of what a detector adds to each of `CHANNELS`, at least what the pixels of an image leave."""
+    on_dlo, cube = (np.hypot(detector.bias, own) for own in (detector.noise, detector.cube_noise))
+    keypoints = np.maximum(np.repeat([on_dlo, cube], [2 * ON_DLO, 2 * len(COLOURS)]), PIXEL)
+    return np.concatenate([[detector.slip] * 2, keypoints, np.zeros(len(COLOURS) + 2)])
 
 
 def _check_together(names: Sequence[str], observed: Sequence[recordings.Recording]) -> None:

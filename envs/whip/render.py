@@ -13,14 +13,17 @@ from jaxtyping import Array, Float, Int
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.episode import Step, Whip
 from jaxlfi.envs.whip.frames import COLOURS, Frames
-from jaxlfi.envs.whip.parameters import WhipParameters
+from jaxlfi.envs.whip.parameters import MILLIMETRES, WhipParameters, median
 from jaxlfi.envs.whip.physics import engine as physics
 from jaxlfi.envs.whip.physics.engine import Engine, State
+from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.rig import RGBA
+from jaxlfi.envs.whip.trajectory import seen
 from jaxlfi.envs.whip.vision.camera import Camera, project, side_camera
 from jaxlfi.envs.whip.vision.keypoints import KEYPOINTS, ON_DLO
 from jaxlfi.envs.whip.vision.raster import segmentation
+from jaxlfi.runs.run import Run
 
 BACKGROUND = (1.0, 1.0, 1.0)
 PALETTE = np.array([BACKGROUND, *(RGBA[name][:3] for name in (*COLOURS, "dlo"))], np.float32)
@@ -171,6 +174,35 @@ def save_pictures(folder: Path, engine: Engine, rollout: Rollout, title: Sequenc
         figures.save_sheet(folder / "sheet.png", film.every(PIECES), ": ".join(title)),
         figures.save_animation(folder / "film.gif", film, "\n".join(title), interval, 0.6 ** (at % PIECES)),
     ]
+
+
+def save_predictive(path: Path, run: Run) -> Path:
+    """Draw what simulations of a posterior are seen to do, over what was observed (`figures.draw_predictive`).
+
+    Args:
+        path: of the png.
+        run: of `real2sim.task`; of several rollouts, the first is shown. The scene is that of mu, seen by the side
+            camera.
+    """
+    from jaxlfi.envs.whip import figures
+
+    steps = rules.STEPS
+    observed, simulated = np.asarray(run.observed), np.asarray(run.history["final_trajectory"])
+    simulated = simulated[np.isfinite(run.history["sample_trajectory_error"][-1])]
+    engine, parameters = pick(), median(*np.median(np.asarray(run.draws()), axis=0) / MILLIMETRES)
+    view, _ = seen(engine, parameters, jnp.asarray(observed[: steps - 1, -2:], jnp.float32))
+    camera = side_camera(parameters)
+    draw = lambda frame: segmentation(camera, frame, parameters.cube_side, size=SIZE).astype(jnp.uint8)
+    shown = figures.Predictive(
+        observed=keypoints_of(jnp.asarray(observed[:steps])),
+        simulated=np.stack([keypoints_of(jnp.asarray(one[:steps])) for one in simulated]),
+        labels=np.asarray(jax.lax.map(draw, view, batch_size=8)),
+        gripper=np.asarray(project(camera, _in_plane(view.gripper))),
+        palette=PALETTE,
+        times=engine.scene.control_interval * np.arange(steps),
+        lines=jax.device_get(lines(camera)),
+    )
+    return figures.save_predictive(path, shown)
 
 
 def _captions(interval: float, rollout: Rollout, at: np.ndarray) -> list[str]:

@@ -1,23 +1,33 @@
 """Figures of a study, from what is kept of it."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.colors import ListedColormap
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon, Rectangle
+from scipy.spatial import ConvexHull
 
 from experiments.policies.barycentres import barycentre
 from experiments.policies.results import Results, label
 from experiments.policies.study import FEM, NOMINAL, STILLS
-from experiments.policies.tables import SETS, difficulty
-from jaxlfi.envs.whip.render import PALETTE
-from jaxlfi.figures import style
-from jaxlfi.figures.learning import WINDOW, running_mean
+from experiments.policies.tables import SETS
+from jaxlfi.envs.whip.parameters import MEDIAN
+from jaxlfi.envs.whip.render import PALETTE, lines
+from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, HAND, RGBA
+from jaxlfi.envs.whip.vision.camera import side_camera
+from jaxlfi.figures import discrepancy, learning, legends, style
 
 ROWS = (*FEM, "median")
-BINS = np.linspace(-2.0, 2.0, 17)
-"""Of returns; what is below is counted in the first."""
+MOMENTS = (0, 3, 5, 7, 16)
+"""Control steps of the stills that are shown."""
+VIEW = ((0.28, 1.0), (0.97, 0.12))
+"""Which part of the image: from left to right, and from bottom to top, in normalised pixels."""
+BAND = 0.7
+"""How pale a band is."""
 EVERY = 3
 """Control steps between the marks on a trajectory, as in the paper."""
 
@@ -28,65 +38,69 @@ def agents(how: str) -> list[str]:
 
 
 def draw_curves(figure: Figure, results: Results) -> None:
-    """Counterpart of the paper's `fig:learning-curves`: a panel a set; a thin line a seed, a thick one their mean."""
-    panels = figure.subplots(len(SETS), 1, sharex=True, sharey=True)
+    """Counterpart of the paper's `fig:learning-curves`: a panel a set, the medians of seeds and their quartiles."""
+    panels = figure.subplots(1, len(SETS), sharey=True)
     for axes, (title, how) in zip(panels, SETS.items(), strict=True):
-        known = [name for name in agents(how) if name in results.trainings]
-        for look, name in zip(style.looks(known).values(), known, strict=True):
-            own = results.trainings[name]
-            returns = running_mean(own["curve"], min(WINDOW, len(own["curve"])))
-            steps = int(own["steps_per_update"]) * (1 + np.arange(len(returns)))
-            axes.plot(steps, returns, color=look.colour, alpha=0.3, linewidth=0.5)
-            axes.plot(steps, returns.mean(axis=1), color=look.colour, linewidth=1.2, label=label(name))
-        axes.set(title=title, ylabel="return")
-        if known:
-            axes.legend(frameon=False, ncols=2, fontsize=6)
-    panels[-1].set_xlabel("environment steps")
+        if known := [name for name in agents(how) if name in results.trainings]:
+            looks = zip(known, style.looks(known).values(), strict=True)
+            curves = {label(name): (look, results.trainings[name]["curve"]) for name, look in looks}
+            learning.draw_curves(axes, curves, int(results.trainings[known[0]]["steps_per_update"]))
+        axes.set_title(title)
+        axes.label_outer()
 
 
 def draw_trajectories(figure: Figure, results: Results, title: str) -> None:
     """Counterpart of the paper's `fig:def-adapt-supp-eef-trajs-plots`, for one set of six policies.
 
-    A row a DLO, one column per policy: accumulated (dx, dz) of the repetitions at the nominal place, and a soft-DTW
-    barycentre for each training seed, marked every three steps. Then the returns at displaced places, and measures.
+    A row a DLO, one column per policy: where the gripper's set-point goes at the nominal place, as a band that holds
+    all episodes of all seeds and their soft-DTW barycentre, marked every three steps. Then the mean return of each seed
+    at displaced places.
     """
     names = agents(SETS[title])
-    grid = figure.subplots(len(ROWS), len(names) + 2, squeeze=False)
+    grid = figure.subplots(len(ROWS), len(names) + 1, squeeze=False, width_ratios=[1] * len(names) + [1.6])
     look = dict(zip(names, style.looks(names).values(), strict=True))
-    measures = {row["DLO"]: row for row in difficulty(results) if row["policies"] == title}
     for row, dlo in zip(grid, ROWS, strict=True):
         for axes, name in zip(row, names, strict=False):
             if (found := _episodes(results, name, dlo)) is not None:
                 _draw_paths(axes, found["actions"][:, :NOMINAL], look[name].colour)
-                axes.set_title(f"{np.mean(found['value']):.2f}", fontsize=6)
-            axes.set(xlim=(-0.15, 0.25), ylim=(-0.3, 0.2))
-            axes.tick_params(labelsize=5)
+            axes.set(xlim=(-0.1, 0.25), ylim=(-0.2, 0.15), xticks=(0, 0.2), yticks=(-0.1, 0, 0.1), aspect="equal")
+            axes.grid(True)
             axes.label_outer()
-        _draw_histogram(row[-2], {name: _episodes(results, name, dlo) for name in names}, look)
-        row[-1].axis("off")
-        own = measures.get("μ, simulated" if dlo == "median" else dlo, {})
-        lines = [f"{name} {own[f'{name}, displaced']}" for name in ("average", "consistency", "difficulty") if own]
-        row[-1].text(0.0, 0.5, "\n".join(lines), fontsize=6, va="center")
-        row[0].set_ylabel("μ, simulated" if dlo == "median" else dlo, fontsize=7)
-    for axes, name in zip(grid[-1], names, strict=False):
-        axes.set_xlabel(label(name), fontsize=7)
-    grid[-1, -2].set_xlabel("return", fontsize=7)
-    figure.supxlabel("accumulated dx [m]", fontsize=7)
-    figure.supylabel("accumulated dz [m]", fontsize=7)
+        there = {name: found for name in names if (found := _episodes(results, name, dlo)) is not None}
+        of_seeds = {name: found["value"][:, NOMINAL:].mean(axis=1) for name, found in there.items()}
+        discrepancy.draw_dots(row[-1], of_seeds, {name: dataclasses.replace(look[name], marker="o") for name in there})
+        row[-1].set(ylim=(-0.1, 2.1), yticks=(0, 1, 2))
+        row[0].set_ylabel(f"{'μ, simulated' if dlo == 'median' else dlo}\nΔz [m]")
+    for axes, name in zip(grid[0], names, strict=False):
+        axes.set_title(label(name), color=look[name].colour, fontweight="bold")
+    grid[0, -1].set_title("mean return of a seed\nat displaced places")
+    for axes in grid[-1, :-1]:
+        axes.set_xlabel("Δx [m]")
+    handles = [
+        Patch(facecolor=style.shade(style.GREY, BAND), label=f"all episodes of all seeds ({NOMINAL} a seed)"),
+        Line2D([], [], color=style.GREY, marker=".", label=f"their barycentre, every {EVERY} steps marked"),
+        Line2D([], [], color=style.GREY, marker="o", linestyle="none", label="a seed"),
+        Line2D([], [], color=style.GREY, linewidth=1.6, label="median of seeds"),
+    ]
+    legends.below(figure, handles, at_most=4)
 
 
 def _episodes(results: Results, name: str, dlo: str) -> Mapping[str, np.ndarray] | None:
     return (results.simulation if dlo == "median" else results.objects).get((name, dlo))
 
 
-def _draw_paths(axes, actions: np.ndarray, colour: str) -> None:
-    for own in actions:
-        paths = [accumulated(one) for one in own]
-        for path in paths:
-            axes.plot(*path.T, color=colour, alpha=0.3, linewidth=0.4)
-        middle = barycentre(paths)
-        axes.plot(*middle.T, color=colour, linewidth=1.0)
-        axes.plot(*middle[::EVERY].T, ".", color=colour, markersize=2)
+def _draw_paths(axes: Axes, actions: np.ndarray, colour: str) -> None:
+    """The paths of all episodes [seeds, episodes, T, 2] as a band, and their barycentre."""
+    paths = [accumulated(one) for own in actions for one in own]
+    for t in range(max(map(len, paths)) - 1):
+        points = np.unique(np.concatenate([path[t : t + 2] for path in paths if len(path) > t + 1]), axis=0)
+        if len(points) > 2:
+            points = points[ConvexHull(points, qhull_options="QJ").vertices]
+        pale = style.shade(colour, BAND)
+        axes.add_patch(Polygon(points, facecolor=pale, edgecolor=pale, linewidth=0.8, joinstyle="round", gid="band"))
+    middle = barycentre(paths)
+    axes.plot(*middle.T, color=colour, linewidth=1.1, zorder=3, gid="barycentre")
+    axes.plot(*middle[::EVERY].T, ".", color=colour, markersize=4, zorder=3)
 
 
 def accumulated(actions: np.ndarray) -> np.ndarray:
@@ -95,38 +109,64 @@ def accumulated(actions: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros((1, 2)), np.cumsum(done, axis=0)])
 
 
-def _draw_histogram(axes, found: Mapping[str, Mapping[str, np.ndarray] | None], look: Mapping) -> None:
-    known = {name: own for name, own in found.items() if own is not None}
-    if known:
-        values = [np.clip(np.ravel(own["value"]), BINS[0], BINS[-1]) for own in known.values()]
-        axes.hist(values, BINS, stacked=True, color=[look[name].colour for name in known])
-    axes.tick_params(labelsize=5)
-
-
 def draw_stills(figure: Figure, strips: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Counterpart of the paper's timelapses: one row per policy and object, a column a control step."""
-    grid = figure.subplots(len(strips), len(STILLS), squeeze=False)
+    """Counterpart of the paper's timelapses: one row per policy and object, a column a moment, start and end marked.
+
+    Args:
+        figure: empty.
+        strips: labels [8, size, size] at the control steps `STILLS`, steps and return by "POLICY@OBJECT".
+    """
+    columns = [STILLS.index(step) for step in MOMENTS]
+    grid = figure.subplots(len(strips), len(columns), squeeze=False)
+    camera = side_camera(MEDIAN)
+    still = lines(camera)
+    width, height = (
+        float(camera.focal_length) * 2 * half / (-camera.position[1] - HAND[1]) for half in (HAND[0], HAND[2])
+    )
     for row, (name, strip) in zip(grid, strips.items(), strict=True):
         policy, dlo = name.split("@")
-        for axes, labels, step in zip(row, strip["labels"], STILLS, strict=True):
-            axes.imshow(labels, cmap=ListedColormap(PALETTE), vmin=-0.5, vmax=len(PALETTE) - 0.5, interpolation="none")
-            axes.set(xticks=[], yticks=[])
-            if step > strip["steps"]:
-                axes.images[0].set_alpha(0.35)
-        row[0].set_ylabel(f"{label(policy)} on {dlo}\n{float(strip['value']):.2f}", fontsize=6)
-    for axes, step in zip(grid[0], STILLS, strict=True):
-        axes.set_title(f"step {step}", fontsize=6)
+        for axes, place in zip(row, columns, strict=True):
+            labels = strip["labels"][place]
+            u, v = grip(labels)
+            axes.plot(*still["table"].T, color=RGBA["table"], linewidth=3, zorder=1)
+            hand = {"facecolor": RGBA["gripper"], "edgecolor": "none", "zorder": 2}
+            axes.add_patch(Rectangle((u - width / 2, v - height), width, height, **hand, gid="gripper"))
+            image = np.concatenate([PALETTE[labels], (labels > 0)[..., None]], axis=-1)
+            axes.imshow(image, extent=(0, 1, 1, 0), interpolation="antialiased", zorder=3)
+            if place == columns[-1]:
+                before = (strip["labels"][0] > 0) & (strip["labels"][0] < len(PALETTE) - 1)
+                around = {"colors": "black", "linewidths": 0.7, "linestyles": ":"}
+                axes.contour(before, levels=[0.5], extent=(0, 1, 0, 1), **around, zorder=4)
+            axes.set(xlim=VIEW[0], ylim=VIEW[1], xticks=[], yticks=[], aspect="equal")
+        row[0].set_ylabel(f"{label(policy)} on {dlo}\nreturn {float(strip['value']):.2f}")
+    words = {columns[0]: "start, ", columns[-1]: "settled, "}
+    for axes, place in zip(grid[0], columns, strict=True):
+        axes.set_title(f"{words.get(place, '')}{CONTROL_INTERVAL * STILLS[place]:.2f} s")
+    handles = [
+        Patch(color=RGBA["gripper"], label="gripper"),
+        Patch(color=RGBA["dlo"], label="DLO"),
+        Line2D([], [], color=RGBA["table"], linewidth=3, label="table"),
+        Line2D([], [], color="black", linewidth=0.7, linestyle=":", label="stack at the start"),
+    ]
+    legends.below(figure, handles)
+
+
+def grip(labels: np.ndarray) -> np.ndarray:
+    """Where the gripper holds the DLO: the middle of its uppermost pixels, in normalised pixels, shape [2]."""
+    rows, across = np.nonzero(labels == len(PALETTE) - 1)
+    size = labels.shape[0]
+    return np.array([across[rows == rows.min()].mean() + 0.5, rows.min()]) / size
 
 
 def save(out: Path, results: Results, strips: Mapping[str, Mapping[str, np.ndarray]]) -> list[Path]:
     """Draw all figures."""
     width = style.TEXT_WIDTH
-    paints = [("curves", (width / 2, 4.2), lambda figure: draw_curves(figure, results))]
+    paints = [("curves", (width, 2.9), lambda figure: draw_curves(figure, results))]
     for title, how in SETS.items():
         paint = lambda figure, title=title: draw_trajectories(figure, results, title)
-        paints.append((f"trajectories-{how}", (1.25 * width, 6.5), paint))
+        paints.append((f"trajectories-{how}", (1.15 * width, 6.4), paint))
     if strips:
-        paints.append(("stills", (width, 0.95 * len(strips) + 0.2), lambda figure: draw_stills(figure, strips)))
+        paints.append(("stills", (width, 1.5 * len(strips) + 0.3), lambda figure: draw_stills(figure, strips)))
     return [_save(out / f"{name}.png", size, paint) for name, size, paint in paints]
 
 

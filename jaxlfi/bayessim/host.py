@@ -110,8 +110,8 @@ class HostEngine(BatchEngine):
         if self.first is None:
             self._begun = made = self._simulated(*self._propose(state, jnp.asarray(0)), np.zeros(self.runs, bool))
             reasons = self.task.reasons
-            counts = jax.device_get((made.kept.sum(axis=-1), made.failed(len(reasons))))
-            require_success(*counts, reasons, self.known_failures)
+            succeeded, failed = jax.device_get((made.kept.sum(axis=-1), made.failed(len(reasons))))
+            require_success(succeeded, failed, reasons, self.known_failures)
 
     def compile(self, state: State, index: int = 0) -> None:
         """Compile the parts of a round ahead of their first use, while no simulator waits."""

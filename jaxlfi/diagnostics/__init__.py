@@ -19,6 +19,7 @@ from jaxlfi.diagnostics.calibration import (
 from jaxlfi.diagnostics.discrepancy import (
     POSTERIOR_SAMPLES,
     Discrepancy,
+    channel_errors,
     compared,
     discrepancy,
     not_simulated,
@@ -32,6 +33,7 @@ from jaxlfi.diagnostics.predictive import PredictiveCheck, Residual, predictive_
 __all__ = [
     "OK", "POSTERIOR_SAMPLES", "SIGNIFICANCE", "BoundEvidence", "Discrepancy", "Estimate", "Finding", "Histogram",
     "Intervals", "PredictiveCheck", "Residual", "TradeOff", "Uniformity", "bound_evidence", "bound_warnings", "c2st",
+    "channel_errors",
     "check_intervals", "check_regions", "compared", "coverage_verdict", "density_ranks", "discrepancy",
     "distance_ranks", "distance_verdict", "edge_mass", "histogram", "mass_beyond", "not_simulated",
     "predictive_check", "ranks", "ranks_verdict", "residuals", "trade_offs", "trajectory_distance", "uniformity",

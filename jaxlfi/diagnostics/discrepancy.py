@@ -75,7 +75,8 @@ def compared(
     first = observed[:1] if missing is None else 0.0
     difference, spread = jnp.asarray(trajectory - observed), jnp.asarray(observed - first)
     distance = _distance if missing is None else functools.partial(_distance_between_gaps, missing)
-    error = jnp.where(failure == 0, jax.vmap(lambda one: distance(one, spread))(difference), jnp.nan)
+    noise = 0.0 if task.channel_noise is None else task.channel_noise
+    error = jnp.where(failure == 0, jax.vmap(lambda one: distance(one, spread, noise))(difference), jnp.nan)
     x = jnp.where((failure == 0)[:, None], x, jnp.nan)
     return Discrepancy(theta, _theta_error(task, theta), error, jnp.asarray(trajectory), x, jnp.asarray(len(theta)))
 
@@ -95,35 +96,74 @@ def _theta_error(task: Task, theta: Float[Array, "samples dim"]) -> Float[Array,
     return jnp.abs(theta - (jnp.nan if truth is None else truth))
 
 
-def trajectory_distance(trajectory: Array, observed: Array) -> Float[Array, ""]:
+def trajectory_distance(
+    trajectory: Array, observed: Array, noise: Float[Array | np.ndarray, " channels"] | float = 0.0
+) -> Float[Array, ""]:
     """Euclidean distance of two trajectories in units of the observed one's standard deviation, per record.
 
-    Each channel is divided by its observed standard deviation, and the square root of the mean square is taken over
-    records and channels: a distance of 1 is as far as the observed trajectory is from its own mean. The plain
-    Euclidean distance that the paper names would make exp(-distance) zero for any two trajectories of a population.
+    The root of the mean square of `channel_errors`: a distance of 1 is as far as the observed trajectory is from its
+    own mean. The plain Euclidean distance that the paper names would make exp(-distance) zero for any two trajectories
+    of a population.
 
     Raises:
         ValueError: for trajectories of different shapes.
     """
+    return _distance(*_compared(trajectory, observed), noise)
+
+
+def channel_errors(
+    trajectory: Array, observed: Array, noise: Float[Array | np.ndarray, " channels"] | float = 0.0
+) -> Float[Array, " channels"]:
+    """Root mean square difference of two trajectories in each channel, shape [C].
+
+    Args:
+        trajectory: shape [T, C] or [T].
+        observed: the same shape.
+        noise: standard deviation of the measurement noise of each channel, shape [C], or of all.
+
+    Returns:
+        In units of the channel's observed standard deviation, or of its noise where that is larger, so that a channel
+        which hardly moves does not count for more than one that is known as well; as they are where both are 0.
+
+    Raises:
+        ValueError: for trajectories of different shapes.
+
+    Example:
+        >>> observed = jnp.stack([jnp.arange(4.0), jnp.zeros(4)], axis=1)
+        >>> [round(float(e), 2) for e in channel_errors(observed + 0.1, observed, noise=jnp.array([0.1, 0.1]))]
+        [0.09, 1.0]
+    """
+    difference, spread = _compared(trajectory, observed)
+    return jnp.sqrt(jnp.mean((difference / _scale(jnp.std(spread, axis=0), noise)) ** 2, axis=0))
+
+
+def _compared(trajectory: Array, observed: Array) -> tuple[Array, Array]:
+    """The difference of two trajectories, and the observed one less its first record, shape [T, C] each."""
     if trajectory.size != observed.size or trajectory.shape[:1] != observed.shape[:1]:
         raise ValueError(
             f"trajectory, observed: expected the same shapes, got {list(trajectory.shape)} and {list(observed.shape)}"
         )
-    return _distance(trajectory.reshape(observed.shape) - observed, observed - observed[:1])
+    difference, spread = trajectory.reshape(observed.shape) - observed, observed - observed[:1]
+    return jnp.asarray(difference.reshape(len(observed), -1)), jnp.asarray(spread.reshape(len(observed), -1))
 
 
-def _distance(difference: Array, spread: Array) -> Float[Array, ""]:
+def _scale(deviation: Array, noise: Array | np.ndarray | float) -> Array:
+    """Units of the errors of channels."""
+    largest = jnp.maximum(deviation, noise)
+    return jnp.where(largest > 0, largest, 1.0)
+
+
+def _distance(difference: Array, spread: Array, noise: Array | np.ndarray | float) -> Float[Array, ""]:
     """The same from the difference, and the observed trajectory less its first record."""
     spread = spread.reshape(len(spread), -1)
-    deviation = jnp.std(spread, axis=0)
-    scale = jnp.where(deviation > 0, deviation, 1.0)
-    return jnp.sqrt(jnp.mean((difference.reshape(spread.shape) / scale) ** 2))
+    return jnp.sqrt(jnp.mean((difference.reshape(spread.shape) / _scale(jnp.std(spread, axis=0), noise)) ** 2))
 
 
-def _distance_between_gaps(missing: np.ndarray, difference: Array, spread: Array) -> Float[Array, ""]:
+def _distance_between_gaps(
+    missing: np.ndarray, difference: Array, spread: Array, noise: Array | np.ndarray | float
+) -> Float[Array, ""]:
     """The same of what is not missing."""
     there = ~missing.reshape(len(missing), -1)
     spread, difference = (jnp.where(there, values.reshape(there.shape), 0.0) for values in (spread, difference))
-    deviation = jnp.std(spread, axis=0, where=there)
-    scale = jnp.where(deviation > 0, deviation, 1.0)
+    scale = _scale(jnp.std(spread, axis=0, where=there), noise)
     return jnp.sqrt(jnp.mean((difference / scale) ** 2, where=there))

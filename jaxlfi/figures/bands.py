@@ -1,13 +1,21 @@
-"""Lines with bands over iterations."""
+"""Lines with bands: the median of several seeds, and where the middle half of them lies."""
 
 import numpy as np
 from matplotlib.axes import Axes
 
+from jaxlfi.figures import statistics
 from jaxlfi.figures.style import Look
 
 
-def draw_band(axes: Axes, x: np.ndarray, middle: np.ndarray, deviation: np.ndarray, look: Look) -> None:
-    """A configuration's line over x, with a band of one deviation to either side where there is one; all [R]."""
-    if np.any(deviation > 0):
-        axes.fill_between(x, middle - deviation, middle + deviation, color=look.colour, alpha=0.16, linewidth=0)
+def draw_band(axes: Axes, x: np.ndarray, values: np.ndarray, look: Look) -> None:
+    """The median of seeds [seeds, R] over x [R], and a band of their quartiles where they differ; NaN is left out."""
+    low, middle, high = statistics.quartiles(values)
+    if np.any(high > low):
+        axes.fill_between(x, low, high, color=look.colour, alpha=0.16, linewidth=0)
     axes.plot(x, middle, **look.line)
+
+
+def over(seeds: int, otherwise: str = "one seed", fewest: int | None = None) -> str:
+    """What bands show, for a legend's title: of several seeds (of some, the fewest), or of what there is of one."""
+    count = f"{seeds}" if fewest in (None, seeds) else f"{fewest} to {seeds}"
+    return f"median of {count} seeds, band: quartiles" if seeds > 1 else otherwise

@@ -1,13 +1,16 @@
-"""exp(-loss) of posterior samples over iterations: trajectories above, each parameter in a grid below."""
+"""exp(-error) of posterior samples over iterations, of trajectories and of each parameter."""
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.bands import draw_band
+from jaxlfi.figures.bands import draw_band, over
 from jaxlfi.figures.collection import Runs, all_of, first_of, seed_count
 from jaxlfi.figures.legends import of_configurations
-from jaxlfi.figures.style import iterations_axis, looks, parameter_name
+from jaxlfi.figures.style import grid_shape, iterations_axis, looks, parameter_name
+
+COLUMNS = 5
+"""Panels side by side, at most."""
 
 
 def trajectory_curve(runs: Runs, configuration: str, alpha: float = 1.0) -> np.ndarray | None:
@@ -25,11 +28,9 @@ def theta_curve(runs: Runs, configuration: str, alpha: float = 1.0) -> np.ndarra
     return np.exp(-alpha * np.stack(errors)) if errors else None
 
 
-def middle_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard error of values [seeds, R, N]: over seeds' means, or over a single seed's samples."""
-    count = len(values) if len(values) > 1 else values.shape[2]
-    deviation = statistics.sd(statistics.mean(values, 2), 0) if len(values) > 1 else statistics.sd(values[0], 1)
-    return statistics.mean(values, (0, 2)), deviation / np.sqrt(count)
+def by_seed(values: np.ndarray) -> np.ndarray:
+    """What the band of values [seeds, R, N] is of: means of each seed [seeds, R], or samples of a single one [N, R]."""
+    return statistics.mean(values, 2) if len(values) > 1 else values[0].T
 
 
 def drawable(runs: Runs) -> bool:
@@ -43,32 +44,25 @@ def draw(figure: Figure, runs: Runs, alpha: float = 1.0) -> None:
     first = first_of(runs)
     trajectories = {name: trajectory_curve(runs, name, alpha) for name in runs}
     thetas = {name: theta_curve(runs, name, alpha) for name in runs}
-    columns = 2 if first.dim <= 4 else 3
-    below = [[f"{d}" for d in range(r, min(r + columns, first.dim))] for r in range(0, first.dim, columns)]
-    mosaic = [["trajectory"] * columns] if any(v is not None for v in trajectories.values()) else []
-    if any(v is not None for v in thetas.values()):
-        # The last row's panels fill its width.
-        mosaic += [row + [row[-1]] * (columns - len(row)) for row in below]
-    heights = [1.5 if row[0] == "trajectory" else 1.0 for row in mosaic]
-    panels = figure.subplot_mosaic(mosaic, gridspec_kw={"height_ratios": heights})
-    for name in runs:
-        for panel, axes in panels.items():
-            values = trajectories[name] if panel == "trajectory" else thetas[name]
-            if values is None:
-                continue
-            values = values if panel == "trajectory" else values[..., int(panel)]
-            draw_band(axes, np.arange(1, first.rounds + 1), *middle_and_error(values), look[name])
-    for panel, axes in panels.items():
-        axes.set_title("trajectory" if panel == "trajectory" else parameter_name(first.names, int(panel)))
+    # The trajectory's, then a parameter's each.
+    panels: list[int | None] = [None] * any(v is not None for v in trajectories.values())
+    panels += [*range(first.dim)] * any(v is not None for v in thetas.values())
+    rows, columns = grid_shape(len(panels), COLUMNS)
+    # Parameters are compared with one another, and with the trajectory: one scale for all of them.
+    every = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    for place, (d, axes) in enumerate(zip(panels, every, strict=False)):
+        for name in runs:
+            values = trajectories[name] if d is None else thetas[name]
+            if values is not None:
+                values = values if d is None else values[..., d]
+                draw_band(axes, np.arange(1, first.rounds + 1), by_seed(values), look[name])
+        axes.set_title("trajectory" if d is None else parameter_name(first.names, d))
         axes.grid(True)
-        left = panel == "trajectory" or int(panel) % columns == 0
-        factor = "" if alpha == 1 else rf"{alpha:g}\,"
-        axes.set_ylabel(rf"$\exp(-{factor}\mathcal{{L}})$" if left else "")
-        iterations_axis(axes, first.rounds, label=panel in mosaic[-1])
-    # Parameters are compared with one another: one scale for all of them.
-    top = max((axes.get_ylim()[1] for panel, axes in panels.items() if panel != "trajectory"), default=1.0)
-    for panel, axes in panels.items():
-        axes.set_ylim(0, None if panel == "trajectory" else top)
-    seeds = seed_count(runs)
-    over = f"{seeds} seeds" if seeds > 1 else "the posterior samples of one seed"
-    of_configurations(figure, look, f"mean ± standard error over {over}")
+        iterations_axis(axes, first.rounds, label=place + columns >= len(panels))
+    for axes in every[len(panels) :]:
+        axes.remove()
+    factor = "" if alpha == 1 else rf"{alpha:g}\,"
+    for axes in every[: len(panels) : columns]:
+        axes.set_ylabel(rf"accuracy $\exp(-{factor}\mathrm{{error}})$")
+    every[0].set_ylim(0, None)
+    of_configurations(figure, look, over(seed_count(runs), "median and quartiles of one seed's posterior samples"))

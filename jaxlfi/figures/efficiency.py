@@ -4,40 +4,42 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from jaxlfi.figures import statistics
+from jaxlfi.figures.bands import draw_band, over
 from jaxlfi.figures.collection import Runs, first_of, seed_count
+from jaxlfi.figures.discrepancy import draw_dots
 from jaxlfi.figures.legends import of_configurations
 from jaxlfi.figures.style import iterations_axis, looks
 
-PANELS = {"attempted": "simulations", "success_rate": "success rate [%]", "cumulative": "cumulative failures"}
+PANELS = {
+    "success_rate": "success rate [%]",
+    "attempted": "simulations in all",
+    "failed": "failed simulations in all",
+}
 
 
 def quantities(runs: Runs, configuration: str) -> dict[str, np.ndarray]:
-    """The values of a configuration by panel, shape [seeds, R] each."""
+    """The values of a configuration by panel: the rate of each round [seeds, R], and sums over rounds [seeds]."""
     attempted = np.stack([h.attempted for h in runs[configuration]]).astype(float)
     failed = np.stack([h.failed for h in runs[configuration]]).astype(float)
     rate = np.where(attempted > 0, 100 * (1 - failed / np.maximum(attempted, 1)), np.nan)
-    return {"attempted": attempted, "success_rate": rate, "cumulative": np.cumsum(failed, axis=1)}
+    return {"success_rate": rate, "attempted": attempted.sum(1), "failed": failed.sum(1)}
 
 
 def draw(figure: Figure, runs: Runs) -> None:
-    """Simulations, success rate and cumulative failures over iterations: means over seeds, and each seed."""
+    """Success rate over iterations, median and quartiles of seeds; simulations and failures in all, a dot a seed."""
     look = looks(list(runs))
-    axes = dict(zip(PANELS, figure.subplots(1, len(PANELS)), strict=True))
+    axes = dict(zip(PANELS, figure.subplots(1, len(PANELS), width_ratios=(1.6, 1, 1)), strict=True))
     rounds = first_of(runs).rounds
-    for name in runs:
-        for panel, values in quantities(runs, name).items():
-            iteration = np.arange(1, rounds + 1)
-            if len(values) > 1:
-                axes[panel].plot(iteration, values.T, color=look[name].colour, linewidth=0.4, alpha=0.6)
-            axes[panel].plot(iteration, statistics.mean(values, 0), **look[name].line)
+    found = {name: quantities(runs, name) for name in runs}
+    for name, own in found.items():
+        draw_band(axes["success_rate"], np.arange(1, rounds + 1), own["success_rate"], look[name])
+    for panel in ("attempted", "failed"):
+        draw_dots(axes[panel], {name: own[panel] for name, own in found.items()}, look)
     for panel, title in PANELS.items():
         axes[panel].set_title(title)
-        axes[panel].grid(True)
         axes[panel].yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True, steps=[1, 2, 5, 10]))
-        iterations_axis(axes[panel], rounds)
+    axes["success_rate"].grid(True)
+    iterations_axis(axes["success_rate"], rounds)
     low, _ = axes["success_rate"].get_ylim()
     axes["success_rate"].set_ylim(max(low, -3.0), 103.0)
-    axes["cumulative"].set_ylim(bottom=0)
-    seeds = seed_count(runs)
-    of_configurations(figure, look, f"mean over {seeds} seeds, thin: each seed" if seeds > 1 else "one seed")
+    of_configurations(figure, look, over(seed_count(runs)))

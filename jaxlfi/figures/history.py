@@ -81,6 +81,7 @@ class History:
     times: np.ndarray | None  # [T]
     record_label: str  # name of the trajectory's row axis, "time"
     channels: tuple[str, ...]  # names of the trajectory's columns
+    channel_noise: np.ndarray  # standard deviations of their measurement noise, [C]; 0 where it is not known
     feasible_low: np.ndarray | None  # limits Phi, [D]
     feasible_high: np.ndarray | None
 
@@ -175,7 +176,8 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
     rounds, _, dim = arrays["theta"].shape
     trajectory = _trajectory(observation.get("trajectory"))
     times = _times(observation.get("times"), trajectory)
-    x, truth = observation.get("x"), observation.get("truth")
+    columns = 0 if trajectory is None else trajectory.shape[1]
+    x = observation.get("x")
     if x is not None and x.ndim != 1:
         raise ValueError(f"{folder / 'observation.npz'}: expected x of one dimension, got shape {x.shape}")
     obs = 0 if x is None else len(x)
@@ -204,10 +206,11 @@ def load(folder: Path | str, configuration: str | None = None) -> History:
         x=x,
         x_scale=_x_scale(dataset, obs),
         summaries=_texts(observation.get("summaries"), None, obs, "x_{}"),
-        truth=np.asarray(truth if truth is not None and truth.shape == (dim,) else np.full(dim, np.nan), float),
+        truth=_vector(observation.get("truth"), dim),
         times=times,
         record_label=_record_label(observation, times),
-        channels=_texts(observation.get("channels"), None, 0 if trajectory is None else trajectory.shape[1], "x{}"),
+        channels=_texts(observation.get("channels"), None, columns, "x{}"),
+        channel_noise=np.nan_to_num(_vector(observation.get("channel_noise"), columns)),
         feasible_low=_limits(config, "low", dim),
         feasible_high=_limits(config, "high", dim),
         **{name: arrays[name] for name in AXES if name not in ("counted", "kept", "failure")},
@@ -346,6 +349,11 @@ def _texts(first: Any, second: Any, length: int, default: str) -> tuple[str, ...
         if isinstance(texts, list) and len(texts) == length and length:
             return tuple(str(text) for text in texts)
     return tuple(default.format(i + 1) for i in range(length))
+
+
+def _vector(values: np.ndarray | None, length: int) -> np.ndarray:
+    """As many numbers, NaN where there are none or others."""
+    return np.asarray(values if values is not None and values.shape == (length,) else np.full(length, np.nan), float)
 
 
 def _limits(config: Mapping[str, Any], side: str, dim: int) -> np.ndarray | None:

@@ -1,19 +1,23 @@
-"""Learning curves: returns of training episodes by domain, one line per seed and their mean."""
+"""Learning curves: returns of training episodes by domain, the median of seeds and a band of their quartiles."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import StrMethodFormatter
 
-from jaxlfi.figures.style import context, looks, new_figure, save
+from jaxlfi.figures.bands import draw_band, over
+from jaxlfi.figures.style import Look, context, looks, new_figure, round_ticks, save
 
 WINDOW = 12
 """Updates that a running mean is taken over."""
 
 
 def draw(figure: Figure, names: Sequence[tuple[str, int]], returns: np.ndarray, steps_per_update: int) -> None:
-    """A thin line for each training, a thick one for the mean of a domain's seeds.
+    """A line for the median of a domain's seeds, and a band of their quartiles.
 
     Args:
         figure: empty.
@@ -21,19 +25,33 @@ def draw(figure: Figure, names: Sequence[tuple[str, int]], returns: np.ndarray, 
         returns: mean return of the episodes that ended in an update, shape [updates, R]; NaN where none did.
         steps_per_update: environment steps.
     """
-    axes = figure.subplots()
     domains = list(dict.fromkeys(domain for domain, _ in names))
-    look = looks(domains)
-    steps = steps_per_update * (1 + np.arange(len(returns)))
-    smooth = running_mean(returns, min(WINDOW, len(returns)))
-    for domain in domains:
-        own = [place for place, (name, _) in enumerate(names) if name == domain]
-        if len(own) > 1:
-            axes.plot(steps, smooth[:, own], color=look[domain].colour, alpha=0.35, linewidth=0.7)
-        axes.plot(steps, smooth[:, own].mean(axis=1), **look[domain].line)
+    own = {domain: returns[:, [name == domain for name, _ in names]] for domain in domains}
+    draw_curves(
+        figure.subplots(), {look.label: (look, own[name]) for name, look in looks(domains).items()}, steps_per_update
+    )
+
+
+def draw_curves(axes: Axes, curves: Mapping[str, tuple[Look, np.ndarray]], steps_per_update: int) -> None:
+    """Draw running means of returns over environment steps, with a legend.
+
+    Args:
+        axes: to draw on.
+        curves: look and mean returns, shape [updates, seeds], by what they are called.
+        steps_per_update: environment steps.
+    """
+    for label, (look, returns) in curves.items():
+        steps = steps_per_update * (1 + np.arange(len(returns)))
+        smooth = running_mean(returns, min(WINDOW, len(returns)))
+        draw_band(axes, steps, smooth.T, dataclasses.replace(look, label=label))
+        axes.lines[-1].set_markevery(max(1, len(returns) // 8))
+    counts = [returns.shape[1] for _, returns in curves.values()]
     axes.set_xlabel("environment steps")
     axes.set_ylabel("return of training episodes")
-    axes.legend(frameon=False)
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    round_ticks(axes.xaxis, 5)
+    axes.grid(True)
+    axes.legend(title=over(max(counts), fewest=min(counts)), title_fontsize="medium", loc="lower right")
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from jaxlfi.figures import statistics
-from jaxlfi.figures.bands import draw_band
+from jaxlfi.figures.bands import draw_band, over
 from jaxlfi.figures.collection import Runs, all_of, seed_count
 from jaxlfi.figures.extent import extent
 from jaxlfi.figures.history import History
@@ -55,11 +55,10 @@ def draw(figure: Figure, runs: Runs) -> None:
                 values = [by_round(h, panel) for h in histories if getattr(h, panel) is not None]
                 if values:
                     x = np.arange(1, every[0].rounds + 1)
-                    draw_band(axes[panel], x, statistics.mean(values, 0), statistics.sd(values, 0), look[name])
+                    draw_band(axes[panel], x, np.stack(values), look[name])
             iterations_axis(axes[panel], every[0].rounds)
-        seeds = seed_count(runs)
-        title = "last training loss, lowest validation loss" + (f"; mean ± sd over {seeds} seeds" if seeds > 1 else "")
-        of_configurations(figure, look, title)
+        seeds = f"; {over(seed_count(runs))}" if seed_count(runs) > 1 else ""
+        of_configurations(figure, look, f"last training loss, lowest validation loss{seeds}")
     for panel in shown:
         axes[panel].set_title(PANELS[panel])
         axes[panel].grid(True)

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxlfi.figures import (
+    channels,
     curves,
     discrepancy,
     efficiency,
@@ -97,8 +98,8 @@ def _efficiency(collection: Collection) -> Made:
     figure = style.new_figure(TEXT_WIDTH, 2.1 + _legend_height(collection.runs))
     efficiency.draw(figure, collection.runs)
     caption = (
-        "Number of simulations in each iteration, the percentage of them that succeeded, and the cumulative number "
-        "of failed simulations." + (" Thin lines are seeds." if seed_count(collection.runs) > 1 else "")
+        "Percentage of the simulations of each iteration that succeeded, and the numbers of all simulations and of "
+        "failed ones in the end." + _bands(collection.runs) + " Dots are seeds." * (seed_count(collection.runs) > 1)
     )
     return figure, "Data efficiency", caption
 
@@ -107,18 +108,18 @@ def _curves(collection: Collection) -> Made:
     if not curves.drawable(collection.runs) or first_of(collection.runs).rounds == 1:
         return None
     known, simulated = _measured(collection.runs)
-    dim = first_of(collection.runs).dim
-    wide = dim > 4
-    rows = -(-dim // (3 if wide else 2))
-    figure = style.new_figure(TEXT_WIDTH if wide and known else COLUMN_WIDTH, 2.3 + (1.2 * rows if known else 0.2))
+    rows, across = style.grid_shape(simulated + known * first_of(collection.runs).dim, curves.COLUMNS)
+    width = TEXT_WIDTH if across > 2 else COLUMN_WIDTH
+    figure = style.new_figure(width, 0.7 + 1.6 * rows + _legend_height(collection.runs))
     curves.draw(figure, collection.runs)
     caption = (
         "Accuracy exp(-error) of posterior samples after each iteration; 1 is perfect."
         + simulated
         * " Trajectory: the error is the Euclidean distance to the observed trajectory, per record and in "
-        "standard deviations of the observed one; a failed simulation has accuracy 0."
+        "standard deviations of the observed one (of its noise where that is larger); a failed simulation has accuracy "
+        "0."
         + known * " Parameters: the error is the absolute difference from the true value."
-        + " Lines are means, bands standard errors."
+        + (_bands(collection.runs) or " Lines are medians of the posterior samples, bands their quartiles.")
     )
     return figure, "Accuracy over iterations", caption
 
@@ -163,7 +164,7 @@ def _losses(collection: Collection) -> Made:
     caption = (
         "Negative log-density of the parameters, scaled to [-1, 1], under the network, mean over the ensemble's "
         "networks: " + ("after each epoch of training." if one else "after the training of each iteration.")
-    ) + " Lines are means over seeds, bands standard deviations." * (seed_count(collection.runs) > 1)
+    ) + _bands(collection.runs)
     return figure, "Training", caption
 
 
@@ -183,6 +184,23 @@ def _predictive(collection: Collection) -> Made:
     if drawn < every:
         caption += f" Of {every} channels, the {drawn} that vary most are shown."
     return figure, "Posterior predictive", caption
+
+
+def _channels(collection: Collection) -> Made:
+    runs = _those(collection.runs, channels.drawable)
+    if not runs:
+        return None
+    rows = len(channels.shown(runs))
+    width = TEXT_WIDTH if rows > 6 or len(runs) > 2 else COLUMN_WIDTH
+    figure = style.new_figure(width, 0.8 + min(0.12 + 0.06 * len(runs), 8.0 / rows) * rows + _legend_height(runs))
+    channels.draw(figure, runs)
+    dot = "seed" if seed_count(runs) > 1 else "simulation"
+    caption = (
+        "Root mean square difference between the observation and simulations of the last posterior in each channel, in "
+        f"its observed standard deviation, or its measurement noise where that is larger: one dot for each {dot}, a "
+        "stroke at the median. The trajectory error is the root mean square over channels."
+    )
+    return figure, "Trajectory error by channel", caption
 
 
 def _pairs(collection: Collection) -> Made:
@@ -248,6 +266,7 @@ PICTURES: dict[str, Callable[[Collection], Made]] = {
     "support": _supports,
     "losses": _losses,
     "predictive": _predictive,
+    "channels": _channels,
     "polars": _polars,
     "seeds": _seeds,
 }
@@ -304,6 +323,10 @@ def _those(runs: Runs, drawable: Callable[[History], bool]) -> Runs:
 
 def _which_seed(runs: Runs) -> str:
     return " Of several seeds, the one of median parameter error is shown." if seed_count(runs) > 1 else ""
+
+
+def _bands(runs: Runs) -> str:
+    return " Lines are medians of seeds, bands their quartiles." if seed_count(runs) > 1 else ""
 
 
 def _legend_height(runs: Runs) -> float:

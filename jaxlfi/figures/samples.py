@@ -97,7 +97,7 @@ def draw(figure: Figure, histories: Sequence[History], titles: Sequence[str] | N
                 lower[row, column].set_ylabel("")
     if len(shown[0]) == 2:
         iteration_bar(figure, upper, histories[0].rounds)
-    _legend(figure, histories)
+    legend(figure, histories)
 
 
 def _panels(figure: Figure, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -145,14 +145,18 @@ def draw_mixture(
     pair: tuple[int, ...],
     window: Sequence[tuple[float, float]] | None = None,
     look: Look | None = None,
+    bar: bool = True,
 ) -> None:
-    """The last mixture's marginal over a pair of parameters (or one), and the path of the weighted means."""
+    """The last mixture's marginal over a pair of parameters (or one), and the path of the weighted means.
+
+    `bar` says what the density of a pair is by a colour bar.
+    """
     window = window or [closer_limits([history], d) for d in pair]
     look = look or looks([history.configuration])[history.configuration]
     weight = density.weights(history.logits[-1])
     mean, covariance = density.marginal(history.means[-1], history.scale_tril[-1], pair)
     if np.isfinite(weight).all() and np.isfinite(mean).all() and np.isfinite(covariance).all():
-        _draw_density(axes, weight, mean, covariance, window, look)
+        _draw_density(axes, weight, mean, covariance, window, look, bar)
     else:
         axes.text(0.5, 0.5, "posterior is not finite", transform=axes.transAxes, ha="center", va="center")
     low, high = (bound[-1] for bound in history.supports)
@@ -168,7 +172,7 @@ def draw_mixture(
     _frame(axes, history, pair, window)
 
 
-def _draw_density(axes: Axes, weight, mean, covariance, window, look: Look) -> None:
+def _draw_density(axes: Axes, weight, mean, covariance, window, look: Look, with_bar: bool) -> None:
     scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     there = weight > 1e-3
     grids = [density.grid(*window[i], mean[there, i], scale[there, i]) for i in range(mean.shape[1])]
@@ -181,6 +185,8 @@ def _draw_density(axes: Axes, weight, mean, covariance, window, look: Look) -> N
         axes.set_ylabel("posterior density")
         return
     mesh: QuadMesh = axes.pcolormesh(*grids, values, cmap=look.density, vmin=0, shading="nearest", zorder=1)
+    if not with_bar:
+        return
     # As wide as the panel, so that columns of panels stay aligned.
     bar = axes.figure.colorbar(mesh, cax=axes.inset_axes([0.0, 1.03, 1.0, 0.045]), orientation="horizontal")
     bar.locator = MaxNLocator(nbins=3, min_n_ticks=2)
@@ -247,18 +253,38 @@ def _frame(axes: Axes, history: History, pair: tuple[int, ...], window: Sequence
         scale[pair[1]].show(axes.yaxis, 5)
 
 
-def _legend(figure: Figure, histories: Sequence[History]) -> None:
+def legend(
+    figure: Figure,
+    histories: Sequence[History],
+    at_most: int | None = None,
+    others: Sequence[Line2D] = (),
+    proposals: bool = True,
+) -> None:
+    """A legend below panels of `draw_proposals` and `draw_mixture`.
+
+    Args:
+        figure: to add it to.
+        histories: what is drawn.
+        at_most: columns of entries.
+        others: more entries.
+        proposals: whether proposals are drawn.
+    """
+
     def marker(shape: str, size: float, label: str, **style) -> Line2D:
         style = {"color": "#3B528B", "linestyle": "none", **style}
         return Line2D([], [], marker=shape, markersize=size, label=label, **style)
 
-    handles = [
+    of_proposals = [
         marker("o", 2.5, "simulated", markeredgewidth=0),
         marker("x", 3, "failed", markeredgewidth=0.7),
         marker("o", 5.5, "mean of data", markeredgecolor="white"),
+    ]
+    handles = [
+        *(of_proposals if proposals else ()),
         marker("s", 6, "support (dotted: first guess)", markerfacecolor="none"),
         marker(r"$\rightarrow$", 7, "weighted mean", color="black", markeredgewidth=0.3),
+        *others,
     ]
     if any(np.isfinite(h.truth).all() for h in histories):
         handles.append(Line2D([], [], label="truth", **(TRUTH_LINE if histories[0].dim == 1 else TRUTH)))
-    below(figure, handles, handletextpad=0.2, columnspacing=1.2)
+    below(figure, handles, at_most, handletextpad=0.2, columnspacing=1.2)

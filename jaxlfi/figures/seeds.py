@@ -51,7 +51,7 @@ def draw_strips(axes: Axes, values: Mapping[str, np.ndarray]) -> None:
         axes.plot(place, every.mean(), linestyle="none", zorder=5, gid="mean", **_MEAN)
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high / low < 50 else (1.0,)))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high / low < 100 else (1.0,)))
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_xticks(range(len(values)), [look[name].label.replace(" + ", "\n+ ") for name in values])

@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from jaxlfi.figures import statistics
 from jaxlfi.figures.history import heuristic_name, read_arrays, read_config
@@ -153,20 +154,25 @@ def _matrix(figure: Figure, grid: Grid, above: Measure | None, below: Measure) -
             aspect=45,
             pad=0.015,
         )
+        bar.locator = MaxNLocator(6, steps=[1, 2, 5, 10])
+        bar.update_ticks()
         side = {"top": "above", "bottom": "below"}[place] + (" the diagonal" if len(counts) > 1 else "")
         bar.set_label(f"{side}: {measure.label}" if above else measure.label)
         bar.outline.set_linewidth(0.4)
 
 
 def _scale(grid: Grid, measure: Measure) -> Normalize:
-    """From the smallest to the largest mean shown; where all are equal, all have the best colour."""
+    """From the smallest to the largest mean shown; where all are equal, all have the best colour.
+
+    Of a success rate from a round number up to all, so that differences are not made larger than they are.
+    """
     pairs = [pair for r in (1, 2) for pair in itertools.combinations(range(len(grid.names)), r)]
     means = [marginal(measure.scale * grid.arrays[measure.name], *pair)[0].ravel() for pair in pairs]
     means = np.concatenate(means)
     means = means[np.isfinite(means)]
     low, high = (means.min(), means.max()) if means.size else (0.0, 1.0)
     if high > low:
-        return Normalize(low, high)
+        return Normalize(low, high) if measure.smaller_is_better else Normalize(10 * np.floor(low / 10), max(high, 100))
     width = 0.01 * max(abs(low), 1.0)
     return Normalize(low, low + width) if measure.smaller_is_better else Normalize(low - width, low)
 
@@ -223,7 +229,8 @@ def _cells(
         return
     for (row, column), value in np.ndenumerate(mean):
         known = np.isfinite(value)
-        text = f"{_number(value)}\n±{_number(sd[row, column])}" if known else "–"
+        number = _number if measure.smaller_is_better else "{:.0f}".format
+        text = f"{number(value)}\n±{number(sd[row, column])}" if known else "–"
         red, green, blue, _ = colours(scale(value)) if known else (1, 1, 1, 1)
         axes.text(
             column,

@@ -1,4 +1,4 @@
-"""Mean, standard deviation and median of the values that are not NaN; NaN where there are none."""
+"""Mean, standard deviation, median and quartiles of the values that are not NaN; NaN where there are none."""
 
 import numpy as np
 
@@ -22,6 +22,15 @@ def sd(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndar
         centre = np.expand_dims(centre, axis)
     squares = np.where(there, (values - centre) ** 2, 0.0).sum(axis)
     return np.where(count > 0, np.sqrt(squares / np.maximum(count - 1, 1)), np.nan)
+
+
+def quartiles(values: np.ndarray) -> np.ndarray:
+    """Lower quartile, median and upper quartile over the first axis of the values that are not NaN, shape [3, ...]."""
+    values = np.asarray(values, float)
+    known = ~np.isnan(values).all(0)
+    found = np.full((3, *values.shape[1:]), np.nan)
+    found[:, known] = np.nanquantile(values[:, known], (0.25, 0.5, 0.75), axis=0)
+    return found
 
 
 def median(values: np.ndarray) -> float:

@@ -105,7 +105,8 @@ def write_run(folder: Path, run: Result, keep_network: bool = False) -> None:
             "times": np.arange(len(run.observed)) if task.times is None else task.times,
             "record_label": np.asarray(task.record_label or ("record" if task.times is None else "time")),
         }
-        | ({} if run.reference is None else {"reference": run.reference}),
+        | ({} if run.reference is None else {"reference": run.reference})
+        | ({} if task.channel_noise is None else {"channel_noise": task.channel_noise}),
         durable=True,
     )
     if keep_network or run.amortised or not run.settings.estimator.closed_form:

@@ -73,6 +73,9 @@ class Task:
         failures: names of the reasons for which a simulation can fail.
         summary_names: names of the summary's numbers, for plots; by default x_1 to x_S.
         channels: names of the columns of a trajectory, for plots.
+        channel_noise: standard deviation of the measurement noise of each column of a trajectory, where it is known,
+            shape [C]. Trajectory errors are in units of it where a channel moves less than it, so that a channel at
+            rest does not dominate.
         times: times of the rows of a trajectory, shape [T], for plots.
         record_label: what the rows of a trajectory are counted by, for plots; by default "time" where there are
             `times`, else "record".
@@ -113,6 +116,7 @@ class Task:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     hyperparameters: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     name: str = "task"
+    channel_noise: Any = None
 
     def __post_init__(self):
         store = lambda field, value: object.__setattr__(self, field, value)
@@ -151,6 +155,11 @@ class Task:
         if isinstance(self.summary, str):
             store("summary", summaries.named(self.summary))
         is_natural(self.prior_space)
+        if self.channel_noise is not None:
+            noise = _vector(self.channel_noise, len(self.channels) or np.size(self.channel_noise), "channel_noise")
+            if bool(np.any(noise < 0)):
+                raise ValueError(f"channel_noise: expected standard deviations of at least 0, got {noise}")
+            store("channel_noise", noise)
         for field in ("observation", "times"):  # who made them may go on to change them
             store(field, own_arrays.copied(getattr(self, field)))
         if self.prior is not None:

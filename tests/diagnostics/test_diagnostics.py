@@ -3,9 +3,17 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxlfi
-from jaxlfi.diagnostics import POSTERIOR_SAMPLES, compared, discrepancy, not_simulated, trajectory_distance
+from jaxlfi.diagnostics import (
+    POSTERIOR_SAMPLES,
+    channel_errors,
+    compared,
+    discrepancy,
+    not_simulated,
+    trajectory_distance,
+)
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
@@ -96,6 +104,24 @@ def test_discrepancy_shapes_and_failures(key):
     np.testing.assert_array_equal(np.isnan(seen.trajectory_error), failed)
     ok = int(np.flatnonzero(~failed)[0])
     np.testing.assert_allclose(seen.trajectory_error[ok], trajectory_distance(seen.trajectory[ok], observed), rtol=1e-5)
+
+
+def test_a_channel_at_rest_does_not_dominate_the_trajectory_error(key):
+    """A cube that moves by 0.0007 where the detector errs by 0.005, as the simulations do."""
+    rng = np.random.default_rng(0)
+    observed = np.stack([np.sin(np.arange(16.0)), 0.5 + 0.0007 * rng.normal(size=16)], axis=1).astype(np.float32)
+    simulated = observed + np.float32([0.05, 0.005]) * np.resize([-1, 1], 16)[:, None]
+    plain, noise = channel_errors(simulated, observed), np.float32([0.0, 0.005])
+    assert plain[1] > 5 > 0.1 > plain[0] > 0.05
+    own = channel_errors(simulated, observed, noise)
+    np.testing.assert_allclose(own, [plain[0], 1.0], rtol=1e-4)
+    distance = trajectory_distance(simulated, observed, noise)
+    assert distance == pytest.approx(np.sqrt(np.mean(np.square(own))), rel=1e-5) and distance < 0.8
+    # And so it is for a task that knows its noise.
+    known = task(lambda key, theta: jnp.asarray(simulated), channel_noise=noise)
+    np.testing.assert_allclose(see(key, known, belief(), observed, n=3).trajectory_error, distance, rtol=1e-5)
+    with pytest.raises(ValueError, match="channel_noise: expected standard deviations of at least 0"):
+        task(moving, channel_noise=[-1.0, 0.0])
 
 
 def test_summaries_are_those_of_the_trajectories_and_nan_where_there_are_none(key):

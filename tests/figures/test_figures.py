@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 from scipy import stats
 
 from jaxlfi.figures import (
+    channels,
     curves,
     density,
     discrepancy,
@@ -288,6 +289,69 @@ def points_of(image: Path) -> np.ndarray:
     return imread(image)
 
 
+THIRTY = ("gripper x (m)", *(f"keypoint {i} {axis}" for i in range(14) for axis in "uv"), "action dx (m)")
+"""As many channels as a whip has."""
+
+
+def write_thirty(folder: Path) -> Path:
+    """A run of thirty channels: the second hardly moves, to which all simulations are blind, the last not at all."""
+    write_run(folder, records=16, channels=THIRTY)
+
+    def still(arrays):
+        arrays["trajectory"][:, 1] = 0.5 + 0.0007 * np.resize([-1, 1], 16)
+        arrays["trajectory"][:, -1] = 0.0
+        arrays["channel_noise"] = np.r_[0.0, 0.005, np.zeros(28)]
+
+    def blind(arrays):
+        arrays["final_trajectory"][..., 1] = 0.505
+        arrays["final_trajectory"][..., -1] = 0.0
+
+    change(folder, "observation.npz", still)
+    change(folder, "history.npz", blind)
+    return folder
+
+
+def test_channels_are_in_units_of_noise_where_they_hardly_move(tmp_path):
+    history = load(write_thirty(tmp_path / "run"))
+    found = channels.errors(history)
+    assert found.shape == (len(history.predictions), 30)
+    np.testing.assert_allclose(found[:, 1], 1.0, rtol=0.02)  # and 7 in observed standard deviations
+    moved = (history.predictions - history.observed)[..., 0]
+    np.testing.assert_allclose(found[:, 0], np.sqrt(np.mean(moved**2, 1)) / history.observed[:, 0].std())
+
+
+def test_channels_shows_each_seed_and_the_median_of_what_can_differ(tmp_path, compared):
+    history = load(write_thirty(tmp_path / "run"))
+    (axes,) = drawn(channels.draw, {"ok": [history]}).axes
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert labels == list(THIRTY[:-1])  # an action is that of the observation
+    assert "sd" in axes.get_xlabel() and axes.get_xscale() == "log"
+    dots, medians = marked(axes, "dots"), marked(axes, "median")
+    for row in range(29):
+        own = channels.errors(history)[:, row]
+        np.testing.assert_allclose(dots[row].get_xdata(), own)
+        assert medians[row].get_xdata()[0] == pytest.approx(np.median(own))
+    (axes,) = drawn(channels.draw, compared.runs).axes
+    expected = [channels.errors(h)[:, 0].mean() for h in compared.runs["ok"]]
+    np.testing.assert_allclose(marked(axes, "dots")[0].get_xdata(), expected)
+
+
+def test_pictures_are_no_higher_than_a_screen_and_their_axes_in_natural_units(tmp_path):
+    """At the resolution of the report, 300 pixels to an inch, also of thirty channels."""
+    collection = open_collection(write_thirty(tmp_path / "run"))
+    for name, make in reporting.PICTURES.items():
+        with style.context():
+            if (made := make(collection)) is None:
+                continue
+        assert 300 * made[0].get_size_inches()[1] <= 3000, name
+        for axes in made[0].axes:
+            texts = [axes.get_xlabel(), axes.get_ylabel(), axes.get_title()]
+            for text in texts:
+                assert not text.startswith("ln ") and " ln " not in text and "ln(" not in text, (name, text)
+            for text in texts[:2]:  # of parameters
+                assert "[1/time]" in text or not ("bounds" in text or any(own in text for own in NATURAL)), (name, text)
+
+
 # The mixture
 
 
@@ -384,33 +448,31 @@ def test_samples_pairs_all_parameters():
     assert samples.pairs(5) == [(0, 1), (2, 3), (4, 0)]
 
 
-def test_efficiency_lines_are_means_over_seeds(compared):
+def test_efficiency_shows_medians_of_seeds_and_each_in_the_end(compared):
     figure = drawn(efficiency.draw, compared.runs)
     histories = compared.runs["broad"]
     attempted = np.stack([h.attempted for h in histories])
     failed = np.stack([h.failed for h in histories])
-    draws = {
-        "simulations": attempted,
-        "success rate [%]": 100 * (attempted - failed) / attempted,
-        "cumulative failures": failed.cumsum(1),
-    }
-    for title, values in draws.items():
-        shown = line(panel(figure, title), "broad")
-        np.testing.assert_allclose(shown.get_xdata(), np.arange(1, histories[0].rounds + 1))
-        np.testing.assert_allclose(shown.get_ydata(), values.mean(0))
+    shown = line(panel(figure, "success rate [%]"), "broad")
+    np.testing.assert_allclose(shown.get_xdata(), np.arange(1, histories[0].rounds + 1))
+    np.testing.assert_allclose(shown.get_ydata(), np.median(100 * (attempted - failed) / attempted, axis=0))
+    for title, values in {"failed simulations in all": failed, "simulations in all": attempted}.items():
+        axes = next(axes for axes in figure.axes if axes.get_title() == title)
+        np.testing.assert_allclose(line(axes, "broad").get_ydata(), values.sum(1))
 
 
-def test_curves_are_means_of_exp_of_negative_losses(compared):
+def test_curves_are_medians_of_seeds_means_of_exp_of_negative_losses(compared):
     figure = drawn(curves.draw, compared.runs, alpha=0.5)
     histories = compared.runs["misspecified+mode"]
     error = np.stack([h.trajectory_error for h in histories])
     assert np.isnan(error).any()
-    expected = np.where(np.isnan(error), 0.0, np.exp(-0.5 * error)).mean((0, 2))
+    expected = np.median(np.where(np.isnan(error), 0.0, np.exp(-0.5 * error)).mean(2), axis=0)
     label = "misspecified + MODE"
     np.testing.assert_allclose(line(panel(figure, "trajectory"), label).get_ydata(), expected)
     for d, name in enumerate(NATURAL):
         theta = np.stack([h.theta_error[..., d] for h in histories])
-        np.testing.assert_allclose(line(panel(figure, name), label).get_ydata(), np.exp(-0.5 * theta).mean((0, 2)))
+        expected = np.median(np.exp(-0.5 * theta).mean(2), axis=0)
+        np.testing.assert_allclose(line(panel(figure, name), label).get_ydata(), expected)
 
 
 def test_discrepancy_shows_each_seed_and_their_median(compared):
@@ -449,7 +511,7 @@ def test_losses_of_one_run_by_epoch_and_of_several_by_round(compared):
     for i, shown in enumerate(panel(figure, "training loss").lines):
         np.testing.assert_allclose(shown.get_ydata(), history.loss[i].mean(0))
     figure = drawn(losses.draw, compared.runs)
-    best = np.stack([h.validation_loss.mean(1).min(-1) for h in compared.runs["ok"]]).mean(0)
+    best = np.median([h.validation_loss.mean(1).min(-1) for h in compared.runs["ok"]], axis=0)
     np.testing.assert_allclose(line(panel(figure, "validation loss"), "OK").get_ydata(), best)
 
 
@@ -711,7 +773,7 @@ def names_of(paths: list[Path]) -> list[str]:
 
 
 EVERYTHING = ["pairs", "samples", "efficiency", "curves", "discrepancy", "support", "losses"]
-EVERYTHING += ["predictive", "polars", "seeds"]
+EVERYTHING += ["predictive", "channels", "polars", "seeds"]
 OF_SEVERAL = {"discrepancy", "seeds"}
 """Pictures in which a single run would be a single dot."""
 
@@ -737,10 +799,10 @@ def test_report_of_a_comparison(compared):
 @pytest.mark.parametrize(
     ("options", "missing"),
     [
-        ({"dim": 1, "channels": ("x",)}, set()),
+        ({"dim": 1, "channels": ("x",)}, {"channels"}),
         ({"dim": 3, "truth": False}, set()),
         ({"dim": 4, "rounds": 1, "epochs": 1, "components": 1, "records": 21}, {"efficiency", "curves"}),
-        ({"dim": 2, "failures": 1.0, "records": 1}, {"predictive"}),
+        ({"dim": 2, "failures": 1.0, "records": 1}, {"predictive", "channels"}),
         ({"dim": 2, "failures": 0.0, "configuration": "ok"}, {"efficiency", "support"}),
     ],
     ids=["one", "unknown-truth", "one-round", "all-failed", "constant"],
@@ -753,8 +815,8 @@ def test_report_of_one_run(tmp_path, options, missing):
 
 
 def test_legends_fit_into_figures_of_one_column(tmp_path):
-    collection = open_collection(write_run(tmp_path / "run", rounds=2, records=21))
-    for name in ("curves", "predictive", "polars"):
+    four, one = (open_collection(write_run(tmp_path / str(d), dim=d, rounds=2, records=21)) for d in (4, 1))
+    for name, collection in {"curves": one, "predictive": four, "polars": four}.items():
         with style.context():
             figure, _, _ = reporting.PICTURES[name](collection)
             figure.draw_without_rendering()

@@ -22,15 +22,18 @@ def test_running_means_are_of_the_last_known_values(window, seed):
             np.testing.assert_allclose(got[i, column], expected, atol=1e-12)
 
 
-def test_a_thick_line_is_the_mean_of_a_domains_seeds():
-    names = [("uniform", 0), ("uniform", 1), ("median", 0)]
-    returns = np.stack([np.arange(30.0), np.arange(30.0) + 2, -np.arange(30.0)], axis=1)
+def test_a_line_is_the_median_of_a_domains_seeds_and_a_band_their_quartiles():
+    names = [("uniform", 0), ("uniform", 1), ("uniform", 2), ("median", 0)]
+    returns = np.stack([np.arange(30.0), np.arange(30.0) + 2, np.arange(30.0) + 9, -np.arange(30.0)], axis=1)
     figure = Figure()
     learning.draw(figure, names, returns, steps_per_update=192)
     (axes,) = figure.axes
     lines = {line.get_label(): line for line in axes.get_lines() if not line.get_label().startswith("_")}
-    assert set(lines) == {"uniform", "median"} and len(axes.get_lines()) == 4
+    assert set(lines) == {"uniform", "median"} and len(axes.get_lines()) == 2
     np.testing.assert_array_equal(lines["median"].get_xdata(), 192 * np.arange(1, 31))
-    mean = learning.running_mean(returns[:, :2], learning.WINDOW).mean(axis=1)
-    np.testing.assert_allclose(lines["uniform"].get_ydata(), mean)
+    middle = learning.running_mean(returns[:, 1:2], learning.WINDOW)[:, 0]
+    np.testing.assert_allclose(lines["uniform"].get_ydata(), middle)
+    (band,) = axes.collections
+    ends = band.get_paths()[0].vertices[:, 1]
+    assert ends.max() == middle[-1] + 3.5 and ends.min() == middle[0] - 1.0
     np.testing.assert_allclose(lines["median"].get_ydata()[-1], -23.5)

@@ -3,6 +3,7 @@
 The stages are commands with tests of their own; here they leave what they would leave.
 """
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -235,6 +236,7 @@ def test_the_page_says_all_of_it(tmp_path, monkeypatch):
     for name in ("film.gif", "policy_0/curves.png"):
         (out / name).write_bytes(b"")
     monkeypatch.setattr(r2s2r_page, "load", lambda folder: None)
+    monkeypatch.setattr(r2s2r_page, "predicted", lambda out, runs: [out / "predictive_1.png"])
     monkeypatch.setattr(r2s2r_page, "believed", lambda folder, run: [{"run": folder.name, "median": "200"}])
     policy = a_policy(tmp_path / "policy.npz")
     arguments = r2s2r.parser().parse_args(["--object", "dlo-0", "--out", str(out)])
@@ -247,6 +249,8 @@ def test_the_page_says_all_of_it(tmp_path, monkeypatch):
         str(policy),
     ):
         assert part in text
+    alternatives = re.findall(r'<img[^>]* alt="([^"]*)"', text)
+    assert len(alternatives) == 3 and all(len(words.split()) > 5 for words in alternatives)
     assert "sheet.png" not in text
 
 

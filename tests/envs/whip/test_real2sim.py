@@ -19,7 +19,7 @@ from jaxlfi.envs.whip.parameters import median
 from jaxlfi.envs.whip.physics.chain import Chain
 from jaxlfi.envs.whip.physics.native import NativeEngine
 from jaxlfi.envs.whip.physics.scene import Scene
-from jaxlfi.envs.whip.real2sim import CHANNELS, DATA, NUISANCES, recorded, task, whip_task
+from jaxlfi.envs.whip.real2sim import CHANNELS, DATA, NUISANCES, PIXEL, channel_noise, recorded, task, whip_task
 from jaxlfi.envs.whip.trajectory import trajectory
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
@@ -157,3 +157,11 @@ def test_without_mujoco_the_task_says_what_to_install():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode != 0 and "pip install 'jaxlfi[whip]'" in done.stderr.splitlines()[-1]
+
+
+def test_the_noise_of_channels_is_the_detectors_and_at_least_a_pixels():
+    mask, clean = (dict(zip(CHANNELS, channel_noise(DETECTORS[name]), strict=True)) for name in ("mask", "clean"))
+    assert mask["gripper x (m)"] == 0.002 and mask["yellow hit"] == mask["action dx (m)"] == 0.0
+    assert mask["DLO 4 v"] == pytest.approx(np.hypot(0.004, 0.005))
+    assert mask["red u"] == pytest.approx(np.hypot(0.001, 0.005))
+    assert clean["DLO 1 u"] == clean["yellow v"] == PIXEL
