@@ -32,10 +32,9 @@ from jaxlfi.diagnostics.predictive import PredictiveCheck, Residual, predictive_
 
 __all__ = [
     "OK", "POSTERIOR_SAMPLES", "SIGNIFICANCE", "BoundEvidence", "Discrepancy", "Estimate", "Finding", "Histogram",
-    "Intervals", "PredictiveCheck", "Residual", "TradeOff", "Uniformity", "bound_evidence", "bound_warnings", "c2st",
-    "channel_errors",
-    "check_intervals", "check_regions", "compared", "coverage_verdict", "density_ranks", "discrepancy",
-    "distance_ranks", "distance_verdict", "edge_mass", "histogram", "mass_beyond", "not_simulated",
+    "Intervals", "PredictiveCheck", "Residual", "TradeOff", "Uniformity", "bound_evidence", "bound_warnings",
+    "c2st", "channel_errors", "check_intervals", "check_regions", "compared", "coverage_verdict", "density_ranks",
+    "discrepancy", "distance_ranks", "distance_verdict", "edge_mass", "histogram", "mass_beyond", "not_simulated",
     "predictive_check", "ranks", "ranks_verdict", "residuals", "trade_offs", "trajectory_distance", "uniformity",
     "unlike",
 ]  # fmt: skip
