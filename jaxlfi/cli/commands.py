@@ -322,7 +322,7 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
     if arguments.json:
         _print_json(folder, folders.read_config(folder))
     if plan.kind == RUN:
-        found = RunSummary.read(folder)
+        found = RunSummary.read(folder).at(folder)
         tables.show(summaries.parameter_table(found), output.results)
         for line in (*found.sentences, *found.steps()):
             _say(output.results, line)

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     import pandas
 
 NAME = "summary.json"
+FOLDER = "FOLDER"
+"""What next steps call the folder of a run that may not be saved yet."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,6 +131,13 @@ class RunSummary:
     def steps(self) -> list[str]:
         """What to do next, in lines of text."""
         return ["Next:", *(f"- {step}" for step in self.next_steps)] if self.next_steps else []
+
+    def at(self, folder: Path | str) -> "RunSummary":
+        """The same of a run that is saved in a folder, whose next steps name it."""
+        saved = (
+            step.replace(f"`run.save({FOLDER})`, then ", "").replace(FOLDER, f"{folder}") for step in self.next_steps
+        )
+        return dataclasses.replace(self, next_steps=tuple(saved))
 
     def to_html(self) -> str:
         """The table and the sentences, as a page or a notebook shows them."""

@@ -20,6 +20,7 @@ COMMONEST = 3
 """Reasons of failed simulations that are named, at most."""
 CHANNELS = 4
 """Channels that are named, at most: those with the greatest residuals."""
+ALL = "all of its numbers"
 EDGE = "A support that can grow: `--heuristic edge`, or `heuristic=jaxlfi.Edge()`."
 LOOK = "Look at the misfit: `jaxlfi report FOLDER` draws simulations of the posterior beside the observation."
 DIAGNOSE = "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER`."
@@ -98,6 +99,8 @@ def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
         count = observed.shape[1]
         known = () if run.task is None else tuple(run.task.channels)
         series = known if len(known) == count else tuple(f"channel {c + 1}" for c in range(count))
+    if series == ("channel 1",):  # the only one, without a name
+        series = (ALL,)
     if series:
         observed = observed.reshape(len(observed), -1)
         return list(series), np.asarray(run.history["final_trajectory"]).reshape(-1, *observed.shape), observed
@@ -109,7 +112,7 @@ def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
     finite = simulated[np.isfinite(simulated).all(axis=1)]
     scale = finite.std(axis=0) if len(finite) else np.ones(len(x))
     scale = np.where(scale > 0, scale, np.inf)[:, None]
-    return ["all of its numbers"], simulated[..., None] / scale, x[:, None] / scale
+    return [ALL], simulated[..., None] / scale, x[:, None] / scale
 
 
 def fit_sentence(names: list[str], found: list[Residual]) -> tuple[str, bool]:

@@ -84,7 +84,7 @@ def write_run(folder: Path, run: Result, keep_network: bool = False) -> None:
         },
         durable=True,
     )
-    atomic.write_json(folder / run_summary.NAME, account.summary(run, draws).to_dict())
+    atomic.write_json(folder / run_summary.NAME, account.summary(run, draws).at(run_summary.FOLDER).to_dict())
     dataset = jax.device_get(run.dataset)
     rows = slice(int(dataset.size))
     columns = {name: getattr(dataset, name)[rows] for name in ("theta", "x", "round", "weight")}

@@ -15,7 +15,7 @@ import jaxlfi
 from jaxlfi.distributions.space import Space
 from jaxlfi.figures.collection import open_collection
 from jaxlfi.figures.page import render
-from jaxlfi.io.run_summary import NAME, RunSummary
+from jaxlfi.io.run_summary import FOLDER, NAME, RunSummary
 from jaxlfi.runs.summarise import summarised
 from tests.small import gaussian, settings
 
@@ -210,12 +210,20 @@ def test_forms_agree_and_come_back_from_a_file(tmp_path):
         RunSummary.read(tmp_path)
 
 
+def test_next_steps_of_a_saved_run_name_its_folder():
+    found = RunSummary(
+        (), (), ("Check: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER`.", "Look: `jaxlfi report FOLDER`.")
+    )
+    assert found.at("runs/a").next_steps == ("Check: `jaxlfi diagnose runs/a`.", "Look: `jaxlfi report runs/a`.")
+
+
 def test_a_run_states_what_its_folder_and_page_state(tmp_path):
     run = jaxlfi.infer(jax.random.key(0), gaussian(), np.array([0.8, -0.6], np.float32), settings=settings(rounds=1))
     found = run.summary()
     draws = np.asarray(run.draws())
     np.testing.assert_allclose([one.median for one in found.parameters], np.median(draws, axis=0), rtol=1e-5)
     folder = run.save(tmp_path / "run")
+    found = found.at(FOLDER)
     assert RunSummary.read(folder) == found
     page = render(open_collection(folder), [])
     assert found.to_html() in page and page.index("<h2>Answer</h2>") < page.index("<h2>Results</h2>")
