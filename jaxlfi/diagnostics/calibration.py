@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.special import bdtr, bdtrc
 
 from jaxlfi.diagnostics.arguments import Draws, Truths, checked_ranks, numbers, truths_and_draws
 from jaxlfi.distributions.arguments import is_concrete
@@ -264,8 +263,13 @@ def _edges(draws: int) -> np.ndarray:
 
 def _two_sided(count: int, probability: np.ndarray) -> np.ndarray:
     """Probability that a binomial count is as far out as each of 0 to N, or farther, shape [K, N + 1]."""
-    k, p = np.arange(count + 1), probability[:, None]
-    return np.minimum(1.0, 2 * np.minimum(bdtr(k, count, p), bdtrc(k - 1, count, p)))
+    # Not SciPy's tails: those of mirrored counts would be rounded differently, and equal probabilities not tie.
+    log_factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, count + 1)))])
+    k = np.arange(count + 1)
+    log_choose = log_factorial[-1] - log_factorial - log_factorial[::-1]
+    mass = np.exp(log_choose + k * np.log(probability)[:, None] + (count - k) * np.log1p(-probability)[:, None])
+    below, above = np.cumsum(mass, axis=1), np.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
+    return np.minimum(1.0, 2 * np.minimum(below, above))
 
 
 @functools.lru_cache(maxsize=16)
