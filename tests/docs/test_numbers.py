@@ -15,6 +15,8 @@ import pytest
 from experiments import embedding, misspecification, mujoco_sysid, widths
 from experiments.policies import report
 from experiments.policies import results as policies
+from experiments.sharpness.held_out import HELD_OUT
+from experiments.sharpness.tables import table as sharpness
 from experiments.sota import rows as sota
 from experiments.sota.__main__ import METHODS as SOTA_METHODS
 from experiments.sota.cases import SETTINGS as SOTA_SETTINGS
@@ -74,6 +76,26 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
 )
 def test_widths(line):
     assert " ".join(line.split()) in page("widths")
+
+
+def sharpness_row(problem: str, box: str, heuristic: str) -> list[str]:
+    """Of the table that the study's arrays make."""
+    for line in sharpness(RESULTS / "sharpness/held-out", [problem]).splitlines()[2:]:
+        cells = [cell.strip() for cell in line.strip("| ").split("|")]
+        if cells[2:4] == [box, heuristic]:
+            return cells
+    return []
+
+
+@pytest.mark.parametrize("problem", HELD_OUT)
+def test_held_out_problems(problem):
+    if right := sharpness_row(problem, "right", "fixed"):
+        ratio, worst, z, half, most, exact = right[7:13]
+        cells = [ratio + f" ({worst})", z, half, most, exact, *right[14:16], right[17]]
+        assert " ".join(f"| `{problem}` | {' | '.join(cells)} |".split()) in page("sharpness")
+    if wrong := [sharpness_row(problem, box, "edge") for box in ("one", "all")]:
+        cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[16]}" for row in wrong if row]
+        assert not cells or f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
 EMBEDDING = RESULTS / "embedding/lotka_volterra/misspecified+edge"

@@ -90,7 +90,13 @@ def test_sample_trajectories_are_three_queues_at_the_truth():
 def test_main_writes_a_table_arrays_and_a_picture(runs, tmp_path, capsys):
     out = tmp_path / "results"
     main([str(runs), "--out", str(out)])
-    assert {path.name for path in out.iterdir()} == {"table.md", "errors.npz", "samples.npz", "samples.png"}
+    assert {path.name for path in out.iterdir()} == {
+        "table.md",
+        "errors.npz",
+        "errors.png",
+        "samples.npz",
+        "samples.png",
+    }
     with np.load(out / "errors.npz") as errors:
         np.testing.assert_allclose(errors["ok/sorted"], [0.42, 0.84])
         np.testing.assert_allclose(errors["broad/sorted"], [0.42, 0.42])
