@@ -69,7 +69,7 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     "line",
     [
         line
-        for study in ("widths", "normaliser", "threshold", "folds")
+        for study in ("widths", "normaliser", "threshold", "quotient")
         for folder in sorted((RESULTS / study).glob("*/*"))
         for line in widths.table(folder).splitlines()[2:]
     ],
@@ -449,7 +449,7 @@ def test_engines_of_the_whip():
 
 def test_front_page():
     """The figures below the example of the project's README."""
-    error = arrays("folds/lotka_volterra/misspecified+edge/quick-own")["error"]
+    error = arrays("quotient/lotka_volterra/misspecified+edge/quick-own")["error"]
     assert len(error) == 100 and np.sum(error > widths.LOST) == 1
     text = f"EDGE ends with a summed error of {error.mean():.2f} in the mean of 100 seeds, and loses one run"
     assert text in " ".join((ROOT.parent / "README.md").read_text().split())
