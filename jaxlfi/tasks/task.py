@@ -156,7 +156,7 @@ class Task:
             store("summary", summaries.named(self.summary))
         is_natural(self.prior_space)
         if self.channel_noise is not None:
-            noise = _vector(self.channel_noise, len(self.channels) or np.size(self.channel_noise), "channel_noise")
+            noise = _vector(self.channel_noise, len(self.channels) or None, "channel_noise")
             if bool(np.any(noise < 0)):
                 raise ValueError(f"channel_noise: expected standard deviations of at least 0, got {noise}")
             store("channel_noise", noise)
@@ -303,11 +303,12 @@ class Task:
         return hash((self.name, self.names, self.log, self.failures))
 
 
-def _vector(value: Any, length: int, name: str) -> np.ndarray:
+def _vector(value: Any, length: int | None, name: str) -> np.ndarray:
+    wanted = f"{name}: expected {'some' if length is None else length} finite numbers"
     try:
         vector = np.array(own_arrays.array(value), np.float32)
     except (ValueError, TypeError, OverflowError) as error:
-        raise ValueError(f"{name}: expected {length} finite numbers, got {value!r}") from error
-    if vector.shape != (length,) or not np.isfinite(vector).all():
-        raise ValueError(f"{name}: expected {length} finite numbers, got shape {vector.shape}")
+        raise ValueError(f"{wanted}, got {value!r}") from error
+    if vector.ndim != 1 or len(vector) != (length or len(vector)) or not np.isfinite(vector).all():
+        raise ValueError(f"{wanted}, got shape {vector.shape}")
     return vector

@@ -281,7 +281,7 @@ def test_the_books_balance():
     assert size == kept.sum()
     np.testing.assert_array_equal(state.dataset.theta[:size], simulations.theta[kept])
     # The same numbers, but the compiler may compute them twice, in two kernels that round differently.
-    np.testing.assert_allclose(state.dataset.x[:size], simulations.x[kept], rtol=2e-6)
+    np.testing.assert_allclose(state.dataset.x[:size], simulations.x[kept], rtol=2e-6, atol=1e-8)
     np.testing.assert_array_equal(state.dataset.round[:size], np.nonzero(kept)[0])
     # Kept rows are those that the simulator would not refuse.
     assert (state.dataset.theta[:size, 1] >= -2).all() and (state.dataset.theta[:size, 0] <= 2).all()

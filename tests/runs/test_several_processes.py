@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from jaxlfi.cli import joined
+from jaxlfi.cli import multi_process
 from jaxlfi.cli import parser as cli
 from jaxlfi.io import files as atomic
 from tests.hosts import done, started
@@ -103,7 +103,7 @@ REFUSED = [
 def test_flags_that_do_not_fit_are_refused(flags, line):
     arguments = cli.parse(["infer", TASK, *flags, "--out", "out"])
     with pytest.raises(ValueError, match=f"^{line}"):
-        joined.wanted(arguments)
+        multi_process.wanted(arguments)
 
 
 def test_a_command_refuses_them_in_one_line(tmp_path):

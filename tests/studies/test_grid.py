@@ -286,7 +286,7 @@ def test_a_simulator_that_always_fails_is_refused(finished, monkeypatch):
         """An engine whose simulations fail."""
 
         task, known_failures = TASK, ""
-        start = compile = lambda *_: None
+        start = begin = compile = lambda *_: None
 
         def round(self, state, index):
             """One round."""

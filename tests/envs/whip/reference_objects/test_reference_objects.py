@@ -160,7 +160,7 @@ def test_the_physics_is_not_that_of_inference():
     # Policies act on the objects by the task's observations, and films are drawn by its figures.
     acting = {
         "robot": {"observer"},
-        "deployment": {"control"},
+        "deployment": {"control", "observer"},
         "repetitions": {"environment"},
         "film": {"figures", "render"},
     }
