@@ -107,8 +107,11 @@ def without_pool(
     log_p, slopes = jax.vjp(pool, points.reshape(-1, points.shape[-1]))
     (slope,) = slopes(jnp.ones_like(log_p))
     log_p, slope = log_p.reshape(share.shape), slope.reshape(points.shape)
-    sound = (q.weights > 0) & jnp.all(jnp.isfinite(log_p) & jnp.all(jnp.isfinite(slope), axis=-1), axis=1)
-    log_p, slope = jnp.where(sound[:, None], log_p, 0.0), jnp.where(sound[:, None, None], slope, 0.0)
+    known = jnp.isfinite(log_p) & jnp.all(jnp.isfinite(slope), axis=-1)
+    sound = (q.weights > 0) & jnp.any(known, axis=1)
+    # Where nothing is known of the pool, as where a prior is zero, it is taken to be flat.
+    mean = jnp.sum(log_p, axis=1, where=known) / jnp.maximum(jnp.sum(known, axis=1), 1)
+    log_p, slope = jnp.where(known, log_p, mean[:, None]), jnp.where(known[..., None], slope, 0.0)
 
     log_mass, means, scale_tril = jax.vmap(_quotient)(q.means, q.scale_tril, log_p, slope)
     weights = jnp.where(sound, q.weights, 0.0)

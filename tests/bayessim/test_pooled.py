@@ -113,6 +113,17 @@ def test_a_support_that_nothing_was_proposed_in_leaves_q_as_it_is():
     assert effective == 0
 
 
+def test_where_a_prior_is_zero_the_pool_counts_as_flat():
+    """A uniform prior that ends in the middle of the component: half of its points are where nothing is proposed."""
+    prior = distrax.Independent(distrax.Uniform(jnp.array([0.8, -2.0]), jnp.array([4.0, 6.0])), 1)
+    wide = gaussian(factor=2 * FACTOR)
+    found, effective = without_pool(task_of(prior), gaussian(), proposals(*[wide] * 9), 9, 0.0, BOX)
+    assert np.isfinite(found.mean).all() and np.isfinite(found.covariance).all() and 0 < effective <= 1
+    wider, _ = without_pool(task_of(), gaussian(), proposals(*[wide] * 9), 9, 0.0, BOX)
+    assert np.all(np.diag(gaussian().covariance) <= np.diag(found.covariance) + 1e-6)
+    assert np.all(np.diag(found.covariance) <= np.diag(wider.covariance) + 1e-6)
+
+
 def test_a_prior_that_proposals_have_as_a_factor_drops_out(key):
     prior = distrax.MultivariateNormalDiag(jnp.array([0.5, 1.0]), jnp.array([1.0, 2.0]))
     theta = jnp.array([[0.0, 0.0], [1.0, 2.0], [2.0, -1.0]])
