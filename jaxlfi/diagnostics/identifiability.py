@@ -93,7 +93,8 @@ def _together(names, values: np.ndarray, places: np.ndarray, write, within: floa
         own = rows[np.ix_([row for row in range(len(rows)) if rows[row, group].any()], group)]
         several, known = [names[places[d]] for d in group], _reduced(own / scale[group], within)
         left = np.var(z[:, group] @ (known * scale[group]).T, axis=0) / np.sum((known * scale[group]) ** 2, axis=1)
-        if len(group) > MOST or (left >= 1 - TOGETHER).any():  # not so once it is put into words
+        idle = ~known.any(axis=0)
+        if len(group) > MOST or idle.any() or (left >= 1 - TOGETHER).any():  # not so once it is put into words
             continue
         units = 1.0 if write is _product else scale[group]  # logarithms have none
         other = _reduced(_complement(known * units) / units, within)
@@ -247,6 +248,7 @@ def _simple(rows: np.ndarray) -> bool:
 def _complement(rows: np.ndarray) -> np.ndarray:
     """Simple vectors that are orthogonal to all rows, and span all that are."""
     scale = np.abs(rows).max(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
     _, sizes, right = np.linalg.svd(rows / scale)
     return _reduced(right[len(sizes) :] / scale)
 
