@@ -125,7 +125,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     control.add_argument("--remote", action="store_true", help="allow a driver on another host")
     options.add_seed(control, "seed of a reference object's camera (default: 0)")
     options.add_out(
-        control, "FILE", "the recording, a new .npz; its description is written to a .json of the same name"
+        control, "FILE", "the new .npz file for the recording; metadata go into a .json file of the same name"
     )
 
     options.add(commands)

@@ -24,8 +24,11 @@ ALL = "all of its numbers"
 EDGE = "A support that can grow: `--heuristic edge`, or `heuristic=jaxlfi.Edge()`."
 LOOK = "Look at the misfit: `jaxlfi report FOLDER` draws simulations of the posterior beside the observation."
 DIAGNOSE = "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER`."
-DIAGNOSE_OWN = f"{DIAGNOSE[:-2]} --task MODULE:TASK`, where TASK is the task's name in the file MODULE.py."
-"""Of a task made in Python, which the command line has to be told of."""
+DIAGNOSE_OWN = (
+    "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER --task MODULE:TASK`, where "
+    "TASK is the task's name in the file MODULE.py."
+)
+"""For a task that was defined in Python: the command line needs to know where."""
 
 
 def summary(run: Result, draws: Float[Array | np.ndarray, "n dim"]) -> RunSummary:

@@ -33,7 +33,7 @@ ATOMIC = MODEST.replace(hidden=(16, 16), steps=1000, batch_size=100, loss="atomi
 # --------------------------------------------------------------------------------------- the proposals cancel
 
 
-@pytest.mark.slow  # test_atomic.py: the loss by itself is least at the posterior, whatever the proposals
+@pytest.mark.slow  # test_atomic.py tests in the quick suite that the posterior minimises the loss under any proposal
 def test_the_atomic_loss_needs_no_correction_for_its_proposals():
     """Two later rounds of proposals like the posterior: by likelihood they count the data again and halve the
     covariance; the atomic loss keeps it. Measured for sixteen runs: traces of 1.9 to 2.4, by likelihood of 0.9 to 1.1.

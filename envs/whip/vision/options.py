@@ -123,7 +123,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--actions", metavar="FILE", help='an .npz with an array "actions" [16, 2] in m (default: exploratory actions)'
     )
     add_seed(record, "of the camera and the scene's look")
-    add_out(record, "FILE", "the recording, a new .npz; its description is written beside it as .json")
+    add_out(record, "FILE", "the new .npz file for the recording; metadata go into a .json file of the same name")
 
 
 def add_out(command: argparse.ArgumentParser, metavar: str, help: str) -> None:
