@@ -20,7 +20,7 @@ from jaxlfi.estimators import dataset as datasets
 from jaxlfi.estimators import validity
 from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.dataset import Dataset
-from jaxlfi.estimators.training import FitInfo, fit
+from jaxlfi.estimators.training import FitInfo, Lesson, fit_keys, prepare, train, trained
 from jaxlfi.heuristics import Adaptation, Heuristic
 from jaxlfi.tasks.priors import prior_draws
 from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
@@ -53,6 +53,26 @@ class State(struct.PyTreeNode):
     def feasible(self) -> Support:
         """Phi; a named support that the task declares wider than Phi widens it for the run."""
         return self.network.scale
+
+
+class Gathered(struct.PyTreeNode):
+    """What a round has before it trains the network.
+
+    Attributes:
+        simulations: of the round.
+        dataset: all simulations so far.
+        attempts: as of `State`.
+        proposals: what all rounds drew from, this one's among them.
+        lesson: the network, and what it is going to learn from.
+        effective_size: effective number of simulations under the loss weights, shape [].
+    """
+
+    simulations: Simulations
+    dataset: Dataset
+    attempts: Dataset | None
+    proposals: Belief
+    lesson: Lesson
+    effective_size: Float[Array, "*batch"]
 
 
 class Round(struct.PyTreeNode):
@@ -125,7 +145,7 @@ def proposal(settings: Settings, belief: Belief) -> Belief:
     return belief.replace(mixture=belief.mixture.inflated(settings.inflation))
 
 
-def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> Float[Array, "attempts dim"]:
+def propose(key: jax.Array, prior: Any, settings: Settings, belief: Belief) -> Float[Array, "attempts dim"]:
     """Draw theta ~ p_i (line 8): the prior over Theta_0 in the first round, then the restricted posterior.
 
     A belief that is not informed is the prior over its support: so it is in the first round, and always by `Truncate`.
@@ -135,7 +155,7 @@ def propose(key: jax.Array, task: Task, settings: Settings, belief: Belief) -> F
     posterior has locked itself onto a place where it learns nothing more.
     """
     key_prior, key_posterior, key_choice = jax.random.split(key, 3)
-    attempts, prior = settings.simulation_budget, task.inference.prior
+    attempts = settings.simulation_budget
     factor = None if prior is None or settings.accounts_for_prior else prior.log_prob
     inside = None if prior is None else Region(belief.support, prior)
     informed = RESTRICTIONS[settings.restriction](key_posterior, belief, attempts, settings.inflation, factor, inside)
@@ -154,48 +174,109 @@ def update(
     simulations: Simulations,
 ) -> tuple[State, Round]:
     """The part of a round that follows its simulations (lines 9-17)."""
+    prior = task.inference.prior
+    key_fit, key_condition = settings.estimator.keys(key)
+    gathered = gather(jax.random.clone(key_fit), prior, settings, state, round, simulations)
+    _, key_train = fit_keys(key_fit)
+    learnt = train(key_train, gathered.lesson, expected_size(settings, state, round))
+    return conclude(
+        key_condition, prior, len(task.reasons), settings, heuristic, observed, state, round, gathered, learnt
+    )
+
+
+def gather(
+    key: jax.Array,
+    prior: Any,
+    settings: Settings,
+    state: State,
+    round: Int[Array, ""] | int,
+    simulations: Simulations,
+) -> Gathered:
+    """Add the round's simulations to all others, and make the network ready to learn from them (line 9).
+
+    Args:
+        key: of the fit, consumed; the other part of it is for training.
+        prior: of the task (`Task.inference.prior`), None for a uniform one.
+        settings: the numbers of the run.
+        state: what the rounds before left.
+        round: index of the round, from 0.
+        simulations: of the round.
+    """
     dataset = datasets.augment(state.dataset, simulations, round)
     proposed = proposal(settings, state.belief)
     proposals = jax.tree.map(lambda all_, now: all_.at[round].set(now), state.proposals, proposed)
-    correction = CORRECTIONS[settings.correction]
-    weights = correction.row_weights(task, dataset, proposals, round, settings.defensive)
-    prior = task.inference.prior
+    weights = CORRECTIONS[settings.correction].row_weights(prior, dataset, proposals, round, settings.defensive)
     log_prior = None if prior is None else prior.log_prob(dataset.theta)
-    # The rows that the rounds still to come have room for are not there yet.
-    expected = dataset.capacity - (settings.rounds - 1 - round) * settings.simulations_per_round
-    key_fit, key_condition = state.network.estimator.keys(key)
     network, attempts = _started(state, dataset), state.attempts
     if attempts is not None:
         attempts = datasets.augment(attempts, _outcomes(simulations), round)
-        learnt = network.validity.learnt(jax.random.fold_in(jax.random.clone(key_fit), 1), attempts)
+        learnt = network.validity.learnt(jax.random.fold_in(jax.random.clone(key), 1), attempts)
         network = network.replace(validity=learnt)
         # Success is a part of the prior of the simulations that the atomic losses compare.
         log_prior = (0.0 if log_prior is None else log_prior) + learnt.log_prob(dataset.theta)
-    network, fit_info = fit(key_fit, network, dataset, weights, expected, log_prior)
-    posterior = network.condition(observed, state.belief.support, key_condition)
-    mixture, not_positive_definite = correction.change(task, posterior.mixture, proposed)
+    key_prepare, _ = fit_keys(key)
+    lesson = prepare(key_prepare, network, dataset, weights, log_prior)
+    return Gathered(simulations, dataset, attempts, proposals, lesson, effective_size(weights))
+
+
+def expected_size(settings: Settings, state: State, round: Int[Array, ""] | int) -> Int[Array, ""] | int:
+    """Rows of the dataset after a round without failures: those that later rounds have room for are not there yet."""
+    return state.dataset.capacity - (settings.rounds - 1 - round) * settings.simulations_per_round
+
+
+def conclude(
+    key: jax.Array | None,
+    prior: Any,
+    reasons: int,
+    settings: Settings,
+    heuristic: Heuristic,
+    observed: Float[Array, " obs"],
+    state: State,
+    round: Int[Array, ""] | int,
+    gathered: Gathered,
+    learnt: tuple[dict, FitInfo],
+) -> tuple[State, Round]:
+    """The posterior of the observation by the trained network, and the support adapted to it (lines 11-17).
+
+    Args:
+        key: consumed; None for an estimator of closed form.
+        prior: as of `gather`.
+        reasons: number of reasons for which a simulation can fail.
+        settings: the numbers of the run.
+        heuristic: how the support is adapted.
+        observed: the real trajectory's summary x^r, shape [S].
+        state: what the rounds before left.
+        round: index of the round, from 0.
+        gathered: its simulations and those before.
+        learnt: the weights that training on them ended with, and its losses (line 10).
+    """
+    params, fit_info = learnt
+    network, correction = trained(gathered.lesson, params), CORRECTIONS[settings.correction]
+    proposed = proposal(settings, state.belief)
+    posterior = network.condition(observed, state.belief.support, key)
+    mixture, not_positive_definite = correction.change(prior, posterior.mixture, proposed)
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     reported, effective_share = belief, jnp.ones(())
     if correction.report is not None:
         estimator: Any = network.estimator  # one with a closed form: `Settings.check` sees to it
         q = estimator.weighted(network, observed)
         divided, effective_share = correction.report(
-            task, q, proposals, round, settings.defensive, state.belief.support
+            prior, q, gathered.proposals, round, settings.defensive, state.belief.support
         )
         reported = belief.replace(mixture=divided)
     info = Round(
-        simulations=simulations,
-        failed=simulations.failed(len(task.reasons)),
+        simulations=gathered.simulations,
+        failed=gathered.simulations.failed(reasons),
         proposal=proposed,
         belief=reported,
         adaptation=adaptation,
         correction=CorrectionInfo(
-            effective_size(weights), not_positive_definite, posterior.mass_inside, effective_share
+            gathered.effective_size, not_positive_definite, posterior.mass_inside, effective_share
         ),
         fit=fit_info,
     )
     progress = advanced(state.progress, mixture, settings.min_rounds)
-    after = State(belief, reported, proposals, dataset, network, progress, attempts)
+    after = State(belief, reported, gathered.proposals, gathered.dataset, network, progress, gathered.attempts)
     return _unless_settled(state, after, info) if settings.min_rounds else (after, info)
 
 
@@ -254,7 +335,7 @@ def step(
     Returns:
         The next state, and what the round did.
     """
-    theta = propose(keys.propose, task, settings, state.belief)
+    theta = propose(keys.propose, task.inference.prior, settings, state.belief)
     x, failure = simulate(keys.simulate, task, theta)
     simulations = within_budget(theta, x, failure, settings.simulations_per_round)
     return update(keys.update, task, settings, heuristic, observed, state, round, simulations)

@@ -20,7 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.bayessim import algorithm
-from jaxlfi.bayessim.algorithm import Round, State
+from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.keys import init_key, key_of, round_keys, run_keys
 from jaxlfi.bayessim.programs import compiled, program
 from jaxlfi.bayessim.record import record
@@ -133,22 +133,6 @@ def _reading(task: Task, settings: Settings, run: RunInputs) -> Settings:
     return settings.replace(estimator=settings.estimator.reading(layout))
 
 
-def propose_one(
-    task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int
-) -> tuple[Float[Array, "attempts dim"], jax.Array]:
-    """Proposals of a round, and the key of their simulations."""
-    keys = round_keys(run_keys(run.key).run, index)
-    return algorithm.propose(keys.propose, task, settings, state.belief), keys.simulate
-
-
-def update_one(
-    task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, simulations: Simulations
-) -> tuple[State, Round]:
-    """The part of a round that follows its simulations."""
-    keys = round_keys(run_keys(run.key).run, index)
-    return algorithm.update(keys.update, task, settings, run.heuristic, run.x, state, index, simulations)
-
-
 def check_draws(run: RunInputs, state: State) -> tuple[Float[Array, "samples dim"], Array]:
     """Draws of the posterior after a run's last round, in inference space, and the key of their simulations."""
     key_draw, key_simulate = run_keys(run.key).of_predictive(state.progress.rounds - 1)
@@ -177,7 +161,8 @@ def given_one(
     task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, simulations: Simulations
 ) -> tuple[State, dict[str, Array]]:
     """One round of one run on given simulations, and its record."""
-    state, info = update_one(task, settings, run, state, index, simulations)
+    keys = round_keys(run_keys(run.key).run, index)
+    state, info = algorithm.update(keys.update, task, settings, run.heuristic, run.x, state, index, simulations)
     return state, record(info, state.progress, check_one(task, settings, run, state))
 
 
@@ -231,7 +216,7 @@ class BatchEngine:
     def start(self) -> State:
         """The state before the first round."""
         first = None if self.first is None else len(self.first.theta)
-        start = program(functools.partial(start_one, self.task, first), self.mesh, (None, 0))
+        start = program(functools.partial(start_one, self.task, first), self.mesh, (None, 0), quick=True)
         return start(self.settings, self.inputs)
 
     def begin(self, state: State) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,6 @@ from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_algebra import product, quotient, reduce
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.tasks.priors import InferencePrior
-from jaxlfi.tasks.task import Task
 
 
 class CorrectionInfo(struct.PyTreeNode):
@@ -39,21 +39,21 @@ class Correction:
     """A way from q_phi to p-hat: weights in the loss before the fit, and a change of the mixture after it.
 
     Attributes:
-        row_weights: (task, dataset, proposals, round, defensive fraction) -> weight of each row in the loss, shape [C].
-        change: (task, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
-        report: (task, q, all rounds' proposals, round, defensive fraction, support) -> the mixture that a run reports
+        row_weights: (prior, dataset, proposals, round, defensive fraction) -> weights of rows in the loss, shape [C].
+        change: (prior, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
+        report: (prior, q, all rounds' proposals, round, defensive fraction, support) -> the mixture that a run reports
             and the effective share of q's draws, where it is not what proposals and heuristics go on with; else None.
         accounts_for_prior: whether it does all that is done for a task's own prior; else proposals do.
     """
 
-    row_weights: Callable[[Task, Dataset, Belief, Array | int, Array | float], Array]
-    change: Callable[[Task, GaussianMixture, Belief], tuple[GaussianMixture, Array]]
+    row_weights: Callable[[Any, Dataset, Belief, Array | int, Array | float], Array]
+    change: Callable[[Any, GaussianMixture, Belief], tuple[GaussianMixture, Array]]
     report: Callable[..., tuple[GaussianMixture, Array]] | None = None
     accounts_for_prior: bool = False
 
 
 def equal_weights(
-    task: Task,
+    prior: Any,
     dataset: Dataset,
     proposals: Belief,
     round: Int[Array, ""] | int,
@@ -63,27 +63,27 @@ def equal_weights(
     return jnp.where(dataset.valid, dataset.weight, 0.0)
 
 
-def unchanged(task: Task, q: GaussianMixture, previous: Belief) -> tuple[GaussianMixture, Array]:
+def unchanged(prior: Any, q: GaussianMixture, previous: Belief) -> tuple[GaussianMixture, Array]:
     """p-hat = q: the pooled proposals are treated as uniform."""
     return q, jnp.asarray(0)
 
 
-def times_reference(task: Task, q: GaussianMixture, previous: Belief) -> tuple[GaussianMixture, Array]:
+def times_reference(prior: Any, q: GaussianMixture, previous: Belief) -> tuple[GaussianMixture, Array]:
     """p-hat proportional to (p_i / p~) q, to the letter of line 11, reduced to as many components as q has.
 
     p~ is the prior: uniform, and then a constant, or a Gaussian that the task brings, which is divided out.
     """
     posterior, _ = product(q, previous.mixture)
     bad = jnp.asarray(0)
-    if task.inference.prior is not None:
-        posterior, info = quotient(posterior, gaussian_prior(task.inference.prior), policy="skip")
+    if prior is not None:
+        posterior, info = quotient(posterior, gaussian_prior(prior), policy="skip")
         bad = info.not_positive_definite
     posterior = reduce(posterior, q.logits.shape[-1])
     posterior = jax.tree.map(lambda new, old: jnp.where(previous.informed, new, old), posterior, q)
     return posterior, jnp.where(previous.informed, bad, 0)
 
 
-def divided_by_proposal(task: Task, q: GaussianMixture, proposal: Belief) -> tuple[GaussianMixture, Array]:
+def divided_by_proposal(prior: Any, q: GaussianMixture, proposal: Belief) -> tuple[GaussianMixture, Array]:
     """p-hat proportional to q / p~, with the round's proposal p~ as one Gaussian of its mean and covariance.
 
     What rounds of proposals s times as wide as the posterior leave too narrow by sqrt(1 - 1/s^2) is widened again.
@@ -97,7 +97,7 @@ def divided_by_proposal(task: Task, q: GaussianMixture, proposal: Belief) -> tup
 
 
 def importance_weights(
-    task: Task,
+    prior: Any,
     dataset: Dataset,
     proposals: Belief,
     round: Int[Array, ""] | int,
@@ -110,7 +110,7 @@ def importance_weights(
     mean (Ionides 2008). Clipped proposals have atoms on the bounds, which a density leaves out. The defensive fraction
     of a round's proposals, drawn from the prior over its support, is part of its density.
     """
-    log_pooled = log_pool(task, proposals, round, defensive, dataset.theta, factored=False)
+    log_pooled = log_pool(prior, proposals, round, defensive, dataset.theta, factored=False)
     log_weight = jnp.where(dataset.valid & jnp.isfinite(log_pooled), -log_pooled, -jnp.inf)
     # A simulation that was given with its density stands for so many draws of the prior.
     weight = dataset.weight * jnp.exp(log_weight - jnp.max(log_weight, initial=-1e30))

@@ -12,13 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlfi.bayessim.algorithm import State
-from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_draws, propose_one, update_one
+from jaxlfi.bayessim.batch import BatchEngine, RunInputs
 from jaxlfi.bayessim.multi_process import SharedEngine
-from jaxlfi.bayessim.programs import compiled, program
-from jaxlfi.bayessim.record import record
+from jaxlfi.bayessim.programs import Call, call
 from jaxlfi.bayessim.settings import Settings
+from jaxlfi.bayessim.staged import StagedEngine
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
-from jaxlfi.distributions.precision import single
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.tasks.host import require_success
 from jaxlfi.tasks.journal import Journal
@@ -36,7 +35,9 @@ def engine_for(
     journal: Journal | None = None,
     processes: Processes = ALONE,
 ) -> BatchEngine | SharedEngine:
-    """The engine that steps a batch: one compiled program, in several processes too, or rounds around a host simulator.
+    """The engine that steps a batch: one compiled program, in several processes too, or stages.
+
+    A single run takes stages, and so do rounds around a host simulator.
 
     Raises:
         ValueError: for a host simulator in several processes.
@@ -49,10 +50,12 @@ def engine_for(
         return SharedEngine(task, settings, inputs, processes, first)
     if task.on_host:
         return HostEngine(task, settings, inputs, first, journal)
+    if len(inputs.x) == 1:
+        return StagedEngine(task, settings, inputs, first)
     return BatchEngine(task, settings, inputs, first=first)
 
 
-class HostEngine(BatchEngine):
+class HostEngine(StagedEngine):
     """Steps the runs of a batch by one round each, simulating them one after another on the host."""
 
     references: np.ndarray
@@ -68,9 +71,7 @@ class HostEngine(BatchEngine):
         """Prepare, without compiling; see `BatchEngine` and `engine_for`."""
         self.journal = journal or Journal()
         self._begun: Simulations | None = None
-        part = lambda one, *axes: program(functools.partial(one, task), self.mesh, (None, 0, 0, None, *axes))
-        super().__init__(task, settings, inputs, devices=jax.local_devices()[:1], first=first)
-        self._propose_many, self._update_many = part(propose_one), part(update_one, 0)
+        super().__init__(task, settings, inputs, first)
 
     def load(self, inputs: RunInputs) -> None:
         """Take the inputs of a batch, whose summaries are counted from the observed ones (`jaxlfi.tasks.reference`)."""
@@ -108,38 +109,18 @@ class HostEngine(BatchEngine):
             SimulatorError: where no simulation succeeds.
         """
         if self.first is None:
-            self._begun = made = self._simulated(*self._propose(state, jnp.asarray(0)), np.zeros(self.runs, bool))
+            inputs = (self.settings, self.inputs, state, jnp.asarray(0))
+            self._begun = made = self.simulated(inputs, np.zeros(self.runs, bool))
             reasons = self.task.reasons
             succeeded, failed = jax.device_get((made.kept.sum(axis=-1), made.failed(len(reasons))))
             require_success(succeeded, failed, reasons, self.known_failures)
 
-    def compile(self, state: State, index: int = 0) -> None:
-        """Compile the parts of a round ahead of their first use, while no simulator waits."""
-        place = jnp.asarray(index)
-        theta, _ = self._propose(state, place)
-        if index == 0 and self.first is not None:
-            simulations = self.first_round()
-        else:
-            simulations = _stacked([self._nothing(own) for own in theta])
-        compiled(self._update_many, (self.settings, self.inputs, state, place, simulations))
-        compiled(_check_draws, (self.inputs, state))
-
-    def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
-        """Step every run; see `BatchEngine.round`."""
-        place, settled = jnp.asarray(index), np.asarray(state.progress.settled)
-        if index == 0 and self.first is not None:
-            simulations = self.first_round()
-        elif index == 0 and self._begun is not None:
-            simulations, self._begun = self._begun, None
-        else:
-            simulations = self._simulated(*self._propose(state, place), settled)
-        state, info = _call(self._update_many, self.settings, self.inputs, state, place, simulations)
-        return state, jax.device_get(record(info, state.progress, self._checked(state, settled)))
-
-    def _propose(self, state: State, place: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return _call(self._propose_many, self.settings, self.inputs, state, place)
-
-    def _simulated(self, theta: jax.Array, keys: jax.Array, settled: np.ndarray) -> Simulations:
+    def simulated(self, inputs: tuple, settled: np.ndarray) -> Simulations:
+        """The simulations of a round: none of runs that have settled. Those of the first round may be there already."""
+        if self._begun is not None:
+            begun, self._begun = self._begun, None
+            return begun
+        theta, keys = call(self._propose, *inputs)
         shape, wanted = self.inputs.observed.shape[1:], self.settings.simulations_per_round
         made = []
         for run, (key, own, over) in enumerate(zip(keys, theta, settled, strict=True)):
@@ -149,15 +130,22 @@ class HostEngine(BatchEngine):
         self.journal.run = None
         return _stacked(made)
 
+    def simulations_like(self, theta: jax.ShapeDtypeStruct, keys: jax.ShapeDtypeStruct) -> Simulations:
+        """Shapes of a round's simulations."""
+        return jax.eval_shape(jax.vmap(self._nothing), theta)
+
+    def simulator_calls(self, proposed: tuple, drawn: list) -> list[Call]:
+        """None: no compiled program holds the simulator."""
+        return []
+
     def _nothing(self, theta: jax.Array) -> Simulations:
         """No simulations of the parameters [A, D]: of a run at its end."""
         flags = jnp.zeros(len(theta), bool)
         x = jnp.zeros((len(theta), self.inputs.x.shape[-1]))
         return Simulations(theta, x, jnp.zeros(len(theta), jnp.int32), flags, flags, jnp.ones(len(theta)))
 
-    def _checked(self, state: State, settled: np.ndarray) -> Discrepancy:
+    def compared(self, theta: jax.Array, keys: jax.Array, settled: np.ndarray) -> Discrepancy:
         """How far the runs' posteriors are from truth and observation; of runs at their end, as was seen before."""
-        theta, keys = _call(_check_draws, self.inputs, state)
         for run, (own, key) in enumerate(zip(theta, keys, strict=True)):
             last = self._last_seen[run]
             if settled[run] and last is not None:
@@ -180,14 +168,6 @@ def _references(task: Task, settings: Settings, observed: np.ndarray, x: np.ndar
         return np.zeros_like(x)
     alike = estimator.reading(layout(task.summary, observed.shape[1:], x.shape[1])).alike
     return np.stack([reference_of(own, alike) for own in x])
-
-
-_check_draws = jax.jit(single(jax.vmap(check_draws)))
-
-
-def _call(many: Any, *arguments: Any) -> Any:
-    """Call a program compiled once: a state that was read back from a checkpoint does not compile it anew."""
-    return compiled(many, arguments)(*arguments)
 
 
 def _stacked(trees: list[Any]) -> Any:

@@ -6,6 +6,7 @@ next, and runs are lost. So proposals and heuristics go on with q as it is, and 
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,6 @@ from jaxlfi.distributions.mixture import GaussianMixture, lower_factor
 from jaxlfi.distributions.region import region
 from jaxlfi.distributions.support import Support
 from jaxlfi.tasks.priors import prior_mass
-from jaxlfi.tasks.task import Task
 
 COMPONENT_POINTS = 64
 """Points of each component, at least, that its mass in a support and the pool's slope are taken over."""
@@ -34,7 +34,7 @@ FARTHEST = 1.0
 
 
 def log_pool(
-    task: Task,
+    prior: Any,
     proposals: Belief,
     round: Int[Array, ""] | int,
     defensive: Float[Array, ""] | float,
@@ -46,7 +46,7 @@ def log_pool(
     Clipped proposals have atoms on the bounds, which are left out.
 
     Args:
-        task: for its prior.
+        prior: of the task (`Task.inference.prior`), None for a uniform one.
         proposals: of all rounds, stacked.
         round: the last that counts, from 0.
         defensive: fraction of each round's proposals drawn from the prior over its support.
@@ -56,7 +56,6 @@ def log_pool(
     Returns:
         -inf where no round proposed, shape [N].
     """
-    prior = task.inference.prior
     factor = prior if factored else None
 
     def log_density(proposal: Belief) -> Array:
@@ -80,7 +79,7 @@ def log_pool(
 
 
 def without_pool(
-    task: Task,
+    prior: Any,
     q: GaussianMixture,
     proposals: Belief,
     round: Int[Array, ""] | int,
@@ -92,7 +91,7 @@ def without_pool(
     Outside the support, where nothing was proposed, the pool is what it is at the nearest point inside.
 
     Args:
-        task: for its prior.
+        prior: of the task (`Task.inference.prior`), None for a uniform one.
         q: as the network has it, not truncated.
         proposals: of all rounds, stacked.
         round: the last that counts, from 0.
@@ -103,7 +102,7 @@ def without_pool(
         The mixture, of as many components, and the effective share of q's draws under the weights 1 / p_pool.
     """
     points, share = (leaf.reshape(len(q.logits), -1, *leaf.shape[1:]) for leaf in _points(q))
-    pool = lambda theta: log_pool(task, proposals, round, defensive, support.clip(theta))
+    pool = lambda theta: log_pool(prior, proposals, round, defensive, support.clip(theta))
     log_p, slopes = jax.vjp(pool, points.reshape(-1, points.shape[-1]))
     (slope,) = slopes(jnp.ones_like(log_p))
     log_p, slope = log_p.reshape(share.shape), slope.reshape(points.shape)

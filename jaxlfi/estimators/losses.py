@@ -29,11 +29,11 @@ class Rows(struct.PyTreeNode):
         from_prior: 1 for those drawn from the prior itself, in the first round, 0 for others, shape [N].
     """
 
-    value: Float[Array, "n value"]
-    given: Float[Array, "n given"]
-    weights: Float[Array, " n"]
-    log_prior: Float[Array, " n"]
-    from_prior: Float[Array, " n"]
+    value: Float[Array, "*batch n value"]
+    given: Float[Array, "*batch n given"]
+    weights: Float[Array, "*batch n"]
+    log_prior: Float[Array, "*batch n"]
+    from_prior: Float[Array, "*batch n"]
 
     def take(self, rows: Int[Array, " m"]) -> "Rows":
         """Some of them."""

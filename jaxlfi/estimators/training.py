@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxlfi.estimators.base import SCHEDULES, Network, viewed
 from jaxlfi.estimators.dataset import Dataset
@@ -47,6 +47,25 @@ class _Best(struct.PyTreeNode):
     at: Int[Array, ""]
 
 
+class Lesson(struct.PyTreeNode):
+    """A network that is ready to be trained, and what it learns from.
+
+    Attributes:
+        network: with normalisers, and fresh weights unless it is trained on.
+        rows: the simulations as the networks see them.
+        order: places of the filled rows in random order, the same for all networks, so that those that are held out
+            can compare them; the places of the others follow, shape [C].
+        size: number of filled rows, shape [].
+        late: which rows are of the later rounds, shape [C].
+    """
+
+    network: Network
+    rows: Rows
+    order: Int[Array, "*batch cap"]
+    size: Int[Array, "*batch"]
+    late: Bool[Array, "*batch cap"]
+
+
 def fit(
     key: jax.Array,
     network: Network,
@@ -71,48 +90,82 @@ def fit(
     Returns:
         The trained network and what happened.
     """
+    key_prepare, key_train = fit_keys(key)
+    lesson = prepare(key_prepare, network, dataset, weights, log_prior)
+    params, info = train(key_train, lesson, expected_size)
+    return trained(lesson, params), info
+
+
+def fit_keys(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The keys of what comes before training, and of training."""
+    before, training = jax.random.split(key)
+    return before, training
+
+
+def prepare(
+    key: jax.Array,
+    network: Network,
+    dataset: Dataset,
+    weights: Float[Array, " cap"],
+    log_prior: Float[Array, " cap"] | None = None,
+) -> Lesson:
+    """What comes before training; the arguments are those of `fit`."""
     estimator = network.estimator
-    key_init, key_fit = jax.random.split(key)
     if estimator.warm_start:
         x = network.given(dataset.x)
     else:
-        network, x = network.restarted(key_init, dataset)
+        network, x = network.restarted(key, dataset)
     theta = network.to_network(dataset.theta)
     log_prior = jnp.zeros_like(weights) if log_prior is None else log_prior
-    key_rows = jax.random.fold_in(jax.random.clone(key_init), 1)
+    key_rows = jax.random.fold_in(jax.random.clone(key), 1)
     from_prior = (dataset.round == 0).astype(weights.dtype)
-    data = estimator.rows(key_rows, theta, x, weights, log_prior, from_prior)
+    rows = estimator.rows(key_rows, theta, x, weights, log_prior, from_prior)
+    order = shuffled(jax.random.fold_in(jax.random.clone(key), 2), jnp.arange(dataset.capacity), dataset.size)
+    return Lesson(network, rows, order, dataset.size, dataset.late)
 
-    # The same rows are held out of all networks, so that these can be compared by them.
-    rows = shuffled(jax.random.fold_in(jax.random.clone(key_init), 2), jnp.arange(dataset.capacity), dataset.size)
+
+def train(key: jax.Array, lesson: Lesson, expected_size: Int[Array, ""] | int) -> tuple[dict, FitInfo]:
+    """The weights of the trained ensemble: by far the most of the time that a round takes.
+
+    Args:
+        key: consumed.
+        lesson: of `prepare`.
+        expected_size: as of `fit`.
+    """
+    network = lesson.network
+    estimator = network.estimator
 
     def one(key, params, view):
-        own = data.replace(given=viewed(data.given, view))
-        return _fit_one(key, estimator, params, own, rows, dataset.size, expected_size)
+        own = lesson.rows.replace(given=viewed(lesson.rows.given, view))
+        return _fit_one(key, estimator, params, own, lesson.order, lesson.size, expected_size)
 
-    keys = jax.random.split(key_fit, estimator.ensemble_size)
-    params, info = jax.vmap(one)(keys, network.params, network.views)
-    network = network.replace(params=params)
-    if network.log_weights is not None:
-        network = network.replace(log_weights=_weights(network, dataset, data, rows))
-    return network, info
+    keys = jax.random.split(key, estimator.ensemble_size)
+    return jax.vmap(one)(keys, network.params, network.views)
 
 
-def _weights(network: Network, dataset: Dataset, data: Rows, rows: Array) -> Float[Array, " member"]:
+def trained(lesson: Lesson, params: dict) -> Network:
+    """The network with the weights that it has learnt, and those of its ensemble's members."""
+    network = lesson.network.replace(params=params)
+    if network.log_weights is None:
+        return network
+    return network.replace(log_weights=_weights(network, lesson))
+
+
+def _weights(network: Network, lesson: Lesson) -> Float[Array, " member"]:
     """Log-weights of the ensemble's members, by stacking; equal where nothing is held out or no likelihood is learnt.
 
     By the held-out rows of the later rounds, which are nearer to the observation than those before.
     """
-    estimator = network.estimator
+    estimator, capacity = network.estimator, len(lesson.order)
     if not estimator.validation or estimator.loss != "likelihood":
         return estimator.equal_weights
-    count = jnp.floor(estimator.validation * dataset.size).astype(jnp.int32)
-    places = jnp.arange(max(2, int(estimator.validation * dataset.capacity)))
-    held_out = jnp.take(rows, jnp.maximum(dataset.size - count, 1) + places, mode="clip")
-    own = data.take(held_out)
-    module: Any = estimator.embedded(dataset.theta.shape[-1])
+    count = jnp.floor(estimator.validation * lesson.size).astype(jnp.int32)
+    places = jnp.arange(max(2, int(estimator.validation * capacity)))
+    held_out = jnp.take(lesson.order, jnp.maximum(lesson.size - count, 1) + places, mode="clip")
+    own = lesson.rows.take(held_out)
+    module: Any = estimator.embedded(network.scale.dim)
     score = lambda params, view: module.apply(params, viewed(own.given, view)).log_prob(own.value)
-    return stacked(jax.vmap(score)(network.params, network.views), (places < count) * dataset.late[held_out] * 1.0)
+    return stacked(jax.vmap(score)(network.params, network.views), (places < count) * lesson.late[held_out] * 1.0)
 
 
 def _fit_one(key_epochs, estimator, params, data, rows, size, expected_size):

@@ -349,7 +349,7 @@ _propose = jax.jit(algorithm.propose, static_argnums=1)
 
 def uniform_fraction(settings: Settings, key) -> float:
     """The fraction of proposals that is not from the narrow posterior."""
-    draws = np.asarray(_propose(key, TASK, settings, NARROW))
+    draws = np.asarray(_propose(key, TASK.inference.prior, settings, NARROW))
     return float((np.abs(draws - [-1.0, 2.0]).max(axis=1) > 0.02).mean())
 
 
@@ -361,14 +361,14 @@ def test_the_defensive_fraction_of_proposals_is_uniform(fraction, key):
 
 
 def test_the_defensive_draws_are_those_of_the_current_support(key):
-    draws = np.asarray(_propose(key, TASK, MANY.replace(defensive=1.0), NARROW))
+    draws = np.asarray(_propose(key, TASK.inference.prior, MANY.replace(defensive=1.0), NARROW))
     for d in range(2):
         assert stats.kstest(draws[:, d], stats.uniform(BOX.low[d], BOX.width[d]).cdf).pvalue > 1e-3
 
 
 def test_before_any_data_all_proposals_are_from_the_prior(key):
     nothing = NARROW.replace(informed=jnp.asarray(False))
-    draws = np.asarray(_propose(key, TASK, MANY.replace(defensive=0.0), nothing))
+    draws = np.asarray(_propose(key, TASK.inference.prior, MANY.replace(defensive=0.0), nothing))
     for d in range(2):
         assert stats.kstest(draws[:, d], stats.uniform(BOX.low[d], BOX.width[d]).cdf).pvalue > 1e-3
 

@@ -21,8 +21,9 @@ BOX = Support([-9.0, -7.0], [9.0, 7.0])
 
 
 @functools.cache
-def task(prior=None) -> Task:
-    return Task(lambda key, theta: theta, ("a", "b"), {"box": BOX}, BOX, prior=prior)
+def prior_of(prior):
+    """A prior as a task has it."""
+    return Task(lambda key, theta: theta, ("a", "b"), {"box": BOX}, BOX, prior=prior).inference.prior
 
 
 multiplied = jax.jit(CORRECTIONS["paper"].change, static_argnums=0)
@@ -61,31 +62,31 @@ def on_grid(mixture: GaussianMixture, expected) -> None:
 
 @pytest.mark.parametrize("name", ["none", "importance"])
 def test_some_corrections_leave_the_mixture_as_it_is(name):
-    posterior, bad = CORRECTIONS[name].change(task(), Q, INFORMED)
+    posterior, bad = CORRECTIONS[name].change(None, Q, INFORMED)
     assert posterior is Q and int(bad) == 0
 
 
 @pytest.mark.parametrize("name", ["none", "paper"])
 def test_some_corrections_weigh_all_filled_rows_the_same(name):
-    weights = CORRECTIONS[name].row_weights(task(), data(np.ones((3, 2)), 5), INFORMED, 0, 0.0)
+    weights = CORRECTIONS[name].row_weights(None, data(np.ones((3, 2)), 5), INFORMED, 0, 0.0)
     np.testing.assert_array_equal(weights, [1, 1, 1, 0, 0])
 
 
 @pytest.mark.parametrize("name", ["none", "paper"])
 def test_simulations_given_with_a_density_keep_their_weights(name):
     given = data(np.ones((3, 2)), 5).replace(weight=jnp.array([0.5, 2.0, 0.25, 7.0, 1.0]))
-    weights = CORRECTIONS[name].row_weights(task(), given, INFORMED, 0, 0.0)
+    weights = CORRECTIONS[name].row_weights(None, given, INFORMED, 0, 0.0)
     np.testing.assert_array_equal(weights, [0.5, 2.0, 0.25, 0, 0])
 
 
 def test_to_the_letter_multiplies_by_the_reference():
-    posterior, bad = multiplied(task(), Q, INFORMED)
+    posterior, bad = multiplied(None, Q, INFORMED)
     assert int(bad) == 0 and posterior.logits.shape == (1,)
     on_grid(posterior, lambda theta: density(Q)(theta) * density(PREVIOUS)(theta))
 
 
 def test_to_the_letter_divides_by_a_gaussian_prior():
-    posterior, bad = multiplied(task(PRIOR), Q, INFORMED)
+    posterior, bad = multiplied(prior_of(PRIOR), Q, INFORMED)
     assert int(bad) == 0
     prior = stats.multivariate_normal([0.5, -1.0], np.array([[4.0, 1.4], [1.4, 9.49]]))
     on_grid(posterior, lambda theta: density(Q)(theta) * density(PREVIOUS)(theta) / prior.pdf(theta))
@@ -96,9 +97,9 @@ def test_a_prior_too_narrow_to_divide_by_is_counted():
     counted.
     """
     narrow = distrax.MultivariateNormalDiag(jnp.zeros(2), jnp.array([0.1, 5.0]))
-    posterior, bad = multiplied(task(narrow), Q, INFORMED)
+    posterior, bad = multiplied(prior_of(narrow), Q, INFORMED)
     assert int(bad) == 1
-    undivided, _ = multiplied(task(), Q, INFORMED)
+    undivided, _ = multiplied(None, Q, INFORMED)
     np.testing.assert_allclose(posterior.mean, undivided.mean, atol=1e-5)
 
 
@@ -114,7 +115,7 @@ def test_mixtures_keep_their_number_of_components():
         jnp.array([[0.2, 0.4], [-0.6, 0.0]]),
         jnp.stack([PREVIOUS.scale_tril[0], jnp.eye(2)]),
     )
-    posterior, _ = multiplied(task(), q, dataclasses.replace(INFORMED, mixture=before))
+    posterior, _ = multiplied(None, q, dataclasses.replace(INFORMED, mixture=before))
     assert posterior.logits.shape == (2,)
     on_grid(posterior, lambda theta: density(q)(theta) * density(before)(theta))
 
@@ -122,7 +123,7 @@ def test_mixtures_keep_their_number_of_components():
 def test_before_any_data_there_is_no_reference():
     nothing = uninformed(BOX, 1)
     for prior in (None, PRIOR):
-        posterior, bad = multiplied(task(prior), Q, nothing)
+        posterior, bad = multiplied(prior_of(prior), Q, nothing)
         np.testing.assert_array_equal(posterior.means, Q.means)
         np.testing.assert_array_equal(posterior.scale_tril, Q.scale_tril)
         assert int(bad) == 0
@@ -132,7 +133,7 @@ def test_to_the_letter_refuses_other_priors():
     with pytest.raises(
         ValueError, match=r"^correction='paper' .* multivariate normal, got Independent; use correction="
     ):
-        multiplied(task(distrax.Independent(distrax.Laplace(jnp.zeros(2), jnp.ones(2)), 1)), Q, INFORMED)
+        multiplied(prior_of(distrax.Independent(distrax.Laplace(jnp.zeros(2), jnp.ones(2)), 1)), Q, INFORMED)
 
 
 # --------------------------------------------------------------------------------------- importance weights
@@ -167,7 +168,7 @@ def truncated(weights):
 
 
 def test_in_the_first_round_all_weigh_the_same():
-    weights = importance(task(), data(THETA), ROUNDS, 0)
+    weights = importance(None, data(THETA), ROUNDS, 0)
     np.testing.assert_allclose(relative(weights), 1, rtol=1e-5)
     np.testing.assert_array_equal(weights[30:], 0)
 
@@ -175,18 +176,18 @@ def test_in_the_first_round_all_weigh_the_same():
 @pytest.mark.parametrize("rounds", [2, 3])
 def test_weights_against_numpy(rounds):
     """A uniform first round, then Gaussians almost wholly inside the box; rounds to come do not count."""
-    weights = importance(task(), data(THETA), ROUNDS, rounds - 1)
+    weights = importance(None, data(THETA), ROUNDS, rounds - 1)
     each = [np.full(30, 1 / (18.0 * 14.0)), density(PREVIOUS)(THETA), density(Q)(THETA)][:rounds]
     np.testing.assert_allclose(relative(weights), relative(truncated(1 / np.sum(each, axis=0))), rtol=5e-3)
 
 
 def test_the_defensive_fraction_is_part_of_the_proposal():
     fraction = 0.3
-    weights = importance(task(), data(THETA), ROUNDS, 1, fraction)
+    weights = importance(None, data(THETA), ROUNDS, 1, fraction)
     uniform = np.full(30, 1 / (18.0 * 14.0))
     proposal = uniform + fraction * uniform + (1 - fraction) * density(PREVIOUS)(THETA)
     np.testing.assert_allclose(relative(weights), relative(truncated(1 / proposal)), rtol=5e-3)
-    assert np.abs(relative(weights) - relative(importance(task(), data(THETA), ROUNDS, 1))).max() > 0.1
+    assert np.abs(relative(weights) - relative(importance(None, data(THETA), ROUNDS, 1))).max() > 0.1
 
 
 def test_simulations_given_with_a_density_count_as_draws_of_the_prior():
@@ -194,12 +195,12 @@ def test_simulations_given_with_a_density_count_as_draws_of_the_prior():
     given = data(THETA).replace(weight=jnp.ones(40).at[:10].set(2.0))
     plain = 1 / (np.full(30, 1 / (18.0 * 14.0)) + density(PREVIOUS)(THETA))
     expected = plain * np.where(np.arange(30) < 10, 2.0, 1.0)
-    weights = importance(task(), given, ROUNDS, 1)
+    weights = importance(None, given, ROUNDS, 1)
     np.testing.assert_allclose(relative(weights), relative(truncated(expected)), rtol=5e-3)
 
 
 def test_a_prior_of_the_tasks_own_is_target_and_first_proposal():
-    weights = importance(task(PRIOR), data(THETA), ROUNDS, 1)
+    weights = importance(prior_of(PRIOR), data(THETA), ROUNDS, 1)
     normal = stats.multivariate_normal([0.5, -1.0], np.array([[4.0, 1.4], [1.4, 9.49]]))
     draws = normal.rvs(200_000, random_state=0)
     mass = np.mean(np.all((draws > BOX.low) & (draws < BOX.high), axis=1))
@@ -216,7 +217,7 @@ def test_a_proposal_restricted_to_its_box_is_denser_inside():
     """
     half = Support([0.2, -7.0], [9.0, 7.0])
     rounds = proposals(uninformed(BOX, 1), Belief(PREVIOUS, half, jnp.asarray(True)))
-    weights = importance(task(), data(THETA), rounds, 1)
+    weights = importance(None, data(THETA), rounds, 1)
     inside = THETA[:, 0] > 0.2
     expected = 1 / (1 / 252 + np.where(inside, 2 * density(PREVIOUS)(THETA), 0.0))
     # Mass inside is estimated from 512 draws: five standard errors of a half.
@@ -228,7 +229,7 @@ def test_weights_are_truncated():
     rounds = proposals(INFORMED)
     theta = np.tile([0.2, 0.4], (30, 1))
     theta[3] = [-4.0, 5.0]
-    weights = np.asarray(importance(task(), data(theta), rounds, 1))
+    weights = np.asarray(importance(None, data(theta), rounds, 1))
     assert weights.argmax() == 3
     plain = 1 / density(PREVIOUS)(theta)
     np.testing.assert_allclose(relative(weights), relative(truncated(plain)), rtol=1e-2)
@@ -237,13 +238,13 @@ def test_weights_are_truncated():
 
 def test_rows_that_no_proposal_could_draw_and_empty_rows_weigh_nothing():
     small = dataclasses.replace(INFORMED, support=Support([-1.0, -1.0], [2.0, 2.0]))
-    weights = importance(task(), data([[0.0, 0.0], [3.0, 0.0]]), proposals(small), 1)
+    weights = importance(None, data([[0.0, 0.0], [3.0, 0.0]]), proposals(small), 1)
     assert float(weights[0]) > 0
     np.testing.assert_array_equal(weights[1:], 0.0)
 
 
 def test_no_rows_at_all_have_finite_weights():
-    weights = importance(task(), data(np.zeros((0, 2))), ROUNDS, 1)
+    weights = importance(None, data(np.zeros((0, 2))), ROUNDS, 1)
     np.testing.assert_array_equal(weights, np.zeros(40))
 
 

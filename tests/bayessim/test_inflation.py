@@ -102,7 +102,7 @@ def test_the_quotient_leaves_the_likelihood_of_any_proposals(factor):
         jnp.array([[[0.5, 0.0], [-0.9, 0.3]], [[0.2, 0.0], [0.1, 0.4]]]),
     )
     proposal = Belief(_inflated(LIKELIHOOD, factor), WIDE, jnp.asarray(True))
-    found, indefinite = _divided(gaussian(), _product(likelihood, proposal.mixture), proposal)
+    found, indefinite = _divided(None, _product(likelihood, proposal.mixture), proposal)
     assert int(indefinite) == 0
     np.testing.assert_allclose(found.weights, likelihood.weights, rtol=1e-3)
     np.testing.assert_allclose(found.means, likelihood.means, atol=2e-3)
@@ -111,7 +111,7 @@ def test_the_quotient_leaves_the_likelihood_of_any_proposals(factor):
 
 def test_the_quotient_leaves_the_first_round_as_it_is():
     nothing = Belief(LIKELIHOOD, WIDE, jnp.asarray(False))
-    found, _ = _divided(gaussian(), LIKELIHOOD, nothing)
+    found, _ = _divided(None, LIKELIHOOD, nothing)
     np.testing.assert_array_equal(found.means, LIKELIHOOD.means)
     np.testing.assert_array_equal(found.scale_tril, LIKELIHOOD.scale_tril)
 
@@ -120,7 +120,7 @@ def test_the_quotient_leaves_the_first_round_as_it_is():
 def test_proposals_are_so_many_times_as_wide(restriction, key):
     drawn = settings(inflation=2.5, restriction=restriction, simulation_budget=4000)
     belief = Belief(LIKELIHOOD, WIDE, jnp.asarray(True))
-    theta = np.asarray(jax.jit(algorithm.propose, static_argnums=1)(key, gaussian(), drawn, belief))
+    theta = np.asarray(jax.jit(algorithm.propose, static_argnums=1)(key, None, drawn, belief))
     deviations = 2.5 * np.sqrt(np.diag(LIKELIHOOD.covariance))
     for d in range(2):
         assert stats.kstest(theta[:, d], stats.norm(LIKELIHOOD.mean[d], deviations[d]).cdf).pvalue > 1e-3

@@ -47,7 +47,7 @@ EXACT = _product(gaussian_linear.posterior(X), AS_MIXTURE)
 @pytest.mark.parametrize("restriction", ["clip", "reject", "mixed"])
 def test_proposals_are_the_wide_posterior_times_the_prior(restriction, key):
     drawn = settings(inflation=2.0, restriction=restriction, simulation_budget=4000)
-    theta = np.asarray(_propose(key, TASK, drawn, BELIEF))
+    theta = np.asarray(_propose(key, TASK.inference.prior, drawn, BELIEF))
     expected = _product(BELIEF.mixture.inflated(2.0), AS_MIXTURE)
     for d in range(2):
         marginal = stats.norm(float(expected.mean[d]), float(jnp.sqrt(expected.covariance[d, d])))
@@ -59,7 +59,7 @@ def test_proposals_are_the_wide_posterior_times_the_prior(restriction, key):
 def test_they_stay_in_the_support(restriction, key):
     box = Support([-0.5, 0.0], [0.5, 0.3])
     drawn = settings(inflation=2.0, restriction=restriction, simulation_budget=500)
-    theta = np.asarray(_propose(key, TASK, drawn, BELIEF.replace(support=box)))
+    theta = np.asarray(_propose(key, TASK.inference.prior, drawn, BELIEF.replace(support=box)))
     assert theta.shape == (500, 2) and ((theta >= np.asarray(box.low)) & (theta <= np.asarray(box.high))).all()
 
 
@@ -77,7 +77,7 @@ def test_they_stay_in_the_support(restriction, key):
 )
 def test_what_accounts_for_the_prior_by_itself_proposes_as_without_one(accounting, key):
     accounting = accounting.replace(defensive=0.0)
-    theta = [_propose(jax.random.clone(key), task, accounting, BELIEF) for task in (TASK, PLAIN)]
+    theta = [_propose(jax.random.clone(key), task.inference.prior, accounting, BELIEF) for task in (TASK, PLAIN)]
     np.testing.assert_array_equal(*theta)
 
 
@@ -141,7 +141,7 @@ def test_nothing_is_proposed_where_the_prior_is_zero(restriction, correction, ke
     drawn = settings(inflation=2.0, restriction=restriction, correction=correction, simulation_budget=500)
     for shift in (0.0, 8.0):
         belief = BELIEF.replace(mixture=BELIEF.mixture.affine(jnp.ones(2), jnp.full(2, shift)))
-        theta = np.asarray(_propose(jax.random.clone(key), BOUNDED, drawn, belief))
+        theta = np.asarray(_propose(jax.random.clone(key), BOUNDED.inference.prior, drawn, belief))
         assert theta.shape == (500, 2) and (np.sum(theta**2, axis=1) <= 1).all()
         assert len(np.unique(theta, axis=0)) > 400
 

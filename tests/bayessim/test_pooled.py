@@ -18,9 +18,11 @@ BOX = Support(LOW, HIGH)
 MEAN, FACTOR = np.array([0.8, 1.5]), np.array([[0.5, 0.0], [0.3, 0.4]])
 
 
-def task_of(prior=None, box=BOX):
-    names = tuple("abcdef"[: box.dim])
-    return jaxlfi.Task(lambda key, theta: theta, names=names, supports={"box": box}, feasible=box, prior=prior)
+def prior_of(prior):
+    """A prior as a task has it."""
+    return jaxlfi.Task(
+        lambda key, theta: theta, names=("a", "b"), supports={"box": BOX}, feasible=BOX, prior=prior
+    ).inference.prior
 
 
 def gaussian(mean=MEAN, factor=FACTOR):
@@ -40,13 +42,13 @@ def proposals(*informed, box=BOX):
 def test_the_pool_is_the_mixture_of_the_rounds():
     wide = gaussian(factor=2 * FACTOR)
     theta = np.array([[0.0, 1.0], [1.0, 3.0], [-3.5, 5.5]], np.float32)
-    found = np.asarray(log_pool(task_of(), proposals(wide, wide), 1, 0.0, jnp.asarray(theta)))
+    found = np.asarray(log_pool(None, proposals(wide, wide), 1, 0.0, jnp.asarray(theta)))
     normal = stats.multivariate_normal(MEAN, 4 * FACTOR @ FACTOR.T)
     draws = normal.rvs(400_000, random_state=0)
     inside = np.mean(np.all((draws > LOW) & (draws < HIGH), axis=1))
     expected = np.log(1 / 64 + normal.pdf(theta) / inside)  # the third proposal is of a round to come
     np.testing.assert_allclose(found, expected, atol=0.02)
-    assert np.isneginf(log_pool(task_of(), proposals(wide), 1, 0.0, jnp.array([[5.0, 0.0]])))
+    assert np.isneginf(log_pool(None, proposals(wide), 1, 0.0, jnp.array([[5.0, 0.0]])))
 
 
 @pytest.mark.parametrize("dim", [2, 6])
@@ -64,7 +66,7 @@ def test_what_a_gaussian_lost_by_wide_proposals_it_gets_back(inflation, dim):
     learnt = np.linalg.inv(np.linalg.inv(exact) + np.linalg.inv(proposed))
     rounds = proposals(*[gaussian(mean, inflation * factor)] * 40, box=box)
     q = gaussian(mean, np.linalg.cholesky(learnt))
-    found, effective = without_pool(task_of(box=box), q, rounds, 40, 0.0, box)
+    found, effective = without_pool(None, q, rounds, 40, 0.0, box)
     np.testing.assert_allclose(found.covariance, exact, rtol=0.06, atol=0.006)
     np.testing.assert_allclose(found.mean, mean, atol=0.02)
     assert 0.05 < effective < 1
@@ -79,7 +81,7 @@ def test_each_component_is_moved_by_the_slope_of_the_pool():
     )
     leaning = gaussian(np.array([1.5, 0.5]), 1.2 * np.eye(2))
     pool = proposals(leaning, leaning, leaning)
-    found, _ = without_pool(task_of(), q, pool, 3, 0.0, BOX)
+    found, _ = without_pool(None, q, pool, 3, 0.0, BOX)
     draws = np.asarray(q.sample(jax.random.key(3), 200_000))
     weight = 1 / (1 / 64 + 3 * stats.multivariate_normal([1.5, 0.5], 1.44 * np.eye(2)).pdf(draws) / 0.92)
     weight /= weight.sum()
@@ -93,14 +95,14 @@ def test_a_stray_component_where_nothing_was_proposed_stays_light():
     """By the quotient alone, its weight of 0.02 would become 0.63."""
     near, far = gaussian(), gaussian(MEAN - [3.5, 0.0])
     q = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), near, far).replace(logits=jnp.log(jnp.array([0.98, 0.02])))
-    found, _ = without_pool(task_of(), q, proposals(*[gaussian(factor=2 * FACTOR)] * 9), 9, 0.0, BOX)
+    found, _ = without_pool(None, q, proposals(*[gaussian(factor=2 * FACTOR)] * 9), 9, 0.0, BOX)
     assert float(found.weights[1]) < 1.1 * HIGHEST * 0.02
     assert np.linalg.norm(found.means[1] - far.means[0]) < FARTHEST * 0.6
 
 
 def test_a_constant_pool_changes_nothing():
     q = gaussian(np.array([-3.9, 0.0]))  # half of it beyond the bound, where nothing was proposed
-    found, effective = without_pool(task_of(), q, proposals(gaussian()), 0, 0.0, BOX)
+    found, effective = without_pool(None, q, proposals(gaussian()), 0, 0.0, BOX)
     np.testing.assert_allclose(found.mean, q.mean, atol=1e-4)
     np.testing.assert_allclose(found.covariance, q.covariance, rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(effective, 1.0, rtol=1e-5)
@@ -108,7 +110,7 @@ def test_a_constant_pool_changes_nothing():
 
 def test_a_support_that_nothing_was_proposed_in_leaves_q_as_it_is():
     other = Support(np.array([10.0, 10.0]), np.array([11.0, 11.0]))
-    found, effective = without_pool(task_of(), gaussian(), proposals(gaussian()), 1, 0.0, other)
+    found, effective = without_pool(None, gaussian(), proposals(gaussian()), 1, 0.0, other)
     np.testing.assert_array_equal(found.means, gaussian().means)
     assert effective == 0
 
@@ -117,9 +119,9 @@ def test_where_a_prior_is_zero_the_pool_counts_as_flat():
     """A uniform prior that ends in the middle of the component: half of its points are where nothing is proposed."""
     prior = distrax.Independent(distrax.Uniform(jnp.array([0.8, -2.0]), jnp.array([4.0, 6.0])), 1)
     wide = gaussian(factor=2 * FACTOR)
-    found, effective = without_pool(task_of(prior), gaussian(), proposals(*[wide] * 9), 9, 0.0, BOX)
+    found, effective = without_pool(prior_of(prior), gaussian(), proposals(*[wide] * 9), 9, 0.0, BOX)
     assert np.isfinite(found.mean).all() and np.isfinite(found.covariance).all() and 0 < effective <= 1
-    wider, _ = without_pool(task_of(), gaussian(), proposals(*[wide] * 9), 9, 0.0, BOX)
+    wider, _ = without_pool(None, gaussian(), proposals(*[wide] * 9), 9, 0.0, BOX)
     assert np.all(np.diag(gaussian().covariance) <= np.diag(found.covariance) + 1e-6)
     assert np.all(np.diag(found.covariance) <= np.diag(wider.covariance) + 1e-6)
 
@@ -127,9 +129,9 @@ def test_where_a_prior_is_zero_the_pool_counts_as_flat():
 def test_a_prior_that_proposals_have_as_a_factor_drops_out(key):
     prior = distrax.MultivariateNormalDiag(jnp.array([0.5, 1.0]), jnp.array([1.0, 2.0]))
     theta = jnp.array([[0.0, 0.0], [1.0, 2.0], [2.0, -1.0]])
-    task = task_of(prior)
+    own = prior_of(prior)
     rounds = proposals(gaussian(factor=2 * FACTOR))
-    only_first = np.asarray(log_pool(task, rounds, 0, 0.0, theta))
+    only_first = np.asarray(log_pool(own, rounds, 0, 0.0, theta))
     np.testing.assert_allclose(only_first, only_first[0], atol=1e-5)
     # The second round drew from Gaussian * prior / Z, which relative to the prior is Gaussian / Z.
     normal = stats.multivariate_normal(MEAN, 4 * FACTOR @ FACTOR.T)
@@ -137,4 +139,4 @@ def test_a_prior_that_proposals_have_as_a_factor_drops_out(key):
     inside = np.all((draws > LOW) & (draws < HIGH), axis=1)
     z = np.mean(inside * stats.multivariate_normal([0.5, 1.0], np.diag([1.0, 4.0])).pdf(draws))
     expected = np.log(normal.pdf(theta) / z + np.exp(only_first))
-    np.testing.assert_allclose(log_pool(task, rounds, 1, 0.0, theta), expected, atol=0.1)
+    np.testing.assert_allclose(log_pool(own, rounds, 1, 0.0, theta), expected, atol=0.1)

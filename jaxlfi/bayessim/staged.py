@@ -1,0 +1,150 @@
+"""A round in stages, each a compiled program of its own: propose, simulate, gather, train, conclude, compare.
+
+Only two of them, simulating and comparing, hold the user's simulator. The others depend on shapes and settings alone: a
+second simulator of the same shapes finds them in the cache of compiled programs (`jaxlfi.io.compile_cache`), and
+simulations may be made by anything (`jaxlfi.bayessim.host`). All are compiled side by side. A round waits for training
+and for the simulator: these are compiled to run fast, and the others to be compiled fast.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxlfi.bayessim import algorithm
+from jaxlfi.bayessim.algorithm import Gathered, Round, State
+from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_draws
+from jaxlfi.bayessim.keys import round_keys, run_keys
+from jaxlfi.bayessim.programs import Call, call, compile_all, program
+from jaxlfi.bayessim.record import record
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.diagnostics.discrepancy import Discrepancy, discrepancy, not_simulated
+from jaxlfi.estimators.training import FitInfo, Lesson, fit_keys, train
+from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
+from jaxlfi.tasks.task import Task
+
+
+def propose_one(
+    prior: Any, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int
+) -> tuple[Float[Array, "attempts dim"], jax.Array]:
+    """Proposals of a round, and the key of their simulations."""
+    keys = round_keys(run_keys(run.key).run, index)
+    return algorithm.propose(keys.propose, prior, settings, state.belief), keys.simulate
+
+
+def simulate_one(task: Task, settings: Settings, theta: Float[Array, "attempts dim"], key: jax.Array) -> Simulations:
+    """The simulations of a round's proposals."""
+    return within_budget(theta, *simulate(key, task, theta), settings.simulations_per_round)
+
+
+def gather_one(
+    prior: Any, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, simulations: Simulations
+) -> Gathered:
+    """A round's simulations beside all others, and the network ready to learn from them."""
+    key_fit, _ = _update_keys(settings, run, index)
+    return algorithm.gather(key_fit, prior, settings, state, index, simulations)
+
+
+def train_one(
+    settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, lesson: Lesson
+) -> tuple[dict, FitInfo]:
+    """What the network learns."""
+    _, key_train = fit_keys(_update_keys(settings, run, index)[0])
+    return train(key_train, lesson, algorithm.expected_size(settings, state, index))
+
+
+def conclude_one(
+    prior: Any,
+    reasons: int,
+    settings: Settings,
+    run: RunInputs,
+    state: State,
+    index: Int[Array, ""] | int,
+    gathered: Gathered,
+    learnt: tuple[dict, FitInfo],
+) -> tuple[State, Round, Float[Array, "samples dim"], jax.Array]:
+    """The end of a round, draws of its posterior to check it by, and the key of their simulations."""
+    _, key = _update_keys(settings, run, index)
+    state, info = algorithm.conclude(
+        key, prior, reasons, settings, run.heuristic, run.x, state, index, gathered, learnt
+    )
+    return state, info, *check_draws(run, state)
+
+
+def _update_keys(settings: Settings, run: RunInputs, index: Int[Array, ""] | int) -> tuple[jax.Array, jax.Array | None]:
+    """The keys by which a round fits and conditions."""
+    return settings.estimator.keys(round_keys(run_keys(run.key).run, index).update)
+
+
+def compare_one(
+    task: Task, settings: Settings, run: RunInputs, theta: Float[Array, "samples dim"], key: jax.Array
+) -> Discrepancy:
+    """How far a posterior's draws are from truth and observation."""
+    if not settings.predictive:
+        return not_simulated(task, theta, run.observed, run.x.shape[-1])
+    return discrepancy(key, task, theta, run.observed)
+
+
+class StagedEngine(BatchEngine):
+    """Steps a batch on one device, round by round, in stages. To rounding, it gives what `BatchEngine` does."""
+
+    def __init__(self, task: Task, settings: Settings, inputs: RunInputs, first: Simulations | None = None):
+        """Prepare, without compiling; see `BatchEngine`."""
+        super().__init__(task, settings, inputs, devices=jax.local_devices()[:1], first=first)
+        prior, shared = task.inference.prior, (None, 0, 0, None)
+        stage = lambda one, bound, *axes, **how: program(functools.partial(one, *bound), self.mesh, axes, **how)
+        self._propose = stage(propose_one, (prior,), *shared, quick=True)
+        self._simulate = stage(simulate_one, (task,), None, 0, 0)
+        self._gather = stage(gather_one, (prior,), *shared, 0, quick=True)
+        self._train = stage(train_one, (), *shared, 0)
+        self._conclude = stage(conclude_one, (prior, len(task.reasons)), *shared, 0, 0, donate=(2,), quick=True)
+        self._compare = stage(compare_one, (task,), None, 0, 0, 0)
+
+    def compile(self, state: State, index: int = 0) -> None:
+        """Compile all stages ahead of their first use."""
+        inputs = (self.settings, self.inputs, state, jnp.asarray(index))
+        proposed = jax.eval_shape(self._propose, *inputs)
+        made = self.first_round() if self._given(index) else self.simulations_like(*proposed)
+        gathered = jax.eval_shape(self._gather, *inputs, made)
+        learnt = jax.eval_shape(self._train, *inputs, gathered.lesson)
+        _, _, *drawn = jax.eval_shape(self._conclude, *inputs, gathered, learnt)
+        compile_all(
+            [
+                (self._conclude, (*inputs, gathered, learnt)),
+                (self._train, (*inputs, gathered.lesson)),
+                (self._gather, (*inputs, made)),
+                (self._propose, inputs),
+                *self.simulator_calls(proposed, drawn),
+            ]
+        )
+
+    def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
+        """Step every run; see `BatchEngine.round`."""
+        inputs, settled = (self.settings, self.inputs, state, jnp.asarray(index)), np.asarray(state.progress.settled)
+        made = self.first_round() if self._given(index) else self.simulated(inputs, settled)
+        gathered = call(self._gather, *inputs, made)
+        learnt = call(self._train, *inputs, gathered.lesson)
+        state, info, theta, keys = call(self._conclude, *inputs, gathered, learnt)
+        return state, jax.device_get(record(info, state.progress, self.compared(theta, keys, settled)))
+
+    def simulated(self, inputs: tuple, settled: np.ndarray) -> Simulations:
+        """The simulations of a round, proposed by these inputs; of runs that have settled it does not matter which."""
+        return call(self._simulate, self.settings, *call(self._propose, *inputs))
+
+    def compared(self, theta: jax.Array, keys: jax.Array, settled: np.ndarray) -> Discrepancy:
+        """How far draws of the posteriors, shape [L, N, D], are from truth and observation."""
+        return call(self._compare, self.settings, self.inputs, theta, keys)
+
+    def simulations_like(self, theta: jax.ShapeDtypeStruct, keys: jax.ShapeDtypeStruct) -> Simulations:
+        """Shapes of a round's simulations."""
+        return jax.eval_shape(self._simulate, self.settings, theta, keys)
+
+    def simulator_calls(self, proposed: tuple, drawn: list) -> list[Call]:
+        """The stages that hold the simulator, with what they are called with."""
+        return [(self._simulate, (self.settings, *proposed)), (self._compare, (self.settings, self.inputs, *drawn))]
+
+    def _given(self, index: int) -> bool:
+        return index == 0 and self.first is not None
