@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.keys import init_key, key_of, round_keys, run_keys
-from jaxlfi.bayessim.programs import compiled, program
+from jaxlfi.bayessim.programs import program
 from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.discrepancy import POSTERIOR_SAMPLES, Discrepancy, discrepancy, not_simulated
@@ -31,6 +31,7 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network
 from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.heuristics import Choice, Heuristic
+from jaxlfi.io.executables import call, compiled
 from jaxlfi.tasks import summaries
 from jaxlfi.tasks.simulation import Simulations
 from jaxlfi.tasks.task import Task
@@ -216,8 +217,8 @@ class BatchEngine:
     def start(self) -> State:
         """The state before the first round."""
         first = None if self.first is None else len(self.first.theta)
-        start = program(functools.partial(start_one, self.task, first), self.mesh, (None, 0), quick=True)
-        return start(self.settings, self.inputs)
+        start = program(functools.partial(start_one, self.task, first), self.mesh, (None, 0))
+        return call(start, self.settings, self.inputs, quick=True)
 
     def begin(self, state: State) -> None:
         """What comes before the first round is compiled: nothing, where a round is one program."""

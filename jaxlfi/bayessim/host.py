@@ -14,10 +14,10 @@ import numpy as np
 from jaxlfi.bayessim.algorithm import State
 from jaxlfi.bayessim.batch import BatchEngine, RunInputs
 from jaxlfi.bayessim.multi_process import SharedEngine
-from jaxlfi.bayessim.programs import Call, call
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.bayessim.staged import StagedEngine
 from jaxlfi.diagnostics.discrepancy import Discrepancy, compared, not_simulated
+from jaxlfi.io.executables import Call
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.tasks.host import require_success
 from jaxlfi.tasks.journal import Journal
@@ -120,7 +120,7 @@ class HostEngine(StagedEngine):
         if self._begun is not None:
             begun, self._begun = self._begun, None
             return begun
-        theta, keys = call(self._propose, *inputs)
+        theta, keys = self.proposed(inputs)
         shape, wanted = self.inputs.observed.shape[1:], self.settings.simulations_per_round
         made = []
         for run, (key, own, over) in enumerate(zip(keys, theta, settled, strict=True)):

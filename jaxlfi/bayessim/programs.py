@@ -1,27 +1,18 @@
 """Compiled programs of batches, shared by all engines of equal tasks."""
 
 import functools
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxlfi.distributions.precision import single
-from jaxlfi.io import compile_cache
+from jaxlfi.io import executables
 
 KEPT = 64
-"""Number of jitted functions that are kept, and number of their compiled versions for some shapes of arguments."""
-
-
-Call = tuple[Any, tuple]
-"""A jitted function, and what it is called with: arrays, or their shapes."""
-
-QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-"""Compiler options on a CPU that take half of the time or less, of programs that run for milliseconds."""
+"""Number of jitted functions that are kept."""
 
 
 def program(
@@ -29,7 +20,6 @@ def program(
     mesh: Mesh,
     in_axes: tuple[int | None, ...],
     donate: tuple[int, ...] = (),
-    quick: bool = False,
 ) -> Any:
     """A function of one run as a jitted function of a batch; the same one for equal arguments.
 
@@ -38,17 +28,13 @@ def program(
         mesh: of the devices that the runs are divided over, of one axis.
         in_axes: of the other arguments: 0 for one value a run, None for a value that all share.
         donate: places of arguments whose memory the results may take.
-        quick: whether it matters more how long it takes to compile than to run.
     """
-    return _program(one.func, one.args, mesh, in_axes, donate, quick)
+    return _program(one.func, one.args, mesh, in_axes, donate)
 
 
 @functools.lru_cache(maxsize=KEPT)
-def _program(function, bound: tuple, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...], quick: bool):
-    many = side_by_side(functools.partial(function, *bound), mesh, in_axes)
-    # Later versions of XLA have no other fusions on the CPU.
-    options = QUICK if quick and jax.default_backend() == "cpu" and jax.__version_info__ < (0, 10) else None
-    return jax.jit(many, donate_argnums=donate, compiler_options=options)
+def _program(function, bound: tuple, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...]):
+    return jax.jit(side_by_side(functools.partial(function, *bound), mesh, in_axes), donate_argnums=donate)
 
 
 def side_by_side(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...]) -> Callable[..., Any]:
@@ -85,41 +71,7 @@ def _alone(one: functools.partial, in_axes: tuple[int | None, ...], arguments: t
     return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], one(*own))
 
 
-_EXECUTABLES: dict[Any, Any] = {}
-
-
-def compiled(many: Any, arguments: tuple) -> Any:
-    """A jitted function compiled for arguments of these shapes: ahead of its first call, and once."""
-    compile_all([(many, arguments)])
-    return _EXECUTABLES[_signature(many, arguments)]
-
-
-def call(many: Any, *arguments: Any) -> Any:
-    """Call a program compiled once: a state that was read back from a checkpoint does not compile it anew."""
-    return compiled(many, arguments)(*arguments)
-
-
-def compile_all(calls: Sequence[Call]) -> None:
-    """Compile jitted functions for arguments of these shapes, side by side: the compiler leaves Python alone."""
-    missing = {signature: one for one in calls if (signature := _signature(*one)) not in _EXECUTABLES}
-    if not missing:
-        return
-    compile_cache.start()
-    while _EXECUTABLES and len(_EXECUTABLES) + len(missing) > KEPT:
-        del _EXECUTABLES[next(iter(_EXECUTABLES))]
-    with ThreadPoolExecutor(len(missing)) as threads:
-        begun = {signature: threads.submit(many.lower(*given).compile) for signature, (many, given) in missing.items()}
-        _EXECUTABLES.update({signature: one.result() for signature, one in begun.items()})
-
-
-def _signature(many: Any, arguments: tuple) -> tuple:
-    """What a compiled program is known by."""
-    leaves, structure = jax.tree.flatten(arguments)
-    wide = jax.config.jax_enable_x64  # type: ignore[attr-defined]  # jax makes it at run time
-    return many, wide, structure, tuple((np.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves)
-
-
 def forget() -> None:
     """Drop all compiled programs, and the memory they hold; they are compiled anew when they are needed."""
-    _EXECUTABLES.clear()
+    executables.forget()
     _program.cache_clear()

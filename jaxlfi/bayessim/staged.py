@@ -18,11 +18,12 @@ from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.algorithm import Gathered, Round, State
 from jaxlfi.bayessim.batch import BatchEngine, RunInputs, check_draws
 from jaxlfi.bayessim.keys import round_keys, run_keys
-from jaxlfi.bayessim.programs import Call, call, compile_all, program
+from jaxlfi.bayessim.programs import program
 from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.discrepancy import Discrepancy, discrepancy, not_simulated
 from jaxlfi.estimators.training import FitInfo, Lesson, fit_keys, train
+from jaxlfi.io.executables import Call, call, compile_all
 from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
 from jaxlfi.tasks.task import Task
 
@@ -96,11 +97,11 @@ class StagedEngine(BatchEngine):
         super().__init__(task, settings, inputs, devices=jax.local_devices()[:1], first=first)
         prior, shared = task.inference.prior, (None, 0, 0, None)
         stage = lambda one, bound, *axes, **how: program(functools.partial(one, *bound), self.mesh, axes, **how)
-        self._propose = stage(propose_one, (prior,), *shared, quick=True)
+        self._propose = stage(propose_one, (prior,), *shared)
         self._simulate = stage(simulate_one, (task,), None, 0, 0)
-        self._gather = stage(gather_one, (prior,), *shared, 0, quick=True)
+        self._gather = stage(gather_one, (prior,), *shared, 0)
         self._train = stage(train_one, (), *shared, 0)
-        self._conclude = stage(conclude_one, (prior, len(task.reasons)), *shared, 0, 0, donate=(2,), quick=True)
+        self._conclude = stage(conclude_one, (prior, len(task.reasons)), *shared, 0, 0, donate=(2,))
         self._compare = stage(compare_one, (task,), None, 0, 0, 0)
 
     def compile(self, state: State, index: int = 0) -> None:
@@ -113,10 +114,10 @@ class StagedEngine(BatchEngine):
         _, _, *drawn = jax.eval_shape(self._conclude, *inputs, gathered, learnt)
         compile_all(
             [
-                (self._conclude, (*inputs, gathered, learnt)),
-                (self._train, (*inputs, gathered.lesson)),
-                (self._gather, (*inputs, made)),
-                (self._propose, inputs),
+                (self._conclude, (*inputs, gathered, learnt), True),
+                (self._train, (*inputs, gathered.lesson), False),
+                (self._gather, (*inputs, made), True),
+                (self._propose, inputs, True),
                 *self.simulator_calls(proposed, drawn),
             ]
         )
@@ -125,14 +126,18 @@ class StagedEngine(BatchEngine):
         """Step every run; see `BatchEngine.round`."""
         inputs, settled = (self.settings, self.inputs, state, jnp.asarray(index)), np.asarray(state.progress.settled)
         made = self.first_round() if self._given(index) else self.simulated(inputs, settled)
-        gathered = call(self._gather, *inputs, made)
+        gathered = call(self._gather, *inputs, made, quick=True)
         learnt = call(self._train, *inputs, gathered.lesson)
-        state, info, theta, keys = call(self._conclude, *inputs, gathered, learnt)
+        state, info, theta, keys = call(self._conclude, *inputs, gathered, learnt, quick=True)
         return state, jax.device_get(record(info, state.progress, self.compared(theta, keys, settled)))
+
+    def proposed(self, inputs: tuple) -> tuple[jax.Array, jax.Array]:
+        """Proposals of a round, shape [L, A, D], and the keys of their simulations."""
+        return call(self._propose, *inputs, quick=True)
 
     def simulated(self, inputs: tuple, settled: np.ndarray) -> Simulations:
         """The simulations of a round, proposed by these inputs; of runs that have settled it does not matter which."""
-        return call(self._simulate, self.settings, *call(self._propose, *inputs))
+        return call(self._simulate, self.settings, *self.proposed(inputs))
 
     def compared(self, theta: jax.Array, keys: jax.Array, settled: np.ndarray) -> Discrepancy:
         """How far draws of the posteriors, shape [L, N, D], are from truth and observation."""
@@ -144,7 +149,8 @@ class StagedEngine(BatchEngine):
 
     def simulator_calls(self, proposed: tuple, drawn: list) -> list[Call]:
         """The stages that hold the simulator, with what they are called with."""
-        return [(self._simulate, (self.settings, *proposed)), (self._compare, (self.settings, self.inputs, *drawn))]
+        comparison = (self.settings, self.inputs, *drawn)
+        return [(self._simulate, (self.settings, *proposed), False), (self._compare, comparison, False)]
 
     def _given(self, index: int) -> bool:
         return index == 0 and self.first is not None

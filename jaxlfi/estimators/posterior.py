@@ -23,6 +23,7 @@ from jaxlfi.distributions.truncated_mixture import log_mass, truncated_quantiles
 from jaxlfi.distributions.truncation import rejection_sample, truncated_log_prob
 from jaxlfi.estimators.density import Density
 from jaxlfi.io import text_table
+from jaxlfi.io.executables import quickly
 from jaxlfi.tasks import priors
 
 Names = str | int | Sequence[str] | Sequence[int]
@@ -96,7 +97,7 @@ class Posterior(struct.PyTreeNode):
         """
         require_count(n, "n", most=MAX_DRAWS)
         natural = is_natural(space)
-        draws = _sample(as_key(key), self, int(n))
+        draws = quickly(_sampler(int(n)), as_key(key), self)
         return self.space.to_natural(draws) if natural else draws
 
     def log_prob(self, theta: ArrayLike | Sequence, space: SpaceName = "natural") -> Float[Array, "*n"]:
@@ -270,7 +271,7 @@ class Posterior(struct.PyTreeNode):
     def _quantiles(self, levels: Array) -> Array:
         """Of each parameter in inference space, shape [levels, D]."""
         if self._closed:
-            return _mixture_quantiles(self, levels)
+            return quickly(_mixture_quantiles, self, levels)
         return _draws_quantiles(self.sample(jax.random.key(0), STATISTICS_DRAWS, "inference"), levels)
 
     def __repr__(self) -> str:
@@ -448,15 +449,17 @@ def truncated(
 
 
 # Compiled as wholes: operation by operation, a flow's density alone would be hundreds of small programs.
-
-
-_sample = jax.jit(single(lambda key, posterior, n: posterior.inner_draws(key, n)), static_argnums=2)
 _without_prior = jax.jit(single(lambda posterior: posterior.replace(prior=None).on(posterior.support)))
 _draws_moments = jax.jit(single(lambda draws: _weighted_moments(draws, jnp.full(len(draws), 1 / len(draws)))))
 _draws_quantiles = jax.jit(single(lambda draws, levels: jnp.quantile(draws, levels, axis=0)))
 _mixture_quantiles = jax.jit(
     single(lambda posterior, levels: truncated_quantiles(_mixture_of(posterior), posterior.support, levels))
 )
+
+
+@functools.lru_cache(maxsize=64)
+def _sampler(n: int) -> Any:
+    return jax.jit(single(lambda key, posterior: posterior.inner_draws(key, n)))
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))

@@ -5,21 +5,30 @@ time, loading from the cache 0.4 s; the file has half a megabyte.
 
 On every load XLA logs that "+prefer-no-gather" and the like are not features of the machine. They never are:
 they are the compiler's own preferences, listed as if they were features. The log is silenced before jax
-starts, and to keep programs from machines that really differ apart, the folder is named by a hash of the
-processor's model and features.
+starts, or filtered where it has started, and to keep programs from machines that really differ apart, the
+folder is named by a hash of the processor's model and features.
 """
 
+import contextlib
 import hashlib
 import importlib.metadata
 import os
 import platform
+import tempfile
 import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 SWITCH = "JAXLFI_COMPILE_CACHE"
 """Environment variable that turns the cache off where it is 0."""
 LEAST_SECONDS = 0.5
 """Programs that compile in less are not kept."""
+NOISE = (
+    b"PjRt-IFRT does not track XLA executable versions",
+    b"Loading XLA:CPU AOT result. Target machine feature +prefer",
+)
+"""What XLA logs of every program that it loads."""
 FEATURE_LINES = ("model name", "flags", "Features", "CPU implementer", "CPU part")
 """Lines of /proc/cpuinfo that identify which machine code a processor runs, on x86 and on Arm."""
 
@@ -43,26 +52,77 @@ def enable() -> Path | None:
     return folder
 
 
-def start() -> None:
-    """Switch the cache on in a process whose jax has started, unless it has one of its own or `SWITCH` says no."""
+@contextlib.contextmanager
+def used() -> Iterator[None]:
+    """The cache is on within, unless the process has one of its own or `SWITCH` says no.
+
+    The process's own functions are left alone: only programs of ours are kept, in a process whose jax has started.
+    """
     import jax  # here, as the command line enables the cache before jax is there
+
+    if (folder := _folder()) is None:
+        yield
+        return
+    wanted = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": LEAST_SECONDS,
+    }
+    before = {name: getattr(jax.config, name) for name in wanted}
+    _configure(wanted)
+    try:
+        with _without_noise():
+            yield
+    finally:
+        _configure(before)
+
+
+def _configure(values: Mapping[str, Any]) -> None:
+    import jax
     from jax.experimental.compilation_cache import compilation_cache
+
+    for name, value in values.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()  # jax looks for a folder once
+
+
+def _folder() -> Path | None:
+    """The folder to use in a process whose jax has started; None where there is none, or another one is used."""
+    import jax
 
     # jax makes both at run time
     given = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     enabled = jax.config.jax_enable_compilation_cache  # type: ignore[attr-defined]
     if given is not None or not enabled or os.environ.get(SWITCH) == "0":
-        return
+        return None
     folder = default_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         warnings.warn(f"programs are not kept for the next process: {error}", stacklevel=2)
         os.environ[SWITCH] = "0"  # it is said once
+        return None
+    return folder
+
+
+@contextlib.contextmanager
+def _without_noise() -> Iterator[None]:
+    """Keep `NOISE` off the terminal; all else that is written to it comes once the programs are there."""
+    try:
+        terminal = os.dup(2)
+    except OSError:  # there is none
+        yield
         return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_SECONDS)
-    compilation_cache.reset_cache()  # jax has looked for a folder once, and found none
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(terminal, 2)
+            os.close(terminal)
+            caught.seek(0)
+            for line in caught:
+                if not any(noise in line for noise in NOISE):
+                    os.write(2, line)
 
 
 def default_folder() -> Path:

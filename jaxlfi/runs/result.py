@@ -23,6 +23,7 @@ from jaxlfi.estimators.base import Network
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Heuristic
+from jaxlfi.io.executables import quickly
 from jaxlfi.tasks import failures
 from jaxlfi.tasks.failures import Failure, FailureLog
 from jaxlfi.tasks.reference import counted_from
@@ -100,7 +101,7 @@ class Result(struct.PyTreeNode):
         if self.network is None:
             prior = None if self.task is None else self.task.inference.prior
             return _truncated(self.belief.mixture, self.belief.mixture, self.belief.support, self.space, prior)
-        return _posterior_after(self.belief, self.network, self.counted(self.x))
+        return quickly(_posterior_after, self.belief, self.network, self.counted(self.x))
 
     @property
     def amortised(self) -> bool:
@@ -169,7 +170,7 @@ def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
     prior = uninformed(support, settings.estimator.ensemble_size * settings.estimator.components)
     correction = CORRECTIONS[settings.correction]
     if correction.report is None:
-        mixture, _ = correction.change(task, network.condition(x, support, key).mixture, prior)
+        mixture, _ = correction.change(task.inference.prior, network.condition(x, support, key).mixture, prior)
     else:
         mixture = network.estimator.weighted(network, x)
     belief, _ = heuristic(prior, mixture, feasible)

@@ -1,5 +1,8 @@
 """The cache of compiled programs in Python: on by default, off by a switch, never in the way."""
 
+import os
+import subprocess
+import sys
 import warnings
 
 import jax
@@ -7,8 +10,7 @@ import jax.numpy as jnp
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from jaxlfi.bayessim import programs
-from jaxlfi.io import compile_cache
+from jaxlfi.io import compile_cache, executables
 
 SETTINGS = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
@@ -35,7 +37,7 @@ def kept(folder) -> set[str]:
 
 def compiled(number: float) -> float:
     """By a program of its own for each number."""
-    return float(programs.compiled(jax.jit(lambda x: jnp.sin(x) * number), (jnp.ones(3),))(jnp.ones(3))[0])
+    return float(executables.compiled(jax.jit(lambda x: jnp.sin(x) * number), (jnp.ones(3),))(jnp.ones(3))[0])
 
 
 def test_programs_are_kept_and_found(tmp_path):
@@ -50,8 +52,8 @@ def test_programs_are_kept_and_found(tmp_path):
 
 def test_a_folder_of_the_users_own_is_left_as_it_is(tmp_path):
     jax.config.update(SETTINGS[0], str(tmp_path / "own"))
-    compile_cache.start()
-    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "own")
+    with compile_cache.used():
+        assert jax.config.jax_compilation_cache_dir == str(tmp_path / "own")
 
 
 @pytest.mark.parametrize("off", ["switch", "jax"])
@@ -59,9 +61,43 @@ def test_it_can_be_turned_off(tmp_path, monkeypatch, off):
     if off == "switch":
         monkeypatch.setenv(compile_cache.SWITCH, "0")
     jax.config.update("jax_enable_compilation_cache", off != "jax")
-    compile_cache.start()
+    with compile_cache.used():
+        assert jax.config.jax_compilation_cache_dir is None and not kept(tmp_path)
     jax.config.update("jax_enable_compilation_cache", True)
-    assert jax.config.jax_compilation_cache_dir is None and not kept(tmp_path)
+
+
+def test_functions_of_the_process_are_not_kept(tmp_path):
+    compiled(9.25)
+    before = kept(tmp_path)
+    jax.jit(lambda x: jnp.cos(x) * 9.5)(jnp.ones(3)).block_until_ready()
+    assert kept(tmp_path) == before and jax.config.jax_compilation_cache_dir is None
+
+
+def test_what_xla_logs_of_every_program_is_left_out_and_nothing_else(capfd):
+    with compile_cache.used():
+        os.write(2, b"E1 cpu_aot_loader.cc:220] " + compile_cache.NOISE[1] + b"-no-gather is not supported\n")
+        os.write(2, b"W1 pjrt.cc:642] " + compile_cache.NOISE[0] + b".\nE1 out of memory\n")
+    os.write(2, b"afterwards\n")
+    assert capfd.readouterr().err == "E1 out of memory\nafterwards\n"
+
+
+SCRIPT = """
+import jax, jax.numpy as jnp
+from jaxlfi.io import compile_cache, executables
+compile_cache.LEAST_SECONDS = 0.0
+f = jax.jit(lambda x: jnp.linalg.cholesky(x @ x.T) + jnp.sin(x))
+print(float(executables.call(f, jnp.eye(20)).sum()))
+"""
+
+
+def test_a_second_process_loads_programs_in_silence(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    once, again = (
+        subprocess.run([sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=True)
+        for _ in range(2)
+    )
+    assert again.stdout == once.stdout and again.stderr == once.stderr == ""
 
 
 def test_without_a_folder_the_run_goes_on_and_says_so_once(tmp_path):

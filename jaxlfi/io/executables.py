@@ -1,0 +1,75 @@
+"""Programs compiled ahead of their first call, several at a time, and kept: in the process, and on disk."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxlfi.io import compile_cache
+
+Call = tuple[Any, tuple, bool]
+"""A jitted function, what it is called with (arrays, or their shapes), and whether it is to be compiled quickly."""
+
+QUICK = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
+"""Compiler options on a CPU that take half of the time or less, of programs that run for milliseconds."""
+KEPT = 64
+"""Number of programs that are kept."""
+
+_EXECUTABLES: dict[Any, Any] = {}
+
+
+def compiled(many: Any, arguments: tuple, quick: bool = False) -> Any:
+    """A jitted function compiled for arguments of these shapes: ahead of its first call, and once."""
+    compile_all([(many, arguments, quick)])
+    return _EXECUTABLES[_signature(many, arguments, quick)]
+
+
+def call(many: Any, *arguments: Any, quick: bool = False) -> Any:
+    """Call a program compiled once: a state that was read back from a checkpoint does not compile it anew."""
+    return compiled(many, arguments, quick)(*arguments)
+
+
+def quickly(many: Any, *arguments: Any) -> Any:
+    """Call a jitted function that is compiled sooner than it would be, unless it is part of a program being traced."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments)):
+        return many(*arguments)
+    return call(many, *arguments, quick=True)
+
+
+def compile_all(calls: Sequence[Call]) -> None:
+    """Compile jitted functions for arguments of these shapes, side by side: the compiler leaves Python alone."""
+    missing = {signature: one for one in calls if (signature := _signature(*one)) not in _EXECUTABLES}
+    if not missing:
+        return
+    while _EXECUTABLES and len(_EXECUTABLES) + len(missing) > KEPT:
+        del _EXECUTABLES[next(iter(_EXECUTABLES))]
+    # Later versions of XLA have no other fusions on the CPU.
+    options = QUICK if jax.default_backend() == "cpu" and jax.__version_info__ < (0, 10) else None
+
+    def begin(many: Any, arguments: tuple, quick: bool) -> Any:
+        return threads.submit(many.lower(*arguments).compile, options if quick else None)
+
+    with compile_cache.used(), ThreadPoolExecutor(len(missing)) as threads:
+        begun = {signature: begin(*one) for signature, one in missing.items()}
+        _EXECUTABLES.update({signature: one.result() for signature, one in begun.items()})
+
+
+def forget() -> None:
+    """Drop all compiled programs, and the memory they hold; they are compiled anew when they are needed."""
+    _EXECUTABLES.clear()
+
+
+def _signature(many: Any, arguments: tuple, quick: bool) -> tuple:
+    """What a compiled program is known by."""
+    leaves, structure = jax.tree.flatten(arguments)
+    wide = jax.config.jax_enable_x64  # type: ignore[attr-defined]  # jax makes it at run time
+    shapes = tuple((np.shape(leaf), jax.dtypes.result_type(leaf), _placed(leaf)) for leaf in leaves)
+    return many, quick, wide, structure, shapes
+
+
+def _placed(leaf: Any) -> Any:
+    """Where an array is, unless it is where all are by default."""
+    sharding = getattr(leaf, "sharding", None)
+    return None if sharding is None or sharding.device_set == {jax.local_devices()[0]} else sharding
