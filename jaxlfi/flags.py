@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxlfi.fields import Declared
+from jaxlfi.fields import Declared, check_value
 
 Families = Mapping[str, Mapping[str, Declared]]
 """Fields by the name of the class that declares them, and by their own name."""
@@ -49,7 +49,7 @@ def add(
             names = (flag, f"--no-{flag[2:]}")
         else:
             reading, names = {"action": _Collect} | _reading(some, several), (flag,)
-        group.add_argument(*names, dest=name, into=into, help=_help(name, owners, presets), **reading)
+        group.add_argument(*names, dest=name, into=into, owners=owners, help=_help(name, owners, presets), **reading)
 
 
 def seed(text: str) -> int:
@@ -92,15 +92,26 @@ def glossary(families: Families) -> str:
 
 
 class _Collect(argparse.Action):
-    """Put the value into a dictionary of the arguments, under the field's name."""
+    """Put the value into a dictionary of the arguments, under the field's name.
 
-    def __init__(self, *args: Any, into: str, kind: Callable[[Any], Any] = lambda values: values, **kwargs: Any):
+    A value that none of the classes with such a field takes is refused at once, and not only once jax has started.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        into: str,
+        owners: Mapping[str, Declared],
+        kind: Callable[[Any], Any] = lambda values: values,
+        **kwargs: Any,
+    ):
         super().__init__(*args, default=argparse.SUPPRESS, **kwargs)
-        self.into, self.kind = into, kind
+        self.into, self.owners, self.kind = into, owners, kind
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
-        collected = getattr(namespace, self.into, None) or {}
-        setattr(namespace, self.into, collected | {self.dest: self.kind(values)})
+        collected, value = getattr(namespace, self.into, None) or {}, self.kind(values)
+        _require(self.owners, value)
+        setattr(namespace, self.into, collected | {self.dest: value})
 
 
 class _Switch(_Collect):
@@ -112,6 +123,23 @@ class _Switch(_Collect):
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
         super().__call__(parser, namespace, option_string != self.no)
+
+
+def _require(owners: Mapping[str, Declared], value: Any) -> None:
+    """Refuse a value, or one of the numbers for each parameter, that no class with such a field takes.
+
+    Raises:
+        ValueError: in the words of the first of these classes.
+    """
+    for one in value if isinstance(value, list) else [value]:
+        errors = []
+        for field in owners.values():
+            try:
+                check_value(field, one)
+            except ValueError as error:
+                errors.append(error)
+        if len(errors) == len(owners):
+            raise errors[0]
 
 
 def _reading(field: Declared, several: bool) -> dict[str, Any]:

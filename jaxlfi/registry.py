@@ -59,14 +59,21 @@ class Family:
         """
         if ":" in reference:
             return named(self.word, reference)
-        registered = self.points()
-        if reference not in registered:
-            raise ValueError(f"{self.word}: expected one of {list(registered)} or {self.own}, got {reference!r}")
-        point, *others = registered[reference]
+        self.require(reference)
+        point, *others = self.points()[reference]
         if others:
             packages = [f"{package_of(each)} ({each.value})" for each in (point, *others)]
             self.refuse_clash(reference, packages, f": name the one that is meant as {self.own}")
         return _loaded(self.word, f"{reference!r} ({point.value})", *_place(point))
+
+    def require(self, reference: str) -> None:
+        """Refuse a name that is not registered, and import nothing.
+
+        Raises:
+            ValueError: listing those that are.
+        """
+        if ":" not in reference and reference not in (registered := self.points()):
+            raise ValueError(f"{self.word}: expected one of {list(registered)} or {self.own}, got {reference!r}")
 
     def refuse_clash(self, name: str, packages: list[str], advice: str = "") -> NoReturn:
         """Refuse a name that several packages register.

@@ -25,8 +25,9 @@ from jaxlfi.cli.exit_status import refuse, resuming, warnings_in_lines
 from jaxlfi.cli.own_fields import FIELDS, HELP
 from jaxlfi.cli.own_fields import PRESETS as VALUES
 from jaxlfi.fields import declared
+from jaxlfi.io import workfolder
 from jaxlfi.io.formats import PLAN, recorded
-from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, Classes, package_of
+from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, TASKS, Classes, package_of
 
 PRESETS = ("quick", "paper")
 METHODS = ("bayessim", "apt", "npe", "snle")
@@ -532,6 +533,7 @@ def _work(arguments: argparse.Namespace) -> int:
     try:
         if arguments.command in ("infer", "compare", "grid"):
             arguments.task = _reference(arguments)
+            _refuse_early(arguments)
         prepare_jax(arguments)
     except ValueError as error:
         return refuse("jaxlfi", error, debug)
@@ -557,6 +559,17 @@ def _work(arguments: argparse.Namespace) -> int:
                 return refuse("jaxlfi", error, debug, commands.advice(error, prepared))
         arguments.joined.leave()
     return 0
+
+
+def _refuse_early(arguments: argparse.Namespace) -> None:
+    """Refuse what can be seen to be wrong before jax starts, which takes seconds; all is checked again later.
+
+    Raises:
+        ValueError: for a task that is not there, or a folder that something is in.
+    """
+    TASKS.require(references.parse(arguments.task, TASKS.word)[0])
+    if not multi_process.wanted(arguments):  # one of several may have begun with the folder
+        workfolder.refuse_occupied(arguments.out)
 
 
 def _reference(arguments: argparse.Namespace) -> str:
