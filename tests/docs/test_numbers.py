@@ -78,11 +78,12 @@ def test_widths(line):
     assert " ".join(line.split()) in page("widths")
 
 
-def sharpness_row(problem: str, box: str, heuristic: str) -> list[str]:
+def sharpness_row(problem: str, box: str, heuristic: str, simulations: str = "1,000") -> list[str]:
     """Of the table that the study's arrays make."""
-    for line in sharpness(RESULTS / "sharpness/held-out", [problem]).splitlines()[2:]:
+    folder = RESULTS / "sharpness" / ("held-out" if simulations == "1,000" else "budgets")
+    for line in sharpness(folder, [problem]).splitlines()[2:]:
         cells = [cell.strip() for cell in line.strip("| ").split("|")]
-        if cells[2:4] == [box, heuristic]:
+        if cells[2:4] == [box, heuristic] and cells[5] == simulations:
             return cells
     return []
 
@@ -96,6 +97,10 @@ def test_held_out_problems(problem):
     if wrong := [sharpness_row(problem, box, "edge") for box in ("one", "all")]:
         cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[16]}" for row in wrong if row]
         assert not cells or f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+    budgets = [sharpness_row(problem, "right", "fixed", simulations) for simulations in ("300", "3,000")]
+    if all(budgets):
+        cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}" for row in budgets]
+        assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
 EMBEDDING = RESULTS / "embedding/lotka_volterra/misspecified+edge"
