@@ -81,9 +81,9 @@ def test_the_command_line_says_so_in_one_line(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("task", "embedding", "asked"),
     [
-        ("own", "trials", "own,trials=2,pooling=all"),
-        ("own,pooling=mean", "trials", "own,pooling=mean,trials=2"),
-        ("own", "series", "own,trials=2"),
+        ("own:task", "trials", "own:task,trials=2,pooling=all"),
+        ("own:task,pooling=mean", "trials", "own:task,pooling=mean,trials=2"),
+        ("own:task", "series", "own:task,trials=2"),
     ],
 )
 def test_files_of_several_trials_are_pooled_by_the_embedding_of_trials(task, embedding, asked, tmp_path, monkeypatch):
