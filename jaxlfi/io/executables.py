@@ -45,8 +45,7 @@ def compile_all(calls: Sequence[Call]) -> None:
         return
     while _EXECUTABLES and len(_EXECUTABLES) + len(missing) > KEPT:
         del _EXECUTABLES[next(iter(_EXECUTABLES))]
-    # Later versions of XLA have no other fusions on the CPU.
-    options = QUICK if jax.default_backend() == "cpu" and jax.__version_info__ < (0, 10) else None
+    options = _quick_options()
 
     def begin(many: Any, arguments: tuple, quick: bool) -> Any:
         return threads.submit(many.lower(*arguments).compile, options if quick else None)
@@ -54,6 +53,13 @@ def compile_all(calls: Sequence[Call]) -> None:
     with compile_cache.used(), ThreadPoolExecutor(len(missing)) as threads:
         begun = {signature: begin(*one) for signature, one in missing.items()}
         _EXECUTABLES.update({signature: one.result() for signature, one in begun.items()})
+
+
+def _quick_options() -> dict[str, Any] | None:
+    """What makes compiling quick; None where there is nothing to be gained."""
+    optimised = not jax.config.jax_disable_most_optimizations  # type: ignore[attr-defined]
+    # Later versions of XLA have no other fusions on the CPU.
+    return QUICK if optimised and jax.default_backend() == "cpu" and jax.__version_info__ < (0, 10) else None
 
 
 def forget() -> None:
