@@ -57,7 +57,7 @@ def compile_all(calls: Sequence[Call]) -> None:
 
 def _quick_options() -> dict[str, Any] | None:
     """What makes compiling quick; None where there is nothing to be gained."""
-    optimised = not jax.config.jax_disable_most_optimizations  # type: ignore[attr-defined]
+    optimised = not jax.config.read("jax_disable_most_optimizations")
     # Later versions of XLA have no other fusions on the CPU.
     return QUICK if optimised and jax.default_backend() == "cpu" and jax.__version_info__ < (0, 10) else None
 

@@ -116,3 +116,12 @@ def test_a_damaged_program_is_compiled_anew(tmp_path):
     jax.clear_caches()
     with pytest.warns(UserWarning, match="Error reading persistent compilation cache entry"):
         assert compiled(7.25) == pytest.approx(7.25 * 0.8414710)
+
+
+def test_programs_are_compiled_as_the_process_asks(monkeypatch):
+    """Tests, which want hardly any optimisation, get no more; else there are options that need not be there for ever."""
+    assert executables._quick_options() is None
+    monkeypatch.setattr(jax.config, "read", lambda name: False)
+    quick = executables._quick_options()
+    assert quick is None if jax.default_backend() != "cpu" or jax.__version_info__ >= (0, 10) else quick
+    jax.jit(lambda x: x + 1).lower(jnp.ones(2)).compile(compiler_options=quick)
