@@ -10,13 +10,11 @@ import jaxlfi
 from jaxlfi.bayessim.batch import BatchEngine, RunSpec, stack_inputs
 from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.staged import StagedEngine
-from jaxlfi.estimators.flow_estimators import MaskedFlow
 from jaxlfi.heuristics import Edge
 from jaxlfi.io import executables
-from tests.small import gaussian, settings, whole_runs  # noqa: F401 - a fixture
+from tests.small import SETTINGS, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([[0.8, -0.6]], np.float32)
-FLOW = MaskedFlow(hidden=(8,), transforms=2, learning_rate=1e-3, epochs=0, steps=50, batch_size=20, loss="atomic")
 
 
 def stepped(make, settings):
@@ -34,10 +32,11 @@ def stepped(make, settings):
     "changes",
     [
         {"correction": "pooled", "inflation": 2.0, "restriction": "mixed", "min_rounds": 1},
-        {"correction": "importance", "predictive": False},
-        {"estimator": FLOW},
+        pytest.param(
+            {"estimator": SETTINGS.estimator.replace(loss="atomic"), "predictive": False}, marks=pytest.mark.slow
+        ),
     ],
-    ids=["pooled", "importance", "atomic"],
+    ids=["pooled", "atomic"],
 )
 def test_stages_give_the_numbers_of_the_fused_round(whole_runs, changes):  # noqa: F811 - the fixture
     """To rounding, which training amplifies; keys used otherwise would change draws by their own width."""
