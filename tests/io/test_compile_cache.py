@@ -119,7 +119,7 @@ def test_a_damaged_program_is_compiled_anew(tmp_path):
 
 
 def test_programs_are_compiled_as_the_process_asks(monkeypatch):
-    """Tests, which want hardly any optimisation, get no more; else there are options that need not be there for ever."""
+    """Tests, which want hardly any optimisation, get no more; and the options are some that the compiler knows."""
     assert executables._quick_options() is None
     monkeypatch.setattr(jax.config, "read", lambda name: False)
     quick = executables._quick_options()
