@@ -25,11 +25,11 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 # Tests, and the processes they start, run for milliseconds what would be compiled for seconds. Half of that goes into
-# the newer fusions of XLA, which later versions cannot do without.
+# the newer fusions of XLA, which later versions cannot do without, and a tenth of the rest into making code in pieces.
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 os.environ.setdefault("XLA_FLAGS", "")
 if jax.__version_info__ < (0, 10):
-    os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 
 # Tracing allocates objects by the million: by default Python would look for cycles among them a thousand times a file.
 gc.set_threshold(50_000, 20, 50)

@@ -3,6 +3,7 @@
 import functools
 
 import jax
+import jaxtyping
 import pytest
 
 from jaxlfi.bayessim.settings import Settings
@@ -51,7 +52,10 @@ def whole_runs():
     """What tests of whole runs need of jax; import this into their module.
 
     No key-reuse checker: it takes a vmapped scan over keys for a reuse (jax 0.9.2). Unbatched runs are checked
-    elsewhere.
+    elsewhere. Nor are the shapes that signatures state, which takes a quarter of the time of tracing: those of a run's
+    parts are where these are tested, and of whole runs in `bayessim/test_algorithm.py` and `estimators/test_apt.py`.
     """
+    jaxtyping.config.update("jaxtyping_disable", True)
     with jax.debug_key_reuse(False):
         yield
+    jaxtyping.config.update("jaxtyping_disable", False)
