@@ -51,10 +51,13 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("jaxlfi")
 
-MEMORY = 1600 * 2**20
-"""Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory."""
+MEMORY = min(max(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 10, 1600 * 2**20), 2400 * 2**20)
+"""Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory.
 
-MAX_MEMORY = 1700 * 2**20
+A tenth of the machine's, within limits: what is forgotten has to be traced and read again.
+"""
+
+MAX_MEMORY = MEMORY + 100 * 2**20
 """Bytes beyond which it does so between two tests of one file, which would mostly have used the same programs."""
 
 

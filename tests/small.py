@@ -1,6 +1,9 @@
 """What the tests of whole runs share: settings that take milliseconds, and one task for many runs."""
 
 import functools
+import json
+from pathlib import Path
+from typing import Any
 
 import jax
 import jaxtyping
@@ -45,6 +48,12 @@ def command(*arguments: str) -> int:
         return cli.main([str(argument) for argument in arguments])
     except SystemExit as stop:
         return stop.code
+
+
+def read_ledger(folder: Path) -> list[dict[str, Any]]:
+    """The ledger of a run folder, one dictionary a round; numbers that were not known are NaN."""
+    lines = [json.loads(line) for line in (folder / "ledger.jsonl").read_text().splitlines()]
+    return [{name: float("nan") if value is None else value for name, value in line.items()} for line in lines]
 
 
 @pytest.fixture(autouse=True, scope="module")

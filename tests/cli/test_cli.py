@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import jaxlfi
-from jaxlfi import flags, registry
+from jaxlfi import figures, flags, registry
 from jaxlfi.bayessim import memory
 from jaxlfi.bayessim.presets import HYPERPARAMETERS, METHODS, PRESETS
 from jaxlfi.bayessim.settings import Settings
@@ -265,7 +265,7 @@ def test_compare_writes_its_table(comparison):
         error = atomic.read_arrays(folder / "history.npz")["sample_theta_error"][-1]
         assert float(line["theta_error"]) == pytest.approx(error.sum(-1).mean(), rel=1e-5)
         assert float(line["success_rate"]) == 1.0 and float(line["seconds"]) > 0
-    assert run_store.read_table(comparison / "table.csv")[0]["configuration"] == "ok"
+    assert figures.read_table(comparison / "table.csv")[0].configuration == "ok"
 
 
 def test_a_seed_has_one_observation_in_all_configurations(comparison):
@@ -333,8 +333,6 @@ def test_json_of_several_runs_is_by_folder(comparison, capsys):
 
 
 def test_report_names_what_it_drew(comparison, monkeypatch, capsys):
-    from jaxlfi import figures
-
     monkeypatch.setattr(figures, "report", lambda folder: [folder / "report.html"])
     assert command("report", comparison) == 0
     assert "report.html" in capsys.readouterr().out

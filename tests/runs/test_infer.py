@@ -16,10 +16,10 @@ from jaxlfi.envs import gaussian_linear
 from jaxlfi.heuristics import Choice, Edge, Fixed, Truncate
 from jaxlfi.io import files as atomic
 from jaxlfi.io.workfolder import StoreError, as_json
-from jaxlfi.runs.folder import read_ledger, run_config
+from jaxlfi.runs.folder import run_config
 from jaxlfi.runs.load import load
 from jaxlfi.tasks.host import SimulatorError
-from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
+from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, read_ledger, settings, whole_runs  # noqa: F401 - a fixture
 
 infer_module = importlib.import_module("jaxlfi.runs.infer")  # the package's name is the function's
 pytestmark = pytest.mark.filterwarnings("ignore::jaxlfi.SupportWarning")

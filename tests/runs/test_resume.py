@@ -11,9 +11,8 @@ from jaxlfi.io import files as atomic
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.runs.execute import changed_machine
-from jaxlfi.runs.folder import read_ledger
 from tests.killed import Killed, kill_at
-from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
+from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, read_ledger, whole_runs  # noqa: F401 - a fixture
 
 ARGUMENTS = ("infer", TASK, "--support", "misspecified", *FLAGS, "--seeds", "2", "--out")
 """One program for all tests; what is killed has two runs, and so two of some files."""
