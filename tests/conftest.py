@@ -25,11 +25,11 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 # Tests, and the processes they start, run for milliseconds what would be compiled for seconds. Half of that goes into
-# the newer fusions of XLA, which later versions cannot do without.
+# the newer fusions of XLA, which later versions cannot do without, and a tenth of the rest into making code in pieces.
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 os.environ.setdefault("XLA_FLAGS", "")
 if jax.__version_info__ < (0, 10):
-    os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 
 # Tracing allocates objects by the million: by default Python would look for cycles among them a thousand times a file.
 gc.set_threshold(50_000, 20, 50)
@@ -51,10 +51,13 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("jaxlfi")
 
-MEMORY = 1600 * 2**20
-"""Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory."""
+MEMORY = min(max(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 10, 1600 * 2**20), 2400 * 2**20)
+"""Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory.
 
-MAX_MEMORY = 1700 * 2**20
+A tenth of the machine's, within limits: what is forgotten has to be traced and read again.
+"""
+
+MAX_MEMORY = MEMORY + 100 * 2**20
 """Bytes beyond which it does so between two tests of one file, which would mostly have used the same programs."""
 
 

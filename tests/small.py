@@ -1,8 +1,12 @@
 """What the tests of whole runs share: settings that take milliseconds, and one task for many runs."""
 
 import functools
+import json
+from pathlib import Path
+from typing import Any
 
 import jax
+import jaxtyping
 import pytest
 
 from jaxlfi.bayessim.settings import Settings
@@ -46,12 +50,21 @@ def command(*arguments: str) -> int:
         return stop.code
 
 
+def read_ledger(folder: Path) -> list[dict[str, Any]]:
+    """The ledger of a run folder, one dictionary a round; numbers that were not known are NaN."""
+    lines = [json.loads(line) for line in (folder / "ledger.jsonl").read_text().splitlines()]
+    return [{name: float("nan") if value is None else value for name, value in line.items()} for line in lines]
+
+
 @pytest.fixture(autouse=True, scope="module")
 def whole_runs():
     """What tests of whole runs need of jax; import this into their module.
 
     No key-reuse checker: it takes a vmapped scan over keys for a reuse (jax 0.9.2). Unbatched runs are checked
-    elsewhere.
+    elsewhere. Nor are the shapes that signatures state, which takes a quarter of the time of tracing: those of a run's
+    parts are where these are tested, and of whole runs in `bayessim/test_algorithm.py` and `estimators/test_apt.py`.
     """
+    jaxtyping.config.update("jaxtyping_disable", True)
     with jax.debug_key_reuse(False):
         yield
+    jaxtyping.config.update("jaxtyping_disable", False)

@@ -26,7 +26,7 @@ def biased(
 
 
 def deviations(
-    does: Effects, theta: Float[Array, " dim"], noise: Float[np.ndarray, " signals"]
+    does: Effects, theta: Float[Array | np.ndarray, " dim"], noise: Float[np.ndarray, " signals"]
 ) -> Float[Array, " signals"]:
     """Standard deviations of the signals' noise, given or inferred."""
     deviation = jnp.asarray(noise, jnp.float32)

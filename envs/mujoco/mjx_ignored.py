@@ -186,5 +186,5 @@ def _sensors(model: mujoco.MjModel) -> list[str]:
     return found
 
 
-def _name(model: mujoco.MjModel, kind: str, number: int) -> str:
+def _name(model: mujoco.MjModel, kind: str, number: int | np.integer) -> str:
     return getattr(model, kind)(int(number)).name or str(number)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 SENSORS = (mujoco.mjtSensor.mjSENS_FRAMEQUAT, mujoco.mjtSensor.mjSENS_BALLQUAT)
-Columns = tuple[int, int, int, int]
+Columns = tuple[int, ...]
 """Where w, x, y and z of an orientation are among the signals."""
 
 

@@ -92,10 +92,10 @@ def check_start(
             )
     for sensor, columns in oriented.items():
         names = [signals[column] for column in columns]
-        first = [begins[name] for name in names]
-        if None in first:
+        begun = [begins[name] for name in names]
+        if None in begun:
             continue
-        off = [orientations.angle(np.array(first), own[[where[c] for c in columns]]) for own in values]
+        off = [orientations.angle(np.array(begun), own[[where[c] for c in columns]]) for own in values]
         noise = 2 * float(np.mean([noises[name] for name in names]))  # an angle is twice that of its quaternions
         if min(off) > max(FAR * noise, LEAST) + np.ptp(off):
             say(

@@ -93,7 +93,8 @@ def _named_units(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> Log
 
 def _fresh(log: Log, signals: Sequence[str]) -> Log:
     """Without samples that only repeat the one before, where a sensor is slower than the recording."""
-    changed, said = dict(log.signals), {}
+    changed = dict(log.signals)
+    said: dict[tuple[int, int, int], list[str]] = {}
     for name in signals:
         there = np.flatnonzero(np.isfinite(log.signals[name]))
         values = log.signals[name][there]

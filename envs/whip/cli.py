@@ -166,10 +166,13 @@ def _run(arguments: argparse.Namespace) -> None:
 
     compile_cache.enable()
     if arguments.command in options.COMMANDS:
-        from jaxlfi.envs.whip.vision import commands
+        from jaxlfi.envs.whip.vision import commands as of_vision
+
+        getattr(of_vision, options.COMMANDS[arguments.command])(arguments)
     else:
         from jaxlfi.envs.whip import commands
-    getattr(commands, options.COMMANDS.get(arguments.command, arguments.command))(arguments)
+
+        getattr(commands, arguments.command)(arguments)
 
 
 main = Command(

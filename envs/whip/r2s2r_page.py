@@ -51,7 +51,7 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
         key, act = jax.random.key(arguments.seed), policy.load(policies[-1])
         last = deploy(key, load_object(arguments.object), act, whole=True)
         if last.recording is not None:
-            film.save_pictures(out, last, PLACE.cube_side, f"{arguments.object}: return {last.value:.2f}")
+            film.save_pictures(out, last, float(PLACE.cube_side), f"{arguments.object}: return {last.value:.2f}")
     runs = [arguments.posterior] if arguments.posterior else [out / "iteration_1/posterior"]
     runs += [out / f"iteration_{iteration}/posterior" for iteration in range(2, arguments.iterations + 1)]
     posteriors = {folder: load(folder) for folder in runs}

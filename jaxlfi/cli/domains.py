@@ -57,6 +57,8 @@ def domain(environment: "Environment", word: str) -> tuple[str, Callable]:
     Raises:
         ValueError: for what names none, a point outside of Phi, and the posterior of other parameters.
     """
+    import numpy as np
+
     from jaxlfi.rl import domains
 
     kind, _, rest = word.partition(":")
@@ -67,13 +69,13 @@ def domain(environment: "Environment", word: str) -> tuple[str, Callable]:
         box = supports[rest or next(iter(supports))]
         return f"uniform-{rest}" if rest else "uniform", lambda key, n: domains.uniform(key, box, n)
     if kind == "median" and not rest:
-        return "median", lambda key, n: domains.point(environment.nominal, n)
+        return "median", lambda key, n: domains.point(np.asarray(environment.nominal), n)
     if kind == "point":
         try:
             numbers = [float(number) for number in rest.split(",")]
         except ValueError:
             raise ValueError(f"domain: expected point:X,Y,... of numbers, got {word!r}") from None
-        theta = domains.check_point(environment, numbers)
+        theta = domains.check_point(environment, np.asarray(numbers))
         return f"point-{'-'.join(f'{number:g}' for number in numbers)}", lambda key, n: domains.point(theta, n)
     folder = Path(word)
     if not folder.is_dir():

@@ -68,7 +68,7 @@ def show(table: Table, on: Console | None = None) -> None:
 
 def _stacked(table: Table, heading: int, width: int) -> Group:
     """The rows of a table one below the other, each a line for every cell."""
-    blocks = [Text.from_markup(str(table.title), style="italic")] if table.title else []
+    blocks: list[Text | Table] = [Text.from_markup(str(table.title), style="italic")] if table.title else []
     cells = zip(*(column.cells for column in table.columns), strict=True)
     for row, values in zip(table.rows, cells, strict=True):
         block = Table.grid(padding=(0, 2), pad_edge=False)

@@ -270,10 +270,6 @@ class NSF(nn.Module):
         return Flow(tuple(transforms), self.dim, x.shape[:-1])
 
 
-FLOWS: dict[str, type[nn.Module]] = {"maf": MAF, "nsf": NSF}
-"""Flow networks by name. All are made as `FLOWS[name](dim)`, and map x to a `Flow`."""
-
-
 def coupling(dim: int, transform: int) -> np.ndarray:
     """Which dimensions a coupling transform changes, boolean [D]: those whose number has 1, or 0, in a binary digit.
 

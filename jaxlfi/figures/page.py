@@ -161,7 +161,8 @@ def _widths_table(found: Mapping[str, Any]) -> str:
 def _estimate(found: Mapping[str, float | None] | None, words: Callable[[float], str]) -> str:
     if found is None:
         return "–"
-    value, low, high = ("∞" if found[name] is None else words(found[name]) for name in ("value", "low", "high"))
+    numbers = (found[name] for name in ("value", "low", "high"))
+    value, low, high = ("∞" if number is None else words(number) for number in numbers)
     return f"{value} [{low}, {high}]"
 
 

@@ -36,7 +36,9 @@ def parameter_errors(history: History, unit: History) -> np.ndarray | None:
 
 def summary_errors(history: History, unit: History) -> np.ndarray | None:
     """|x - x^r| of the samples' simulations in standard deviations of a run's first round, shape [N, S], or None."""
-    if history.final_x is None or unit.x_scale is None or not MIN_SPOKES <= len(history.x) <= MAX_SPOKES:
+    if history.final_x is None or history.x is None or unit.x_scale is None:
+        return None
+    if not MIN_SPOKES <= len(history.x) <= MAX_SPOKES:
         return None
     # A summary that never varied has no unit, and no spoke.
     scale = np.where(unit.x_scale > 0, unit.x_scale, np.nan)

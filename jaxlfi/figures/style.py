@@ -73,12 +73,12 @@ OTHER_COLOURS = ("#7F7F7F", "#C2578F", "#8A8A1F", "#4F7CAC", "#B0713B", "#2E2E2E
 
 SET_COLOURS = ("#15158B", "#F5A025", "#025358", "#C52B21", "#30B9EB", "#45200E", "#995FDD", "#369060")
 """Colours of sets of samples that belong to no configuration, from the nine above."""
-_SET_LINES = ("-", (0, (4, 1.2)), (0, (1, 1)), (0, (6, 1, 1, 1)))
+_SET_LINES: tuple[str | tuple, ...] = ("-", (0, (4, 1.2)), (0, (1, 1)), (0, (6, 1, 1, 1)))
 
 GREY = "#777777"
 """Colour of legend entries that hold for all configurations."""
 
-_MARKERS = {
+_MARKERS: dict[str, tuple[str, str | tuple]] = {
     "ok": ("o", "-"),
     "misspecified": ("X", (0, (4, 1.2))),
     "broad": ("s", (0, (1, 1))),

@@ -101,7 +101,7 @@ def check_belief(environment: Environment, space: Space, feasible: Support, unit
     if any(own and other and own != other for own, other in pairs):
         raise ValueError(
             f"domain: expected a posterior in units {list(environment.units)}, those of {environment.name}, "
-            f"got one in {list(units)}"
+            f"got one in {list(units or ())}"
         )
     # A bound that was inferred as a logarithm comes back from there rounded.
     own, known = (np.asarray([box.low, box.high], float) for box in (feasible, environment.feasible))

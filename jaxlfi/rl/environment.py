@@ -50,11 +50,11 @@ class Signals:
 
     def to_unit(self, values: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
         """From units to what a policy works with."""
-        return (values - np.float32(self.centre)) / np.float32(self.scale)
+        return (values - np.asarray(self.centre, np.float32)) / np.asarray(self.scale, np.float32)
 
     def from_unit(self, values: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
         """The way back."""
-        return values * np.float32(self.scale) + np.float32(self.centre)
+        return values * np.asarray(self.scale, np.float32) + np.asarray(self.centre, np.float32)
 
 
 class EnvState(struct.PyTreeNode):

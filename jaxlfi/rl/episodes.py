@@ -1,5 +1,6 @@
 """Episodes one after another, in many environments side by side, as Brax's `acting` steps them."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -100,7 +101,7 @@ class Batch:
 
         # Keys move on with every step, so that none is used twice.
         next_keys, fresh = self._begin(state.key, state.domain)
-        choose = lambda new, old: jax.vmap(jnp.where)(done, new, old)
+        choose: Callable[[Any, Any], Any] = lambda new, old: jax.vmap(jnp.where)(done, new, old)
         return Episodes(
             env=jax.tree.map(choose, fresh, env),
             key=next_keys,

@@ -9,8 +9,6 @@ While a command runs its folder also holds `checkpoint/` (`jaxlfi.runs.checkpoin
 """
 
 import contextlib
-import csv
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -196,26 +194,3 @@ def run_config(task: Task, origin: Origin, spec: RunSpec, settings: Settings) ->
         "widths": widths_note(settings, spec.heuristic),
         **provenance.environment(),
     }
-
-
-def read_ledger(folder: Path) -> list[dict[str, Any]]:
-    """The ledger of a run folder, one dictionary a round; numbers that were not known are NaN.
-
-    Raises:
-        StoreError: if it is missing or damaged.
-    """
-    path = folder / "ledger.jsonl"
-    try:
-        lines = [json.loads(line) for line in path.read_text().splitlines()]
-    except (OSError, ValueError, RecursionError) as error:
-        raise StoreError(f"expected a ledger, got a missing or damaged {path}") from error
-    return [{name: float("nan") if value is None else value for name, value in line.items()} for line in lines]
-
-
-def read_table(path: Path) -> list[dict[str, Any]]:
-    """The table of a comparison; what was unknown is NaN."""
-    with path.open(newline="") as file:
-        return [
-            {name: line[name] if name == "configuration" else float(line[name] or "nan") for name in TABLE_COLUMNS}
-            for line in csv.DictReader(file)
-        ]

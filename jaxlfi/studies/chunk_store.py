@@ -10,9 +10,6 @@ from jaxlfi.io import files as atomic
 from jaxlfi.io.processes import ALONE, Processes
 from jaxlfi.io.workfolder import StoreError
 
-LABELS = ("fingerprint", "seconds")
-"""Arrays of a chunk's file that are no results."""
-
 
 @dataclasses.dataclass(frozen=True)
 class ChunkStore:

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -17,8 +17,6 @@ from jaxlfi.tasks import own_arrays, prior_checks, priors, summaries
 from jaxlfi.tasks.command import Command
 from jaxlfi.tasks.equality import same
 from jaxlfi.tasks.host import HostSimulator
-
-Simulate = Callable[..., Any]
 
 LABEL = re.compile(r"\w[\w .-]*")
 """What a support may be called: it names folders of a comparison, where "+" joins it with a heuristic."""

@@ -70,10 +70,9 @@ def run_alone(key, heuristic, support):
 
 @pytest.mark.parametrize("index", range(len(SPECS)))
 def test_each_run_of_a_batch_is_the_pure_run_of_its_seed(stepped, index):
+    """By the choice of all rules, which is one program for each; that it is its rule, the heuristics' tests say."""
     state, _, _, inputs = stepped
-    own = SPECS[index]
-    # Run 1 by its own rule, the others by the choice of all rules, which is the same program for each.
-    heuristic = own.heuristic if index == 1 else jax.tree.map(lambda leaf: leaf[index], inputs.heuristic)
+    own, heuristic = SPECS[index], jax.tree.map(lambda leaf: leaf[index], inputs.heuristic)
     alone = run_alone(run_keys(jax.random.key(own.seed)).run, heuristic, own.support)
     for ours, theirs in zip(jax.tree.leaves(state), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(ours[index], theirs, rtol=2e-3, atol=2e-3)

@@ -10,9 +10,8 @@ import pytest
 import jaxlfi
 from jaxlfi.bayessim.host import HostEngine
 from jaxlfi.envs.gaussian_linear import posterior
-from jaxlfi.runs.folder import read_ledger
 from jaxlfi.tasks.host import HostSimulator, SimulatorError
-from tests.small import FLAGS, SETTINGS, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
+from tests.small import FLAGS, SETTINGS, command, gaussian, read_ledger, settings, whole_runs  # noqa: F401 - a fixture
 from tests.tasks.test_host import Counting, numpy_simulate
 
 OBSERVED = np.array([0.8, -0.6], np.float32)

@@ -24,10 +24,10 @@ from jaxlfi.estimators.base import Network, untrained
 from jaxlfi.estimators.density import EnsembleDensity
 from jaxlfi.estimators.flow_estimators import FlowEstimator, MaskedFlow
 from jaxlfi.heuristics import Fixed
-from jaxlfi.runs import folder as run_store
 from jaxlfi.runs.result import DRAWS
 from jaxlfi.tasks.task import Task
 from tests.bayessim.test_algorithm import EXACT, MODEST, TASK, X, infer, run_of, whitened
+from tests.small import read_ledger
 
 ATOMIC = MODEST.replace(hidden=(16, 16), steps=1000, batch_size=100, loss="atomic")
 # --------------------------------------------------------------------------------------- the proposals cancel
@@ -243,7 +243,7 @@ def test_a_library_run_draws_from_the_flow_and_saves_it(flow_run, tmp_path):
 
 
 def test_the_ledger_says_how_much_of_the_posterior_is_inside(folder):
-    ledger = run_store.read_ledger(folder)
+    ledger = read_ledger(folder)
     assert all(0 <= line["mass_inside"] <= 1 for line in ledger)
 
 

@@ -10,9 +10,10 @@ import optax
 import pytest
 from scipy import stats
 
-from jaxlfi.estimators.flows import FLOWS, MAF, NSF, coupling, spline
+from jaxlfi.estimators.flows import MAF, NSF, coupling, spline
 from jaxlfi.estimators.mdn import MDN
 
+FLOWS = {"maf": MAF, "nsf": NSF}
 SMALL = {"transforms": 2, "hidden": 8, "blocks": 1}
 """For what takes longer to compile than to run."""
 

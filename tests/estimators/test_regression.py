@@ -15,10 +15,13 @@ from jaxlfi.estimators.stacking import stacked
 from jaxlfi.estimators.statistics import LAGS, QUANTILES, statistics, statistics_size
 
 SERIES = np.random.default_rng(0).gamma(2.0, [1.0, 3.0], (63, 2)).cumsum(0)[::3]
+statistics_of, ridge_of, fitted = jax.jit(statistics), jax.jit(ridge), jax.jit(fit_regression)
+features_of = jax.jit(lambda regression, x: regression(x))
+"""Compiled as wholes: by themselves, their operations would be hundreds of programs."""
 
 
 def test_statistics_against_numpy():
-    found = np.asarray(statistics(jnp.asarray(SERIES, jnp.float32)))
+    found = np.asarray(statistics_of(jnp.asarray(SERIES, jnp.float32)))
     assert found.shape == (statistics_size(21, 2),)
     z = (SERIES - SERIES.mean(0)) / SERIES.std(0)
     expected = [
@@ -37,8 +40,8 @@ def test_statistics_against_numpy():
 @given(power=st.integers(-18, 18), sign=st.sampled_from([-1, 1]))
 def test_a_unit_moves_logarithms_and_scales_the_rest(power, sign):
     count = 2 * (5 + len(LAGS) + len(QUANTILES))
-    plain = np.asarray(statistics(jnp.asarray(SERIES, jnp.float32)))[:count].reshape(-1, 2)
-    other = np.asarray(statistics(jnp.asarray(sign * 10.0**power * SERIES, jnp.float32)))[:count].reshape(-1, 2)
+    plain = np.asarray(statistics_of(jnp.asarray(SERIES, jnp.float32)))[:count].reshape(-1, 2)
+    other = np.asarray(statistics_of(jnp.asarray(sign * 10.0**power * SERIES, jnp.float32)))[:count].reshape(-1, 2)
     np.testing.assert_allclose(other[1:3] - plain[1:3], power * np.log(10), atol=1e-3)
     np.testing.assert_allclose(other[3], sign * plain[3], atol=1e-3)
     np.testing.assert_allclose(other[4:10], plain[4:10], atol=1e-3)
@@ -48,7 +51,7 @@ def test_a_unit_moves_logarithms_and_scales_the_rest(power, sign):
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, -7.0, 3e30])
 def test_a_constant_series_has_finite_statistics(value):
-    found = np.asarray(statistics(jnp.full((12, 1), value, jnp.float32)))
+    found = np.asarray(statistics_of(jnp.full((12, 1), value, jnp.float32)))
     assert np.isfinite(found).all()
     assert (found[3:10] == 0).all()
 
@@ -64,7 +67,7 @@ def test_predictions_by_the_other_folds_are_those_of_fits_to_them():
     y = x @ rng.normal(size=(4, 2)) + rng.normal(0.0, 1.0, (83, 2))
     x[80:], y[80:] = np.nan, np.inf  # rows that are not there
     single = lambda values: jnp.asarray(values, jnp.float32)
-    coefficients, intercept, by_others = map(np.asarray, ridge(single(x), single(y), jnp.arange(83) < 80))
+    coefficients, intercept, by_others = map(np.asarray, ridge_of(single(x), single(y), jnp.arange(83) < 80))
     inner, outer = x[:80] - x[:80].mean(0), y[:80] - y[:80].mean(0)
     fits = [np.linalg.solve(inner.T @ inner + penalty * np.eye(4), inner.T @ outer) for penalty in PENALTIES]
     chosen = [PENALTIES[np.argmin([np.abs(fit[:, d] - coefficients[d]).max() for fit in fits])] for d in range(2)]
@@ -83,7 +86,7 @@ def test_features_do_not_tell_a_parameter_that_the_summary_does_not(seen):
     """Predictions that leave one row out are linear in what it holds: their correlation with it is -1."""
     rng = np.random.default_rng(5)
     x, theta = rng.normal(size=(500, 12)), rng.uniform(-1.7, 1.7, (500, 3))
-    *_, by_others = ridge(jnp.asarray(x, jnp.float32), jnp.asarray(theta, jnp.float32), jnp.ones(500, bool))
+    *_, by_others = ridge_of(jnp.asarray(x, jnp.float32), jnp.asarray(theta, jnp.float32), jnp.ones(500, bool))
     for d in range(3):
         feature = np.asarray(by_others)[:, d : d + 1]
         feature = (feature - feature.mean()) / feature.std()
@@ -104,14 +107,12 @@ def simulated(n, seed, dim=2, obs=30):
 def test_features_tell_level_and_spread_of_simulations_that_were_not_seen():
     theta, x = simulated(600, 0)
     every = jnp.ones(600, bool)
-    regression, features = jax.jit(fit_regression)(
-        unfitted(2, 30, 1), jnp.asarray(theta), jnp.asarray(x), every, jnp.arange(600) >= 200
-    )
+    regression, features = fitted(unfitted(2, 30, 1), jnp.asarray(theta), jnp.asarray(x), every, jnp.arange(600) >= 200)
     assert features.shape == (600, 4)
     np.testing.assert_allclose(features.mean(0), 0, atol=1e-3)
     np.testing.assert_allclose(features.std(0), 1, rtol=1e-3)
     new, seen = simulated(400, 1)
-    found = np.asarray(regression(jnp.asarray(seen)))
+    found = np.asarray(features_of(regression, jnp.asarray(seen)))
     assert np.corrcoef(found[:, 0], new[:, 0])[0, 1] > 0.8  # of the raw numbers
     assert abs(np.corrcoef(found[:, 1], new[:, 1])[0, 1]) < 0.4  # in which the spread is not linear
     assert np.corrcoef(found[:, 3], new[:, 1])[0, 1] > 0.95  # of the statistics
@@ -122,24 +123,25 @@ def test_a_network_learns_from_residuals_as_large_as_those_of_a_new_simulation()
     rng = np.random.default_rng(2)
     theta = rng.normal(size=(600, 1)).astype(np.float32)
     x = (theta + rng.normal(0.0, 4.0, (600, 60))).astype(np.float32)
-    fitted = jnp.arange(600) < 200
+    every = jnp.ones(200, bool)
     one = unfitted(1, 60, 60)  # a single record of 60 channels: no series
-    regression, features = fit_regression(one, jnp.asarray(theta[:200]), jnp.asarray(x[:200]), *[fitted[:200]] * 2)
-    new = np.asarray(regression(jnp.asarray(x[200:])))
+    regression, features = fitted(one, jnp.asarray(theta[:200]), jnp.asarray(x[:200]), every, every)
+    new = np.asarray(features_of(regression, jnp.asarray(x[200:])))
     correlation = lambda a, b: np.corrcoef(a[:, 0], b[:, 0])[0, 1]
     own, others = correlation(np.asarray(features), theta[:200]), correlation(new, theta[200:])
-    again = correlation(np.asarray(regression(jnp.asarray(x[:200]))), theta[:200])
+    again = correlation(np.asarray(features_of(regression, jnp.asarray(x[:200]))), theta[:200])
     assert abs(own - others) < 0.02 and again - others > 0.04
 
 
 def test_a_series_that_comes_as_a_difference_has_the_statistics_of_the_sum():
-    theta, x = simulated(300, 3)
+    theta, x = simulated(600, 3)
     origin = np.linspace(-3, 3, 30).astype(np.float32)
-    every = jnp.ones(300, bool)
-    plain, _ = fit_regression(unfitted(2, 30, 1), jnp.asarray(theta), jnp.asarray(x), every, every)
+    every = jnp.ones(600, bool)
+    plain, _ = fitted(unfitted(2, 30, 1), jnp.asarray(theta), jnp.asarray(x), every, every)
     counted = unfitted(2, 30, 1).replace(origin=jnp.asarray(origin))
-    other, _ = fit_regression(counted, jnp.asarray(theta), jnp.asarray(x - origin), every, every)
-    np.testing.assert_allclose(other(jnp.asarray(x[:9] - origin)), plain(jnp.asarray(x[:9])), atol=2e-2)
+    other, _ = fitted(counted, jnp.asarray(theta), jnp.asarray(x - origin), every, every)
+    moved, same = features_of(other, jnp.asarray(x[:400] - origin)), features_of(plain, jnp.asarray(x[:400]))
+    np.testing.assert_allclose(moved, same, atol=2e-2)
 
 
 @pytest.mark.parametrize(("obs", "features"), [(9, 3), (16, 6), (17, 6), (40, 6)])

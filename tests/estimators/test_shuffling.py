@@ -15,7 +15,11 @@ BEYOND = 2**LARGEST_PLACE + 1
 """Rows that are too many for the fast way."""
 
 
-@given(seed=st.integers(0, 2**32 - 1), capacity=st.integers(1, 300), data=st.data())
+CAPACITIES = (1, 2, 5, 64, 127, 128, 129, 300)
+"""A few, as each is compiled anew: powers of two, their neighbours, and others."""
+
+
+@given(seed=st.integers(0, 2**32 - 1), capacity=st.sampled_from(CAPACITIES), data=st.data())
 def test_the_filled_rows_stay_in_front_and_each_is_there_once(seed, capacity, data):
     count = data.draw(st.integers(0, capacity))
     rows = np.random.default_rng(seed).permutation(capacity)
@@ -41,10 +45,10 @@ def test_every_order_of_four_rows_is_as_likely(capacity):
     assert scipy.stats.chisquare(counts).pvalue > 1e-4
 
 
-def test_a_row_goes_anywhere_of_two_thousand():
+def test_a_row_goes_anywhere_of_five_hundred():
     keys = jax.random.split(jax.random.key(4), 20_000)
-    first = jax.vmap(lambda key: jnp.argmax(shuffled(key, jnp.arange(2000), 1000) == 17))(keys)
-    counts, _ = np.histogram(np.asarray(first), bins=50, range=(0, 1000))
+    place = jax.jit(jax.vmap(lambda key: jnp.argmax(shuffled(key, jnp.arange(500), 250) == 17)))
+    counts, _ = np.histogram(np.asarray(place(keys)), bins=50, range=(0, 250))
     assert counts.sum() == 20_000
     assert scipy.stats.chisquare(counts).pvalue > 1e-4
 

@@ -5,7 +5,6 @@ import warnings
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 from scipy import stats
@@ -141,15 +140,6 @@ def test_the_mean_and_the_maximum_are_those_of_the_draws(ways):
     assert float(posterior.log_prob(best)) >= float(np.max(posterior.log_prob(jnp.asarray(theta)))) - 1e-3
 
 
-@pytest.fixture
-def unchecked():
-    """Arguments as users pass them: signatures are not checked, which they are in tests only."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
-
-
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("n", [-1, 0, 2.5, True, "10"])
 def test_a_number_of_draws_is_whole_and_positive(ways, n):
     run, _ = ways
@@ -158,7 +148,6 @@ def test_a_number_of_draws_is_whole_and_positive(ways, n):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_bad_arguments_are_named(ways):
     posterior = ways[0].posterior
     with pytest.raises(ValueError, match=r"^theta: expected shape \[\.\.\., 2\], got \[3\]$"):

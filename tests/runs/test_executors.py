@@ -15,10 +15,9 @@ import pytest
 
 import jaxlfi
 from jaxlfi.io import files as atomic
-from jaxlfi.runs.folder import read_ledger
 from jaxlfi.tasks import failures
 from jaxlfi.tasks.executors import workers
-from tests.small import FLAGS, SETTINGS, command, whole_runs  # noqa: F401 - a fixture
+from tests.small import FLAGS, SETTINGS, command, read_ledger, whole_runs  # noqa: F401 - a fixture
 from tests.troubled import calls, task
 
 ROOT = Path(__file__).parents[2]

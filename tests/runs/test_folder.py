@@ -17,7 +17,7 @@ from jaxlfi.runs import folder as folders
 from jaxlfi.runs.describe import heuristic_from_json, heuristic_to_json, settings_from_json, settings_to_json
 from jaxlfi.tasks.observation import observe
 from jaxlfi.tasks.simulation import trajectory_and_outcome
-from tests.small import FLAGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
+from tests.small import FLAGS, TASK, command, gaussian, read_ledger, whole_runs  # noqa: F401 - a fixture
 
 ROUNDS, SIMULATIONS, BUDGET, DIM, COMPONENTS, OBS, SAMPLES = 2, 20, 25, 2, 4, 2, 20
 
@@ -162,7 +162,7 @@ def test_tasks_name_as_many_summaries_as_they_have(module):
 
 
 def test_the_ledger_agrees_with_the_history(folder):
-    ledger = folders.read_ledger(folder)
+    ledger = read_ledger(folder)
     history = atomic.read_arrays(folder / "history.npz")
     assert [line["round"] for line in ledger] == [0, 1]
     for i, line in enumerate(ledger):

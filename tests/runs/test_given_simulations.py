@@ -13,12 +13,11 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.envs.gaussian_linear import MIXING, NOISE, posterior
 from jaxlfi.io import files as atomic
 from jaxlfi.io.workfolder import StoreError
-from jaxlfi.runs.folder import read_ledger
 from jaxlfi.runs.load import load
 from jaxlfi.studies.calibration import read_run
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.presimulated import presimulated, read_simulations
-from tests.small import FLAGS, SETTINGS, command, gaussian, settings, whole_runs  # noqa: F401 - a fixture
+from tests.small import FLAGS, SETTINGS, command, gaussian, read_ledger, settings, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
 BOX = np.array([[-3.0, -3.0], [3.0, 3.0]])

@@ -11,12 +11,13 @@ from jaxlfi.io import files as atomic
 from jaxlfi.runs import execute as executing
 from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.runs.execute import changed_machine
-from jaxlfi.runs.folder import read_ledger
 from tests.killed import Killed, kill_at
-from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
+from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, read_ledger, whole_runs  # noqa: F401 - a fixture
 
 ARGUMENTS = ("infer", TASK, "--support", "misspecified", *FLAGS, "--seeds", "2", "--out")
 """One program for all tests; what is killed has two runs, and so two of some files."""
+MORE = 6
+"""Rounds that finished runs are given: for all of them, as each number is a program."""
 
 
 @pytest.mark.slow
@@ -149,9 +150,9 @@ def test_a_finished_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
     assert len(before["theta"]) == 4 and before["settled"][-1]
     lines = (out / "ledger.jsonl").read_text()
     shutil.copytree(out, tmp_path / "killed")
-    assert command("resume", out, "--rounds", 6, "--no-figures") == 0
+    assert command("resume", out, "--rounds", MORE, "--no-figures") == 0
     after = atomic.read_arrays(out / "history.npz")
-    assert len(after["theta"]) == 6 and (after["attempted"] > 0).all() and not after["settled"].any()
+    assert len(after["theta"]) == MORE and (after["attempted"] > 0).all() and not after["settled"].any()
     for name in before.keys() - {"settled", "names", "reasons"}:
         if not name.startswith("final_"):
             assert after[name][:4].tobytes() == before[name].tobytes(), name
@@ -159,17 +160,17 @@ def test_a_finished_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
         assert rows[: len(made[name])].tobytes() == made[name].tobytes(), name
     assert len(rows) > 0 and (out / "ledger.jsonl").read_text().startswith(lines)
     config = json.loads((out / "config.json").read_text())
-    assert config["status"] == "finished" and config["settings"]["rounds"] == 6
+    assert config["status"] == "finished" and config["settings"]["rounds"] == MORE
     assert config["extended"] == [{"rounds": 9, "min_rounds": 4, "made": 4}]
     with monkeypatch.context() as patch:
         kill_at(patch, 4, midway=False)
         with pytest.raises(Killed):
-            command("resume", tmp_path / "killed", "--rounds", 6, "--no-figures")
+            command("resume", tmp_path / "killed", "--rounds", MORE, "--no-figures")
     assert command("resume", tmp_path / "killed", "--no-figures") == 0
     for name in ("posterior.npz", "dataset.npz"):
         assert_same_arrays(out / name, tmp_path / "killed" / name)
     capsys.readouterr()
-    for rounds, message in ((6, "expected more than the 6 of"), (0, "expected more than the 6 of")):
+    for rounds, message in ((MORE, "expected more than the 6 of"), (0, "expected more than the 6 of")):
         assert command("resume", out, "--rounds", rounds) == 2
         assert f"error: rounds: {message}" in capsys.readouterr().err
     shutil.rmtree(out / "checkpoint")  # as earlier versions and run.save leave it
@@ -180,11 +181,11 @@ def test_a_finished_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
 def test_more_rounds_in_python_are_those_of_the_command_line(tmp_path):
     for name in ("python", "cli"):
         jaxlfi.infer(0, gaussian(), settings=SETTINGS, out=tmp_path / name)
-    more = lambda: jaxlfi.infer(0, gaussian(), settings=SETTINGS.replace(rounds=3), out=tmp_path / "python")
+    more = lambda: jaxlfi.infer(0, gaussian(), settings=SETTINGS.replace(rounds=MORE), out=tmp_path / "python")
     run = more()
-    assert run.history["theta"].shape[0] == 3 == run.settings.rounds
+    assert run.history["theta"].shape[0] == MORE == run.settings.rounds
     np.testing.assert_array_equal(more().draws(), run.draws())  # it is complete, and is read
-    executing.extend(tmp_path / "cli", 3)
+    executing.extend(tmp_path / "cli", MORE)
     plan, observed = executing.reopen(tmp_path / "cli", gaussian())
     (same,) = executing.execute(plan, observed, tmp_path / "cli")
     np.testing.assert_array_equal(same.draws(), run.draws())

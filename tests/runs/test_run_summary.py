@@ -17,7 +17,7 @@ from jaxlfi.figures.collection import open_collection
 from jaxlfi.figures.page import render
 from jaxlfi.io.run_summary import FOLDER, NAME, RunSummary
 from jaxlfi.runs.summarise import summarised
-from tests.small import gaussian, settings
+from tests.small import SETTINGS, gaussian
 
 SPACE = Space(("mass", "stiffness"), (False, True))
 GUESS, PHI = jaxlfi.Support([1.0, 0.0], [3.0, 2.0]), jaxlfi.Support([0.0, -2.0], [6.0, 4.0])
@@ -218,7 +218,7 @@ def test_next_steps_of_a_saved_run_name_its_folder():
 
 
 def test_a_run_states_what_its_folder_and_page_state(tmp_path):
-    run = jaxlfi.infer(jax.random.key(0), gaussian(), np.array([0.8, -0.6], np.float32), settings=settings(rounds=1))
+    run = jaxlfi.infer(jax.random.key(0), gaussian(), np.array([0.8, -0.6], np.float32), settings=SETTINGS)
     found = run.summary()
     draws = np.asarray(run.draws())
     np.testing.assert_allclose([one.median for one in found.parameters], np.median(draws, axis=0), rtol=1e-5)

@@ -52,7 +52,8 @@ def graph(weights: Weights, size: int = SIZE):
     from jaxlfi.rl.onnx_graph import TensorProto, finished, helper, numpy_helper
 
     params = jax.device_get(weights.params)["params"]
-    nodes, constants = [], []
+    nodes: list[Any] = []
+    constants: list[Any] = []
 
     def constant(array, kind=np.float32) -> str:
         name = f"constant_{len(constants)}"

@@ -97,7 +97,8 @@ def _normals(camera: Camera, bodies: Bodies, body: Int[Array, "size size"], righ
     """Normals of the faces that are seen, three images; of bodies that are hit, that is the face which is entered."""
     (x, y, z), towards = planes(camera, bodies)
     at = jnp.maximum(body - 1, 0)
-    nearest, normals = jnp.full(body.shape, jnp.inf), (jnp.zeros(body.shape),) * 3
+    nearest = jnp.full(body.shape, jnp.inf)
+    normals: tuple[Array, ...] = (jnp.zeros(body.shape),) * 3
     for face in range(6):
         plane = x[at, face] * right + y[at, face] * down + z[at, face]
         first = towards[at, face] & (plane < nearest)

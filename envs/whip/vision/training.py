@@ -98,7 +98,8 @@ def dlo_masks(
     Returns:
         Masks as the transporter sees them, and points of the DLO from the grip to the tip, in normalised pixels.
     """
-    masks, lines = [], []
+    masks: list[np.ndarray] = []
+    lines: list[np.ndarray] = []
     for i in range(len(rollouts.valid)):
         frames, parameters = jax.tree.map(lambda leaf, i=i: leaf[i], (rollouts.frames, rollouts.parameters))
         made = _masks(jax.random.fold_in(key, i), side_camera(parameters), frames, parameters.cube_side)
