@@ -174,7 +174,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 main = Command(
     "whip",
-    "whipping: render, plan, deploy, control, record, see",
+    "the whipping task: render, plan, deploy, control, record, see",
     _arguments,
     _run,
     description="Render rollouts of the DLO whipping task, plan whips, let policies whip, control robots, learn to "

@@ -40,7 +40,7 @@ class Settings(Checked):
         default=0,
         low=0,
         high=100_000,
-        help="rounds after which a run may end, once its posterior has settled; 0: it makes all",
+        help="rounds after which a run may end, once its posterior has settled; 0: make all rounds",
     )
     simulations_per_round: int = option(
         default=100, low=1, high=100_000_000, help="largest number of valid simulations added per round"

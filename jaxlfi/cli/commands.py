@@ -199,15 +199,16 @@ def resume(arguments: argparse.Namespace, output: Output) -> Prepared | None:
     config = workfolder.read(folder, *REPORTED, TRAINING)
     if arguments.json and config["format"] not in SUMMARISED:
         raise ValueError(f"json: expected a folder of infer or compare, which has summaries, got {folder}")
-    if arguments.rounds is not None and config["format"] != RUN:
-        raise ValueError(f"rounds: expected the folder of one run (of one seed), got {folder}")
+    more = "rounds" if arguments.rounds is not None else "simulations" if arguments.simulations is not None else None
+    if more is not None and config["format"] != RUN:
+        raise ValueError(f"{more}: expected the folder of one run (of one seed), got {folder}")
     if config["format"] == TRAINING:
         train.resume(folder, output, not arguments.no_figures, arguments.joined)
         return None
-    if arguments.rounds is not None:
+    if more is not None:
         if arguments.joined.count > 1:
-            raise ValueError("rounds: expected one process, got several")
-        executing.extend(folder, arguments.rounds)
+            raise ValueError(f"{more}: expected one process, got several")
+        executing.extend(folder, arguments.rounds, arguments.simulations)
         config = workfolder.read(folder, RUN)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
         if arguments.joined.writes:

@@ -54,6 +54,13 @@ examples:
 
 """
 
+RESUME_EXAMPLES = """\
+examples:
+  jaxlfi resume runs/edge                        finish what was interrupted; the result is bit-for-bit the same
+  jaxlfi resume runs/edge --simulations 3000     continue until the run has 3,000 simulations in all
+  jaxlfi resume runs/edge --rounds 30            continue to 30 rounds in all
+"""
+
 DIAGNOSE_EXAMPLES = """\
 Truths are drawn from the run's own posterior, and from the prior over a support, and simulated. The run's method is
 asked for the posterior of each: by its network, where the run had one round and kept it (--method npe, or --rounds 1

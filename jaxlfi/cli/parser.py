@@ -124,10 +124,11 @@ def own_commands(families: Families) -> list[Command]:
         ),
         Command(
             "resume",
-            "go on with a run that was stopped, or for more rounds",
+            "continue an interrupted run, or a finished one with more simulations",
             _resume,
             _work,
-            "Go on with a run that was stopped or killed, or for more rounds with one that is finished.",
+            "Continue a run that was interrupted, or a finished one with more rounds or simulations.",
+            help_texts.RESUME_EXAMPLES,
         ),
         Command(
             "sample",
@@ -146,7 +147,7 @@ def own_commands(families: Families) -> list[Command]:
         ),
         Command(
             "report",
-            "draw the pictures of a run",
+            "draw the figures of a run",
             _report,
             _work,
             "Draw all pictures of a folder from its saved files.",
@@ -218,11 +219,18 @@ def _grid(command: argparse.ArgumentParser, families: Families) -> None:
 def _resume(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add("folder", type=Path, metavar="DIR", help="the folder the command was given")
-    add(
+    more = command.add_mutually_exclusive_group()
+    more.add_argument(
         "--rounds",
         type=int,
         metavar="N",
-        help="go on to so many rounds in all, also with a run that is finished (default: those it was begun with)",
+        help="number of rounds in all, also for a finished run (default: the number that it was begun with)",
+    )
+    more.add_argument(
+        "--simulations",
+        type=int,
+        metavar="N",
+        help="number of valid simulations in all, also for a finished run: makes as many rounds as that takes",
     )
     _add_executor(command)
     multi_process.add_flags(command)

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 NAME = "summary.json"
 FOLDER = "FOLDER"
 """What next steps call the folder of a run that may not be saved yet."""
+UNSAVED = "; for a run without a folder, `jaxlfi.infer` again with "
+"""Begins the end of a step that a run in a folder does not need."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,10 +136,12 @@ class RunSummary:
 
     def at(self, folder: Path | str) -> "RunSummary":
         """The same of a run that is saved in a folder, whose next steps name it."""
-        saved = (
-            step.replace(f"`run.save({FOLDER})`, then ", "").replace(FOLDER, f"{folder}") for step in self.next_steps
-        )
-        return dataclasses.replace(self, next_steps=tuple(saved))
+
+        def saved(step: str) -> str:
+            needed, without, _ = step.replace(f"`run.save({FOLDER})`, then ", "").partition(UNSAVED)
+            return needed.replace(FOLDER, f"{folder}") + "." * bool(without)
+
+        return dataclasses.replace(self, next_steps=tuple(map(saved, self.next_steps)))
 
     def to_html(self) -> str:
         """The table and the sentences, as a page or a notebook shows them."""
