@@ -296,7 +296,7 @@ def diagnose(arguments: argparse.Namespace, output: Output) -> None:
     if arguments.no_figures:
         return
     for path in _figures().checks.report(out):
-        _say(output.notes, f"{'page' if path.suffix == '.html' else 'picture'}: {path}")
+        _name(output.notes, path)
     if out == arguments.folder / DIAGNOSTICS and (arguments.folder / "report.html").exists():
         _figures().report(arguments.folder)  # it says how far widths can be trusted, and this is known now
         _say(output.notes, f"page of the run, again: {arguments.folder / 'report.html'}")
@@ -376,9 +376,14 @@ def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, output: O
 
 
 def draw(folder: Path, console: Console) -> None:
-    """Draw all pictures of a folder from its saved files, and name them."""
+    """Draw all figures of a folder from its saved files, and name them and the page that shows them."""
     for path in _figures().report(folder):
-        _say(console, f"picture: {path}")
+        _name(console, path)
+
+
+def _name(console: Console, path: Path) -> None:
+    """Name a page or a figure that was drawn."""
+    _say(console, f"{'page' if path.suffix == '.html' else 'figure'}: {path}")
 
 
 def _figures():

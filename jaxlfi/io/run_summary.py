@@ -160,12 +160,22 @@ def _parameter_of(described: Mapping[str, Any]) -> ParameterSummary:
     return ParameterSummary(**{**described, **pairs, **numbers, "leans": tuple(described["leans"])})
 
 
+def with_unit(unit: str) -> str:
+    """What follows a number: its unit, where it has one.
+
+    Example:
+        >>> f"2{with_unit('kg')}, 3{with_unit('1/day')}, 4{with_unit('')}"
+        '2 kg, 3 per day, 4'
+    """
+    unit = f"per {unit[2:]}" if unit.startswith("1/") and len(unit) > 2 else unit
+    return f" {unit}" if unit else ""
+
+
 def _row(one: ParameterSummary) -> list[str]:
     interval = lambda ends: f"[{one.shown(ends[0])}, {one.shown(ends[1])}]"
-    unit = f" {one.unit}" if one.unit else ""
     return [
         one.name,
-        one.shown(one.median) + unit,
+        one.shown(one.median) + with_unit(one.unit),
         interval(one.central_50),
         interval(one.central_90),
         _times(one.narrower),

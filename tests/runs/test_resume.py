@@ -204,8 +204,7 @@ def test_a_total_of_simulations_becomes_the_rounds_it_takes(tmp_path, capsys):
     # Of one that was stopped, what it was begun with counts as there.
     with pytest.raises(ValueError, match=f"expected more than the {wanted - 1 + per_round} of"):
         executing.extend(tmp_path / "simulations", simulations=made + 1)
-    with pytest.raises(SystemExit):
-        command("resume", tmp_path / "python", "--rounds", 9, "--simulations", 1000)
+    assert command("resume", tmp_path / "python", "--rounds", 9, "--simulations", 1000) == 2
     assert "not allowed with argument --rounds" in capsys.readouterr().err
 
 
