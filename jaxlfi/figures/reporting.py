@@ -85,8 +85,8 @@ def _samples(collection: Collection) -> Made:
     first, second = ("Left", "Right") if len(histories) == 1 else ("Above", "Below")
     caption = (
         f"{first}: the parameters simulated in each iteration and the supports they were drawn from (boxes), coloured "
-        f"by iteration; {'crosses are failed simulations, ' * failed}large dots the means of all simulations up to each "
-        "iteration. "
+        f"by iteration; {'crosses are failed simulations, ' * failed}large dots the means of all simulations up to "
+        "each iteration. "
         f"{second}, enlarged: the density of the last posterior's mixture and its support (box); arrows join the "
         "weighted means of the posteriors of successive iterations." + _which_seed(collection.runs)
     )
