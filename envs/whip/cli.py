@@ -50,7 +50,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--detector",
         default="clean",
         metavar="NAME",
-        help="a model of its errors: clean, mask, noisy, transporter, learnt or learnt-transporter (default: clean)",
+        help="detector whose errors are simulated: clean, mask, noisy, transporter, learnt or learnt-transporter "
+        "(default: clean)",
     )
     options.add_out(render, "DIR", "a new folder")
 

@@ -150,7 +150,7 @@ def own_commands(families: Families) -> list[Command]:
             "draw the figures of a run",
             _report,
             _work,
-            "Draw all pictures of a folder from its saved files.",
+            "Draw all figures of a run, comparison or grid from its saved files.",
         ),
     ]
 
@@ -218,7 +218,7 @@ def _grid(command: argparse.ArgumentParser, families: Families) -> None:
 
 def _resume(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
-    add("folder", type=Path, metavar="DIR", help="the folder the command was given")
+    add("folder", type=Path, metavar="DIR", help="the folder that the command wrote")
     more = command.add_mutually_exclusive_group()
     more.add_argument(
         "--rounds",
@@ -241,7 +241,7 @@ def _resume(command: argparse.ArgumentParser) -> None:
 def _sample(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
-    add("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
+    add("-n", "--number", type=int, default=1000, metavar="N", help="number of draws (default: 1000)")
     add("--seed", type=flags.seed, default=0, metavar="N", help="seed of the draws (default: 0)")
     add(
         "--out",
@@ -261,13 +261,15 @@ def _diagnose(command: argparse.ArgumentParser) -> None:
         help="where truths are drawn: posterior, the name of a support, or one of each (default: posterior, and the "
         "task's first support)",
     )
-    add("--truths", type=int, default=100, metavar="N", help="of each reference (default: 100)")
-    add("--draws", type=int, default=200, metavar="L", help="draws from the posterior of each (default: 200)")
-    add("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
+    add("--truths", type=int, default=100, metavar="N", help="number of truths at each reference (default: 100)")
+    add(
+        "--draws", type=int, default=200, metavar="L", help="number of draws from each truth's posterior (default: 200)"
+    )
+    add("--seed", type=int, default=0, metavar="S", help="seed of all random numbers (default: 0)")
     add(
         "--task",
         metavar="TASK",
-        help="what was inferred, for a run that was made in Python (default: the task recorded with the run)",
+        help="the task, for a run that was made in Python (default: the task recorded with the run)",
     )
     add(
         "--against",

@@ -57,7 +57,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ENVIRONMENT",
         help="an environment's name, such as whip, or module:factory; NAME,key=value sets options",
     )
-    parser.add_argument("--domain", nargs="+", required=True, metavar="DOMAIN", help="what to train on; several: each")
+    parser.add_argument(
+        "--domain",
+        nargs="+",
+        required=True,
+        metavar="DOMAIN",
+        help="one or several domains; each has policies of its own",
+    )
     parser.add_argument(
         "--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results"
     )
