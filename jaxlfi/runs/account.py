@@ -50,9 +50,10 @@ def account(run: Result, found: RunSummary) -> RunSummary:
     """The summary of a run's parameters with sentences on the run as a whole, and all that there is to do next."""
     strange, (fit, fits) = _observation(run), _fit(run)
     settled, more = _settled(run)
-    steps = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more + list(found.next_steps)
+    first = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more
+    steps = (*first, *found.next_steps, *[_diagnose(run)] * (not first))  # widths are measured of what may be kept
     sentences = (*found.sentences, strange, fit, _failures(run), settled)
-    return RunSummary(found.parameters, tuple(filter(None, sentences)), tuple(steps) or (_diagnose(run),))
+    return RunSummary(found.parameters, tuple(filter(None, sentences)), steps)
 
 
 def _diagnose(run: Result) -> str:

@@ -178,7 +178,7 @@ def test_what_to_do_next_follows_from_what_was_found(run):
     history = run.history | {name: jnp.asarray(value) for name, value in STILL.items()}
     fixed = run.replace(history=history | {"final_trajectory": jnp.asarray(around(run))}, heuristic=jaxlfi.Fixed())
     assert account(fixed, leaning).next_steps == (EDGE, "A wider Phi: ...")
-    assert account(fixed.replace(heuristic=jaxlfi.Edge()), leaning).next_steps == ("A wider Phi: ...",)
+    assert account(fixed.replace(heuristic=jaxlfi.Edge()), leaning).next_steps == ("A wider Phi: ...", DIAGNOSE_OWN)
     at_phi = fixed.replace(feasible=run.belief.support)
     assert EDGE not in account(at_phi, leaning).next_steps
     assert account(fixed, RunSummary(parameters(), ())).next_steps == (DIAGNOSE_OWN,)
