@@ -167,7 +167,7 @@ def _shown(median: float, low: float, high: float) -> str:
     """
     if not high > low or not 1e-4 < abs(median) < 1e6:
         return f"{median:.3g} [{low:.3g}, {high:.3g}]"
-    decimals = max(1 - math.floor(math.log10(high - low)), 0)
+    decimals = max(math.ceil(-math.log10((high - low) / 3)), 0)
     return f"{median:.{decimals}f} [{low:.{decimals}f}, {high:.{decimals}f}]"
 
 

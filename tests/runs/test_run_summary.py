@@ -197,7 +197,9 @@ def test_parameters_that_are_known_but_trade_off_are_said_to_do_so():
     assert [one.verdict for one in found.parameters] == ["identified"] * 2
     sentence = next(one for one in found.sentences if "trade off" in one)
     assert sentence.startswith("mass and stiffness trade off against each other (correlation 1.00): mass - ")
-    assert " * stiffness varies " in sentence and not said(found, "separately")
+    (middle, low, high), rest = value_in(sentence)
+    assert " * stiffness = _ varies " in rest and not said(found, "separately")
+    np.testing.assert_allclose([middle, low, high], 0.8 + 2 * 0.01 * 1.6449 * np.array([0.0, -1.0, 1.0]), atol=0.011)
     assert not any("different ways" in step for step in found.next_steps)
     apart = np.stack([1.0 + 2 * shared, 0.1 + RNG.normal(0.0, 0.15, 4000)], axis=1)
     assert not said(of(apart, guess=PHI, last=PHI, space=linear), "trade off")
