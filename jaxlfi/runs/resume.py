@@ -1,6 +1,7 @@
 """Continuing a saved run in Python, as `jaxlfi resume` does."""
 
 import dataclasses
+import warnings
 from concurrent.futures import Executor
 from pathlib import Path
 
@@ -55,14 +56,17 @@ def resume(
         if rounds is not None or simulations is not None:
             executing.extend(folder, rounds, simulations)
         config = folders.read_config(folder)
-        if config["format"] != RUN or "runs" not in config:
+        if config["format"] != RUN:
             raise workfolder.StoreError(f"folder: expected that of one run, got {str(folder)!r}")
         if workfolder.is_finished(config):
             return load(folder, task)
         plan, observed = executing.reopen(folder, task)
         if executor is not None:
-            timeout = config["simulation_timeout"]
-            plan = dataclasses.replace(plan, task=one_by_one(plan.task, executor, timeout))
+            if not config.get("one_by_one", False):
+                raise ValueError(f"executor: expected none for {folder}, whose simulations were made in batches")
+            plan = dataclasses.replace(plan, task=one_by_one(plan.task, executor))
         run = executed(plan, observed, progress, callback, folder)
         executing.finish(folder, plan, [run])
-        return run
+    for category, text in run.findings():
+        warnings.warn(text, category, stacklevel=2)
+    return run

@@ -693,6 +693,7 @@ def test_failed_simulations_have_an_entry_where_there_are_some(tmp_path):
 @pytest.mark.parametrize("dim", [2, 5])
 def test_a_pair_plot_begins_right_below_its_title(tmp_path, dim):
     figure = drawn(pairs.draw, [load(write_run(tmp_path / "run", dim=dim))])
+    figure.draw_without_rendering()
     title, first = (axes.get_position() for axes in figure.axes[:2])
     assert 0 < (title.y0 - first.y1) + title.height < 0.6 / figure.get_figheight()
 
