@@ -104,7 +104,7 @@ def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
         count = observed.shape[1]
         known = () if run.task is None else tuple(run.task.channels)
         series = known if len(known) == count else tuple(f"channel {c + 1}" for c in range(count))
-    if series == ("channel 1",):  # the only one, without a name
+    if len(series) == 1:  # the only one needs no name
         series = (ALL,)
     if series:
         observed = observed.reshape(len(observed), -1)
