@@ -80,6 +80,14 @@ def test_a_channel_that_the_model_misses_is_named(run):
     assert sentence.endswith("in arm angle). The model lacks something there.") and found.next_steps == (LOOK,)
 
 
+def test_the_only_channel_needs_no_name(run):
+    observed, x = np.asarray(run.observed)[:, :1], run.dataset.x[:, ::2]
+    alone = run.replace(task=task(channels=("in bed",)), observed=observed, x=observed.ravel())
+    found = told(alone.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., :1], **STILL)
+    (sentence,) = [one for one in found.sentences if one.startswith("Simulations of the posterior fit")]
+    assert sentence.endswith(" times their scatter.")
+
+
 def test_where_nothing_was_simulated_nothing_is_said_of_the_fit(run):
     failed = np.full((20, len(TIMES), 2), np.nan)
     failed[:3] = around(run)[:3]
