@@ -192,12 +192,11 @@ def test_the_command_trains_what_the_library_does(finished, tmp_path, capsys):
     assert picture.startswith(b"\x89PNG") and len(picture) > 5000
 
 
-def test_how_a_policy_fares_is_told_by_its_own_points_and_how_it_began(finished):
+def test_how_a_policy_fares_is_told_by_its_own_points_and_how_it_began():
     """The worst tenth of 20 points is two; an update in which no episode ended says nothing."""
-    _, result = finished
     outcomes = {"value": np.stack([np.arange(20.0), np.full(20, 3.0)]), "steps": np.ones((2, 20)), "hit": np.eye(2, 20)}
     curves = {"value": np.array([[np.nan, np.nan], [-4.0, np.nan], [5.0, np.nan]])}
-    result = dataclasses.replace(result, outcomes=outcomes, curves=curves)
+    result = training.Result((("uniform", 0), ("median", 0)), curves, outcomes, None)
     assert result.fared(0) == {"return": 9.5, "worst tenth": 0.5, "at first": -4.0, "hit": 0.05}
     assert np.isnan(result.fared(1)["at first"]) and result.fared(1)["worst tenth"] == 3.0
 
