@@ -18,6 +18,7 @@ from jaxlfi.heuristics import Centre as Centre, Choice as Choice, Edge as Edge, 
 from jaxlfi.heuristics import Heuristic as Heuristic, Matched as Matched, Mode as Mode, Truncate as Truncate
 from jaxlfi.runs.infer import infer as infer
 from jaxlfi.runs.load import load as load
+from jaxlfi.runs.resume import resume as resume
 from jaxlfi.runs.run import MisspecificationWarning as MisspecificationWarning
 from jaxlfi.runs.run import Run as Run, SupportWarning as SupportWarning
 from jaxlfi.tasks.errors import ExecutorError as ExecutorError, SimulatorError as SimulatorError

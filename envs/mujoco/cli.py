@@ -33,15 +33,19 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "and beside it a .png of six moments. Needs EGL or OSMesa.",
     )
     film.add_argument("run", type=Path, metavar="RUN", help="folder of a run: jaxlfi infer mujoco,config=FILE")
-    film.add_argument("--draws", type=_count, default=12, metavar="N", help="how many ghosts (default: 12)")
+    film.add_argument("--draws", type=_count, default=12, metavar="N", help="number of ghosts (default: 12)")
     film.add_argument(
         "--slower", type=float, default=1.0, metavar="X", help="times slower than the recording (default: 1)"
     )
     film.add_argument(
-        "--size", type=_size, default=(640, 640), metavar="WxH", help="of the film, in pixels (default: 640x640)"
+        "--size", type=_size, default=(640, 640), metavar="WxH", help="size of the film in pixels (default: 640x640)"
     )
-    film.add_argument("--camera", metavar="NAME", help="of the model (default: a view that shows the whole motion)")
-    film.add_argument("--episode", type=int, default=0, metavar="N", help="of several recordings, from 0 (default: 0)")
+    film.add_argument(
+        "--camera", metavar="NAME", help="the model's camera (default: a view that shows the whole motion)"
+    )
+    film.add_argument(
+        "--episode", type=int, default=0, metavar="N", help="which of several recordings, from 0 (default: 0)"
+    )
     film.add_argument(
         "--out",
         type=flags.output,
@@ -52,9 +56,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
     fit = commands.add_parser(
         "fit",
-        help="find points of least squares from a posterior's draws",
-        description="Follow the best of some draws to points of least squares, by Gauss-Newton steps, and take the "
-        "integrator's own error off. Prints each point with 90 % intervals, which points explain the recording as "
+        help="find least-squares estimates from a posterior's draws",
+        description="Refine the best of some draws to least-squares estimates, by Gauss-Newton steps, and subtract the "
+        "integrator's own error. Prints each estimate with 90 % intervals, which points explain the recording as "
         "well as the best, which parameters trade off against each other or are on a bound of Phi, and what the model "
         "gets wrong, as unmodelled_force and a table [discrepancy] for the task's file.",
     )
@@ -64,8 +68,12 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of a run, to start from its posterior; or the TOML file of a task, or a task as `jaxlfi infer` "
         "takes it, to start from Phi",
     )
-    fit.add_argument("--starts", type=_count, default=64, metavar="N", help="draws to choose from (default: 64)")
-    fit.add_argument("--keep", type=_count, default=4, metavar="N", help="the best of them to follow (default: 4)")
+    fit.add_argument(
+        "--starts", type=_count, default=64, metavar="N", help="number of draws to choose from (default: 64)"
+    )
+    fit.add_argument(
+        "--keep", type=_count, default=4, metavar="N", help="number of them to follow, the best ones (default: 4)"
+    )
     fit.add_argument(
         "--out",
         type=flags.output,
@@ -109,7 +117,7 @@ main = Command(
     "film and refine the posterior of a MuJoCo model",
     _arguments,
     _run,
-    description="What follows inference of a MuJoCo model: films of its posterior, and points of least squares.",
+    description="Film the posterior of a MuJoCo model, and find least-squares estimates from it.",
     epilog=EXAMPLES,
 )
 parser = main.parser

@@ -23,7 +23,7 @@ MOST = 4.0
 def by_mjx(task: Task) -> Task:
     """The task with simulations by MJX, in single precision.
 
-    Films and points of least squares of it are MuJoCo's own, as of any task of a MuJoCo model.
+    Its films and least-squares estimates are MuJoCo's own, as for any task of a MuJoCo model.
 
     Args:
         task: of a MuJoCo model, as `mujoco_task` makes it.

@@ -50,7 +50,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--detector",
         default="clean",
         metavar="NAME",
-        help="a model of its errors: clean, mask, noisy, transporter, learnt or learnt-transporter (default: clean)",
+        help="detector whose errors are simulated: clean, mask, noisy, transporter, learnt or learnt-transporter "
+        "(default: clean)",
     )
     options.add_out(render, "DIR", "a new folder")
 
@@ -177,7 +178,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 main = Command(
     "whip",
-    "whipping: render, plan, deploy, control, record, see",
+    "the whipping task: render, plan, deploy, control, record, see",
     _arguments,
     _run,
     description="Render rollouts of the DLO whipping task, plan whips, let policies whip, control robots, learn to "

@@ -57,10 +57,16 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)"
     )
-    parser.add_argument("--preset", choices=("quick", "paper"), default="quick", help="of all stages (default: quick)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all stages (default: 0)")
-    parser.add_argument("--iterations", type=int, default=1, metavar="N", help="times to go round (default: 1)")
-    parser.add_argument("--total-steps", type=int, metavar="N", help="of each training (default: the preset's)")
+    parser.add_argument(
+        "--preset", choices=("quick", "paper"), default="quick", help="settings of all stages (default: quick)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all stages (default: 0)")
+    parser.add_argument(
+        "--iterations", type=int, default=1, metavar="N", help="number of times around the loop (default: 1)"
+    )
+    parser.add_argument(
+        "--total-steps", type=int, metavar="N", help="environment steps of each training (default: the preset's)"
+    )
     parser.add_argument("--policy", type=Path, metavar="FILE", help="a policy.npz in place of the first training")
     parser.add_argument("--recording", type=Path, metavar="FILE", help="a recorded rollout in place of the first one")
     parser.add_argument("--posterior", type=Path, metavar="RUN", help="a finished run in place of the first inference")

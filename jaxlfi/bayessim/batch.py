@@ -260,7 +260,7 @@ class BatchEngine:
         return jax.tree.map(lambda leaf: jax.device_put(jnp.asarray(leaf)[rows], sharding), tree)
 
     def _one(self, index: int) -> tuple[Callable, tuple]:
-        """What one run does in a round, and the arguments that it takes besides."""
+        """What one run does in a round, and its further arguments."""
         if index == 0 and self.first is not None:
             return given_one, (self.first_round(),)
         return round_one, ()

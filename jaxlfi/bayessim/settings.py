@@ -30,7 +30,7 @@ class Settings(Checked):
         inflation: how many times as wide as the posterior the proposals are drawn, about its mean; 1 is the paper.
             Uncorrected, with proposals s times as wide, a Gaussian posterior settles at sqrt(1 - 1/s^2) of its width,
             where with s = 1 it narrows every round (docs: calibration). A leaf.
-        predictive: whether 20 draws of each round's posterior are simulated besides, to compare them with the
+        predictive: whether 20 draws of each round's posterior are also simulated, to compare them with the
             observation (section V). These simulations are reported in the ledger; inference does not see them.
     """
 
@@ -40,7 +40,7 @@ class Settings(Checked):
         default=0,
         low=0,
         high=100_000,
-        help="rounds after which a run may end, once its posterior has settled; 0: it makes all",
+        help="rounds after which a run may end once its posterior has settled; 0: make all rounds",
     )
     simulations_per_round: int = option(
         default=100, low=1, high=100_000_000, help="largest number of valid simulations added per round"

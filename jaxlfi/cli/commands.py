@@ -199,15 +199,16 @@ def resume(arguments: argparse.Namespace, output: Output) -> Prepared | None:
     config = workfolder.read(folder, *REPORTED, TRAINING)
     if arguments.json and config["format"] not in SUMMARISED:
         raise ValueError(f"json: expected a folder of infer or compare, which has summaries, got {folder}")
-    if arguments.rounds is not None and config["format"] != RUN:
-        raise ValueError(f"rounds: expected the folder of one run (of one seed), got {folder}")
+    more = "rounds" if arguments.rounds is not None else "simulations" if arguments.simulations is not None else None
+    if more is not None and config["format"] != RUN:
+        raise ValueError(f"{more}: expected the folder of one run (of one seed), got {folder}")
     if config["format"] == TRAINING:
         train.resume(folder, output, not arguments.no_figures, arguments.joined)
         return None
-    if arguments.rounds is not None:
+    if more is not None:
         if arguments.joined.count > 1:
-            raise ValueError("rounds: expected one process, got several")
-        executing.extend(folder, arguments.rounds)
+            raise ValueError(f"{more}: expected one process, got several")
+        executing.extend(folder, arguments.rounds, arguments.simulations)
         config = workfolder.read(folder, RUN)
     if config.get("status") == "finished" or ("status" not in config and (folder / "posterior.npz").exists()):
         if arguments.joined.writes:
@@ -295,7 +296,7 @@ def diagnose(arguments: argparse.Namespace, output: Output) -> None:
     if arguments.no_figures:
         return
     for path in _figures().checks.report(out):
-        _say(output.notes, f"{'page' if path.suffix == '.html' else 'picture'}: {path}")
+        _name(output.notes, path)
     if out == arguments.folder / DIAGNOSTICS and (arguments.folder / "report.html").exists():
         _figures().report(arguments.folder)  # it says how far widths can be trusted, and this is known now
         _say(output.notes, f"page of the run, again: {arguments.folder / 'report.html'}")
@@ -375,9 +376,14 @@ def _run_grid(folder: Path, work: Work, arguments: argparse.Namespace, output: O
 
 
 def draw(folder: Path, console: Console) -> None:
-    """Draw all pictures of a folder from its saved files, and name them."""
+    """Draw all figures of a folder from its saved files, and name them and the page that shows them."""
     for path in _figures().report(folder):
-        _say(console, f"picture: {path}")
+        _name(console, path)
+
+
+def _name(console: Console, path: Path) -> None:
+    """Name a page or a figure that was drawn."""
+    _say(console, f"{'page' if path.suffix == '.html' else 'figure'}: {path}")
 
 
 def _figures():

@@ -20,16 +20,18 @@ examples:
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("environment", metavar="ENVIRONMENT", help="an environment's name, as of jaxlfi train")
+    parser.add_argument("environment", metavar="ENVIRONMENT", help="an environment's name, as for jaxlfi train")
     parser.add_argument(
         "policies", nargs="+", type=Path, metavar="FILE", help="policy.npz files that jaxlfi train wrote"
     )
     parser.add_argument(
-        "--domain", nargs="+", required=True, metavar="DOMAIN", help="what to evaluate on; several: each"
+        "--domain", nargs="+", required=True, metavar="DOMAIN", help="one or several domains to evaluate on"
     )
-    parser.add_argument("--episodes", type=int, default=128, metavar="N", help="on each domain (default: 128)")
     parser.add_argument(
-        "--seed", type=flags.seed, default=0, metavar="N", help="of the points and episodes (default: 0)"
+        "--episodes", type=int, default=128, metavar="N", help="number of episodes on each domain (default: 128)"
+    )
+    parser.add_argument(
+        "--seed", type=flags.seed, default=0, metavar="N", help="seed of the points and episodes (default: 0)"
     )
     parser.add_argument("--out", type=flags.output, metavar="FILE", help="a new .csv, a row for each policy and domain")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")

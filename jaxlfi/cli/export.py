@@ -27,7 +27,7 @@ examples:
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("policy", type=Path, metavar="POLICY", help="a policy.npz, or the folder of its training")
-    parser.add_argument("--format", choices=SUFFIXES, default="numpy", help="of the file (default: numpy)")
+    parser.add_argument("--format", choices=SUFFIXES, default="numpy", help="format of the file (default: numpy)")
     parser.add_argument("--out", type=flags.output, required=True, metavar="FILE", help="a new file")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
 

@@ -54,14 +54,21 @@ examples:
 
 """
 
-DIAGNOSE_EXAMPLES = """\
-Truths are drawn from the run's own posterior, and from the prior over a support, and simulated. The run's method is
-asked for the posterior of each: by its network, where the run had one round and kept it (--method npe, or --rounds 1
---keep-network), else by repeating the whole inference side by side, in chunks that are saved as they end. A command
-that was stopped goes on when it is given again. It takes about as long as that many runs; a failed check does not
-change the exit status, 0.
+RESUME_EXAMPLES = """\
+examples:
+  jaxlfi resume runs/edge                        finish what was interrupted; the result is bit-for-bit the same
+  jaxlfi resume runs/edge --simulations 3000     continue until the run has 3,000 simulations in all
+  jaxlfi resume runs/edge --rounds 30            continue to 30 rounds in all
+"""
 
-widths, of each parameter, at each reference:
+DIAGNOSE_EXAMPLES = """\
+Truths are drawn from the run's own posterior and from the prior over a support, and simulated; the run's method then
+infers a posterior for each. If the run had one round and kept its network (--method npe, or --rounds 1
+--keep-network), the network gives it at once. Otherwise the whole inference is repeated for each truth, side by side
+in chunks that are saved as they end, which takes about as long as that many runs. Repeating the command continues an
+interrupted one. A failed check does not change the exit status, 0.
+
+widths of each parameter's intervals, at each reference:
   honest        90 % intervals held 90 % of the truths, and are known to be of the right width to within 1.5
   too narrow    they held fewer; the number is how many times as wide they would have to be. too wide: more
   biased        truths lie to one side of the intervals' medians
@@ -72,7 +79,7 @@ checks, over a support:
   rank          of each truth among its draws, by parameter (simulation-based calibration)
   coverage      how often the densest region of a level holds the truth; around random points (TARP)
   classifier    accuracy of a classifier that separates truths from draws, given the simulation
-  predictive    (of the run itself) whether its own observation looks like simulations of its own posterior
+  predictive    whether the run's own observation looks like simulations of its own posterior
 verdicts:
   over-confident, under-confident: posteriors are too narrow, too wide; biased low, high: they lie below, above
   the truths. A check fails at p up to 0.01, corrected for the number of parameters.

@@ -122,7 +122,7 @@ PPO: dict[str, Field[Any]] = {
 SETTINGS: dict[str, Field[Any]] = {
     "rounds": option(default=10, help="largest number of inference rounds, N_LFI", low=1, high=100000),
     "min_rounds": option(default=0,
-        help="rounds after which a run may end, once its posterior has settled; 0: it makes all", low=0, high=100000),
+        help="rounds after which a run may end once its posterior has settled; 0: make all rounds", low=0, high=100000),
     "simulations_per_round": option(default=100, help="largest number of valid simulations added per round", low=1,
         high=100000000),
     "simulation_budget": option(default=125,
@@ -188,6 +188,6 @@ HELP = {
     "jaxlfi.envs.mujoco.cli:main": "film and refine the posterior of a MuJoCo model",
     "jaxlfi.envs.whip.r2s2r:main": "run the full Real2Sim2Real loop on a reference object",
     "jaxlfi.cli.train:main": "train policies by PPO on domains, such as a posterior",
-    "jaxlfi.envs.whip.cli:main": "whipping: render, plan, deploy, control, record, see",
+    "jaxlfi.envs.whip.cli:main": "the whipping task: render, plan, deploy, control, record, see",
 }
 """What our commands do, by what their entry points lead to."""

@@ -125,10 +125,11 @@ def own_commands(families: Families) -> list[Command]:
         ),
         Command(
             "resume",
-            "go on with a run that was stopped, or for more rounds",
+            "continue an interrupted run, or a finished one with more simulations",
             _resume,
             _work,
-            "Go on with a run that was stopped or killed, or for more rounds with one that is finished.",
+            "Continue a run that was interrupted, or a finished one with more rounds or simulations.",
+            help_texts.RESUME_EXAMPLES,
         ),
         Command(
             "sample",
@@ -147,10 +148,10 @@ def own_commands(families: Families) -> list[Command]:
         ),
         Command(
             "report",
-            "draw the pictures of a run",
+            "draw the figures of a run",
             _report,
             _work,
-            "Draw all pictures of a folder from its saved files.",
+            "Draw all figures of a run, comparison or grid from its saved files.",
         ),
     ]
 
@@ -218,12 +219,19 @@ def _grid(command: argparse.ArgumentParser, families: Families) -> None:
 
 def _resume(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
-    add("folder", type=Path, metavar="DIR", help="the folder the command was given")
-    add(
+    add("folder", type=Path, metavar="DIR", help="the folder that the command wrote")
+    more = command.add_mutually_exclusive_group()
+    more.add_argument(
         "--rounds",
         type=int,
         metavar="N",
-        help="go on to so many rounds in all, also with a run that is finished (default: those it was begun with)",
+        help="number of rounds in all, also for a finished run (default: the number that it was begun with)",
+    )
+    more.add_argument(
+        "--simulations",
+        type=int,
+        metavar="N",
+        help="number of valid simulations in all, also for a finished run: makes as many rounds as that takes",
     )
     _add_executor(command)
     multi_process.add_flags(command)
@@ -234,7 +242,7 @@ def _resume(command: argparse.ArgumentParser) -> None:
 def _sample(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add("folder", type=Path, metavar="DIR", help="the folder of one run (of one seed)")
-    add("-n", "--number", type=int, default=1000, metavar="N", help="draws (default: 1000)")
+    add("-n", "--number", type=int, default=1000, metavar="N", help="number of draws (default: 1000)")
     add("--seed", type=flags.seed, default=0, metavar="N", help="seed of the draws (default: 0)")
     add(
         "--out",
@@ -254,13 +262,15 @@ def _diagnose(command: argparse.ArgumentParser) -> None:
         help="where truths are drawn: posterior, the name of a support, or one of each (default: posterior, and the "
         "task's first support)",
     )
-    add("--truths", type=int, default=100, metavar="N", help="of each reference (default: 100)")
-    add("--draws", type=int, default=200, metavar="L", help="draws from the posterior of each (default: 200)")
-    add("--seed", type=int, default=0, metavar="S", help="of all random numbers (default: 0)")
+    add("--truths", type=int, default=100, metavar="N", help="number of truths at each reference (default: 100)")
+    add(
+        "--draws", type=int, default=200, metavar="L", help="number of draws from each truth's posterior (default: 200)"
+    )
+    add("--seed", type=int, default=0, metavar="S", help="seed of all random numbers (default: 0)")
     add(
         "--task",
         metavar="TASK",
-        help="what was inferred, for a run that was made in Python (default: the task recorded with the run)",
+        help="the task, for a run that was made in Python (default: the task recorded with the run)",
     )
     add(
         "--against",

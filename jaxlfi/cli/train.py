@@ -5,6 +5,7 @@ This module imports neither jax nor numpy before it has to, so that `--help` ans
 
 import argparse
 import contextlib
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from jaxlfi.cli.domains import DOMAINS, domains_of
 from jaxlfi.cli.exit_status import removed_if, resuming
 from jaxlfi.cli.own_fields import FIELDS, POLICIES
 from jaxlfi.io.formats import TRAINING, recorded
+from jaxlfi.io.shell import quoted
 from jaxlfi.registry import ENVIRONMENTS
 
 if TYPE_CHECKING:
@@ -55,7 +57,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ENVIRONMENT",
         help="an environment's name, such as whip, or module:factory; NAME,key=value sets options",
     )
-    parser.add_argument("--domain", nargs="+", required=True, metavar="DOMAIN", help="what to train on; several: each")
+    parser.add_argument(
+        "--domain",
+        nargs="+",
+        required=True,
+        metavar="DOMAIN",
+        help="one or several domains; each has policies of its own",
+    )
     parser.add_argument(
         "--out", type=flags.output, required=True, metavar="DIR", help="a new or empty folder for the results"
     )
@@ -137,13 +145,22 @@ def run(
         result = training.resumed(out, environment, on_chunk, processes or ALONE)
         if scalars:
             scalars.write(result.curves)  # where nothing was left to train, it was not called
-    facts = [name for name in result.outcomes if name not in training.NOT_FACTS]
-    table = Table("domain", "seed", "return", *facts, title=f"on {training.HELD_OUT} other points of each domain")
-    for place, (trained_on, seed) in enumerate(result.names):
-        means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]
-        table.add_row(escape(trained_on), str(seed), *(f"{mean:.2f}" for mean in means))
+    rows = [result.fared(place) for place in range(len(result.names))]
+    table = Table("domain", "seed", *rows[0], title=f"on {training.HELD_OUT} other points of each domain")
+    for (trained_on, seed), row in zip(result.names, rows, strict=True):
+        table.add_row(
+            escape(trained_on), str(seed), *("-" if math.isnan(one) else f"{one:.2f}" for one in row.values())
+        )
     tables.show(table, output.results)
-    output.notes.print(f"policies: {out}/DOMAIN/seed_NNN/policy.npz", markup=False, soft_wrap=True)
+    say = lambda line: output.notes.print(line, markup=False, soft_wrap=True, highlight=False)
+    say(
+        "return: the rewards of an episode added up, averaged over the points; worst tenth: over the points with the "
+        "lowest; at first: as the training began, with noise in the actions"
+    )
+    say(f"policies: {out}/DOMAIN/seed_NNN/policy.npz")
+    evaluate = f"jaxlfi evaluate {quoted(config['environment'])} {out}/*/*/policy.npz --domain DOMAIN ..."
+    if config["environment"] is not None:
+        say(f"on other domains, all on the same episodes: {evaluate}")
     if figures:
         draw(out, output.notes)
 

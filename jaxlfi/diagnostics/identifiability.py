@@ -8,6 +8,7 @@ widths of the box, where all parameters have the same scale. Both say what they 
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -38,6 +39,7 @@ class TradeOff:
         places: of the parameters, from 0.
         known: combinations that hardly vary, in words.
         unknown: the combinations that vary instead.
+        ranges: median and central 90 % interval of each known combination.
         correlation: of two parameters, or of their logarithms where the combination is a product; else NaN.
         factor: how many times less the known combinations vary than the parameters would let them independently.
     """
@@ -45,6 +47,7 @@ class TradeOff:
     places: tuple[int, ...]
     known: tuple[str, ...]
     unknown: tuple[str, ...]
+    ranges: tuple[tuple[float, float, float], ...]
     correlation: float
     factor: float
 
@@ -66,6 +69,8 @@ def trade_offs(names: Sequence[str], draws: Float[np.ndarray, "n dim"]) -> list[
         >>> [found] = trade_offs(["stiffness", "mass"], np.stack([mass * ratio, mass], axis=1))
         >>> found.known, found.unknown, f"{found.correlation:.2f}"
         (('stiffness / mass',), ('stiffness * mass',), '1.00')
+        >>> [tuple(round(value, 2) for value in values) for values in found.ranges]
+        [(1.0, 0.97, 1.03)]
     """
     draws = np.asarray(draws, np.float64)
     positive = np.flatnonzero((draws > 0).all(axis=0))
@@ -104,11 +109,19 @@ def _together(names, values: np.ndarray, places: np.ndarray, write, within: floa
                 places=tuple(int(d) for d in places[group]),
                 known=tuple(write(several, row) for row in known),
                 unknown=tuple(write(several, row) for row in other),
+                ranges=tuple(_range(values[:, group], row, product=write is _product) for row in known),
                 correlation=float(np.mean(z[:, group[0]] * z[:, group[1]])) if pair else np.nan,
                 factor=float(1 / np.sqrt(max(left.max(), 1e-12))),
             )
         )
     return found
+
+
+def _range(values: np.ndarray, row: np.ndarray, product: bool) -> tuple[float, float, float]:
+    """Median and central 90 % of a combination as it is written: of a product, `values` are logarithms."""
+    combined = values @ (_powers(row) if product else _weights(row))
+    median, low, high = map(float, np.quantile(np.exp(combined) if product else combined, (0.5, 0.05, 0.95)))
+    return median, low, high
 
 
 def unconstrained(name: str, more: str = "") -> str:
@@ -134,14 +147,28 @@ def not_separate(names: Sequence[str], known: Sequence[str], unknown: Sequence[s
 def trade_off_sentence(names: Sequence[str], one: TradeOff, each_known: bool = True) -> str:
     """What a trade-off means, in words, where each of its parameters is known by itself as well, or is not."""
     several = [names[d] for d in one.places]
+    known = [f"{text} = {_shown(*values)}" for text, values in zip(one.known, one.ranges, strict=True)]
     note = "" if np.isnan(one.correlation) else f" (correlation {one.correlation:.2f})"
     if not each_known:
-        return not_separate(several, one.known, one.unknown, note)
+        return not_separate(several, known, one.unknown, note)
     verb = "varies" if len(one.known) == 1 else "vary"
     return (
-        f"{listed(several)} trade off against each other{note}: {listed(one.known)} {verb} {one.factor:.2g} times less "
+        f"{listed(several)} trade off against each other{note}: {listed(known)} {verb} {one.factor:.2g} times less "
         "than it would if they were independent."
     )
+
+
+def _shown(median: float, low: float, high: float) -> str:
+    """A median with its interval, with as many digits as the interval's width needs.
+
+    Example:
+        >>> _shown(0.7213, 0.6804, 0.7651), _shown(1234.0, 1100.0, 1371.0), _shown(5.0, 5.0, 5.0)
+        ('0.72 [0.68, 0.77]', '1234 [1100, 1371]', '5 [5, 5]')
+    """
+    if not high > low or not 1e-4 < abs(median) < 1e6:
+        return f"{median:.3g} [{low:.3g}, {high:.3g}]"
+    decimals = max(math.ceil(-math.log10((high - low) / 3)), 0)
+    return f"{median:.{decimals}f} [{low:.{decimals}f}, {high:.{decimals}f}]"
 
 
 def listed(texts: Sequence[str]) -> str:
@@ -274,20 +301,29 @@ def _reduced(rows: np.ndarray, within: float = EXACT) -> np.ndarray:
 
 def _product(names: Sequence[str], powers: np.ndarray) -> str:
     """As "a * b^2 / c"."""
-    powers = 2 * powers if 0.5 in np.abs(powers) else powers
-    powers = powers * (1.0 if powers[np.flatnonzero(powers)[0]] > 0 else -1.0)
+    powers = _powers(powers)
     power = lambda name, value: name if value == 1 else f"{name}^{value:.2g}"
     above = " * ".join(power(name, value) for name, value in zip(names, powers, strict=True) if value > 0)
     below = "".join(f" / {power(name, -value)}" for name, value in zip(names, powers, strict=True) if value < 0)
     return above + below
 
 
+def _powers(powers: np.ndarray) -> np.ndarray:
+    """Powers as they are written: no square roots, and the first one positive."""
+    return _weights(2 * powers if 0.5 in np.abs(powers) else powers)
+
+
+def _weights(weights: np.ndarray) -> np.ndarray:
+    """Weights with the first one positive."""
+    return weights * (1.0 if weights[np.flatnonzero(weights)[0]] > 0 else -1.0)
+
+
 def _sum(names: Sequence[str], weights: np.ndarray) -> str:
     """As "a + 2 * b - c"."""
-    weights = weights * (1.0 if weights[np.flatnonzero(weights)[0]] > 0 else -1.0)
+    weights = _weights(weights)
     text = ""
     for name, value in zip(names, weights, strict=True):
         if value:
-            term = name if abs(value) == 1 else f"{abs(value):.3g} * {name}"
+            term = name if abs(value) == 1 else f"{abs(value):.2g} * {name}"
             text += f"{' + ' if value > 0 else ' - '}{term}" if text else term
     return text

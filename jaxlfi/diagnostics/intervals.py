@@ -31,7 +31,7 @@ APART = 1e-3
 """How far numbers that are the same are drawn apart, in units of the distance to the next one."""
 HONEST, NARROW, WIDE, UNDECIDED = "honest", "too narrow", "too wide", "undecided"
 BIASED_LOW, BIASED_HIGH = "biased low", "biased high"
-"""Words of a verdict; one that is too narrow or too wide may be biased besides."""
+"""Words of a verdict; one that is too narrow or too wide may also be biased."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -89,7 +89,7 @@ def unlike(
     occurs is seen where each number does. Simulations in which a summary has one value only leave no room for another.
 
     For a series, `channels` names its columns. Then the standard deviation of each channel over time, and its steps
-    from record to record in units of that, are compared besides: a series in another unit or in another order has
+    from record to record in units of that, are also compared: a series in another unit or in another order has
     values that occur, in a combination that does not.
 
     Where simulations of several rounds are given, those about the posterior make an observation from the model a

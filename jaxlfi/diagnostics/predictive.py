@@ -12,7 +12,7 @@ MIN_RESIDUALS = 8
 FAR = 3.0
 """Residual, in units of the simulations' scatter, from which on a model is said to lack something."""
 FURTHER = 1.5
-"""How many times as far as the farthest of the simulations it must be, besides: smooth series have few free numbers."""
+"""How many times as far as the farthest of the simulations it must also be: smooth series have few free numbers."""
 REACH = 2.0
 """Robust standard deviations at which values are clipped before means and correlations are taken."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxlfi.figures import statistics, style
-from jaxlfi.figures.collection import Collection, all_of, first_of
+from jaxlfi.figures.collection import Collection, all_of, first_of, seed_count
 from jaxlfi.figures.history import heuristic_name
 from jaxlfi.figures.style import looks, natural, unit_label
 from jaxlfi.io import files, web_page
@@ -274,30 +274,48 @@ def _notes(collection: Collection) -> str:
     return "".join(f'<p class="note">{prose(note)}</p>' for note in notes)
 
 
+_MEANING = {
+    "theta_error": "Parameter error: |θ − θ<sub>gt</sub>| summed over parameters, mean over posterior samples.",
+    "trajectory_error": "Trajectory error: distance per record from the observed trajectory in its standard deviations,"
+    " mean over the posterior samples whose simulation succeeded.",
+    "success_rate": "Success rate: percentage of all simulations that succeeded.",
+    "seconds": "Time: without compiling.",
+}
+
+
 def _table(collection: Collection) -> str:
-    """Mean, median and standard deviation over seeds of every measure, one row for each configuration."""
+    """Every measure that is known, one row for each configuration; of several seeds, mean, median and deviation."""
     look = looks(list(collection.values("seed")))
-    head = "".join(f'<th class="first" colspan="3">{name}</th>' for name in _COLUMNS.values())
-    below = '<th class="first">mean</th><th>median</th><th>sd</th>' * len(_COLUMNS)
     columns = {measure: collection.values(measure) for measure in _COLUMNS}
+    columns = {
+        measure: values for measure, values in columns.items() if any(np.isfinite(own).any() for own in values.values())
+    }
+    several = seed_count(collection.runs) > 1
+    span = ' colspan="3"' * several
+    head = "".join(f'<th class="first"{span}>{_COLUMNS[measure]}</th>' for measure in columns)
+    head = f"<tr><th>{'' if several else 'configuration'}</th>{'<th></th>' * several}{head}</tr>"
+    if several:
+        below = '<th class="first">mean</th><th>median</th><th>sd</th>' * len(columns)
+        head += f"<tr><th>configuration</th><th>seeds</th>{below}</tr>"
     lines = []
     for name, own in look.items():
         cells = []
         for measure, values in columns.items():
             scaled = values[name] * (100 if measure == "success_rate" else 1)
-            deviation = float(statistics.sd(scaled)) if len(scaled) > 1 else float("nan")
-            three = [_number(x) for x in (float(statistics.mean(scaled)), statistics.median(scaled), deviation)]
-            cells.append('<td class="first">{}</td><td>{}</td><td>{}</td>'.format(*three))
-        seeds, label = len(values[name]), html.escape(_without_escapes(own.label))
+            shown = [float(statistics.mean(scaled))]
+            if several:
+                deviation = float(statistics.sd(scaled)) if len(scaled) > 1 else float("nan")
+                shown += [float(statistics.median(scaled)), deviation]
+            first, *others = map(_number, shown)
+            cells.append(f'<td class="first">{first}</td>{"".join(f"<td>{one}</td>" for one in others)}')
+        seeds = f"<td>{len(collection.values('seed')[name])}</td>" * several
+        label = html.escape(_without_escapes(own.label))
         swatch = f'<i class="swatch" style="background:{own.colour}"></i>{label}'
-        lines.append(f"<tr><td>{swatch}</td><td>{seeds}</td>{''.join(cells)}</tr>")
+        lines.append(f"<tr><td>{swatch}</td>{seeds}{''.join(cells)}</tr>")
+    words = [_MEANING[measure] for measure in columns]
+    words += ["Mean, median and standard deviation (sd) are over seeds."] * several
     return wide(
-        f"<table><thead><tr><th></th><th></th>{head}</tr>"
-        f"<tr><th>configuration</th><th>seeds</th>{below}</tr></thead><tbody>{''.join(lines)}</tbody>"
-        "<caption>Parameter error: |θ − θ<sub>gt</sub>| summed over parameters, mean over posterior samples. "
-        "Trajectory error: distance per record from the observed trajectory in its standard deviations, mean over the "
-        "posterior samples whose simulation succeeded. Success rate: percentage of all simulations that succeeded. "
-        "Mean, median and standard deviation (sd) are over seeds.</caption></table>"
+        f"<table><thead>{head}</thead><tbody>{''.join(lines)}</tbody><caption>{' '.join(words)}</caption></table>"
     )
 
 

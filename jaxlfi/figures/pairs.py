@@ -43,6 +43,11 @@ _MARKERS = "DsvP^X<>"
 _SUPPORT = {"linestyle": "-", "linewidth": 0.9}
 _FIRST_SUPPORT = {"linestyle": (0, (1, 1.2)), "linewidth": 0.8}
 
+TITLE = 0.3
+"""Height of a title above a pair plot, in inches."""
+ROOMY = 1.4
+"""Width of a panel, in inches, from which on numbers fit side by side below it."""
+
 Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper bounds of the parameters, shape [D] each."""
 
@@ -283,7 +288,9 @@ def draw_groups(
     windows = [window([cloud for group in groups for cloud in group], d, points) for d in range(dim)]
     # Groups of panels with a gap beside and a title above them: one grid keeps all panels of one size.
     widths = [1.0] * dim + ([0.16] + [1.0] * dim) * (columns - 1)
-    heights = ([0.32 if titles else 0.01] + [1.0] * dim) * rows
+    panel = figure.get_figwidth() / sum(widths)  # inches
+    header = TITLE / panel if titles else 0.01
+    heights = ([header] + [1.0] * dim) * rows
     grid = figure.add_gridspec(len(heights), len(widths), width_ratios=widths, height_ratios=heights)
     for place, group in enumerate(groups):
         top, left = (dim + 1) * (place // columns) + 1, (dim + 1) * (place % columns)
@@ -299,7 +306,7 @@ def draw_groups(
                     draw_marginal(axes, group, i, points)
                 else:
                     draw_pair(axes, group, (j, i), points)
-                _frame(axes, (j, i), windows, scale, last=i == dim - 1, numbered=left == 0)
+                _frame(axes, (j, i), windows, scale, last=i == dim - 1, numbered=left == 0, upright=panel < ROOMY)
     figure.align_labels()
 
 
@@ -322,13 +329,14 @@ def _frame(
     scale: Sequence[Scale],
     last: bool,
     numbered: bool,
+    upright: bool,
 ) -> None:
-    """Limits and ticks; numbers and labels at the left and lower sides of the group."""
+    """Limits and ticks; numbers and labels at the left and lower sides of the group, upright where it is narrow."""
     x, y = pair
     axes.set_xlim(*windows[x])
     scale[x].show(axes.xaxis, 4)
     axes.tick_params(labelsize=6, labelbottom=last, pad=1.2)
-    axes.tick_params(axis="x", labelrotation=90)
+    axes.tick_params(axis="x", labelrotation=90 * upright)
     if not last:
         axes.set_xlabel("")
     if x == y:

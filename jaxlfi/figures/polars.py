@@ -1,5 +1,6 @@
 """Radar plots: errors of posterior samples by parameter, and of their simulations by summary."""
 
+import re
 import textwrap
 from collections.abc import Sequence
 
@@ -34,11 +35,18 @@ def parameter_errors(history: History, unit: History) -> np.ndarray | None:
     return history.theta_error[-1] / (high[0] - low[0])
 
 
+def named(history: History) -> bool:
+    """Whether its summaries have names. Records of a trajectory have none: the posterior predictive shows them."""
+    return not all(re.fullmatch(r"x_\d+", name) for name in history.summaries)
+
+
 def summary_errors(history: History, unit: History) -> np.ndarray | None:
     """|x - x^r| of the samples' simulations in standard deviations of a run's first round, shape [N, S], or None."""
     if history.final_x is None or history.x is None or unit.x_scale is None:
         return None
     if not MIN_SPOKES <= len(history.x) <= MAX_SPOKES:
+        return None
+    if not named(history):
         return None
     # A summary that never varied has no unit, and no spoke.
     scale = np.where(unit.x_scale > 0, unit.x_scale, np.nan)

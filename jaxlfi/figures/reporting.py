@@ -78,13 +78,15 @@ def columns(runs: Runs) -> tuple[list[History], list[str]]:
 
 def _samples(collection: Collection) -> Made:
     histories, titles = columns(collection.runs)
+    failed = any((history.failed > 0).any() for history in histories)
     rows = len(samples.pairs(histories[0].dim))
     figure = style.new_figure(TEXT_WIDTH, 0.75 + (rows * 2.2 if len(histories) == 1 else 2 * rows * 1.72))
     samples.draw(figure, histories, titles)
     first, second = ("Left", "Right") if len(histories) == 1 else ("Above", "Below")
     caption = (
         f"{first}: the parameters simulated in each iteration and the supports they were drawn from (boxes), coloured "
-        "by iteration; crosses are failed simulations, large dots the means of all simulations up to each iteration. "
+        f"by iteration; {'crosses are failed simulations, ' * failed}large dots the means of all simulations up to "
+        "each iteration. "
         f"{second}, enlarged: the density of the last posterior's mixture and its support (box); arrows join the "
         "weighted means of the posteriors of successive iterations." + _which_seed(collection.runs)
     )

@@ -274,9 +274,10 @@ def legend(
         style = {"color": "#3B528B", "linestyle": "none", **style}
         return Line2D([], [], marker=shape, markersize=size, label=label, **style)
 
+    failed = any((history.failed > 0).any() for history in histories)
     of_proposals = [
         marker("o", 2.5, "simulated", markeredgewidth=0),
-        marker("x", 3, "failed", markeredgewidth=0.7),
+        *[marker("x", 3, "failed", markeredgewidth=0.7)] * failed,
         marker("o", 5.5, "mean of data", markeredgecolor="white"),
     ]
     handles = [

@@ -52,10 +52,12 @@ class RoundProgress:
     def __enter__(self) -> "RoundProgress":
         """Show the bar, or say what begins."""
         if self._bar:
+            self._bar.update(self._task, description=f"{self._label}, compiling")
             self._bar.start()
         else:
             self._console.print(
-                f"{self._label}: {self._rounds - self._done} of {self._rounds} {self._unit}s to do", markup=False
+                f"{self._label}: {self._rounds - self._done} of {self._rounds} {self._unit}s to do, after compiling",
+                markup=False,
             )
         return self
 
@@ -68,6 +70,8 @@ class RoundProgress:
 
     def compiled(self, seconds: float) -> None:
         """Say how long compiling took; the estimate of the time left starts now."""
+        if self._bar:
+            self._bar.update(self._task, description=self._label)
         self._console.print(f"compiled in {seconds:.1f} s")
         self._began = self._shown = time.monotonic()
 

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 NAME = "summary.json"
 FOLDER = "FOLDER"
 """What next steps call the folder of a run that may not be saved yet."""
+UNSAVED = "; for a run without a folder, `jaxlfi.infer` again with "
+"""Begins the end of a step that a run in a folder does not need."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,10 +136,12 @@ class RunSummary:
 
     def at(self, folder: Path | str) -> "RunSummary":
         """The same of a run that is saved in a folder, whose next steps name it."""
-        saved = (
-            step.replace(f"`run.save({FOLDER})`, then ", "").replace(FOLDER, f"{folder}") for step in self.next_steps
-        )
-        return dataclasses.replace(self, next_steps=tuple(saved))
+
+        def saved(step: str) -> str:
+            needed, without, _ = step.replace(f"`run.save({FOLDER})`, then ", "").partition(UNSAVED)
+            return needed.replace(FOLDER, f"{folder}") + "." * bool(without)
+
+        return dataclasses.replace(self, next_steps=tuple(map(saved, self.next_steps)))
 
     def to_html(self) -> str:
         """The table and the sentences, as a page or a notebook shows them."""
@@ -156,12 +160,22 @@ def _parameter_of(described: Mapping[str, Any]) -> ParameterSummary:
     return ParameterSummary(**{**described, **pairs, **numbers, "leans": tuple(described["leans"])})
 
 
+def with_unit(unit: str) -> str:
+    """What follows a number: its unit, where it has one.
+
+    Example:
+        >>> f"2{with_unit('kg')}, 3{with_unit('1/day')}, 4{with_unit('')}"
+        '2 kg, 3 per day, 4'
+    """
+    unit = f"per {unit[2:]}" if unit.startswith("1/") and len(unit) > 2 else unit
+    return f" {unit}" if unit else ""
+
+
 def _row(one: ParameterSummary) -> list[str]:
     interval = lambda ends: f"[{one.shown(ends[0])}, {one.shown(ends[1])}]"
-    unit = f" {one.unit}" if one.unit else ""
     return [
         one.name,
-        one.shown(one.median) + unit,
+        one.shown(one.median) + with_unit(one.unit),
         interval(one.central_50),
         interval(one.central_90),
         _times(one.narrower),

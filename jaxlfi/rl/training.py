@@ -12,6 +12,7 @@ import csv
 import dataclasses
 import functools
 import io
+import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -81,6 +82,21 @@ class Result:
     curves: Mapping[str, np.ndarray]
     outcomes: Mapping[str, np.ndarray]
     params: Any
+
+    def fared(self, place: int) -> dict[str, float]:
+        """How one of the policies fares on the held-out points, and how it did when it began to learn.
+
+        Returns:
+            The mean return, that of the worst tenth of the points, the mean return of the first update in which an
+            episode ended (NaN if there was none), and the mean of each fact.
+        """
+        values = np.asarray(self.outcomes["value"][place])
+        learning = np.asarray(self.curves["value"])[:, place]
+        known = learning[np.isfinite(learning)]
+        worst = np.sort(values)[: max(len(values) // 10, 1)]
+        facts = {name: float(np.mean(value[place])) for name, value in self.outcomes.items() if name not in NOT_FACTS}
+        first = float(known[0]) if len(known) else math.nan
+        return {"return": float(values.mean()), "worst tenth": float(worst.mean()), "at first": first} | facts
 
 
 def begin(plan: Plan, out: Path, processes: Processes = ALONE) -> None:

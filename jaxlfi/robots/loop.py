@@ -31,7 +31,7 @@ class Log:
     Attributes:
         times: when observations were made, in s since the first command, shape [N].
         observations: shape [N, O].
-        extras: what robots report besides, by name, shape [N, ...].
+        extras: what else robots report, by name, shape [N, ...].
         asked: displacements that the policy asked for, NaN where it was not asked, shape [S, A].
         actions: displacements that were commanded, 0 where set-points were held, shape [S, A].
         targets: set-points that were commanded, shape [S, A].

@@ -11,7 +11,7 @@ from jaxlfi.bayessim.convergence import LAG, changes
 from jaxlfi.diagnostics.identifiability import listed
 from jaxlfi.diagnostics.misspecification import RECORDS
 from jaxlfi.diagnostics.predictive import MIN_RESIDUALS, Residual, residuals
-from jaxlfi.io.run_summary import RunSummary
+from jaxlfi.io.run_summary import UNSAVED, RunSummary
 from jaxlfi.runs.result import Result
 from jaxlfi.runs.summarise import summarised
 from jaxlfi.runs.unlike import names_of, observation_findings
@@ -20,7 +20,8 @@ COMMONEST = 3
 """Reasons of failed simulations that are named, at most."""
 CHANNELS = 4
 """Channels that are named, at most: those with the greatest residuals."""
-ALL = "all of its numbers"
+ALL = ""
+"""The name of all numbers of an observation together."""
 EDGE = "A support that can grow: `--heuristic edge`, or `heuristic=jaxlfi.Edge()`."
 LOOK = "Look at the misfit: `jaxlfi report FOLDER` draws simulations of the posterior beside the observation."
 DIAGNOSE = "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER`."
@@ -49,9 +50,10 @@ def account(run: Result, found: RunSummary) -> RunSummary:
     """The summary of a run's parameters with sentences on the run as a whole, and all that there is to do next."""
     strange, (fit, fits) = _observation(run), _fit(run)
     settled, more = _settled(run)
-    steps = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more + list(found.next_steps)
+    first = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more
+    steps = (*first, *found.next_steps, *[_diagnose(run)] * (not first))  # widths are measured of what may be kept
     sentences = (*found.sentences, strange, fit, _failures(run), settled)
-    return RunSummary(found.parameters, tuple(filter(None, sentences)), tuple(steps) or (_diagnose(run),))
+    return RunSummary(found.parameters, tuple(filter(None, sentences)), steps)
 
 
 def _diagnose(run: Result) -> str:
@@ -102,7 +104,7 @@ def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
         count = observed.shape[1]
         known = () if run.task is None else tuple(run.task.channels)
         series = known if len(known) == count else tuple(f"channel {c + 1}" for c in range(count))
-    if series == ("channel 1",):  # the only one, without a name
+    if len(series) == 1:  # the only one needs no name
         series = (ALL,)
     if series:
         observed = observed.reshape(len(observed), -1)
@@ -131,7 +133,7 @@ def fit_sentence(names: list[str], found: list[Residual]) -> tuple[str, bool]:
     Example:
         >>> fit_sentence(["arm", "pendulum"], [Residual(1.1, 1.4), Residual(9.0, 1.3)])[0]
         'Simulations of the posterior miss the observation: its residual is 9.0 times their scatter in pendulum \
-(1.1 in arm): the model lacks something there.'
+(1.1 in arm). The model lacks something there.'
     """
     known = [(one, name) for one, name in zip(found, names, strict=True) if np.isfinite(one.ratio)]
     known = sorted(known, key=lambda pair: -pair[0].ratio)
@@ -142,16 +144,19 @@ def fit_sentence(names: list[str], found: list[Residual]) -> tuple[str, bool]:
         rest = f", and no more in {len(known) - CHANNELS} others" if len(known) > CHANNELS else ""
         return f"Simulations of the posterior fit the observation: its residual is {_listed(near)}{rest}.", True
     rest = f" ({_listed(near, '')})" if near else ""
+    there = " there" * any(name for _, name in far)
     return (
-        f"Simulations of the posterior miss the observation: its residual is {_listed(far)}{rest}: the model lacks "
-        "something there."
+        f"Simulations of the posterior miss the observation: its residual is {_listed(far)}{rest}. The model lacks "
+        f"something{there}."
     ), False
 
 
 def _listed(pairs: list[tuple[Residual, str]], unit: str = " times their scatter") -> str:
     """The greatest residuals, with their channels."""
-    first, *others = pairs[:CHANNELS]
-    texts = [f"{first[0].ratio:.1f}{unit} in {first[1]}", *(f"{one.ratio:.1f} in {name}" for one, name in others)]
+    texts = [
+        f"{one.ratio:.1f}{'' if place else unit}{f' in {name}' if name else ''}"
+        for place, (one, name) in enumerate(pairs[:CHANNELS])
+    ]
     return listed(texts)
 
 
@@ -180,10 +185,12 @@ def _settled(run: Result) -> tuple[str, list[str]]:
     made = 1 if "settled" not in history else np.count_nonzero(~history["settled"][:-1]) + 1
     if made == 1 or len(history) < 4:
         return "", []
-    more = [f"More rounds: `--rounds {2 * made}`, or `settings=run.settings.replace(rounds={2 * made})`."]
+    rounds = 2 * made
+    again = f"{UNSAVED}`settings=run.settings.replace(rounds={rounds})`"
+    more = [f"More rounds: `jaxlfi resume FOLDER --rounds {rounds}`{again}."]
     last = [float(history[name][-1]) for name in ("moved", "rescaled", "turned")]
     if not np.isfinite(last).all():
-        return f"{made} rounds are too few to tell whether the posterior has settled: it is compared over {LAG}.", more
+        return f"{made} rounds are too few to tell whether the posterior has settled: that takes more than {LAG}.", more
     if still := changes(*last):
         return (
             f"The posterior had not settled after {made} rounds: over the last {LAG}, it changed its {listed(still)}.",

@@ -404,8 +404,8 @@ def clean(folder: Path) -> None:
     Checkpoint(folder).remove(keep_state=workfolder.read(folder, RUN, RUNS, COMPARE, GRID)["format"] == RUN)
 
 
-def extend(folder: Path, rounds: int) -> None:
-    """Ask a run for more rounds than it was begun with; `reopen` and `execute` then go on with it.
+def extend(folder: Path, rounds: int | None = None, simulations: int | None = None) -> None:
+    """Ask a run for more than it was begun with; `reopen` and `execute` then continue it.
 
     The rounds that were made stay as they are, bit for bit. Those to come differ by chance from the same rounds of a
     run that was begun with as many, whose simulations have more room from the start: sums over them round differently.
@@ -414,23 +414,38 @@ def extend(folder: Path, rounds: int) -> None:
     Args:
         folder: of one run, finished or not.
         rounds: of the run in all.
+        simulations: that are valid, of the run in all; it makes as many rounds as that takes where none fails. Give
+            this or the rounds.
 
     Raises:
-        ValueError: for no more rounds than there are, several runs, a run of one round, or one without its state.
+        ValueError: for no more than there are, several runs, a run of one round, or one without its state.
     """
+    if (rounds is None) == (simulations is None):
+        raise ValueError(f"resume: expected rounds or simulations, got {'neither' if rounds is None else 'both'}")
+    what = "rounds" if simulations is None else "simulations"
     config = folders.read_config(folder)
     if config["format"] != RUN or "runs" not in config:
-        raise StoreError(f"rounds: expected the folder of a command with one run (of one seed), got {folder}")
+        raise StoreError(f"{what}: expected the folder of a command with one run (of one seed), got {folder}")
     checkpoint = Checkpoint(folder)
     settings = describe.settings_from_json(config["settings"])
     done = checkpoint.rounds_done()
     if not done:
-        raise StoreError(f"rounds: expected a run with {checkpoint.folder / 'state.npz'} to go on from, got none")
-    if rounds <= done or (rounds < settings.rounds and not workfolder.is_finished(config)):
+        raise StoreError(
+            f"{what}: expected a run with {checkpoint.folder / 'state.npz'} to continue, got none: commands and "
+            "infer(..., out=...) keep it, and run.save does not"
+        )
+    rows, _, _ = checkpoint.read_rounds(done)
+    least = done if workfolder.is_finished(config) else max(done, settings.rounds)
+    if simulations is not None:
+        made = int(sum(np.sum(row["succeeded"]) for row in rows))
+        rounds = done + max(-(-(simulations - made) // settings.simulations_per_round), 0)
+        if rounds <= least:
+            there = made + (least - done) * settings.simulations_per_round
+            raise ValueError(f"simulations: expected more than the {there} of {folder}, got {simulations}")
+    elif rounds <= least:
         raise ValueError(f"rounds: expected more than the {max(done, settings.rounds)} of {folder}, got {rounds}")
     if settings.rounds == 1:
-        raise ValueError("rounds: expected a run of several rounds, got one, whose network is for any observation")
-    rows, _, _ = checkpoint.read_rounds(done)
+        raise ValueError(f"{what}: expected a run of several rounds, got one, whose network is for any observation")
     settled = bool(np.all(rows[-1]["settled"]))
     more = settings.replace(rounds=rounds, min_rounds=0 if settled else settings.min_rounds).check()
     asked = {"rounds": settings.rounds, "min_rounds": settings.min_rounds, "made": done}

@@ -156,7 +156,7 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
     """A batch of one run, in memory or in a folder."""
     observed = executing.prepare(plan, observation, first)
     if out is None:
-        return _executed(plan, observed, progress, callback, None)
+        return executed(plan, observed, progress, callback, None)
     if not (out / "config.json").exists():
         executing.begin(out, plan, observed)
     with locked(out):
@@ -174,15 +174,15 @@ def _run(plan: BatchPlan, observation: Any, first, progress: bool, callback: Cal
         _, recorded = executing.reopen(out, plan.task)
         _require(out, "observation", recorded.trajectory[0], observed.trajectory[0])
         _require(out, "first round (simulations)", _kept(recorded.first), _kept(observed.first))
-        run = _executed(plan, recorded, progress, callback, out)
+        run = executed(plan, recorded, progress, callback, out)
         executing.finish(out, plan, [run])
         return run
 
 
-def _executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Callback | None, out: Path | None) -> Run:
+def executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Callback | None, out: Path | None) -> Run:
     """The run of a batch of one, with a progress bar."""
-    console = Console(quiet=not progress)
-    with RoundProgress(console, plan.settings.rounds, 0, f"{plan.task.name}: 1 run") as bar:
+    console, done = Console(quiet=not progress), 0 if out is None else executing.rounds_done(out)
+    with RoundProgress(console, plan.settings.rounds, done, f"{plan.task.name}: 1 run") as bar:
 
         def each(index: int, row: dict[str, np.ndarray]) -> None:
             bar.advance()

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxlfi.diagnostics.identifiability import listed, trade_off_sentence, trade_offs, unconstrained
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
-from jaxlfi.io.run_summary import ParameterSummary, RunSummary
+from jaxlfi.io.run_summary import ParameterSummary, RunSummary, with_unit
 
 INNER, OUTER = (0.25, 0.75), (0.05, 0.95)
 """Levels between which half and 90 % of the draws lie."""
@@ -26,9 +26,7 @@ MOVED = 0.05
 """Fraction of the width by which a bound has moved to be spoken of."""
 OUTSIDE = 0.5
 """Share of the draws outside the first guess above which it was wrong."""
-ANOTHER = (
-    "Another experiment, one that {}: let the simulator return its measurements as well, beside those of this one."
-)
+ANOTHER = "Another experiment, in which {}: let the simulator return both, these measurements and the new ones."
 
 
 def summarised(
@@ -72,12 +70,12 @@ def summarised(
     for trade_off in together:
         sentences.append(trade_off_sentence(space.names, trade_off, all(known[d] for d in trade_off.places)))
     unclear = [one.name for d, one in enumerate(parameters) if one.verdict == "not at all" and d not in shared]
-    steps += [ANOTHER.format(f"{listed(unclear)} {'changes' if len(unclear) == 1 else 'change'}")] * bool(unclear)
+    matter = "matters" if len(unclear) == 1 else "matter"
+    steps += [ANOTHER.format(f"{listed(unclear)} {matter}")] * bool(unclear)
     for trade_off in together:
         if not all(known[d] for d in trade_off.places):
-            steps.append(
-                ANOTHER.format(f"{listed([space.names[d] for d in trade_off.places])} change in different ways")
-            )
+            several = listed([space.names[d] for d in trade_off.places])
+            steps.append(ANOTHER.format(f"{several} act in different ways"))
     return RunSummary(parameters, tuple(filter(None, sentences)), tuple(steps))
 
 
@@ -133,7 +131,7 @@ def _decimals(draws: np.ndarray) -> int:
 
 
 def _value(value: float, one: ParameterSummary) -> str:
-    return f"{value:.3g}" + (f" {one.unit}" if one.unit else "")
+    return f"{value:.3g}{with_unit(one.unit)}"
 
 
 def _of_the_guess(one: ParameterSummary, draws: np.ndarray, guess, last, heuristic: str) -> str:
@@ -149,12 +147,14 @@ def _of_the_guess(one: ParameterSummary, draws: np.ndarray, guess, last, heurist
             f"The first guess of {guess[0]:.3g} to {_value(guess[1], one)} for {one.name} was wrong: {heuristic} moved "
             f"{moved}, and {_share(outside)} of the posterior is outside the guess."
         )
-    moved = " and ".join(f"the {side} bound of {one.name} to {_value(now, one)}" for side, now in shifted)
+    (side, now), *others = shifted
+    moved = f"the {side} bound of {one.name} to {_value(now, one)}"
+    moved += "".join(f" and its {side} bound to {_value(now, one)}" for side, now in others)
     return f"{heuristic} moved {moved}; {_share(1 - outside)} of the posterior is within the first guess."
 
 
 def _share(share: float) -> str:
-    return "all" if share > 0.9995 else f"{share:.1%}"
+    return "all" if share > 0.9995 else f"{100 * share:.3g} %"
 
 
 def _of_its_bounds(one: ParameterSummary, last, feasible) -> str:

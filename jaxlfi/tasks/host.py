@@ -16,7 +16,7 @@ from jaxlfi.tasks import own_arrays
 from jaxlfi.tasks.dispatch import alive, here, simulate_each, stacked, through
 from jaxlfi.tasks.errors import SimulatorError
 from jaxlfi.tasks.journal import Journal
-from jaxlfi.tasks.worker import REASONS, Answer, Request, simulated
+from jaxlfi.tasks.worker import REASONS, Answer, Request, as_observed, simulated
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,7 +177,7 @@ class HostSimulator:
         if not fits or trajectory.dtype.kind not in "biuf":
             raise SimulatorError(
                 f"simulate: expected numbers {wanted} for {rows} parameter vectors, "
-                f"got {trajectory.dtype} of shape {list(trajectory.shape)}"
+                f"got {trajectory.dtype} of shape {list(trajectory.shape)}{as_observed(shape)}"
             )
         if shape is not None:
             trajectory = trajectory.reshape(rows, *shape)

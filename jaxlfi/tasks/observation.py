@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import functools
+import re
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,7 +27,12 @@ from jaxlfi.tasks.trials import repeated, together
 
 TRIES = 16
 """Simulations at the truth that may fail before a task counts as unable to simulate its own truth."""
-TIME_COLUMNS = ("time", "times", "timestamp", "seconds", "year", "step", "index", "")
+TIME_UNITS = ("second", "minute", "hour", "day", "week", "month", "year")
+TIME_COLUMNS = (
+    *("", "time", "times", "timestamp", "date", "datetime", "step", "index"),
+    *TIME_UNITS,
+    *(f"{unit}s" for unit in TIME_UNITS),
+)
 """Headings, without a unit in brackets, of a first column that is no channel where it increases; case does not matter.
 pandas' index has an empty one. A small t is one, too, but no T, which may be a temperature."""
 
@@ -409,6 +415,8 @@ def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
     if not has_heading and not all(numbers_in_first):
         raise ValueError(f"expected a row of headings or a row of numbers first, got {','.join(rows[0])!r}")
     width = len(rows[0])
+    if has_heading and _is_time(rows[0][0]):
+        rows[1:] = [[_without_date(first), *others] for first, *others in rows[1:]]
     for number, row in enumerate(rows[has_heading:], start=1 + has_heading):
         if len(row) != width or not all(cell in MISSING or _is_number(cell) for cell in row):
             raise ValueError(f"expected {width} numbers in row {number}, got {','.join(row)!r}")
@@ -417,6 +425,16 @@ def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
     return rows[0] if has_heading else [], np.array(
         [[float("nan" if cell in MISSING else cell) for cell in row] for row in rows[has_heading:]]
     )
+
+
+def _without_date(cell: str) -> str:
+    """A date such as 1978-01-22, or with a time of day, as its seconds since 1970; another cell as it is."""
+    if not re.match(r"\d{4}-\d{2}", cell):
+        return cell
+    try:
+        return str(np.datetime64(cell.removesuffix("Z").strip(), "us").astype(float) / 1e6)
+    except ValueError:
+        return cell
 
 
 def _channels(headings: list[str], table: np.ndarray, columns: Columns, say: Say) -> np.ndarray:

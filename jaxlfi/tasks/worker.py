@@ -100,15 +100,18 @@ def checked(trajectory: np.ndarray, outcome: Any, shape: Sequence[int] | None) -
     long = lambda lengths: [length for length in lengths if length != 1]
     fits = trajectory.ndim >= 1 and (shape is None or long(trajectory.shape) == long(shape))
     if not fits or trajectory.dtype.kind not in records.KINDS:
-        return failed(
-            "wrong_shape",
-            f"expected numbers of shape {wanted}, got {trajectory.dtype} of shape {list(trajectory.shape)}",
-        )
+        got = f"{trajectory.dtype} of shape {list(trajectory.shape)}"
+        return failed("wrong_shape", f"expected numbers of shape {wanted}, got {got}{as_observed(shape)}")
     try:
         code = code_of(outcome)
     except ValueError as error:
         return failed("wrong_shape", str(error))
     return Answer(code, trajectory if shape is None else trajectory.reshape(shape))
+
+
+def as_observed(shape: Sequence[int] | None) -> str:
+    """Where the shape that is expected of a simulation comes from, for the end of an error."""
+    return "" if shape is None else f" (the observation has shape {list(shape)})"
 
 
 def with_outcome(result: Any) -> tuple[Any, Any]:

@@ -170,7 +170,7 @@ def test_markup_in_names_is_printed_as_it_is(tmp_path, monkeypatch, capsys):
     assert f"samples: {out / 'samples.csv'}" in capsys.readouterr().out
     monkeypatch.setattr(figures, "report", lambda folder: [folder / "[/x].png"])
     assert command("report", out) == 0
-    assert f"picture: {out / '[/x].png'}" in capsys.readouterr().out
+    assert f"figure: {out / '[/x].png'}" in capsys.readouterr().out
     assert "[/nothing]" in error_line(capsys, "infer", TASK, "--support", "[/nothing]", "--out", tmp_path / "new")
 
 

@@ -456,7 +456,7 @@ def test_front_page():
     """The figures below the example of the project's README."""
     error = arrays("quotient/lotka_volterra/misspecified+edge/quick-own")["error"]
     assert len(error) == 100 and np.sum(error > widths.LOST) == 1
-    text = f"EDGE ends with a summed error of {error.mean():.2f} in the mean of 100 seeds, and loses one run"
+    text = f"the summed error with EDGE is {error.mean():.2f} on average over 100 seeds, and one run is lost"
     assert text in " ".join((ROOT.parent / "README.md").read_text().split())
 
 
@@ -678,7 +678,7 @@ def test_points_and_posteriors_of_mujoco_models():
     )
     assert found("puck", "right", "scipy") == 0
     least = sum(found(name, "wrong", "sysid") for name in three)
-    text = f"EDGE finds the truth of {sum(by_edge['wrong'])} of 150 recordings, and `mujoco.sysid` of {least}"
+    text = f"EDGE finds the truth in {sum(by_edge['wrong'])} of 150 recordings, and `mujoco.sysid` in {least}"
     assert text in " ".join((ROOT.parent / "README.md").read_text().split())
 
 

@@ -674,6 +674,30 @@ def test_polars_leave_out_what_has_no_unit_or_no_value(tmp_path):
     assert [text.get_text() for text in both.axes[-1].texts] == ["none"]
 
 
+def test_records_of_a_trajectory_are_no_spokes(tmp_path):
+    folder = write_run(tmp_path / "run")
+    assert set(polars.panels([load(folder)])) == {"parameters", "summaries"}
+    records = np.array([f"x_{place}" for place in range(1, 6)])
+    change(folder, "observation.npz", lambda a: a.update(summaries=records))
+    assert set(polars.panels([load(folder)])) == {"parameters"}
+
+
+def test_failed_simulations_have_an_entry_where_there_are_some(tmp_path):
+    for failures in (0.3, 0.0):
+        history = load(write_run(tmp_path / f"{failures}", failures=failures))
+        assert history.failed.any() == (failures > 0)
+        (legend,) = drawn(samples.draw, [history]).legends
+        assert ("failed" in [text.get_text() for text in legend.get_texts()]) == (failures > 0)
+
+
+@pytest.mark.parametrize("dim", [2, 5])
+def test_a_pair_plot_begins_right_below_its_title(tmp_path, dim):
+    figure = drawn(pairs.draw, [load(write_run(tmp_path / "run", dim=dim))])
+    figure.draw_without_rendering()
+    title, first = (axes.get_position() for axes in figure.axes[:2])
+    assert 0 < (title.y0 - first.y1) + title.height < 0.6 / figure.get_figheight()
+
+
 def test_the_robust_sd_of_normal_numbers_is_their_standard_deviation():
     x = np.random.default_rng(2).normal(5.0, [0.3, 20.0], (40_000, 2))
     x[:100] = 1e6  # but for a few

@@ -62,6 +62,8 @@ def test_a_page_is_well_formed_and_says_what_its_pictures_show(written):
         assert base64.b64decode(picture["src"].partition("base64,")[2]).startswith(b"\x89PNG")
     assert "`" not in page.text and "jaxlfi diagnose <run>" in page.text
     assert page.text.index("Answer") < page.text.index("Posterior by pairs of parameters")
+    results = page.text.partition("Results")[2]
+    assert "parameter error" in results and "median" not in results.partition("Parameter error")[0]  # of one run
 
 
 def test_nothing_of_fixed_width_is_wider_than_a_phone():

@@ -41,3 +41,16 @@ def test_a_narrow_window_shows_every_number(width):
     for word in ("4/200", "rounds,", "0:00:00", "elapsed,", "left", "12 runs", "1234,", "5000"):
         assert word in file.getvalue().rpartition("lotka_volterra")[2], word
     assert "\u2026" not in file.getvalue()
+
+
+def test_compiling_is_said_until_it_is_over():
+    """In a bar by its description; in lines at the start. Where nobody says that it is over, the first round does."""
+    for over in (lambda shown: shown.compiled(3.0), lambda shown: shown.advance()):
+        shown = RoundProgress(Console(file=io.StringIO(), force_terminal=True, width=120), 4, 0, "2 runs")
+        with shown:
+            assert shown._bar.tasks[0].description == "2 runs, compiling"
+            over(shown)
+            assert shown._bar.tasks[0].description == "2 runs"
+    lines = io.StringIO()
+    with RoundProgress(Console(file=lines, width=120), 4, 0, "2 runs"):
+        assert lines.getvalue() == "2 runs: 4 of 4 rounds to do, after compiling\n"

@@ -182,12 +182,23 @@ def test_the_command_trains_what_the_library_does(finished, tmp_path, capsys):
                "--entropy", "0", "--initial-deviation", "1") == 0  # fmt: skip
     printed = capsys.readouterr().out
     assert "update 4 of 4" in printed and "uniform" in printed
+    assert "worst tenth" in printed and "at first" in printed
+    assert f"jaxlfi evaluate {REFERENCE} {tmp_path / 'run'}/*/*/policy.npz --domain" in printed
     for path in ("uniform/seed_000/policy.npz", "median/seed_000/policy.npz"):
         ours, theirs = load(tmp_path / "run" / path), load(out / path)
         for a, b in zip(ours.weights, theirs.weights, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-4)
     picture = (tmp_path / "run" / "curves.png").read_bytes()
     assert picture.startswith(b"\x89PNG") and len(picture) > 5000
+
+
+def test_how_a_policy_fares_is_told_by_its_own_points_and_how_it_began():
+    """The worst tenth of 20 points is two; an update in which no episode ended says nothing."""
+    outcomes = {"value": np.stack([np.arange(20.0), np.full(20, 3.0)]), "steps": np.ones((2, 20)), "hit": np.eye(2, 20)}
+    curves = {"value": np.array([[np.nan, np.nan], [-4.0, np.nan], [5.0, np.nan]])}
+    result = training.Result((("uniform", 0), ("median", 0)), curves, outcomes, None)
+    assert result.fared(0) == {"return": 9.5, "worst tenth": 0.5, "at first": -4.0, "hit": 0.05}
+    assert np.isnan(result.fared(1)["at first"]) and result.fared(1)["worst tenth"] == 3.0
 
 
 @pytest.mark.slow

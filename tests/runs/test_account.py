@@ -77,7 +77,15 @@ def test_a_channel_that_the_model_misses_is_named(run):
     (sentence,) = [one for one in found.sentences if "miss the observation" in one]
     ratio = residuals(around(run, (0.0, 9.0)), run.observed)[1].ratio
     assert f"its residual is {ratio:.1f} times their scatter in pendulum angle (" in sentence and 8 < ratio < 10
-    assert sentence.endswith("in arm angle): the model lacks something there.") and found.next_steps == (LOOK,)
+    assert sentence.endswith("in arm angle). The model lacks something there.") and found.next_steps == (LOOK,)
+
+
+def test_the_only_channel_needs_no_name(run):
+    observed, x = np.asarray(run.observed)[:, :1], run.dataset.x[:, ::2]
+    alone = run.replace(task=task(channels=("in bed",)), observed=observed, x=observed.ravel())
+    found = told(alone.replace(dataset=run.dataset.replace(x=x)), final_trajectory=around(run)[..., :1], **STILL)
+    (sentence,) = [one for one in found.sentences if one.startswith("Simulations of the posterior fit")]
+    assert sentence.endswith(" times their scatter.")
 
 
 def test_where_nothing_was_simulated_nothing_is_said_of_the_fit(run):
@@ -131,7 +139,7 @@ def test_summaries_are_compared_where_there_is_no_series(run):
     many = np.asarray(run.observed).ravel()
     unnamed = run.replace(task=task(channels=()), observed=many, x=many)
     found = told(unnamed, final_x=around(run).reshape(20, -1), **STILL)
-    assert any("times their scatter in all of its numbers." in one for one in found.sentences)
+    assert any(one.endswith("times their scatter.") for one in found.sentences)
 
 
 def test_an_observation_unlike_the_simulations_is_said_to_be_so(run):
@@ -162,7 +170,11 @@ def test_whether_a_run_had_settled_is_said(run):
         "The posterior had not settled after 4 rounds: over the last 3, it changed its means by up to 1.3 standard "
         "deviations."
     )
-    assert found.next_steps[-1] == "More rounds: `--rounds 8`, or `settings=run.settings.replace(rounds=8)`."
+    assert found.next_steps[-1] == (
+        "More rounds: `jaxlfi resume FOLDER --rounds 8`; for a run without a folder, `jaxlfi.infer` again with "
+        "`settings=run.settings.replace(rounds=8)`."
+    )
+    assert found.at("runs/a").next_steps[-1] == "More rounds: `jaxlfi resume runs/a --rounds 8`."
     found = told(run, **{name: [np.inf] * 4 for name in STILL})
     assert found.sentences[-1].startswith("4 rounds are too few to tell whether the posterior has settled")
     one = run.replace(history={name: value[:1] for name, value in run.history.items()})
@@ -174,7 +186,7 @@ def test_what_to_do_next_follows_from_what_was_found(run):
     history = run.history | {name: jnp.asarray(value) for name, value in STILL.items()}
     fixed = run.replace(history=history | {"final_trajectory": jnp.asarray(around(run))}, heuristic=jaxlfi.Fixed())
     assert account(fixed, leaning).next_steps == (EDGE, "A wider Phi: ...")
-    assert account(fixed.replace(heuristic=jaxlfi.Edge()), leaning).next_steps == ("A wider Phi: ...",)
+    assert account(fixed.replace(heuristic=jaxlfi.Edge()), leaning).next_steps == ("A wider Phi: ...", DIAGNOSE_OWN)
     at_phi = fixed.replace(feasible=run.belief.support)
     assert EDGE not in account(at_phi, leaning).next_steps
     assert account(fixed, RunSummary(parameters(), ())).next_steps == (DIAGNOSE_OWN,)

@@ -9,6 +9,7 @@ import pytest
 import jaxlfi
 from jaxlfi.io import files as atomic
 from jaxlfi.runs import execute as executing
+from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import Checkpoint, CheckpointError
 from jaxlfi.runs.execute import changed_machine
 from tests.killed import Killed, kill_at
@@ -170,12 +171,42 @@ def test_a_finished_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
     for name in ("posterior.npz", "dataset.npz"):
         assert_same_arrays(out / name, tmp_path / "killed" / name)
     capsys.readouterr()
+    assert command("resume", out, "--simulations", 20 * MORE) == 2
+    assert "error: simulations: expected more than the 120 of" in capsys.readouterr().err
     for rounds, message in ((MORE, "expected more than the 6 of"), (0, "expected more than the 6 of")):
         assert command("resume", out, "--rounds", rounds) == 2
         assert f"error: rounds: {message}" in capsys.readouterr().err
     shutil.rmtree(out / "checkpoint")  # as earlier versions and run.save leave it
     assert command("resume", out, "--rounds", 8) == 2
     assert "error: rounds: expected a run with" in capsys.readouterr().err
+
+
+def test_a_total_of_simulations_becomes_the_rounds_it_takes(tmp_path, capsys):
+    """Of 2 rounds of 20: 61 in all take two more rounds, the same as asking for four."""
+    for name in ("rounds", "simulations", "python"):
+        jaxlfi.infer(0, gaussian(), settings=SETTINGS, out=tmp_path / name)
+    made = int(atomic.read_arrays(tmp_path / "rounds" / "history.npz")["succeeded"].sum())
+    per_round = SETTINGS.simulations_per_round
+    wanted = made + per_round + 1
+    executing.extend(tmp_path / "rounds", rounds=SETTINGS.rounds + 2)
+    executing.extend(tmp_path / "simulations", simulations=wanted)
+    configs = [folders.read_config(tmp_path / name)["settings"] for name in ("rounds", "simulations")]
+    assert configs[0] == configs[1]
+    run = jaxlfi.resume(tmp_path / "python", gaussian(), simulations=wanted)
+    assert int(run.dataset.size) >= wanted > made and run.settings.rounds == SETTINGS.rounds + 2
+    np.testing.assert_array_equal(jaxlfi.resume(tmp_path / "rounds", gaussian()).draws(), run.draws())
+    np.testing.assert_array_equal(jaxlfi.resume(tmp_path / "python", gaussian()).draws(), run.draws())  # it is complete
+    size = int(run.dataset.size)
+    for simulations in (size, 1):
+        with pytest.raises(ValueError, match=f"simulations: expected more than the {size} of"):
+            jaxlfi.resume(tmp_path / "python", gaussian(), simulations=simulations)
+    with pytest.raises(ValueError, match="expected rounds or simulations, got both"):
+        jaxlfi.resume(tmp_path / "python", gaussian(), simulations=10 * size, rounds=9)
+    # Of one that was stopped, what it was begun with counts as there.
+    with pytest.raises(ValueError, match=f"expected more than the {wanted - 1 + per_round} of"):
+        executing.extend(tmp_path / "simulations", simulations=made + 1)
+    assert command("resume", tmp_path / "python", "--rounds", 9, "--simulations", 1000) == 2
+    assert "not allowed with argument --rounds" in capsys.readouterr().err
 
 
 def test_more_rounds_in_python_are_those_of_the_command_line(tmp_path):

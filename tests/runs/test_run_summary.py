@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 
 import jax
 import numpy as np
@@ -83,6 +84,13 @@ def test_numbers_are_shown_to_within_half_of_the_last_digit(value, decimals):
     assert one.shown(math.nan) == "-"
 
 
+def value_in(sentence: str) -> tuple[list[float], str]:
+    """Median and interval of "= 1.0 [0.9, 1.1]" in a sentence, and the sentence with "= _" in its place."""
+    found = re.search(r"= ([\d.-]+) \[([\d.-]+), ([\d.-]+)\]", sentence)
+    assert found, sentence
+    return list(map(float, found.groups())), sentence.replace(found[0], "= _")
+
+
 def said(summary: RunSummary, words: str) -> bool:
     return any(words in sentence for sentence in summary.sentences)
 
@@ -98,6 +106,11 @@ def test_a_wrong_first_guess_is_said_and_a_right_one_is_not():
     (sentence,) = of(last=wider).sentences
     assert sentence == ("EDGE moved the upper bound of mass to 5.5 kg; all of the posterior is within the first guess.")
     assert not said(of(beyond, guess=wider, last=wider), "guess")
+    (sentence,) = of(last=jaxlfi.Support([0.5, 0.0], [5.5, 2.0])).sentences
+    assert sentence.startswith("EDGE moved the lower bound of mass to 0.5 kg and its upper bound to 5.5 kg; all of")
+    mostly = np.stack([np.where(RNG.uniform(size=4000) < 0.74, 4.0, 2.0) + RNG.normal(0.0, 0.1, 4000), NARROW[:, 1]], 1)
+    (share,) = re.findall(r"and ([\d.]+) % of the posterior is outside the guess", of(mostly, last=wider).sentences[0])
+    assert float(share) == pytest.approx(74, abs=3)
 
 
 def test_what_is_not_constrained_is_said():
@@ -107,7 +120,7 @@ def test_what_is_not_constrained_is_said():
         "The observation does not constrain stiffness: its posterior is about as wide as its box.",
     )
     (step,) = found.next_steps
-    assert step.startswith("Another experiment, one that stiffness changes: let the simulator return")
+    assert step.startswith("Another experiment, in which stiffness matters: let the simulator return")
     assert [one.verdict for one in found.parameters] == ["identified", "not at all"]
     half = np.stack([NARROW[:, 0], np.exp(RNG.normal(1.0, 0.4, 4000).clip(0, 2))], axis=1)
     assert [one.verdict for one in of(half).parameters] == ["identified", "weakly"] and not said(of(half), "constrain")
@@ -150,12 +163,16 @@ def test_parameters_not_separately_identifiable_are_named_with_their_combination
     assert [one.verdict for one in found.parameters] == ["not at all"] * 2
     known, unknown = ("mass / stiffness", "mass * stiffness")[::sign]
     correlation = f"{sign}.00" if sign < 0 else "1.00"
-    assert found.sentences == (
-        f"mass and stiffness are not separately identifiable (correlation {correlation}): only {known} is well "
-        f"determined; {unknown} is not.",
+    (sentence,) = found.sentences
+    (middle, low, high), rest = value_in(sentence)
+    assert rest == (
+        f"mass and stiffness are not separately identifiable (correlation {correlation}): only {known} = _ is well "
+        f"determined; {unknown} is not."
     )
+    exact = np.exp(np.array([0.0, -1.0, 1.0]) * 1.6449 * 0.03)  # of a log-normal combination
+    np.testing.assert_allclose([middle, low, high], exact, atol=0.015)
     (step,) = found.next_steps
-    assert step.startswith("Another experiment, one that mass and stiffness change in different ways: let")
+    assert step.startswith("Another experiment, in which mass and stiffness act in different ways: let")
     free = np.exp(RNG.uniform(-1.0, 1.0, (4000, 2)))
     assert not said(summarised(free, both, None, (box, box, box), None, "EDGE"), "separately")
 
@@ -166,7 +183,7 @@ def test_a_combination_of_three_is_found_where_no_two_are_correlated_much():
     logs[:, 2] = -logs[:, 0] - logs[:, 1] + RNG.normal(0.0, 0.03, 4000)
     assert np.abs(np.corrcoef(logs.T)[np.triu_indices(3, 1)]).max() < 0.8
     found = summarised(np.exp(logs), space, None, (box, box, box), None, "EDGE")
-    assert said(found, "a, b and c are not separately identifiable: only a * b * c is well determined; ")
+    assert said(found, "a, b and c are not separately identifiable: only a * b * c = 1.0")
     assert sum("separately" in sentence for sentence in found.sentences) == 1
     logs[:, 2] = RNG.normal(0.0, 0.03, 4000)
     assert not said(summarised(np.exp(logs), space, None, (box, box, box), None, "EDGE"), "separately")
@@ -180,7 +197,9 @@ def test_parameters_that_are_known_but_trade_off_are_said_to_do_so():
     assert [one.verdict for one in found.parameters] == ["identified"] * 2
     sentence = next(one for one in found.sentences if "trade off" in one)
     assert sentence.startswith("mass and stiffness trade off against each other (correlation 1.00): mass - ")
-    assert " * stiffness varies " in sentence and not said(found, "separately")
+    (middle, low, high), rest = value_in(sentence)
+    assert " * stiffness = _ varies " in rest and not said(found, "separately")
+    np.testing.assert_allclose([middle, low, high], 0.8 + 2 * 0.01 * 1.6449 * np.array([0.0, -1.0, 1.0]), atol=0.011)
     assert not any("different ways" in step for step in found.next_steps)
     apart = np.stack([1.0 + 2 * shared, 0.1 + RNG.normal(0.0, 0.15, 4000)], axis=1)
     assert not said(of(apart, guess=PHI, last=PHI, space=linear), "trade off")

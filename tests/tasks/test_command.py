@@ -23,6 +23,7 @@ from jaxlfi.tasks.worker import REASONS, Request, simulated
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "command"
 THETA = np.array([0.1, -2.5], np.float32)
+AS_OBSERVED = " (the observation has shape [2])"
 
 
 @pytest.mark.parametrize(
@@ -97,8 +98,8 @@ def test_lines_of_different_lengths_and_headings_are_refused():
     ("code", "reason", "message"),
     [
         ("print('[1, 2]')", None, ""),
-        ("print('[1, 2, 3]')", "wrong_shape", "expected numbers of shape [2], got int64 of shape [3]"),
-        ("""print('["a", "b"]')""", "wrong_shape", "expected numbers of shape [2], got <U1 of shape [2]"),
+        ("print('[1, 2, 3]')", "wrong_shape", f"expected numbers of shape [2], got int64 of shape [3]{AS_OBSERVED}"),
+        ("""print('["a", "b"]')""", "wrong_shape", f"expected numbers of shape [2], got <U1 of shape [2]{AS_OBSERVED}"),
         ("print('hello')", "error", "ValueError: standard output: expected lines of as many numbers each"),
         ("import sys; sys.exit('no mesh')", "error", "exit status 1: no mesh"),
         ("import os; os.kill(os.getpid(), 11)", "crash", "ended by SIGSEGV: nothing on standard error"),

@@ -30,6 +30,7 @@ from tests.troubled import WAYS, Troubled, calls
 THETA = gaussian().support("ok").sample(jax.random.key(1), 250)
 KEY = jax.random.key(2)
 MILD = (0.1, 0.1, 0.0, 0.0, 0.1)
+AS_OBSERVED = " (the observation has shape [2])"
 
 
 def troubled(*rates, **changes):
@@ -209,8 +210,8 @@ def test_trials_are_made_together():
         (lambda rng, theta: (theta, -7), 1, ""),
         (lambda rng, theta: 1 / 0, -1, "ZeroDivisionError: division by zero"),
         (lambda rng, theta: sys.exit(3), -1, "SystemExit: 3"),
-        (lambda rng, theta: theta[:1], -2, "expected numbers of shape [2], got float32 of shape [1]"),
-        (lambda rng, theta: "no", -2, "expected numbers of shape [2], got <U2 of shape []"),
+        (lambda rng, theta: theta[:1], -2, f"expected numbers of shape [2], got float32 of shape [1]{AS_OBSERVED}"),
+        (lambda rng, theta: "no", -2, f"expected numbers of shape [2], got <U2 of shape []{AS_OBSERVED}"),
         (lambda rng, theta: (theta, theta), -2, "expected a scalar outcome, got float32 of shape [2]"),
     ],
 )
@@ -242,7 +243,7 @@ def test_finished_simulations_are_found_again_and_a_torn_one_is_made_again(tmp_p
     assert set(again.known.split("; ")) == {
         "",
         "error: ZeroDivisionError: bad luck",
-        "wrong_shape: expected numbers of shape [2], got float64 of shape [7]",
+        "wrong_shape: expected numbers of shape [2], got float64 of shape [7] (the observation has shape [2])",
     }
     again.clear()
     assert not path.exists()

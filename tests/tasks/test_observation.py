@@ -98,6 +98,8 @@ FLAT = "{}\n1,8,-1\n1,5,2\n2,4,7\n"
         ("TIMESTAMP,a,b", True),
         (",a,b", True),
         ("Year,hare,lynx", True),
+        ("day,ill,well", True),
+        ("Minutes (min),a,b", True),
         ("S,I,R", False),
         ("T,p,v", False),
         ("s,a,b", False),
@@ -114,6 +116,20 @@ def test_a_column_is_time_where_its_heading_says_so_and_it_increases(tmp_path, h
     assert read(tmp_path / "rising.csv", say=said.append).shape == (3, 3 - time)
     assert len(said) == time and all("left out" in line and repr(heading.split(",")[0]) in line for line in said)
     assert read(tmp_path / "flat.csv", say=said.append).shape == (3, 3) and len(said) == time
+
+
+def test_dates_are_times(tmp_path):
+    """By their order; a date elsewhere, or none, is no number."""
+    rows = [("1978-01-22", 3), ("1978-01-23", 8), ("1978-02-01", 26)]
+    write = lambda text: (tmp_path / "x.csv").write_text(text)
+    write("date,in bed\n" + "".join(f"{day},{count}\n" for day, count in rows))
+    np.testing.assert_array_equal(read(tmp_path / "x.csv"), [[3], [8], [26]])
+    write("time,in bed\n" + "".join(f"{day}T08:00:00Z,{count}\n" for day, count in rows))
+    np.testing.assert_array_equal(read(tmp_path / "x.csv"), [[3], [8], [26]])
+    for text in ("date,in bed\n1978-13-45,3\n", "bed,date\n3,1978-01-22\n", "date,in bed\nMonday,3\n"):
+        write(text)
+        with pytest.raises(ValueError, match="expected 2 numbers in row 2"):
+            read(tmp_path / "x.csv")
 
 
 def test_times_that_single_precision_cannot_tell_apart_increase(tmp_path):

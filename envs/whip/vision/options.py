@@ -40,12 +40,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--object",
         nargs="+",
         metavar="NAME",
-        help="of the FEM reference objects, dlo-0 to dlo-3, in turn (default: random DLOs of the simulator)",
+        help="FEM reference objects to show, dlo-0 to dlo-3, in turn (default: random DLOs of the simulator)",
     )
     pictures.add_argument(
         "--sharp", action="store_true", help="without blur and noise: for train-vision, which adds them anew each time"
     )
-    add_seed(pictures, "of everything that is random (default: 0)")
+    add_seed(pictures, "seed of everything that is random (default: 0)")
     add_out(pictures, "DIR", "a new folder")
 
     imported = commands.add_parser(
@@ -59,7 +59,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     source.add_argument("--yolo", type=Path, metavar="DIR", help="a folder of .txt files with polygons")
     imported.add_argument("--images", type=Path, required=True, metavar="DIR", help="the folder of the pictures")
     imported.add_argument(
-        "--classes", type=Path, metavar="FILE", help="of YOLO: the classes' names, classes.txt or data.yaml"
+        "--classes", type=Path, metavar="FILE", help="for YOLO: file of the classes' names, classes.txt or data.yaml"
     )
     imported.add_argument(
         "--name",
@@ -94,20 +94,23 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar="DIR",
         help="data sets that the segmenter learns from, one's own among them (default: sharp raycast ones are made)",
     )
-    train.add_argument("--steps", type=int, metavar="N", help="of each training (default: the preset's)")
-    add_seed(train, "of everything that is random (default: 0)")
+    train.add_argument("--steps", type=int, metavar="N", help="training steps of each network (default: the preset's)")
+    add_seed(train, "seed of everything that is random (default: 0)")
     add_out(train, "DIR", "a new folder, or one to go on with")
 
     export = commands.add_parser(
         "export-vision",
-        help="the segmenting network as one file that runs elsewhere",
+        help="write the segmenting network as one file that runs elsewhere",
         description="Write the network that segments pictures as one file, from bytes [256, 256, 3] to labels "
         "[256, 256]: ONNX, for onnxruntime and others (extra onnx), or StableHLO, for JAX on cpu, cuda or tpu (extra "
         "stablehlo).",
     )
-    export.add_argument("--format", choices=FORMATS, default="onnx", help="of the file (default: onnx)")
+    export.add_argument("--format", choices=FORMATS, default="onnx", help="format of the file (default: onnx)")
     export.add_argument(
-        "--weights", type=Path, metavar="DIR", help="by train-vision (default: those that come with the package)"
+        "--weights",
+        type=Path,
+        metavar="DIR",
+        help="folder of the networks, made by train-vision (default: those that come with the package)",
     )
     add_out(export, "FILE", "a new .onnx, or .npz of StableHLO")
 
@@ -122,7 +125,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     record.add_argument(
         "--actions", metavar="FILE", help='an .npz with an array "actions" [16, 2] in m (default: exploratory actions)'
     )
-    add_seed(record, "of the camera and the scene's look")
+    add_seed(record, "seed of the camera and the scene's look")
     add_out(record, "FILE", "the new .npz file for the recording; metadata go into a .json file of the same name")
 
 
@@ -146,11 +149,11 @@ def add_detector(command: argparse.ArgumentParser) -> None:
         "network segments; learnt-transporter: a second network finds the DLO's keypoints (default: centreline)",
     )
     command.add_argument(
-        "--renderer", choices=RENDERERS, default="mujoco", help=f"of pictures: {_RENDERER} (default: mujoco)"
+        "--renderer", choices=RENDERERS, default="mujoco", help=f"renderer of pictures: {_RENDERER} (default: mujoco)"
     )
     command.add_argument(
         "--weights",
         type=Path,
         metavar="DIR",
-        help="of the networks, by train-vision (default: those that come with it)",
+        help="folder of the networks, made by train-vision (default: those that come with the package)",
     )
