@@ -442,7 +442,7 @@ def extend(folder: Path, rounds: int | None = None, simulations: int | None = No
         if rounds <= least:
             there = made + (least - done) * settings.simulations_per_round
             raise ValueError(f"simulations: expected more than the {there} of {folder}, got {simulations}")
-    elif rounds <= least:
+    elif rounds is not None and rounds <= least:
         raise ValueError(f"rounds: expected more than the {max(done, settings.rounds)} of {folder}, got {rounds}")
     if settings.rounds == 1:
         raise ValueError(f"{what}: expected a run of several rounds, got one, whose network is for any observation")
