@@ -55,12 +55,19 @@ class Simulations(struct.PyTreeNode):
 
 
 def trajectory_and_outcome(
-    task: Task, key: jax.Array, theta: Float[Array | np.ndarray, " dim"]
+    task: Task, key: jax.Array, theta: Float[Array | np.ndarray, " dim"], design: Array | None = None
 ) -> tuple[Array, Int[Array, ""]]:
-    """One simulation at theta [D] in inference space: its trajectory and 0, or the code of the reason it failed for."""
+    """One simulation at theta [D] in inference space: its trajectory and 0, or the code of the reason it failed for.
+
+    With a design [K], that of a task which has one and is of a single experiment, in place of its nominal design.
+    """
     natural = task.space.to_natural(theta)
     with own():
-        result = task.simulate(key, jnp.asarray(natural, float))
+        natural = jnp.asarray(natural, float)
+        if design is None:
+            result = task.simulate(key, natural)
+        else:
+            result = task.simulate.function(key, natural, jnp.asarray(design, float))
         trajectory, outcome = result if isinstance(result, tuple) else (result, jnp.asarray(0))
         trajectory, outcome = jnp.asarray(trajectory).astype(jnp.float32), _code(jnp.asarray(outcome))
     return with_outcome(task, trajectory, outcome)
