@@ -126,8 +126,7 @@ def folder(tmp_path_factory):
     """A run whose task can be found by name."""
     with jax.debug_key_reuse(False):
         run = jaxlfi.infer(jax.random.key(0), task(), settings=small.settings())
-    path = run.save(tmp_path_factory.mktemp("runs") / "arm")
-    return path
+    return run.save(tmp_path_factory.mktemp("runs") / "arm")
 
 
 def test_the_command_writes_what_it_prints(folder, tmp_path, capsys):
