@@ -4,9 +4,9 @@
 
 For each of 20 truths, drawn anew, the nominal experiment is made first. Its posterior is exact: the likelihood is
 known, and importance sampling that is adapted in steps from the whole box finds it, so that what is measured is the
-choice of designs and not a network. From this posterior `jaxlfi.design` chooses the next experiment; it is made, as are the
-nominal one again and experiments at random, and the posterior of both recordings is exact, too. What is saved is, of
-each, how wide the 90 % intervals are, whether they hold the truth, and which design it was.
+choice of designs and not a network. From this posterior `jaxlfi.design` chooses the next experiment; it is made, as are
+the nominal one again and experiments at random, and the posterior of both recordings is exact, too. What is saved is,
+of each, how wide the 90 % intervals are, whether they hold the truth, and which design it was.
 
     times, starts   Lotka-Volterra: when to count ten times, and which populations to release
     arm, load       a motor turns an arm in a horizontal plane: mass, gear and damping are an exact ridge, whatever the

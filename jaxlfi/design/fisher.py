@@ -24,13 +24,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlfi.design.regions import Region
-from jaxlfi.design.simulations import flat_noise, in_chunks, jacobian, noise_of, response
+from jaxlfi.design.simulations import flat_noise, in_chunks, jacobian, noise_of, one_of, response
 from jaxlfi.distributions.precision import single
-from jaxlfi.tasks.simulation import summarised, trajectory_and_outcome
+from jaxlfi.tasks.simulation import summarised
 from jaxlfi.tasks.task import Task
 
-DRAWS = 64
-"""Parameter vectors that a design's information is averaged over, in each region."""
+DRAWS, DRAWS_ON_HOST = 64, 16
+"""Parameter vectors that a design's information is averaged over, in each region; fewer outside JAX."""
 REPEATS = 64
 """Simulations at each of them where the noise is not declared."""
 STEP = 0.1
@@ -53,7 +53,7 @@ class FisherRater:
             [A, D]; None for all.
         criterion: "information" in bits, or "variance": minus the mean of the variances of `about` (or all parameters)
             after it as fractions of those before, which is A-optimality.
-        draws: of each region.
+        draws: of each region; by default 64, and 16 outside JAX.
         repeats: simulations at each, where the noise is not declared.
     """
 
@@ -62,7 +62,7 @@ class FisherRater:
     regions: tuple[Region, ...]
     about: Float[np.ndarray, "wanted dim"] | None = None
     criterion: Criterion = "information"
-    draws: int = DRAWS
+    draws: int | None = None
     repeats: int = REPEATS
 
     @property
@@ -88,7 +88,7 @@ class FisherRater:
         ]
 
     def _matrices(self, region: Region, designs: np.ndarray) -> np.ndarray:
-        theta = region.draws[: self.draws]
+        theta = region.draws[: self.draws or (DRAWS_ON_HOST if self.task.on_host else DRAWS)]
         steps = STEP * np.sqrt(np.diagonal(region.covariance))
         if self.task.on_host:
             return np.stack([_on_host(self.task, theta, steps, design) for design in designs])
@@ -158,7 +158,7 @@ def _declared(task: Task, key: jax.Array, theta: Array, steps: Array, designs: A
         scaled = slope / flat_noise(_noise(task), shape)[:, None]
         fine = jnp.all(jnp.isfinite(value)) & jnp.all(jnp.isfinite(scaled))
         if task.design.response is None:
-            fine &= trajectory_and_outcome(task, jax.random.clone(key), theta, design)[1] == 0
+            fine &= one_of(task, key, theta, design)[1] == 0
         scaled = jnp.where(fine, scaled, 0.0)
         return jnp.matmul(scaled.T, scaled, precision="highest")
 
@@ -179,7 +179,7 @@ def _estimated(task: Task, keys: jax.Array, theta: Array, steps: Array, designs:
 
     def one(theta: Array, design: Array) -> Array:
         def summary(key: jax.Array, theta: Array) -> tuple[Array, Array]:
-            return summarised(task, *trajectory_and_outcome(task, jax.random.clone(key), theta, design))
+            return summarised(task, *one_of(task, key, theta, design))
 
         x, failure = jax.vmap(summary, (0, None))(keys, theta)
         slopes = jax.vmap(lambda key: jacobian(lambda theta: summary(key, theta)[0], theta, steps)[1])(keys)

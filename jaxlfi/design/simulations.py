@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.precision import own, single
-from jaxlfi.tasks.experiments import at
+from jaxlfi.tasks.experiments import at, simulator_at
 from jaxlfi.tasks.simulation import simulate_batch, summarised, trajectory_and_outcome
 from jaxlfi.tasks.task import Task
 
@@ -71,12 +71,17 @@ def in_chunks(function: Callable[[Array], Any], designs: np.ndarray) -> Any:
 @single
 def _simulated(task: Task, keys: jax.Array, theta: Array, designs: Array) -> tuple[Array, Array, Array]:
     def one(key, theta, design):
-        trajectory, failure = trajectory_and_outcome(task, jax.random.clone(key), theta, design)  # one for all designs
+        trajectory, failure = one_of(task, key, theta, design)
         x, failure = summarised(task, trajectory, failure)
         return trajectory, x, (failure == 0) & _safe(task, trajectory)
 
     over_theta = jax.vmap(one, (0, 0, None))
     return jax.vmap(over_theta, (None, None, 0))(keys, theta, designs)
+
+
+def one_of(task: Task, key: jax.Array, theta: Array, design: Array) -> tuple[Array, Array]:
+    """One simulation at theta [D] in inference space, and its outcome; its key serves other designs, too."""
+    return trajectory_and_outcome(task, jax.random.clone(key), theta, simulator_at(task, design))
 
 
 def _safe(task: Task, trajectory: Array) -> Array:
@@ -115,7 +120,7 @@ def flat_noise(noise: tuple[float, ...], shape: tuple[int, ...]) -> Array:
 def response(task: Task, key: jax.Array, theta: Array, design: Array) -> Array:
     """A trajectory without its noise, or with noise that is the same for all parameters, shape [T] or [T, C]."""
     if task.design.response is None:
-        return trajectory_and_outcome(task, jax.random.clone(key), theta, design)[0]
+        return one_of(task, key, theta, design)[0]
     natural = task.space.to_natural(theta)
     with own():
         found = task.design.response(jnp.asarray(natural, float), jnp.asarray(design, float))

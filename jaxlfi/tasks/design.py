@@ -55,6 +55,8 @@ class Design:
             task's `channel_noise`. Noise is independent from record to record.
         safe: `safe(trajectory) -> bool`: whether an experiment that ran like this would have been harmless. A design
             is rejected where too many draws of the posterior make it fail this, or the simulation fail.
+        of: the task of an experiment with this design, of the same parameters, where the task's own simulator takes no
+            design: its recordings are then of other experiments, as those under recorded controls.
         controls: `controls(design[K]) -> (headings, rows)`: what is to be played on the real system, written as CSV.
 
     Raises:
@@ -72,6 +74,7 @@ class Design:
     noise: Any = None
     safe: Callable[..., Any] | None = None
     controls: Callable[..., Any] | None = None
+    of: Any = None
 
     def __post_init__(self):
         store = lambda field, value: object.__setattr__(self, field, value)

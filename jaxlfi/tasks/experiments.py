@@ -1,7 +1,7 @@
 """A task at other designs: one experiment, or several of them inferred together."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -88,7 +88,12 @@ def experiments(task: Task, designs: Sequence[Any]) -> Task:
 
 
 def single(task: Task) -> Task:
-    """The task of one experiment that a task of several was made of; any other task as it is."""
+    """The task of one experiment with a design: that which a task of several was made of, else the task itself.
+
+    Where a task's own recordings are of another kind of experiment, it is the one that its design is `of`.
+    """
+    if task.design is not None and task.design.of is not None:
+        return task.design.of
     function = _function(task)
     return function.one if isinstance(function, Experiments) else task
 
@@ -99,9 +104,10 @@ def designs_of(task: Task) -> tuple[tuple[float, ...], ...]:
     return function.points if isinstance(function, Experiments) else (function.point,)
 
 
-def free_function(task: Task) -> Any:
-    """The simulator that takes a design, of a task of one experiment or of several."""
-    return _function(single(task)).function
+def simulator_at(task: Task, design: Any) -> Callable[[Any, Any], Any]:
+    """The simulator of a task of one experiment at another design, which may be traced."""
+    function = _function(task).function
+    return lambda key, theta: function(key, theta, jnp.asarray(design, float))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Simulating a batch of parameters, with every failure counted by its reason."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -55,19 +55,18 @@ class Simulations(struct.PyTreeNode):
 
 
 def trajectory_and_outcome(
-    task: Task, key: jax.Array, theta: Float[Array | np.ndarray, " dim"], design: Array | None = None
+    task: Task,
+    key: jax.Array,
+    theta: Float[Array | np.ndarray, " dim"],
+    simulate: Callable[[jax.Array, Array], Any] | None = None,
 ) -> tuple[Array, Int[Array, ""]]:
     """One simulation at theta [D] in inference space: its trajectory and 0, or the code of the reason it failed for.
 
-    With a design [K], that of a task which has one and is of a single experiment, in place of its nominal design.
+    By another simulator than the task's own where one is given, as of another design.
     """
     natural = task.space.to_natural(theta)
     with own():
-        natural = jnp.asarray(natural, float)
-        if design is None:
-            result = task.simulate(key, natural)
-        else:
-            result = task.simulate.function(key, natural, jnp.asarray(design, float))
+        result = (simulate or task.simulate)(key, jnp.asarray(natural, float))
         trajectory, outcome = result if isinstance(result, tuple) else (result, jnp.asarray(0))
         trajectory, outcome = jnp.asarray(trajectory).astype(jnp.float32), _code(jnp.asarray(outcome))
     return with_outcome(task, trajectory, outcome)

@@ -137,7 +137,8 @@ class Task:
             raise ValueError(f"simulate: expected a function, got {type(self.simulate).__name__}")
         if self.design is not None:
             store("design", designs.declared(self.design))
-            store("simulate", designs.at_nominal(self.simulate, self.design))
+            if self.design.of is None:
+                store("simulate", designs.at_nominal(self.simulate, self.design))
         if clash := set(self.failures) & set(self.simulate.reasons if self.on_host else ()):
             raise ValueError(f"failures: expected other names than those of every simulator, got {sorted(clash)}")
         if len(self.units) != len(names):

@@ -107,8 +107,8 @@ def test_exponential_decay_is_best_measured_at_one_over_its_rate(method, value):
     if method == "fisher":
         rater = FisherRater(jax.random.key(0), decay(), (region,))
     else:
-        rater = ContrastiveRater(jax.random.key(0), decay(), (region,), simulations=1024)
-    found = choose(rater, np.random.default_rng(0), rated=200)
+        rater = ContrastiveRater(jax.random.key(0), decay(), (region,), simulations=512)
+    found = choose(rater, np.random.default_rng(0), rated=96)
     assert found.batch.designs[0, 0] == pytest.approx(1 / value, rel=0.05)
 
 
@@ -125,7 +125,7 @@ def test_michaelis_menten_is_best_measured_at_two_known_points():
         design=Design({"s1": (0.0, most), "s2": (0.0, most)}, response=response, noise=0.001),
     )
     rater = FisherRater(jax.random.key(0), task, (gaussian([top, half], np.diag([0.03**2, 0.008**2])),))
-    found = choose(rater, np.random.default_rng(0), rated=400)
+    found = choose(rater, np.random.default_rng(0), rated=240)
     low, high = np.sort(found.batch.designs[0])
     assert high == pytest.approx(most, rel=0.05)
     assert low == pytest.approx(half * most / (2 * half + most), rel=0.05)
@@ -138,8 +138,8 @@ def test_a_batch_is_as_good_as_the_best_of_all_batches(method):
     if method == "fisher":
         rater = FisherRater(jax.random.key(0), linear(), (region,))
     else:
-        rater = ContrastiveRater(jax.random.key(0), linear(), (region,), simulations=1024)
-    found = choose(rater, np.random.default_rng(0), count=3, rated=120)
+        rater = ContrastiveRater(jax.random.key(0), linear(), (region,), simulations=512)
+    found = choose(rater, np.random.default_rng(0), count=3, rated=64)
     grid = np.linspace(0.0, np.pi, 36, endpoint=False)
     best = max(information(COVARIANCE, angles) for angles in itertools.combinations_with_replacement(grid, 3))
     assert information(COVARIANCE, found.batch.designs[:, 0]) > 0.99 * best
