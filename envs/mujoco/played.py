@@ -221,7 +221,7 @@ def with_design(task: Task, recorded: Simulator, table: Mapping[str, Any], initi
             f"design: expected an interval of at least the model's step, {recorded.model.opt.timestep:g} s, and a "
             f"duration of several, got {interval:g} s and {duration:g} s"
         )
-    times = np.arange(int(round(duration / interval)) + 1) * interval
+    times = np.arange(round(duration / interval) + 1) * interval
     given = table.get("controls", {name: {} for name in recorded.actuators})
     played = tuple(_played(recorded, name, one) for name, one in given.items())
     starts = {name: _bounds(bounds, f"initial: {name}") for name, bounds in table.get("initial", {}).items()}
