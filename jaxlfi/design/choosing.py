@@ -35,9 +35,17 @@ FINER = 0.05
 class Rater(Protocol):
     """Rates designs: `jaxlfi.design.fisher.FisherRater`, `jaxlfi.design.contrastive.ContrastiveRater`."""
 
-    regions: tuple[Region, ...]
-    task: Task
-    key: jax.Array
+    @property
+    def regions(self) -> tuple[Region, ...]:
+        """What is averaged over, the posterior's region first."""
+
+    @property
+    def task(self) -> Task:
+        """Of one experiment, with a design."""
+
+    @property
+    def key(self) -> jax.Array:
+        """Of the simulations."""
 
     @property
     def ceiling(self) -> float:
