@@ -47,13 +47,13 @@ from jaxlfi.tasks.task import Task
 SEED = 20_430
 """Of all truths, recordings and searches."""
 TRUTHS = 20
-RANDOM = 3
+RANDOM = 2
 """Experiments at random that the chosen one is compared with, for each truth."""
-RATED = 160
+RATED = 96
 """Designs that are rated for each choice."""
 SPREAD = 1.5
 """Truths are the task's by up to this factor either way."""
-POINTS = 2048
+POINTS = 1024
 """Of a posterior by importance sampling, in each step."""
 STEPS = 100
 """Of one, at most."""
@@ -264,7 +264,10 @@ def table(folder: Path) -> str:
         "| problem | second experiment | 90 % intervals, as a fraction of the first's | against random | truths held |",
         "|---|---|---|---|---|",
     ]
+    there = [name for name in (*PROBLEMS, "queue") if (folder / f"{name}.npz").exists()]
     for name in PROBLEMS:
+        if name not in there:
+            continue
         kept = np.load(folder / f"{name}.npz")
         width = np.exp(np.mean(np.log(kept["width"]), axis=2))  # [truths, experiments], geometric mean of parameters
         ratio = width[:, 1:] / width[:, :1]
@@ -280,12 +283,14 @@ def table(folder: Path) -> str:
                 f"{held[what].mean():.0%} of {held[what].size} |"
             )
     lines += ["", "| problem | best of all rated, on the ridge | predicted by the chosen one |", "|---|---|---|"]
-    for name in ("arm", "load"):
+    for name in [name for name in ("arm", "load") if name in there]:
         kept = np.load(folder / f"{name}.npz")
         lines.append(
             f"| {name} | {np.median(kept['reach']):.2f} times narrower (at most {kept['reach'].max():.2f}) | "
             f"{np.median(kept['narrower']):.2f} times |"
         )
+    if "queue" not in there:
+        return "\n".join(lines) + "\n"
     kept = np.load(folder / "queue.npz")
     lines += ["", "| jobs before the queue is emptied | bits, at least | variance left: service min | width | rate |"]
     lines.append("|---|---|---|---|---|")
@@ -312,8 +317,7 @@ def main() -> None:
         files.write_arrays(arguments.out / f"{name}.npz", found)
     config = {"truths": arguments.truths, "seed": arguments.seed, "rated": RATED, "random": RANDOM} | environment()
     files.write_json(arguments.out / "config.json", config)
-    if all((arguments.out / f"{name}.npz").exists() for name in [*PROBLEMS, "queue"]):
-        files.write_bytes(arguments.out / "table.md", table(arguments.out).encode())
+    files.write_bytes(arguments.out / "table.md", table(arguments.out).encode())
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ NOISE = 0.1
 """Standard deviation of the logarithm of a count: one in ten individuals is missed, or counted twice."""
 DURATION = 100.0
 """Time that an experiment lasts: one and a half cycles at the truth."""
-INTERVAL = 0.5
-"""Between two integration steps; counts in between are interpolated, to less than a twentieth of the noise."""
+INTERVAL = 1.0
+"""Between two integration steps; counts in between are interpolated, to less than a tenth of the noise."""
 COUNTS = 10
 """How many counts an experiment has."""
 INITIAL = (9.0, 40.0)

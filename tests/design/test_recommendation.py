@@ -71,7 +71,8 @@ def on_the_ridge(task: jaxlfi.Task):
 def test_a_ridge_that_an_experiment_breaks_is_broken():
     found = recommend(jax.random.key(0), task(), *on_the_ridge(task()), rated=96)
     assert found.method == "fisher" and found.ridge.known == "mass / gain"
-    np.testing.assert_allclose(found.designs, [[1.0, 1.0]], atol=0.1)  # all torque and all load
+    torque, load = found.designs[0]
+    assert torque > 0.95 and load > 0.5  # the load that tells most is the arm's mass, about 1 kg
     assert found.narrower > 5 and "Ridge: broken" in found.sentences()[-1]
     now, after = found.widths
     assert (after < 0.3 * now).all() and found.nominal.narrower[0] < 1.1

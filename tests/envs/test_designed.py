@@ -17,7 +17,7 @@ def test_counts_are_those_of_the_equations():
     times = np.array([3.3, 31.9, 77.7])
     exact = solve_ivp(slope, (0, 100), [20.0, 30.0], t_eval=times, rtol=1e-9, atol=1e-9).y.T
     found = designed.log_counts(jnp.asarray(r), jnp.array([20.0, 30.0]), jnp.asarray(times))
-    np.testing.assert_allclose(found, np.log(exact), atol=0.05 * designed.NOISE)
+    np.testing.assert_allclose(found, np.log(exact), atol=0.1 * designed.NOISE)
 
 
 def test_the_order_of_times_makes_no_difference():

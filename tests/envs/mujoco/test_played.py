@@ -79,7 +79,7 @@ def test_designs_of_a_model_are_rated_by_differences():
     about = np.array([[0.0, 1.0]])
     rater = FisherRater(jax.random.key(0), one, (region(1.0, draws),), about, draws=4)
     found = rate(rater, np.array([[0.0, 1.0], [0.05, 1.0]]), tolerance=0.99)
-    assert found.value[0] == pytest.approx(0.0, abs=1e-6) and found.value[1] > 0.3
+    assert found.value[0] == pytest.approx(0.0, abs=0.01) and found.value[1] > 0.3
     assert failures(rater, np.array([[0.05, 1.0], [1.0, 0.3]])).tolist() == [0.0, 1.0]
 
 
