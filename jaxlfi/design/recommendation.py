@@ -13,7 +13,7 @@ from jaxlfi.design import choosing, ridge
 from jaxlfi.design.choosing import Chosen, Rated, Rater
 from jaxlfi.design.contrastive import FOLDS, SIMULATIONS, ContrastiveRater
 from jaxlfi.design.fisher import FisherRater, covariance_after
-from jaxlfi.design.regions import INFLATION, POOL, SHARE, region, regions
+from jaxlfi.design.regions import INFLATION, POOL, SHARE, is_number, region, regions
 from jaxlfi.design.simulations import noise_of
 from jaxlfi.distributions.arguments import require_count
 from jaxlfi.distributions.support import Support
@@ -278,8 +278,8 @@ def recommend(
     """
     require_design(task)
     task = single(task)
-    wanted = (about,) if isinstance(about, str) else tuple(about)
-    if unknown := [name for name in wanted if name not in (*task.names, RIDGE)]:
+    wanted = (about,) if isinstance(about, str) or not isinstance(about, Sequence) else tuple(about)
+    if unknown := [name for name in wanted if not isinstance(name, str) or name not in (*task.names, RIDGE)]:
         raise ValueError(
             f"about: expected some of {', '.join(task.names)}, or {RIDGE}, got {', '.join(map(str, unknown))}"
         )
@@ -293,7 +293,7 @@ def recommend(
             f"rated: expected at least {2 * choosing.CHUNK} designs and {16 * FOLDS} simulations, got {rated} and "
             f"{simulations}"
         )
-    if not 0 <= tolerance < 1:
+    if not (is_number(tolerance) and 0 <= tolerance < 1):
         raise ValueError(f"tolerance: expected a share from 0 and below 1, got {tolerance!r}")
     method = chosen_method(task, method)
     key_draws, key_regions, key_rater, key_search = jax.random.split(key, 4)
@@ -325,7 +325,7 @@ def chosen_method(task: Task, method: str) -> str:
     Raises:
         ValueError: for an unknown one, or one that needs what the task does not declare.
     """
-    if method not in METHODS:
+    if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
     smooth = noise_of(task) is not None and (task.design.response is not None or not task.on_host)
     if method == "fisher" and task.on_host and not smooth:

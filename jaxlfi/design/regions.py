@@ -5,6 +5,7 @@ and the posterior itself is not trusted to be as narrow as it says.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
@@ -43,6 +44,11 @@ class Region:
         return scale[:, None] * np.linalg.cholesky(correlation + 1e-7 * np.eye(len(scale)))
 
 
+def is_number(value: Any) -> bool:
+    """Whether a setting is a number, of Python's or NumPy's."""
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
 def region(weight: float, draws: np.ndarray) -> Region:
     """The region of some draws [N, D]."""
     draws = np.asarray(draws, np.float64)
@@ -70,9 +76,9 @@ def regions(
     Raises:
         ValueError: for numbers outside of these.
     """
-    if not 1 <= inflation < np.inf:
+    if not (is_number(inflation) and 1 <= inflation < np.inf):
         raise ValueError(f"inflation: expected a number of at least 1, got {inflation!r}")
-    if not 0 <= share < 1:
+    if not (is_number(share) and 0 <= share < 1):
         raise ValueError(f"share: expected a number from 0 and below 1, got {share!r}")
     key_wide, key_box = jax.random.split(key)
     mixture = posterior.mixture.inflated(float(inflation))

@@ -10,6 +10,8 @@ import numpy as np
 
 from jaxlfi.tasks.host import HostSimulator
 
+LARGEST = 1e30
+"""Bounds of a design are nearer to zero: they are numbers of single precision."""
 VARIABLES = 'a mapping from names to (low, high) or (low, high, "unit")'
 
 
@@ -81,7 +83,7 @@ class Design:
         given = self.variables
         if isinstance(given, Mapping):
             given = tuple(_variable(name, bounds) for name, bounds in given.items())
-        if not given or not isinstance(given, tuple) or not all(isinstance(one, Variable) for one in given):
+        if not isinstance(given, tuple) or not given or not all(isinstance(one, Variable) for one in given):
             raise ValueError(f"design: expected {VARIABLES}, got {self.variables!r}")
         store("variables", given)
         store("nominal", self._nominal(self.nominal))
@@ -133,7 +135,7 @@ class Design:
             chosen = list((start | dict(chosen)).values())
         try:
             values = tuple(float(one) for one in np.asarray(chosen, float))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"design: expected numbers for {list(self.names)}, got {chosen!r}") from error
         if len(values) != len(self.variables):
             raise ValueError(f"design: expected numbers for {list(self.names)}, got {len(values)} of them")
@@ -161,7 +163,7 @@ def _variable(name: Any, bounds: Any) -> Variable:
     if not isinstance(name, str) or not name or not isinstance(bounds, Sequence) or not 2 <= len(bounds) <= 3:
         raise wrong
     low, high, *unit = bounds
-    number = lambda one: isinstance(one, int | float | np.number) and not isinstance(one, bool) and np.isfinite(one)
+    number = lambda one: isinstance(one, int | float | np.number) and not isinstance(one, bool) and abs(one) < LARGEST
     if not (number(low) and number(high) and low < high and all(isinstance(one, str) for one in unit)):
         raise wrong
     return Variable(name, float(low), float(high), *unit)
