@@ -8,11 +8,8 @@ choice of designs and not a network. From this posterior `jaxlfi.design` chooses
 the nominal one again and experiments at random, and the posterior of both recordings is exact, too. What is saved is,
 of each, how wide the 90 % intervals are, whether they hold the truth, and which design it was.
 
-    times, starts   Lotka-Volterra: when to count ten times, and which populations to release
-    arm, load       a motor turns an arm in a horizontal plane: mass, gear and damping are an exact ridge, whatever the
-                    motor does; with a load of known mass they are not
-    queue           M/G/1: how many jobs before the queue is emptied and begun anew, at the same cost; no likelihood is
-                    known, and the bound is compared with the variance that the best linear predictor leaves
+    arm     a motor turns an arm in a horizontal plane: mass, gear and damping are an exact ridge, whatever it does
+    load    the same, and a load of known mass may be fastened to the arm's end
 """
 
 import argparse
@@ -29,15 +26,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi.design.choosing import rate
-from jaxlfi.design.contrastive import ContrastiveRater
 from jaxlfi.design.recommendation import Recommendation, recommend
-from jaxlfi.design.regions import region
-from jaxlfi.design.simulations import simulated
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs import mg1_repetitions
-from jaxlfi.envs.lotka_volterra import designed
 from jaxlfi.estimators.posterior import truncated
 from jaxlfi.io import files
 from jaxlfi.io.provenance import environment
@@ -57,8 +48,6 @@ POINTS = 1024
 """Of a posterior by importance sampling, in each step."""
 STEPS = 100
 """Of one, at most."""
-JOBS = (1, 2, 4, 8, 15, 30, 60)
-"""Before the queue is begun anew."""
 
 
 def arm(load: bool) -> Task:
@@ -108,8 +97,6 @@ def arm(load: bool) -> Task:
 
 
 PROBLEMS: dict[str, Callable[[], Task]] = {
-    "times": designed.times,
-    "starts": designed.starts,
     "arm": functools.partial(arm, False),
     "load": functools.partial(arm, True),
 }
@@ -228,46 +215,13 @@ def measured(task: Task, truths: int, seed: int) -> dict[str, np.ndarray]:
     return {name: np.array(values) for name, values in found.items()}
 
 
-def queue(truths: int, seed: int) -> dict[str, np.ndarray]:
-    """Bits of each number of jobs [truths, designs], and the variances that linear predictors leave."""
-    task = mg1_repetitions.task()
-    rng = np.random.default_rng(seed)
-    designs = np.array(JOBS, float)[:, None]
-    box = task.support(None)
-    found: dict[str, list] = {"truth": [], "bits": [], "error": [], "left": []}
-    for number in range(truths):
-        key_rate, key_check = jax.random.split(jax.random.key(seed + number))
-        truth = task.truth * SPREAD ** rng.uniform(-1, 1, task.dim)
-        draws = np.clip(truth * np.exp(0.3 * rng.standard_normal((4096, task.dim))), box.low, box.high)
-        rated = rate(ContrastiveRater(key_rate, task, (region(1.0, draws),)), designs)
-        runs = simulated(key_check, task, draws[::-1].astype(np.float32), designs)
-        found["truth"].append(truth)
-        found["bits"].append(rated.value)
-        found["error"].append(rated.error)
-        found["left"].append([_left(draws[::-1], x) for x in runs.x])
-        print(f"{task.name}: truth {number + 1} of {truths}", flush=True)
-    return {name: np.array(values) for name, values in found.items()} | {"jobs": designs[:, 0]}
-
-
-def _left(theta: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Variance that the best linear predictor leaves of each parameter, as a fraction; fitted and judged by halves."""
-    x = np.arcsinh((x - x.mean(axis=0)) / (x.std(axis=0) + 1e-9))
-    features = np.concatenate([np.ones((len(x), 1)), x, x**2], axis=1)
-    half = len(x) // 2
-    coefficients = np.linalg.lstsq(features[:half], theta[:half], rcond=None)[0]
-    return np.var(theta[half:] - features[half:] @ coefficients, axis=0) / np.var(theta[half:], axis=0)
-
-
 def table(folder: Path) -> str:
     """The study's tables, from the arrays."""
     lines = [
         "| problem | second experiment | 90 % intervals, as a fraction of the first's | against random | truths held |",
         "|---|---|---|---|---|",
     ]
-    there = [name for name in (*PROBLEMS, "queue") if (folder / f"{name}.npz").exists()]
     for name in PROBLEMS:
-        if name not in there:
-            continue
         kept = np.load(folder / f"{name}.npz")
         width = np.exp(np.mean(np.log(kept["width"]), axis=2))  # [truths, experiments], geometric mean of parameters
         ratio = width[:, 1:] / width[:, :1]
@@ -283,20 +237,12 @@ def table(folder: Path) -> str:
                 f"{held[what].mean():.0%} of {held[what].size} |"
             )
     lines += ["", "| problem | best of all rated, on the ridge | predicted by the chosen one |", "|---|---|---|"]
-    for name in [name for name in ("arm", "load") if name in there]:
+    for name in PROBLEMS:
         kept = np.load(folder / f"{name}.npz")
         lines.append(
             f"| {name} | {np.median(kept['reach']):.2f} times narrower (at most {kept['reach'].max():.2f}) | "
             f"{np.median(kept['narrower']):.2f} times |"
         )
-    if "queue" not in there:
-        return "\n".join(lines) + "\n"
-    kept = np.load(folder / "queue.npz")
-    lines += ["", "| jobs before the queue is emptied | bits, at least | variance left: service min | width | rate |"]
-    lines.append("|---|---|---|---|---|")
-    for place, jobs in enumerate(kept["jobs"]):
-        left = " | ".join(f"{value:.2f}" for value in kept["left"][:, place].mean(axis=0))
-        lines.append(f"| {jobs:.0f} | {kept['bits'][:, place].mean():.2f} | {left} |")
     return "\n".join(lines) + "\n"
 
 
@@ -306,14 +252,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--truths", type=int, default=TRUTHS, metavar="N")
     parser.add_argument("--seed", type=int, default=SEED, metavar="N")
-    parser.add_argument("--problems", nargs="+", default=[*PROBLEMS, "queue"], metavar="NAME")
+    parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=PROBLEMS)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.problems:
-        if name == "queue":
-            found = queue(arguments.truths, arguments.seed)
-        else:
-            found = measured(PROBLEMS[name](), arguments.truths, arguments.seed)
+        found = measured(PROBLEMS[name](), arguments.truths, arguments.seed)
         files.write_arrays(arguments.out / f"{name}.npz", found)
     config = {"truths": arguments.truths, "seed": arguments.seed, "rated": RATED, "random": RANDOM} | environment()
     files.write_json(arguments.out / "config.json", config)
