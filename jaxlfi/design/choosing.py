@@ -165,7 +165,9 @@ def choose(
     """
     task = rater.task
     starts = spread(task, int(np.ceil(STARTS * rated)), rng)
-    tried, batch, evidence = None, [], []
+    tried: Rated | None = None
+    batch: list[Rated] = []
+    evidence: list[tuple[np.ndarray, ...]] = []
     for slot in range(count):
         total = _total(evidence)
         judge = _judge(rater, slot, total, tolerance, advanced)
@@ -202,7 +204,8 @@ def spread(task: Task, count: int, rng: np.random.Generator) -> Float[np.ndarray
 
 def distinct(task: Task, rated: Rated, count: int) -> Iterator[int]:
     """Places of the best designs, each at some distance from those before."""
-    units, kept = task.design.to_unit(rated.designs), []
+    units = task.design.to_unit(rated.designs)
+    kept: list[int] = []
     far = APART * np.sqrt(units.shape[1])
     for place in np.argsort(-rated.value, kind="stable"):
         if all(np.linalg.norm(units[place] - units[other]) > far for other in kept):
@@ -239,7 +242,7 @@ def _search(judge: Callable, task: Task, starts: np.ndarray, rng: np.random.Gene
 
 
 def _climb(judge: Callable, task: Task, start: np.ndarray, step: float, rated: int, rng: np.random.Generator) -> Rated:
-    tried = []
+    tried: list[Rated] = []
 
     def objective(units: np.ndarray) -> np.ndarray:
         tried.append(judge(task.design.of_unit(units)))
@@ -259,7 +262,9 @@ def _best(rated: Rated) -> Rated:
 
 def _in_order(rater: Rater, batch: list[Rated], evidence: list, tolerance: float) -> Rated:
     """A batch in the order in which each adds most to those before, with what it adds."""
-    left, done, ordered = list(range(len(batch))), [], []
+    left = list(range(len(batch)))
+    done: list[int] = []
+    ordered: list[Rated] = []
     while left:
         given = _total([evidence[place] for place in done])
         values = [_averages(rater, _given(evidence[place], given)) for place in left]

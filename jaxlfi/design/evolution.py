@@ -72,7 +72,8 @@ def maximise(
 
     mean, sigma, covariance = np.array(start, float), step, np.eye(dim)
     path, path_sigma = np.zeros(dim), np.zeros(dim)
-    points, values = [], []
+    points: list[np.ndarray] = []
+    values: list[np.ndarray] = []
     for generation in range(1, generations + 1):
         variance, axes = np.linalg.eigh(covariance)
         scale = np.sqrt(np.maximum(variance, 1e-20))

@@ -28,7 +28,8 @@ def figure_of(arrays: Mapping[str, np.ndarray]) -> Figure:
     count, low = min(len(arrays["labels"]), SHOWN), 0.7 + 0.22 * len(arrays["names"])
     figure = Figure(figsize=(TEXT_WIDTH, HEIGHT + low), layout="constrained")
     panels = figure.add_gridspec(2, count, height_ratios=[HEIGHT, low])
-    first, spread = None, int(arrays["spread"])
+    first: Axes | None = None
+    spread = int(arrays["spread"])
     for k in range(count):
         axes = figure.add_subplot(panels[0, k], sharey=first)
         first = first or axes
