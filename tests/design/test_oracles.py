@@ -164,7 +164,7 @@ def test_a_batch_repeats_an_experiment_only_where_that_is_best():
 def test_experiments_that_would_harm_are_not_chosen():
     """The angle that tells most is beyond what is safe."""
     covariance = np.diag([1.0, 0.01])
-    task = linear(safe=lambda y: jnp.abs(y[0]) < 2.0)
+    task = linear(safe=lambda y: jnp.abs(y[0]) < 1.5)
     region = gaussian([0.0, 0.0], covariance)
     rater = FisherRater(jax.random.key(0), task, (region,))
     free = choose(FisherRater(jax.random.key(0), linear(), (region,)), np.random.default_rng(0), rated=100)
@@ -173,7 +173,7 @@ def test_experiments_that_would_harm_are_not_chosen():
     assert kept.batch.failing[0] <= 0.05 < failures(rater, free.batch.designs)[0]
     assert abs(np.cos(kept.batch.designs[0, 0])) < 0.99
     share = failures(rater, np.array([[0.0]]))[0]
-    assert 0.03 < share < 0.25  # P(|N(0, 1.25)| > 2) = 0.074
+    assert 0.06 < share < 0.35  # P(|N(0, 1.25)| > 1.5) = 0.18
 
 
 def test_where_all_experiments_harm_that_is_said():
