@@ -24,6 +24,9 @@ angle = { deviation = 0.01, time = 0.2 }
 [supports.wide]                     # another first guess, for --support wide
 "joint/hinge/damping" = [0.0001, 0.1]
 
+[design]                            # experiments to choose among (`jaxlfi.envs.mujoco.played`), for `jaxlfi design`
+duration = 3.0
+
 [policy]                            # what policies are to do (`jaxlfi.envs.mujoco.goal`); inference does not read it
 interval = 0.02
 """
@@ -50,6 +53,7 @@ KEYS: Mapping[str, type] = {
     "discrepancy": dict,
     "supports": dict,
     "policy": dict,
+    "design": dict,
     "name": str,
 }
 PARAMETER = ("support", "feasible", "unit", "log", "truth")
@@ -90,6 +94,7 @@ def read(
             summary=summary or config.get("summary", "samples"),
             unmodelled_force=config.get("unmodelled_force", 0.0),
             engine=engine,
+            design=config.get("design"),
             name=config.get("name", path.stem),
         )
     except ValueError as error:

@@ -11,13 +11,13 @@ import mujoco
 import numpy as np
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import columns, logs, noise, plausible, recordings, summaries
+from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, summaries
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import built, effects, initial_state
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.parameters import Parameter
-from jaxlfi.envs.mujoco.simulator import FAILURES, Simulator
+from jaxlfi.envs.mujoco.simulator import FAILURES, Simulator, simulator_of
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.task import Task
 
@@ -38,6 +38,7 @@ def mujoco_task(
     threads: int | None = None,
     unmodelled_force: float = 0.0,
     engine: Literal["native", "mjx"] = "native",
+    design: Mapping[str, Any] | None = None,
     **others: Any,
 ) -> Task:
     """Infer numbers of a MuJoCo model from recordings of controls and sensors.
@@ -65,6 +66,8 @@ def mujoco_task(
             deviation (`forces`); `least_squares` finds it.
         engine: "native" is MuJoCo on the processor's cores, in double precision; "mjx" is MuJoCo in JAX, in single
             precision and inside of compiled programs, where it can simulate the model (`mjx_simulator`).
+        design: experiments that could be made next, as a table of the TOML file says (`played`); they are simulated by
+            MuJoCo itself.
         **others: of `jaxlfi.Task`.
 
     Raises:
@@ -109,6 +112,8 @@ def mujoco_task(
     _check_starts(simulator, parameters, deviations)
     others = {"name": spec.modelname or "mujoco"} | others
     task = task_of(simulator, parameters, measured, summary, supports, unmodelled_force, **others)
+    if design is not None:
+        task = played.with_design(task, simulator_of(task), design, initial or {})
     if engine == "native":
         return task
     from jaxlfi.envs.mujoco.mjx_simulator import by_mjx  # MJX is not needed otherwise

@@ -1,6 +1,7 @@
 """Run: what an inference run found, as `infer` returns it and `load` reads it back."""
 
 import html
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlfi.bayessim.keys import key_of
+from jaxlfi.design import choosing
+from jaxlfi.design.recommendation import Method, Recommendation, recommend
+from jaxlfi.design.regions import INFLATION, SHARE
 from jaxlfi.diagnostics.bounds import BoundEvidence, bound_evidence, bound_warnings
 from jaxlfi.diagnostics.resolution import resolution_warnings
 from jaxlfi.distributions.arguments import is_concrete
@@ -115,6 +120,70 @@ class Run(Result):
         """
         require_one(self, "summary")
         return account.summary(self, self.draws() if draws is None else draws)
+
+    def design(
+        self,
+        experiments: int = 1,
+        about: str | Sequence[str] = (),
+        method: Method = "auto",
+        *,
+        inflation: float = INFLATION,
+        share: float = SHARE,
+        tolerance: float = choosing.TOLERANCE,
+        rated: int | None = None,
+        simulations: int | None = None,
+        seed: int = 0,
+        advanced: Callable[[int], None] = lambda designs: None,
+    ) -> Recommendation:
+        """Which experiment to make next: the designs of the task that are expected to tell most.
+
+        Designs are rated over the posterior made wider and, for a part, over the box that the heuristic has moved to,
+        so that a posterior which is too narrow, or in the wrong place, is not trusted.
+
+        Args:
+            experiments: how many are chosen at once; each then counts on the others.
+            about: parameters that information is wanted of, or "ridge", the direction that the posterior determines
+                worst; all parameters by default.
+            method: "fisher" averages Fisher information (`jaxlfi.design.fisher`), "contrastive" bounds the expected
+                information gain by simulations (`jaxlfi.design.contrastive`); "auto" takes the first where the task
+                declares its noise.
+            inflation: how many times as wide as the posterior designs are rated over.
+            share: weight of the box.
+            tolerance: share of draws of the wider posterior for which a chosen experiment may fail or be unsafe.
+            rated: designs that are rated for each experiment; by default 300, or 75 by a simulator outside JAX.
+            simulations: of each design by the contrastive method; by default 1024, or 256 outside JAX.
+            seed: of all random numbers.
+            advanced: told how many designs have been rated since the last time, for a progress bar.
+
+        Raises:
+            ValueError: for a run whose task is not known or has no design, unknown parameters, numbers out of range,
+                and where every design fails too often.
+
+        Example:
+            >>> print(run.design(about="stiffness"))  # doctest: +SKIP
+            experiment  amplitude [N m]  frequency [Hz]  bits         stiffness +-  damping +-  ridge  fails
+            1           1                2.31            3.10 (0.04)  0.012         0.11        4.1x   0%
+        """
+        require_one(self, "design")
+        if self.task is None:
+            raise ValueError("design: expected a run whose task is known: jaxlfi.load(folder, task=...) takes one")
+        return recommend(
+            key_of(seed),
+            self.task,
+            self.posterior,
+            self.belief.support,
+            self.feasible,
+            self.support,
+            experiments,
+            about,
+            method,
+            inflation,
+            share,
+            tolerance,
+            rated,
+            simulations,
+            advanced,
+        )
 
     def save(self, path: str | Path, exist_ok: bool = False) -> Path:
         """Write a run folder, which `jaxlfi.load` reads and the command line's `sample`, `diagnose` and `report` take.

@@ -1,7 +1,7 @@
 """Simulating a batch of parameters, with every failure counted by its reason."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -55,12 +55,18 @@ class Simulations(struct.PyTreeNode):
 
 
 def trajectory_and_outcome(
-    task: Task, key: jax.Array, theta: Float[Array | np.ndarray, " dim"]
+    task: Task,
+    key: jax.Array,
+    theta: Float[Array | np.ndarray, " dim"],
+    simulate: Callable[[jax.Array, Array], Any] | None = None,
 ) -> tuple[Array, Int[Array, ""]]:
-    """One simulation at theta [D] in inference space: its trajectory and 0, or the code of the reason it failed for."""
+    """One simulation at theta [D] in inference space: its trajectory and 0, or the code of the reason it failed for.
+
+    By another simulator than the task's own where one is given, as of another design.
+    """
     natural = task.space.to_natural(theta)
     with own():
-        result = task.simulate(key, jnp.asarray(natural, float))
+        result = (simulate or task.simulate)(key, jnp.asarray(natural, float))
         trajectory, outcome = result if isinstance(result, tuple) else (result, jnp.asarray(0))
         trajectory, outcome = jnp.asarray(trajectory).astype(jnp.float32), _code(jnp.asarray(outcome))
     return with_outcome(task, trajectory, outcome)

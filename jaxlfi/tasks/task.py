@@ -13,6 +13,7 @@ import numpy as np
 from jaxlfi.distributions.arguments import require_texts
 from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support, check_within
+from jaxlfi.tasks import design as designs
 from jaxlfi.tasks import own_arrays, prior_checks, priors, summaries
 from jaxlfi.tasks.command import Command
 from jaxlfi.tasks.equality import same
@@ -81,6 +82,9 @@ class Task:
             line, and `jaxlfi.settings_for`, take for this task in place of the preset's.
         hyperparameters: of heuristics, by the heuristic's name, that it takes in place of their defaults.
         name: what the task is called in files and figures.
+        design: what can be chosen of an experiment (`jaxlfi.tasks.design.Design`, or a mapping of its variables such
+            as `{"amplitude": (0.1, 1.0, "N m")}`), for `Run.design` to say which experiment tells most. The simulator
+            is then `simulate(key, theta, design[K])`, and the task that of its nominal design.
 
     Raises:
         ValueError: for numbers of names, units and bounds that do not agree, reversed bounds, unknown names in `log`,
@@ -115,6 +119,7 @@ class Task:
     hyperparameters: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     name: str = "task"
     channel_noise: Any = None
+    design: Any = None
 
     def __post_init__(self):
         store = lambda field, value: object.__setattr__(self, field, value)
@@ -128,6 +133,10 @@ class Task:
                 raise ValueError(f"{field}: expected {wanted}, got {getattr(self, field)!r}")
         if not callable(self.simulate):
             raise ValueError(f"simulate: expected a function, got {type(self.simulate).__name__}")
+        if self.design is not None:
+            store("design", designs.declared(self.design))
+            if self.design.of is None:
+                store("simulate", designs.at_nominal(self.simulate, self.design))
         if clash := set(self.failures) & set(self.simulate.reasons if self.on_host else ()):
             raise ValueError(f"failures: expected other names than those of every simulator, got {sorted(clash)}")
         if len(self.units) != len(names):

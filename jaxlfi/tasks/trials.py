@@ -28,7 +28,8 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
     (`embedding="trials"`, which the command line then takes by itself). The posterior is that of all trials together.
 
     Args:
-        task: of one trial. Its own observation, if it has one, is not taken over.
+        task: of one trial. Its own observation, if it has one, is not taken over, nor is what can be chosen of it:
+            trials are all of its nominal design (`jaxlfi.tasks.experiments` has those of several).
         trials: how many, n.
         pooling: how n summaries become one: a name in `POOLINGS`, or "all".
 
@@ -58,6 +59,7 @@ def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
         summarised_jointly(task, trials, pooling),
         simulate=simulate,
         observation=None,
+        design=None,
         settings={**task.settings, "embedding": "trials"} if pooling == ALL else task.settings,
     )
 
@@ -147,17 +149,17 @@ def _in_jax(simulate: Callable, trials: int, key: jax.Array, theta: Array) -> tu
         return result if isinstance(result, tuple) else (result, jnp.asarray(0))
 
     trajectory, outcome = jax.vmap(one)(jax.random.split(key, trials))
-    return trajectory.reshape(-1, *trajectory.shape[2:]), _first_failure(jnp, outcome)
+    return trajectory.reshape(-1, *trajectory.shape[2:]), first_failure(jnp, outcome)
 
 
 def _on_host(function: Callable, trials: int, rng: np.random.Generator, theta: np.ndarray):
     """The same for a simulator on the host: all trials of all thetas in one call."""
     simulated = HostSimulator(function).batch(rng, np.repeat(theta, trials, axis=0))
     trajectory, outcome = (np.asarray(array).reshape(len(theta), trials, *array.shape[1:]) for array in simulated)
-    return trajectory.reshape(len(theta), -1, *trajectory.shape[3:]), _first_failure(np, outcome)
+    return trajectory.reshape(len(theta), -1, *trajectory.shape[3:]), first_failure(np, outcome)
 
 
-def _first_failure(numpy: Any, outcome: Any) -> Any:
+def first_failure(numpy: Any, outcome: Any) -> Any:
     """The outcome of the first trial that failed, else of success; booleans are true for success."""
     if outcome.dtype == bool:
         return numpy.all(outcome, axis=-1)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import embedding, misspecification, mujoco_sysid, widths
+from experiments import design, embedding, misspecification, mujoco_sysid, widths
 from experiments.policies import report
 from experiments.policies import results as policies
 from experiments.sharpness.held_out import HELD_OUT
@@ -779,3 +779,20 @@ def test_the_table_of_observations_unlike_simulations():
     own = {name: kinds["own"] for name, kinds in misspecification.rates(folder).items()}
     assert sum(of for _, of in own.values()) >= 200
     assert all(hits < 0.02 * of for hits, of in own.values())
+
+
+def test_design():
+    made = design.table(RESULTS / "design")
+    assert made == (RESULTS / "design/table.md").read_text()
+    assert all(line in PAGES["design"] for line in made.splitlines())
+    arm, load = (arrays(f"design/{name}") for name in ("arm", "load"))
+    ratio = np.exp(np.log(load["width"][:, 1:] / load["width"][:, :1]).mean(axis=2))
+    ratio = [np.exp(np.log(part).mean()) for part in (ratio[:, 0], ratio[:, 2:])]
+    assert f"leaves intervals of {ratio[0]:.2f} of the first ones, and {ratio[0] / ratio[1]:.2f} times" in page(
+        "design"
+    )
+    assert f"with a known load the chosen one leaves {ratio[0] / ratio[1]:.2f} times the intervals" in page("index")
+    assert f"said to make it at most {arm['reach'].max():.2f} times narrower" in page("design")
+    assert f"expected to become {np.median(load['narrower']):.0f} times narrower" in page("design")
+    held = load["held"][:, 1]
+    assert f"90 % intervals is {held.mean():.0%} of {held.size}".replace("0%", "0 %") in page("design")

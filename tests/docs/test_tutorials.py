@@ -18,6 +18,7 @@ SAYS = {
     "policy": r"trained on cart +cost on the cart of 4 kg: \d",
     "program": r"rate,room\n0\.0",
     "sir": r"infections per case: [34]\.\d",
+    "unidentified": r"Ridge: no experiment within the bounds determines .*\n(.*\n)*.*Ridge: broken",
     "spring": r"The first guess of 1 to 4 N/m for stiffness was wrong: EDGE moved its upper bound",
 }
 """What the outputs of each have in them."""

@@ -181,6 +181,13 @@ def an_arm(place: Path, patch: pytest.MonkeyPatch) -> None:
     assert command(*words.split()) == 0
 
 
+def a_queue(place: Path, patch: pytest.MonkeyPatch) -> None:
+    """A run of a task with a design."""
+    if not (place / "queue").exists():
+        words = f"infer jaxlfi.envs.mg1_repetitions:task {SMALL} --rounds 1 --no-figures --out {place}/queue"
+        assert command(*words.split()) == 0
+
+
 LINE = (
     "train rl.toy:Line --domain uniform --environments 4 --unroll 5 --segments 2 --minibatches 4 --epochs 1 "
     "--total-steps 80 --hidden 8"
@@ -200,6 +207,9 @@ EXAMPLES = {
     "resume": Example("resume @resume", writes=(".html", ".png"), before=interrupted),
     "sample": Example("sample @infer -n 50 --out @sample.csv", needs=("infer",), writes=(".csv",)),
     "diagnose": Example("diagnose @infer --truths 20 --draws 20", needs=("infer",), writes=(".html", ".png")),
+    "design": Example(
+        "design @queue --rated 16 --simulations 64 --out @design", writes=(".json", ".csv", ".png"), before=a_queue
+    ),
     "report": Example("report @grid", needs=("grid",), writes=(".html", ".png")),
     "train": Example(f"{LINE} --out @train", writes=(".png",), extra="brax", slow=True),
     "evaluate": Example(

@@ -1,0 +1,306 @@
+"""Choosing designs: a spread of starts, a search from the best, and batches in which each knows the others."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import qmc
+
+from jaxlfi.design import evolution
+from jaxlfi.design.regions import Region
+from jaxlfi.design.simulations import CHUNK, simulated
+from jaxlfi.tasks.task import Task
+
+RATED = 300
+"""Designs that are rated for each experiment, by default."""
+STARTS = 0.3
+"""Part of them that is spread over all designs."""
+TOLERANCE = 0.05
+"""Share of draws for which a chosen experiment may fail, by default."""
+SAFETY_DRAWS = 64
+"""Draws of the posterior, inflated, that safety is judged by."""
+REFUSED = -1e6
+"""What a design that fails too often is worth, and as much less again as it fails."""
+APART = 0.15
+"""Distance of two designs of a list, in widths of the bounds and per square root of a variable."""
+STEP = 0.2
+"""First step of a search, in widths of the bounds."""
+FINER = 0.05
+"""And where a design of a batch is chosen anew, given the others."""
+
+
+class Rater(Protocol):
+    """Rates designs: `jaxlfi.design.fisher.FisherRater`, `jaxlfi.design.contrastive.ContrastiveRater`."""
+
+    @property
+    def regions(self) -> tuple[Region, ...]:
+        """What is averaged over, the posterior's region first."""
+
+    @property
+    def task(self) -> Task:
+        """Of one experiment, with a design."""
+
+    @property
+    def key(self) -> jax.Array:
+        """Of the simulations."""
+
+    @property
+    def ceiling(self) -> float:
+        """Bits that cannot be exceeded."""
+
+    def evidence(self, designs: np.ndarray, slot: int = 0) -> tuple[np.ndarray, ...]:
+        """What experiments are expected to show, arrays with a leading axis of designs; adds up over experiments."""
+
+    def precision(self, designs: np.ndarray, slot: int = 0) -> np.ndarray:
+        """Their Fisher information in the posterior's region, shape [M, N, D, D]."""
+
+    def terms(self, evidence: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+        """What they are worth, at each of some parameter vectors, region by region."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rated:
+    """Designs with what they are worth.
+
+    Attributes:
+        designs: shape [M, K].
+        value: expected information in bits, given experiments that were chosen already, shape [M].
+        error: its Monte Carlo standard error, shape [M].
+        failing: share of draws for which each fails, shape [M].
+    """
+
+    designs: Float[np.ndarray, "designs k"]
+    value: Float[np.ndarray, " designs"]
+    error: Float[np.ndarray, " designs"]
+    failing: Float[np.ndarray, " designs"]
+
+    def __len__(self) -> int:
+        return len(self.designs)
+
+    def rows(self, places: Any) -> "Rated":
+        """Some of them."""
+        return Rated(*(getattr(self, field.name)[places] for field in dataclasses.fields(self)))
+
+    def joined(self, other: "Rated") -> "Rated":
+        """These and others."""
+        names = [field.name for field in dataclasses.fields(self)]
+        return Rated(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Chosen:
+    """What a search has come to.
+
+    Attributes:
+        batch: the experiments to make; `value` is of each alone, given those before it.
+        together: expected information of them all, in bits, and its Monte Carlo error.
+        rated: all designs that were rated for the first experiment, by themselves.
+        spread: how many of these, from the first on, were spread over all designs.
+    """
+
+    batch: Rated
+    together: tuple[float, float]
+    rated: Rated
+    spread: int
+
+
+def rate(
+    rater: Rater,
+    designs: Float[np.ndarray, "designs k"],
+    slot: int = 0,
+    given: tuple[np.ndarray, ...] | None = None,
+    tolerance: float = TOLERANCE,
+) -> Rated:
+    """Rate designs.
+
+    Args:
+        rater: by a method.
+        designs: their values.
+        slot: place in a batch, whose noise is its own.
+        given: evidence of experiments that will be made besides.
+        tolerance: share of draws for which a design may fail; others are refused.
+    """
+    designs = np.asarray(designs, float)
+    value, error = _averages(rater, _given(rater.evidence(designs, slot), given))
+    if given is not None:
+        value = value - _averages(rater, given)[0]
+    failing = failures(rater, designs)
+    return Rated(designs, np.where(failing > tolerance, REFUSED * (1 + failing), value), error, failing)
+
+
+def failures(rater: Rater, designs: np.ndarray) -> np.ndarray:
+    """Share of draws of the posterior, inflated, for which designs fail or are unsafe, shape [M]."""
+    draws = rater.regions[0].draws[:SAFETY_DRAWS]
+    key = jax.random.fold_in(jax.random.clone(rater.key), 0x5AFE)
+    return 1 - simulated(key, rater.task, draws, designs).fine.mean(axis=1)
+
+
+def choose(
+    rater: Rater,
+    rng: np.random.Generator,
+    count: int = 1,
+    rated: int = RATED,
+    tolerance: float = TOLERANCE,
+    advanced: Callable[[int], None] = lambda designs: None,
+) -> Chosen:
+    """The designs that are worth most, one experiment or a batch of them.
+
+    The first is the best by itself, and each that follows the best given those before: that is no worse than 63 % of
+    the best batch where information has diminishing returns (Nemhauser, Wolsey and Fisher 1978). Then each is chosen
+    anew, given all others, and kept if it is better.
+
+    Args:
+        rater: by a method, of a task with a design.
+        rng: of the search.
+        count: experiments.
+        rated: designs that are rated for each, about.
+        tolerance: share of draws for which an experiment may fail.
+        advanced: told how many designs have been rated since the last time.
+
+    Raises:
+        ValueError: where all designs fail too often.
+    """
+    task = rater.task
+    starts = spread(task, int(np.ceil(STARTS * rated)), rng)
+    tried: Rated | None = None
+    batch: list[Rated] = []
+    evidence: list[tuple[np.ndarray, ...]] = []
+    for slot in range(count):
+        total = _total(evidence)
+        judge = _judge(rater, slot, total, tolerance, advanced)
+        first, others = _search(judge, task, starts, rng, rated)
+        if tried is None:
+            tried = first.joined(others)
+        _require_some(first, others, tolerance)
+        batch.append(_best(first.joined(others)))
+        evidence.append(rater.evidence(batch[-1].designs, slot))
+    for slot in range(count if count > 1 else 0):
+        rest = _total(evidence[:slot] + evidence[slot + 1 :])
+        judge = _judge(rater, slot, rest, tolerance, advanced)
+        found = _climb(judge, task, batch[slot].designs[0], FINER, rated // 3, rng)
+        better = _best(found.joined(judge(batch[slot].designs)))
+        if not np.array_equal(better.designs, batch[slot].designs):
+            batch[slot], evidence[slot] = better, rater.evidence(better.designs, slot)
+    assert tried is not None
+    value, error = _averages(rater, _total(evidence) or evidence[0])
+    return Chosen(_in_order(rater, batch, evidence, tolerance), (float(value[0]), float(error[0])), tried, len(starts))
+
+
+def steps(count: int, rated: int) -> int:
+    """How many designs `choose` rates, about."""
+    return count * rated + (count * (rated // 3) if count > 1 else 0)
+
+
+def spread(task: Task, count: int, rng: np.random.Generator) -> Float[np.ndarray, "designs k"]:
+    """Designs that fill the bounds evenly (a scrambled Sobol sequence), the nominal one first."""
+    size = len(task.design.variables)
+    power = int(np.ceil(np.log2(max(count - 1, 1))))
+    points = qmc.Sobol(size, rng=rng).random_base2(power)[: max(count - 1, 1)]
+    return np.concatenate([np.array([task.design.nominal]), task.design.of_unit(points)])
+
+
+def distinct(task: Task, rated: Rated, count: int) -> Iterator[int]:
+    """Places of the best designs, each at some distance from those before."""
+    units = task.design.to_unit(rated.designs)
+    kept: list[int] = []
+    far = APART * np.sqrt(units.shape[1])
+    for place in np.argsort(-rated.value, kind="stable"):
+        if all(np.linalg.norm(units[place] - units[other]) > far for other in kept):
+            kept.append(int(place))
+            yield int(place)
+        if len(kept) == count:
+            return
+
+
+def _judge(rater: Rater, slot: int, given: Any, tolerance: float, advanced: Callable) -> Callable[[np.ndarray], Rated]:
+    def judge(designs: np.ndarray) -> Rated:
+        parts = []
+        for first in range(0, len(designs), CHUNK):
+            part = designs[first : first + CHUNK]
+            parts.append(rate(rater, part, slot, given, tolerance))
+            advanced(len(part))
+        result = parts[0]
+        for other in parts[1:]:
+            result = result.joined(other)
+        return result
+
+    return judge
+
+
+def _search(judge: Callable, task: Task, starts: np.ndarray, rng: np.random.Generator, rated: int):
+    """The starts, rated, and what two searches have tried: from the best start, and from the best of the others."""
+    first = judge(starts)
+    left = max(rated - len(starts), 0) // 2
+    others = [_climb(judge, task, first.designs[place], STEP, left, rng) for place in distinct(task, first, 2)]
+    found = others[0]
+    for other in others[1:]:
+        found = found.joined(other)
+    return first, found
+
+
+def _climb(judge: Callable, task: Task, start: np.ndarray, step: float, rated: int, rng: np.random.Generator) -> Rated:
+    tried: list[Rated] = []
+
+    def objective(units: np.ndarray) -> np.ndarray:
+        tried.append(judge(task.design.of_unit(units)))
+        return tried[-1].value
+
+    generations = max(rated // CHUNK, 1)
+    evolution.maximise(rng, objective, task.design.to_unit(start), step, generations, CHUNK)
+    found = tried[0]
+    for other in tried[1:]:
+        found = found.joined(other)
+    return found
+
+
+def _best(rated: Rated) -> Rated:
+    return rated.rows([int(np.argmax(rated.value))])
+
+
+def _in_order(rater: Rater, batch: list[Rated], evidence: list, tolerance: float) -> Rated:
+    """A batch in the order in which each adds most to those before, with what it adds."""
+    left = list(range(len(batch)))
+    done: list[int] = []
+    ordered: list[Rated] = []
+    while left:
+        given = _total([evidence[place] for place in done])
+        values = [_averages(rater, _given(evidence[place], given)) for place in left]
+        before = 0.0 if given is None else _averages(rater, given)[0]
+        place = left.pop(int(np.argmax([value[0] for value, _ in values])))
+        value, error = _averages(rater, _given(evidence[place], given))
+        ordered.append(Rated(batch[place].designs, value - before, error, batch[place].failing))
+        done.append(place)
+    found = ordered[0]
+    for other in ordered[1:]:
+        found = found.joined(other)
+    return found
+
+
+def _require_some(first: Rated, others: Rated, tolerance: float) -> None:
+    failing = np.concatenate([first.failing, others.failing])
+    if failing.min() > tolerance:
+        raise ValueError(
+            f"design: expected experiments that fail for at most {tolerance:.0%} of the posterior, but the safest of "
+            f"{len(failing)} fails for {failing.min():.0%}"
+        )
+
+
+def _total(evidence: list) -> tuple[np.ndarray, ...] | None:
+    """Of several experiments; None for none."""
+    return jax.tree.map(lambda *leaves: sum(leaves), *evidence) if evidence else None
+
+
+def _given(evidence: tuple[np.ndarray, ...], given: tuple[np.ndarray, ...] | None) -> tuple[np.ndarray, ...]:
+    return evidence if given is None else jax.tree.map(lambda own, other: own + other, evidence, given)
+
+
+def _averages(rater: Rater, evidence: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean worth over all regions by their weights, and its standard error, shape [M] each."""
+    value, variance = 0.0, 0.0
+    for region, terms in zip(rater.regions, rater.terms(evidence), strict=True):
+        value = value + region.weight * terms.mean(axis=1)
+        variance = variance + region.weight**2 * terms.var(axis=1, ddof=1) / terms.shape[1]
+    return np.asarray(value), np.sqrt(np.asarray(variance))
