@@ -159,7 +159,7 @@ class Design:
 
 
 def _is_bound(value: Any) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and abs(float(value)) < LARGEST
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and bool(-LARGEST < value < LARGEST)
 
 
 def _variable(name: Any, bounds: Any) -> Variable:
