@@ -94,7 +94,8 @@ def glossary(families: Families) -> str:
 class _Collect(argparse.Action):
     """Put the value into a dictionary of the arguments, under the field's name.
 
-    A value that none of the classes with such a field takes is refused at once, and not only once jax has started.
+    A value that none of the classes with such a field takes is refused at once by a ValueError, and not only once jax
+    has started.
     """
 
     def __init__(

@@ -280,8 +280,8 @@ def test_flags_read_values_of_the_type_of_the_default():
     ],
 )
 def test_wrong_arguments_are_refused(swelling, words, message):
-    arguments = cli.parse(words.split())
     with pytest.raises(ValueError, match=f"^{message}"):
+        arguments = cli.parse(words.split())
         kind = HEURISTICS.load(arguments.heuristic)
         rules.refuse_foreign(arguments.hyperparameters, {arguments.heuristic: kind})
         rules.build(kind, arguments.hyperparameters, dim=2)

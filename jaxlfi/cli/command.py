@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from jaxlfi.cli import multi_process
-from jaxlfi.cli.exit_status import exit_status
+from jaxlfi.cli.exit_status import exit_status, refuse
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -83,7 +83,10 @@ class Command:
             0, or what its work returned; 2 for bad input; 130 where it was interrupted.
         """
         parser = self.parser()
-        arguments = parser.parse_args(words)
+        try:
+            arguments = parser.parse_args(words)
+        except ValueError as error:
+            return refuse(parser.prog, error)
         debug, begun = getattr(arguments, "debug", False), lambda: self.begun(arguments)
         work = lambda: exit_status(parser.prog, lambda: self.run(arguments), debug, begun)
         if getattr(arguments, "coordinator", None) is None:

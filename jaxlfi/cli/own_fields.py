@@ -183,6 +183,7 @@ POLICIES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 """Settings of a training of policies, likewise."""
 HELP = {
+    "jaxlfi.cli.design:main": "which experiment to make next",
     "jaxlfi.cli.evaluate:main": "evaluate saved policies on other domains",
     "jaxlfi.cli.export:main": "write a policy as one file for a robot's computer",
     "jaxlfi.envs.mujoco.cli:main": "film and refine the posterior of a MuJoCo model",

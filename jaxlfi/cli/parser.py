@@ -25,7 +25,6 @@ from jaxlfi.cli.exit_status import refuse, resuming, warnings_in_lines
 from jaxlfi.cli.own_fields import FIELDS, HELP
 from jaxlfi.cli.own_fields import PRESETS as VALUES
 from jaxlfi.fields import declared
-from jaxlfi.io import workfolder
 from jaxlfi.io.formats import PLAN, recorded
 from jaxlfi.registry import COMMANDS, ESTIMATORS, HEURISTICS, TASKS, Classes, package_of
 
@@ -577,6 +576,8 @@ def _refuse_early(arguments: argparse.Namespace) -> None:
     Raises:
         ValueError: for a task that is not there, or a folder that something is in.
     """
+    from jaxlfi.io import workfolder  # NumPy, which help does without
+
     TASKS.require(references.parse(arguments.task, TASKS.word)[0])
     if not multi_process.wanted(arguments):  # one of several may have begun with the folder
         workfolder.refuse_occupied(arguments.out)

@@ -90,6 +90,6 @@ def is_natural(space: SpaceName) -> bool:
     Raises:
         ValueError: for another name than "natural" or "inference".
     """
-    if space not in ("natural", "inference"):
+    if not isinstance(space, str) or space not in ("natural", "inference"):
         raise ValueError(f"space: expected 'natural' or 'inference', got {space!r}")
     return space == "natural"

@@ -159,7 +159,9 @@ class Design:
 
 
 def _is_bound(value: Any) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and bool(-LARGEST < value < LARGEST)
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        return False
+    return bool(-LARGEST < value < LARGEST)
 
 
 def _variable(name: Any, bounds: Any) -> Variable:

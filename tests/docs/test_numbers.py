@@ -103,6 +103,14 @@ def test_held_out_problems(problem):
         assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
+@pytest.mark.parametrize("problem", ["thermocouple", "decay_offset"])
+def test_other_methods(problem):
+    table = sharpness(RESULTS / "sharpness/methods", [problem]).splitlines()[2:]
+    cells = [[cell.strip() for cell in line.strip("| ").split("|")] for line in table]
+    found = {row[4]: f"{row[7]} ({row[8]}), {row[9]}, {row[17]}" for row in cells}
+    assert f"| `{problem}` | {found['npe']} | {found['apt']} |" in page("sharpness")
+
+
 EMBEDDING = RESULTS / "embedding/lotka_volterra/misspecified+edge"
 
 

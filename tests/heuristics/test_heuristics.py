@@ -22,7 +22,6 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.heuristics import Centre, Choice, Edge, Fixed, Heuristic, Matched, Mode, Truncate, paired, stretch
 from jaxlfi.heuristics.matching import match
 from jaxlfi.heuristics.truncate import MIN_WIDTH
-from jaxlfi.tasks.task import Task
 from tests.oracles import heuristics as oracle
 from tests.strategies import floats, problems, vectors
 
@@ -409,11 +408,10 @@ def test_truncate_keeps_a_sliver_at_the_bound_the_posterior_has_left_by(side):
 
 def test_after_truncation_proposals_are_uniform_over_the_support(key):
     """Neither from the posterior nor over the support of before."""
-    task = Task(lambda key, theta: theta, ("a", "b"), {"guess": example()[0].support}, example()[2])
     belief, adaptation = apply(Truncate(0.1), *example())
     assert float(adaptation.high_shift[0]) < 0 < float(adaptation.low_shift[1])
     settings = Settings(simulations_per_round=2000, simulation_budget=2000)
-    draws = np.asarray(jax.jit(propose, static_argnums=1)(key, task, settings, belief))
+    draws = np.asarray(jax.jit(propose, static_argnums=1)(key, None, settings, belief))
     for d in range(2):
         uniform = stats.uniform(belief.support.low[d], belief.support.width[d])
         assert stats.kstest(draws[:, d], uniform.cdf).pvalue > 1e-3

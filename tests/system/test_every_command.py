@@ -304,7 +304,7 @@ def run(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
 def test_a_command_names_what_it_wrote_and_all_of_it_can_be_opened(name, run):
     output, place = run(name)
     lines = [line for line in output.splitlines() if not line.startswith("│")]  # a table cuts long names
-    found = re.findall(rf"{re.escape(str(place))}[^\s,;:]*", "\n".join(lines))
+    found = re.findall(rf"{re.escape(str(place))}[^\s,;:`]*", "\n".join(lines))
     named = [path for path in map(Path, found) if "DOMAIN" not in path.parts]
     assert all(path.exists() for path in named), output
     written = {file for path in named for file in (path, *path.rglob("*")) if file.is_file()}
