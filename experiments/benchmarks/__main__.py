@@ -3,6 +3,6 @@
 import subprocess
 import sys
 
-for name in ("lotka_volterra", "training", "grid", "policies", "executors", "mujoco"):
+for name in ("first_answer", "lotka_volterra", "training", "grid", "policies", "executors", "mujoco"):
     print(f"# {name}\n", flush=True)
     subprocess.run([sys.executable, "-m", f"experiments.benchmarks.{name}"], check=True)
