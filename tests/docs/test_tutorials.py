@@ -12,7 +12,7 @@ from jaxlfi.cli import parser as cli
 ROOT = Path(__file__).parents[2]
 TUTORIALS = {path.stem: path.read_text() for path in sorted((ROOT / "docs/tutorials").glob("*.md"))}
 SAYS = {
-    "arm": r"body/payload/mass +0\.[56]",
+    "arm": r"body/payload/mass[ │]+0\.5",
     "choosing": r"npe +width / exact width: \[",
     "diagnostics": r"too narrow +verdict: too narrow;.*\n.*verdict: too wide;.*\n.*verdict: biased low",
     "policy": r"trained on cart +cost on the cart of 4 kg: \d",
