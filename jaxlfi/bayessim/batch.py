@@ -223,10 +223,10 @@ class BatchEngine:
     def begin(self, state: State) -> None:
         """What comes before the first round is compiled: nothing, where a round is one program."""
 
-    def compile(self, state: State, index: int = 0) -> Any:
-        """Compile a round ahead of its first use, so that it can be timed by itself; returns the program."""
+    def compile(self, state: State, index: int = 0) -> list[Any]:
+        """Compile a round ahead of its first use, so that it can be timed by itself; returns its programs."""
         one, more = self._one(index)
-        return self._compiled(one, state, index, *more)
+        return [self._compiled(one, state, index, *more)]
 
     def round(self, state: State, index: int) -> tuple[State, dict[str, np.ndarray]]:
         """Step every run; `state` is consumed.

@@ -46,7 +46,7 @@ class SharedEngine:
         """See `BatchEngine.begin`."""
         self._own.begin(state)
 
-    def compile(self, state: State, index: int = 0) -> Any:
+    def compile(self, state: State, index: int = 0) -> list[Any]:
         """See `BatchEngine.compile`."""
         return self._own.compile(state, index)
 

@@ -15,12 +15,7 @@ KEPT = 64
 """Number of jitted functions that are kept."""
 
 
-def program(
-    one: functools.partial,
-    mesh: Mesh,
-    in_axes: tuple[int | None, ...],
-    donate: tuple[int, ...] = (),
-) -> Any:
+def program(one: functools.partial, mesh: Mesh, in_axes: tuple[int | None, ...], donate: tuple[int, ...] = ()) -> Any:
     """A function of one run as a jitted function of a batch; the same one for equal arguments.
 
     Args:

@@ -104,15 +104,15 @@ class StagedEngine(BatchEngine):
         self._conclude = stage(conclude_one, (prior, len(task.reasons)), *shared, 0, 0, donate=(2,))
         self._compare = stage(compare_one, (task,), None, 0, 0, 0)
 
-    def compile(self, state: State, index: int = 0) -> None:
-        """Compile all stages ahead of their first use."""
+    def compile(self, state: State, index: int = 0) -> list[Any]:
+        """Compile all stages ahead of their first use; returns them."""
         inputs = (self.settings, self.inputs, state, jnp.asarray(index))
         proposed = jax.eval_shape(self._propose, *inputs)
         made = self.first_round() if self._given(index) else self.simulations_like(*proposed)
         gathered = jax.eval_shape(self._gather, *inputs, made)
         learnt = jax.eval_shape(self._train, *inputs, gathered.lesson)
         _, _, *drawn = jax.eval_shape(self._conclude, *inputs, gathered, learnt)
-        compile_all(
+        return compile_all(
             [
                 (self._conclude, (*inputs, gathered, learnt), True),
                 (self._train, (*inputs, gathered.lesson), False),

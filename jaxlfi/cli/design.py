@@ -33,7 +33,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=(),
         metavar="NAME",
-        help="parameters that information is wanted of, or ridge: the direction that the posterior determines worst "
+        help="parameters of interest, or ridge: the direction that the posterior determines worst "
         "(default: all parameters)",
     )
     add(

@@ -162,8 +162,8 @@ class ContrastiveRater:
         key: of the simulations; each place in a batch has noise of its own.
         task: of one experiment, with a design.
         regions: what is averaged over.
-        about: rows that say of which combinations of the parameters, in inference space, information is wanted, shape
-            [A, D]; None for all. The critic then knows these only.
+        about: combinations of interest of the parameters, in inference space, as rows, shape [A, D]; None for all
+            parameters. The critic then knows these only.
         simulations: of each design in each region.
     """
 

@@ -3,7 +3,7 @@
 A measurement y = f(theta, d) + e with noise e of covariance S has the Fisher information F = J' S^-1 J, J = df/dtheta.
 In the Gaussian approximation the covariance C of a belief becomes (C^-1 + F)^-1, and the information gained is half of
 the logarithm of det(I + C F): Bayesian D-optimality (Chaloner and Verdinelli 1995, sections 2 and 4), averaged here
-over theta in each region. What a design tells of some parameters only is half of the logarithm of the ratio of the
+over theta in each region. The information about a subset of the parameters is half of the logarithm of the ratio of the
 determinants of their blocks of the covariance; of one parameter that is c-optimality. A-optimality, the mean ratio of
 variances, is the other criterion.
 
@@ -49,8 +49,8 @@ class FisherRater:
         key: of the noise, where it has to be estimated.
         task: of one experiment, with a design.
         regions: what is averaged over.
-        about: rows that say of which combinations of the parameters, in inference space, information is wanted, shape
-            [A, D]; None for all.
+        about: combinations of interest of the parameters, in inference space, as rows, shape [A, D]; None for all
+            parameters.
         criterion: "information" in bits, or "variance": minus the mean of the variances of `about` (or all parameters)
             after it as fractions of those before, which is A-optimality.
         draws: of each region; by default 64, and 16 outside JAX.

@@ -66,7 +66,7 @@ class Recommendation:
         spread: how many of these, from the first on, fill the bounds evenly.
         ridge: the worst-determined direction.
         reach: how many times narrower that could become at most, by one of the experiments that were rated for it.
-        about: what information is wanted of; () for all parameters.
+        about: parameters of interest; () for all.
         method: "fisher" or "contrastive".
         ceiling: bits that the method cannot find more than.
         tolerance: share of the draws for which a chosen experiment may fail.
@@ -264,14 +264,14 @@ def recommend(
         feasible: Phi, in inference space.
         start: the support that inference began with, in inference space: ridges are judged by its widths.
         experiments: how many are chosen at once.
-        about: parameters that information is wanted of, or "ridge"; all by default.
+        about: parameters of interest, or "ridge"; all by default.
         method: "fisher", "contrastive", or "auto": Fisher information where the noise is declared.
         inflation: how many times as wide as the posterior designs are rated over.
         share: weight of the box.
         tolerance: share of draws for which an experiment may fail.
         rated: designs that are rated for each experiment; by default 300, and a quarter outside JAX.
         simulations: of each design by the contrastive method; by default 1024, and a quarter outside JAX.
-        advanced: told how many designs have been rated since the last time.
+        advanced: called with the number of designs rated since its last call.
 
     Raises:
         ValueError: for a task without a design, unknown names, numbers out of range, and where all designs fail.

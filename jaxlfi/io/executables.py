@@ -1,6 +1,6 @@
 """Programs compiled ahead of their first call, several at a time, and kept: in the process, and on disk."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -22,8 +22,7 @@ _EXECUTABLES: dict[Any, Any] = {}
 
 def compiled(many: Any, arguments: tuple, quick: bool = False) -> Any:
     """A jitted function compiled for arguments of these shapes: ahead of its first call, and once."""
-    compile_all([(many, arguments, quick)])
-    return _EXECUTABLES[_signature(many, arguments, quick)]
+    return compile_all([(many, arguments, quick)])[0]
 
 
 def call(many: Any, *arguments: Any, quick: bool = False) -> Any:
@@ -38,11 +37,17 @@ def quickly(many: Any, *arguments: Any) -> Any:
     return call(many, *arguments, quick=True)
 
 
-def compile_all(calls: Sequence[Call]) -> None:
+def compile_all(calls: Sequence[Call]) -> list[Any]:
     """Compile jitted functions for arguments of these shapes, side by side: the compiler leaves Python alone."""
-    missing = {signature: one for one in calls if (signature := _signature(*one)) not in _EXECUTABLES}
-    if not missing:
-        return
+    wanted = {_signature(*one): one for one in calls}
+    found = {signature: _EXECUTABLES[signature] for signature in wanted if signature in _EXECUTABLES}
+    if missing := {signature: one for signature, one in wanted.items() if signature not in found}:
+        found |= _compile(missing)
+    return [found[signature] for signature in wanted]
+
+
+def _compile(missing: Mapping[Any, Call]) -> dict[Any, Any]:
+    """Compile what is not there yet, and forget the oldest where that is too much."""
     while _EXECUTABLES and len(_EXECUTABLES) + len(missing) > KEPT:
         del _EXECUTABLES[next(iter(_EXECUTABLES))]
     options = _quick_options()
@@ -52,7 +57,9 @@ def compile_all(calls: Sequence[Call]) -> None:
 
     with compile_cache.used(), ThreadPoolExecutor(len(missing)) as threads:
         begun = {signature: begin(*one) for signature, one in missing.items()}
-        _EXECUTABLES.update({signature: one.result() for signature, one in begun.items()})
+        made = {signature: one.result() for signature, one in begun.items()}
+    _EXECUTABLES.update(made)
+    return made
 
 
 def _quick_options() -> dict[str, Any] | None:

@@ -142,7 +142,7 @@ class Run(Result):
 
         Args:
             experiments: how many are chosen at once; each then counts on the others.
-            about: parameters that information is wanted of, or "ridge", the direction that the posterior determines
+            about: parameters of interest, or "ridge", the direction that the posterior determines
                 worst; all parameters by default.
             method: "fisher" averages Fisher information (`jaxlfi.design.fisher`), "contrastive" bounds the expected
                 information gain by simulations (`jaxlfi.design.contrastive`); "auto" takes the first where the task
@@ -153,7 +153,7 @@ class Run(Result):
             rated: designs that are rated for each experiment; by default 300, or 75 by a simulator outside JAX.
             simulations: of each design by the contrastive method; by default 1024, or 256 outside JAX.
             seed: of all random numbers.
-            advanced: told how many designs have been rated since the last time, for a progress bar.
+            advanced: called with the number of designs rated since its last call, for a progress bar.
 
         Raises:
             ValueError: for a run whose task is not known or has no design, unknown parameters, numbers out of range,

@@ -12,6 +12,7 @@ from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.staged import StagedEngine
 from jaxlfi.heuristics import Edge
 from jaxlfi.io import executables
+from jaxlfi.studies.grid.chunks import program_bytes
 from tests.small import SETTINGS, gaussian, settings, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([[0.8, -0.6]], np.float32)
@@ -75,5 +76,5 @@ def test_one_run_goes_in_stages_and_many_are_fused():
         observed = np.repeat(OBSERVED, count, axis=0)
         return engine_for(gaussian(), settings(), stack_inputs([spec] * count, observed, observed)[0])
 
-    assert type(engine(1)) is StagedEngine
+    assert type(engine(1)) is StagedEngine and program_bytes(engine(1)) > 0  # a grid of one run is refused, too
     assert type(engine(2)) is BatchEngine

@@ -110,9 +110,12 @@ def run_bytes(work: Work) -> int:
 
 def program_bytes(engine: BatchEngine | SharedEngine) -> int:
     """Compile, and return how many bytes a round needs on each device; 0 where the compiler does not say."""
-    program = engine.compile(engine.start())
-    sizes = None if program is None else program.memory_analysis()
-    if sizes is None:
+    return max(map(_bytes, engine.compile(engine.start())))
+
+
+def _bytes(program: Any) -> int:
+    """Bytes that a program needs while it runs; 0 where the compiler does not say."""
+    if (sizes := program.memory_analysis()) is None:
         return 0
     return (
         sizes.argument_size_in_bytes + sizes.output_size_in_bytes + sizes.temp_size_in_bytes - sizes.alias_size_in_bytes
