@@ -233,9 +233,14 @@ class Estimator(Checked, abc.ABC):
             return None
         inputs = self.inputs(dim, obs)
         of_summaries = np.arange(inputs) < obs
-        first = (np.arange(self.ensemble_size) < (self.ensemble_size + 1) // 2)[:, None]
-        sees = np.where(first, of_summaries, ~of_summaries | (obs <= FEW)).astype(float)
+        sees = np.where(self.sees_features[:, None], ~of_summaries | (obs <= FEW), of_summaries).astype(float)
         return (sees * np.sqrt(inputs / sees.sum(axis=1, keepdims=True))).astype(np.float32)
+
+    @property
+    def sees_features(self) -> np.ndarray:
+        """Which networks of the ensemble see features of regressions, shape [E]."""
+        first = 0 if self.sees == "regression" else (self.ensemble_size + 1) // 2
+        return np.arange(self.ensemble_size) >= (self.ensemble_size if self.sees == "none" else first)
 
     @property
     def equal_weights(self) -> Float[Array, " member"]:

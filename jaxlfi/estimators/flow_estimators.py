@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.estimators.base import Estimator, viewed
-from jaxlfi.estimators.flows import MAF, NSF, REGRESSION
-from jaxlfi.estimators.mdn import ACTIVATIONS
+from jaxlfi.estimators.flows import MAF, NSF
+from jaxlfi.estimators.mdn import ACTIVATIONS, REGRESSION
 from jaxlfi.estimators.ridge import ridge
 from jaxlfi.fields import option
 

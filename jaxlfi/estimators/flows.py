@@ -10,13 +10,10 @@ from flax import struct
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
-from jaxlfi.estimators.mdn import ACTIVATIONS, Dense
+from jaxlfi.estimators.mdn import ACTIVATIONS, REGRESSION, Dense
 
 LOG_SCALE_BOUND = 3.0
 """Maximum log-scale of one affine transform, in nats. Ten of them take 1e3 to 1e16, whose square float32 holds."""
-
-REGRESSION = "regression"
-"""Name of the parameters by which a spline flow's shift is linear in x: coefficients, the constant last, [D, S + 1]."""
 
 MIN_BIN = 1e-3
 """Minimum width of a spline's bin, as a fraction of its range."""

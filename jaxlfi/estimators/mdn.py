@@ -14,6 +14,12 @@ from jaxlfi.distributions.mixture import GaussianMixture
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "tanh": nn.tanh, "silu": nn.silu}
 """Activations by name."""
+REGRESSION = "regression"
+"""Name of the parameters by which means are linear in x."""
+START = 1.0
+"""Logarithm of the diagonal of U that a network starts from: a standard deviation of 0.37 in [-1, 1]."""
+NEAR = 0.1
+"""What is left of the last layer's random kernel in a network that starts from a regression."""
 
 
 class MixtureHead(struct.PyTreeNode):
@@ -79,30 +85,64 @@ class MDN(nn.Module):
         dim: D.
         hidden: units of each hidden layer.
         activation: name in `ACTIVATIONS`.
+        linear: whether the means have a term that is linear in x, the same for all components: `REGRESSION` among the
+            parameters, from which `around` starts.
     """
 
     components: int
     dim: int
     hidden: tuple[int, ...]
     activation: str
+    linear: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch obs"]) -> MixtureHead:
         """The mixture for each summary vector."""
-        activation = ACTIVATIONS[self.activation]
+        activation, components, dim = ACTIVATIONS[self.activation], self.components, self.dim
+        shift = jnp.zeros(dim)
+        if self.linear:
+            shift = x @ self.param(REGRESSION, nn.initializers.zeros_init(), (dim, x.shape[-1])).T
         for units in self.hidden:
             x = activation(Dense(units)(x))
-        components, dim = self.components, self.dim
         below = dim * (dim - 1) // 2
         out = Dense(components * (1 + 2 * dim + below))(x)
         logits, means, log_diagonal, lower = jnp.split(
             out, np.cumsum([components, components * dim, components * dim]), axis=-1
         )
         shape = (*x.shape[:-1], components)
-        # The start, a diagonal of e^1, is a standard deviation of 0.37 in [-1, 1]; the least one is e^-7.
-        diagonal = jnp.exp(jnp.clip(log_diagonal.reshape(*shape, dim) + 1.0, -7.0, 7.0))
+        # The least standard deviation in [-1, 1] is e^-7.
+        diagonal = jnp.exp(jnp.clip(log_diagonal.reshape(*shape, dim) + START, -7.0, 7.0))
         whitening = lower_triangular(diagonal, lower.reshape(*shape, below))
-        return MixtureHead(logits, means.reshape(*shape, dim), whitening)
+        return MixtureHead(logits, means.reshape(*shape, dim) + shift[..., None, :], whitening)
+
+
+def around(
+    params: dict,
+    components: int,
+    coefficients: Float[Array, "dim obs"],
+    intercept: Float[Array, " dim"],
+    whitening: Float[Array, "dim dim"],
+) -> dict:
+    """Fresh parameters of an `MDN` with a linear term, changed so that it starts near one Gaussian around a regression.
+
+    Its components differ by a tenth of what they differ by otherwise, as they would learn the same if they did not.
+
+    Args:
+        params: of the network's fresh weights, by layer.
+        components: K.
+        coefficients: W of the Gaussian's mean, W x + b.
+        intercept: b.
+        whitening: lower-triangular U of its precision U^T U.
+    """
+    dim = len(intercept)
+    log_diagonal, below = jnp.log(jnp.diagonal(whitening)) - START, whitening[np.tril_indices(dim, -1)]
+    each = [jnp.zeros(1), intercept, log_diagonal, below]
+    output = f"Dense_{sum(name.startswith('Dense_') for name in params) - 1}"
+    changed = {
+        "kernel": NEAR * params[output]["kernel"],
+        "bias": jnp.concatenate([jnp.tile(part, components) for part in each]),
+    }
+    return params | {output: changed, REGRESSION: coefficients}
 
 
 @jax.custom_vjp

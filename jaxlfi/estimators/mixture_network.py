@@ -7,15 +7,16 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_algebra import pool
 from jaxlfi.distributions.support import Support
 from jaxlfi.distributions.truncation import Place
 from jaxlfi.estimators.base import Estimator, Network, viewed
-from jaxlfi.estimators.mdn import ACTIVATIONS, MDN
+from jaxlfi.estimators.mdn import ACTIVATIONS, MDN, REGRESSION, around
 from jaxlfi.estimators.posterior import Posterior, truncated
+from jaxlfi.estimators.ridge import linear_gaussian
 from jaxlfi.fields import hyperparameter, option
 
 TRUNCATED_DEVIATION = 0.87962566
@@ -60,7 +61,7 @@ class MixtureNetwork(Estimator):
 
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one ensemble member for D parameters."""
-        return MDN(self.components, dim, self.hidden, self.activation)
+        return MDN(self.components, dim, self.hidden, self.activation, linear=self.sees != "none")
 
     def check(self) -> "MixtureNetwork":
         """Refuse settings that cannot work, by name; returns the settings."""
@@ -77,18 +78,42 @@ class MixtureNetwork(Estimator):
         if self.embedding != "none":
             return super().initialise(key, dim, obs)
         declared = jax.eval_shape(self.module(dim).init, key, jnp.zeros(self.inputs(dim, obs)))
-        leaves, structure = jax.tree.flatten(declared)
-        sizes = [leaf.size if leaf.ndim == 2 else 0 for leaf in leaves]
+        leaves, structure = jax.tree.flatten_with_path(declared)
+        drawn = [leaf.ndim == 2 and name[-1].key != REGRESSION for name, leaf in leaves]  # kernels [out, in]
+        sizes = [leaf.size if own else 0 for own, (_, leaf) in zip(drawn, leaves, strict=True)]
         members = self.ensemble_size
         draws = jax.random.truncated_normal(key, -2, 2, (members, sum(sizes)), jnp.float32) / TRUNCATED_DEVIATION
         parts = jnp.split(draws, np.cumsum(sizes)[:-1], axis=1)
         fresh = [
             part.reshape(members, *leaf.shape) / math.sqrt(leaf.shape[-1])
-            if leaf.ndim == 2  # a kernel [out, in]; the others are biases
+            if own
             else jnp.zeros((members, *leaf.shape), leaf.dtype)
-            for part, leaf in zip(parts, leaves, strict=True)
+            for own, part, (_, leaf) in zip(drawn, parts, leaves, strict=True)
         ]
         return jax.tree.unflatten(structure, fresh)
+
+    def begin(
+        self,
+        params: dict,
+        theta: Float[Array, "n dim"],
+        x: Float[Array, "n given"],
+        valid: Bool[Array, " n"],
+        views: np.ndarray | None,
+    ) -> dict:
+        """Fresh weights; networks that see features of regressions start near the Gaussian around a regression on them.
+
+        In many dimensions a network does not find it in a thousand simulations.
+        """
+        if self.sees == "none":
+            return params
+
+        def start(own: dict, view: Array | None, featured: Array) -> dict:
+            coefficients, *others = linear_gaussian(viewed(x, view), theta, valid)
+            fresh = own | {REGRESSION: jnp.zeros_like(coefficients)}
+            begun = around(fresh, self.components, coefficients, *others)
+            return jax.tree.map(lambda new, old: jnp.where(featured, new, old), begun, fresh)
+
+        return {"params": jax.vmap(start)(params["params"], views, self.sees_features)}
 
     def density(self, network: Network, x: Float[Array, " obs"]) -> GaussianMixture:
         """q_phi(theta | x) in inference space, the whole ensemble pooled: E K components."""

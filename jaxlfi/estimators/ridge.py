@@ -3,12 +3,15 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.decomposition import svd
 
 PENALTIES = np.logspace(0, 5, 11).astype(np.float32)
 """What is added to the inner products of predictors that have unit variance; 1 weighs as much as one row."""
+LEAST = 1e-5
+"""Variance of what a regression gets wrong, at least, where parameters vary by about 1."""
 FOLDS = 5
 """Parts that rows are dealt into, each of which is predicted by a regression fitted to the others."""
 
@@ -44,6 +47,31 @@ def ridge(
     coefficients = (shrunk * along.T / jnp.where(singular > 0, singular, 1.0)) @ right
     others = _by_others(left * singular, y, valid, jnp.asarray(PENALTIES)[best])
     return coefficients, y_mean - coefficients @ x_mean, others + coefficients @ x_mean
+
+
+def linear_gaussian(
+    x: Float[Array, "cap obs"], y: Float[Array, "cap dim"], valid: Bool[Array, " cap"]
+) -> tuple[Float[Array, "dim obs"], Float[Array, " dim"], Float[Array, "dim dim"]]:
+    """The Gaussian N(W x + b, C) of y given x, by ridge regression.
+
+    C is the covariance of what the regressions fitted to the other folds get wrong, with as many rows more as there are
+    parameters that vary as much, each by itself: few rows leave it positive definite.
+
+    Args:
+        x: predictors, shape [C, S].
+        y: what is predicted, shape [C, D].
+        valid: the rows that count, shape [C].
+
+    Returns:
+        W, b, and the lower-triangular U of the precision U^T U = C^-1.
+    """
+    coefficients, intercept, others = ridge(x, y, valid)
+    wrong = jnp.where(valid[:, None], y - intercept - others, 0.0)
+    products, dim, rows = wrong.T @ wrong, y.shape[-1], jnp.maximum(jnp.sum(valid), 1)
+    variances = jnp.diag(jnp.diagonal(products) / rows + LEAST)
+    covariance = (products + dim * variances) / (rows + dim) + LEAST * jnp.eye(dim)
+    factor = jnp.linalg.cholesky(covariance)
+    return coefficients, intercept, solve_triangular(factor, jnp.eye(dim), lower=True)
 
 
 def _by_others(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from jaxlfi.estimators.mdn import ACTIVATIONS, MDN, MixtureHead
+from jaxlfi.estimators.mdn import ACTIVATIONS, MDN, NEAR, MixtureHead, around
 
 
 def network(module, key, obs: int):
@@ -100,3 +100,19 @@ def test_activations_are_what_they_are_called():
     assert set(ACTIVATIONS) == set(expected)
     for name, values in expected.items():
         np.testing.assert_allclose(ACTIVATIONS[name](jnp.asarray(x)), values, rtol=1e-5, atol=1e-7)
+
+
+def test_a_network_can_start_from_a_regression(key):
+    """Without what is left of the random kernel, it is the Gaussian; with it, a mixture of nearly this one."""
+    module, x = MDN(3, 2, (7, 5), "tanh", linear=True), jax.random.normal(jax.random.key(1), (9, 4))
+    params, apply = network(module, key, 4)
+    coefficients = jnp.array([[0.5, -1.0, 0.0, 2.0], [0.1, 0.3, -0.7, 0.0]])
+    intercept, whitening = jnp.array([0.2, -3.0]), jnp.array([[4.0, 0.0], [-9.0, 20.0]])
+    begun = around(params["params"], 3, coefficients, intercept, whitening)
+    np.testing.assert_allclose(begun["Dense_2"]["kernel"], NEAR * params["params"]["Dense_2"]["kernel"])
+    begun["Dense_2"]["kernel"] *= 0
+    head = apply({"params": begun}, x)
+    expected = x @ coefficients.T + intercept
+    np.testing.assert_allclose(head.means, np.repeat(expected[:, None], 3, axis=1), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(head.whitening, np.broadcast_to(whitening, (9, 3, 2, 2)), rtol=1e-5)
+    np.testing.assert_allclose(jax.nn.softmax(head.logits), np.full((9, 3), 1 / 3), rtol=1e-6)

@@ -8,11 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.estimators.base import untrained
+from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.regression import features_size, fit_regression, unfitted
 from jaxlfi.estimators.ridge import FOLDS, PENALTIES, ridge
 from jaxlfi.estimators.stacking import stacked
 from jaxlfi.estimators.statistics import LAGS, QUANTILES, statistics, statistics_size
+from jaxlfi.estimators.training import fit
 
 SERIES = np.random.default_rng(0).gamma(2.0, [1.0, 3.0], (63, 2)).cumsum(0)[::3]
 statistics_of, ridge_of, fitted = jax.jit(statistics), jax.jit(ridge), jax.jit(fit_regression)
@@ -171,3 +177,26 @@ def test_with_nothing_to_judge_by_members_are_equal():
     for counts in ([0.0, 0.0, 0.0], [0.0, 1.0, 0.0]):
         np.testing.assert_allclose(jnp.exp(stacked(scores, jnp.array(counts))), 0.5)
     assert stacked(scores, jnp.array([1.0, 1.0, 1.0]))[0] > -0.4
+
+
+def test_many_parameters_are_learnt_from_few_simulations(key):
+    """A linear Gaussian model of ten parameters, which networks that start at random do not find."""
+    dim, rows, noise = 10, 600, 0.4
+    generator = np.random.default_rng(4)
+    design = generator.normal(size=(24, dim))
+    theta = generator.uniform(-1, 1, (rows, dim)).astype(np.float32)
+    x = (theta @ design.T + noise * generator.normal(size=(rows, 24))).astype(np.float32)
+    dataset = Dataset(theta, x, jnp.zeros(rows, jnp.int32), jnp.ones(rows), jnp.asarray(rows))
+    box = Support(-jnp.ones(dim), jnp.ones(dim))
+    space = Space(tuple(f"p{d}" for d in range(dim)), (False,) * dim)
+    estimator = QUICK.estimator.replace(ensemble_size=2, epochs=20)
+    before = untrained(jax.random.key(0), estimator, 24, box, space)
+    network, _ = jax.jit(fit)(key, before, dataset, jnp.ones(rows), rows)
+    inside = generator.uniform(-0.5, 0.5, (20, dim))
+    observed = (inside @ design.T + noise * generator.normal(size=(20, 24))).astype(np.float32)
+    found = jax.vmap(lambda x: estimator.weighted(network, x))(observed)
+    exact = np.linalg.inv(design.T @ design) * noise**2
+    ratio = np.sqrt(np.diagonal(jax.vmap(lambda q: q.covariance)(found), axis1=1, axis2=2) / np.diagonal(exact))
+    off = (jax.vmap(lambda q: q.mean)(found) - observed @ np.linalg.pinv(design).T) / np.sqrt(np.diagonal(exact))
+    assert 0.9 < np.exp(np.mean(np.log(ratio))) < 1.2
+    assert np.sqrt(np.mean(off**2)) < 0.5

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlfi.estimators.ridge import PENALTIES, ridge
+from jaxlfi.estimators.ridge import FOLDS, PENALTIES, linear_gaussian, ridge
 
 RIDGE = jax.jit(lambda x, y, valid: ridge(x, y, valid)[:2])
+RIDGE_OTHERS = jax.jit(lambda x, y, valid: ridge(x, y, valid)[2])
 
 
 def problem(rows, obs, noise, seed=0):
@@ -72,3 +73,25 @@ def test_noise_is_not_interpolated_by_more_predictors_than_rows():
 def test_nothing_is_predicted_without_rows():
     for values in RIDGE(jnp.full((4, 3), jnp.nan), jnp.full((4, 2), jnp.nan), jnp.zeros(4, bool)):
         np.testing.assert_array_equal(values, 0)
+
+
+def test_a_linear_gaussian_has_the_covariance_that_is_left():
+    x, y, _ = problem(4000, 6, 0.0)
+    factor = np.array([[0.3, 0.0], [0.25, 0.1]])  # correlated, and of unequal size
+    y = y + np.random.default_rng(1).normal(size=(4000, 2)) @ factor.T
+    _, _, whitening = jax.jit(linear_gaussian)(x, y.astype(np.float32), jnp.ones(4000, bool))
+    covariance = np.linalg.inv(np.float64(whitening.T @ whitening))
+    np.testing.assert_allclose(covariance, factor @ factor.T, rtol=0.06)
+    assert whitening[0, 1] == 0
+
+
+def test_a_linear_gaussian_of_few_rows_is_as_wide_as_what_other_folds_get_wrong():
+    rows, dim = 12, 20
+    generator = np.random.default_rng(2)
+    x, y = (generator.normal(size=(rows, n)).astype(np.float32) for n in (5, dim))
+    coefficients, intercept, whitening = jax.jit(linear_gaussian)(x, y, jnp.ones(rows, bool))
+    variances = np.diagonal(np.linalg.inv(np.float64(whitening.T @ whitening)))
+    others = RIDGE_OTHERS(x, y, jnp.ones(rows, bool))
+    expected = np.mean((y - intercept - others) ** 2, axis=0)
+    np.testing.assert_allclose(variances, expected, rtol=1e-2)
+    assert rows > FOLDS and np.isfinite(coefficients).all()
