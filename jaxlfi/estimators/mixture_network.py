@@ -107,7 +107,7 @@ class MixtureNetwork(Estimator):
         if self.sees == "none":
             return params
 
-        def start(own: dict, view: Array | None, featured: Array) -> dict:
+        def start(own: dict, view: Any, featured: Any) -> dict:
             coefficients, *others = linear_gaussian(viewed(x, view), theta, valid)
             fresh = own | {REGRESSION: jnp.zeros_like(coefficients)}
             begun = around(fresh, self.components, coefficients, *others)
