@@ -57,8 +57,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
     plan = commands.add_parser(
         "plan",
-        help="search for actions that hit the top cube only",
-        description="Search for actions that hit the top cube only, by the cross-entropy method.",
+        help="search for actions that hit the top cube",
+        description="Search for actions of the highest return, that of moving the top cube before any other, by the "
+        "cross-entropy method. Prints which cubes are out of place once the scene has settled.",
     )
     _add_scene(plan)
     options.add_out(plan, "FILE", "a new .npz: actions, value, history")

@@ -21,6 +21,7 @@ from jaxlfi.envs.whip import control as controlling
 from jaxlfi.envs.whip import formats, planner
 from jaxlfi.envs.whip import recording as recordings
 from jaxlfi.envs.whip import render as drawing
+from jaxlfi.envs.whip.aftermath import sentence
 from jaxlfi.envs.whip.episode import Whip
 from jaxlfi.envs.whip.exploration import exploratory_actions
 from jaxlfi.envs.whip.frames import COLOURS
@@ -87,11 +88,13 @@ def plan(arguments: argparse.Namespace) -> None:
     if out.suffix != ".npz" or out.exists():
         raise ValueError(f"out: expected a new .npz file, got {out}")
     parameters = _parameters(arguments)
-    found = _search(jax.random.key(arguments.seed), pick(arguments.engine), parameters)
+    engine = pick(arguments.engine)
+    found = _search(jax.random.key(arguments.seed), engine, parameters)
     out.parent.mkdir(parents=True, exist_ok=True)
     scene = {f"parameters/{name}": value for name, value in vars(parameters).items()}
     atomic.write_arrays(out, {**vars(found), **scene})
-    print(f"mean return {found.value:.2f} after {found.history.size} tries, wrote {out}")
+    left = jax.device_get(jax.jit(planner.left, static_argnums=0)(engine, parameters, jnp.asarray(found.actions)))
+    print(f"mean return {found.value:.2f} after {found.history.size} tries; {sentence(left)}; wrote {out}")
 
 
 def convert(arguments: argparse.Namespace) -> None:

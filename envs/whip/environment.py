@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.aftermath import aftermath
 from jaxlfi.envs.whip.episode import Episode, Whip
 from jaxlfi.envs.whip.frames import COLOURS
 from jaxlfi.envs.whip.observer import FLAGS
@@ -138,6 +139,12 @@ class WhipEnvironment:
         """Apply an action (dx, dz), in m."""
         key, key_step = jax.random.split(state.inner.key)
         return _outlined(stepped(self.whip, key_step, state.inner, action), key)
+
+    def concluded(self, state: EnvState) -> dict[str, Array]:
+        """What the episode leaves behind once the gripper has retracted and the cubes have come to rest."""
+        scene = state.inner
+        found = aftermath(self.whip.engine, scene.parameters, scene.episode.state)
+        return {"settled_hit": found.hit, "settled_clean": found.clean, "displaced": jnp.sum(found.displaced, axis=-1)}
 
 
 def make(detector: str = "mask", engine: str = "auto") -> WhipEnvironment:

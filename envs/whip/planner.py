@@ -10,9 +10,10 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.aftermath import Aftermath, aftermath
 from jaxlfi.envs.whip.parameters import HIGHEST, WhipParameters
 from jaxlfi.envs.whip.physics import engine as physics
-from jaxlfi.envs.whip.physics.engine import Engine
+from jaxlfi.envs.whip.physics.engine import Engine, State
 from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.rig import START
 from jaxlfi.envs.whip.vision.camera import project, side_camera
@@ -231,6 +232,17 @@ def mean_return(
 
 def play(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> Outcome:
     """One episode of given actions, by the rules of `episode.Whip`, with cubes that are seen without error."""
+    return _played(engine, parameters, actions)[1]
+
+
+def left(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> Aftermath:
+    """What an episode of given actions leaves behind."""
+    state, outcome = _played(engine, parameters, actions)
+    return aftermath(engine, parameters, state.replace(failed=outcome.failed))
+
+
+def _played(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2"]) -> tuple[State, Outcome]:
+    """The state in which an episode ends, marked as failed by whatever ended it, and its outcome."""
     camera = side_camera(parameters)
     see = lambda state: project(camera, frames(engine.scene, parameters, state.qpos).cubes)
     first = physics.reset(engine.scene, parameters)
@@ -247,4 +259,5 @@ def play(engine: Engine, parameters: WhipParameters, actions: Float[Array, "16 2
 
     no = jnp.asarray(False)
     nothing = Outcome(jnp.asarray(0.0), jnp.zeros(6, bool), no, no, jnp.asarray(0))
-    return jax.lax.scan(act, (first, no, nothing), actions)[0][2]
+    state, _, outcome = jax.lax.scan(act, (first, no, nothing), actions)[0]
+    return state, outcome

@@ -84,7 +84,8 @@ class Environment(Protocol):
 
     One whose actions displace the set-points of a robot may have an attribute `deployment` besides
     (`jaxlfi.rl.deployment.Deployment`), which its policies then carry; one whose observations are bounded, an attribute
-    `bounds`, the least and the largest ones [2, O], for learners that ask for them (`jaxlfi.rl.gym`).
+    `bounds`, the least and the largest ones [2, O], for learners that ask for them (`jaxlfi.rl.gym`); one where more
+    happens once an episode is over, a method `concluded(state)`, from its last state to facts that evaluations add.
 
     Attributes:
         name: of the environment.

@@ -21,7 +21,7 @@ class Outcomes(struct.PyTreeNode):
         value: returns, shape [N].
         steps: lengths, shape [N].
         failed: whether the episode ended because the simulation became unstable, shape [N].
-        facts: what the environment says of each episode, each [N].
+        facts: what the environment says of each episode, and of what it leaves behind, each [N].
     """
 
     value: Float[Array, "*batch n"]
@@ -76,18 +76,25 @@ def evaluate(key: jax.Array, environment: Environment, act: Callable[[Array], Ar
         none = Outcomes(jnp.asarray(0.0), jnp.asarray(0), jnp.asarray(False), dict(state.facts))
 
         def step(carry, _):
-            state, over, before = carry
+            state, last, over, before = carry
             after = environment.step(state, act(state.observation))
             now = Outcomes(before.value + after.reward, before.steps + 1, after.truncated, dict(after.facts))
-            outcome = jax.tree.map(lambda old, new: jnp.where(over, old, new), before, now)
+            last, outcome = _unless(over, last, after), _unless(over, before, now)
             over |= after.terminated | after.truncated
-            return (after, over, outcome), None
+            return (after, last, over, outcome), None
 
-        first = state, jnp.asarray(False), none
-        (_, _, outcome), _ = jax.lax.scan(step, first, length=environment.steps)
-        return outcome
+        first = state, _unless(jnp.asarray(False), state, state), jnp.asarray(False), none
+        (_, last, _, outcome), _ = jax.lax.scan(step, first, length=environment.steps)
+        more = getattr(environment, "concluded", lambda state: {})(last)
+        return outcome.replace(facts=outcome.facts | dict(more))
 
     return jax.vmap(episode)(jax.random.split(key, len(domain.theta)), domain.theta)
+
+
+def _unless(over: Bool[Array, ""], old: Any, new: Any) -> Any:
+    """What is new, or what was before where an episode is over. Keys are copies: nothing is drawn after the end."""
+    is_key = lambda leaf: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jax.tree.map(lambda a, b: jax.random.clone(b) if is_key(b) else jnp.where(over, a, b), old, new)
 
 
 def cross_evaluate(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.aftermath import Aftermath
 from jaxlfi.envs.whip.control import LOOP, is_over, recording_of
 from jaxlfi.envs.whip.frames import Frames
 from jaxlfi.envs.whip.observer import FLAGS
@@ -41,6 +42,7 @@ class Deployed:
         steps: its number of control steps.
         observations: before each action and after the last one, shape [T + 1, 28].
         actions: shape [T, 2].
+        left: what the episode leaves behind, once the gripper has retracted and the cubes have come to rest.
         recording: of all 16 steps, where these were asked for.
         frames: likewise, all true frames, ten to a step, shape [161].
     """
@@ -52,6 +54,7 @@ class Deployed:
     steps: int
     observations: Float[np.ndarray, "times 28"]
     actions: Float[np.ndarray, "steps 2"]
+    left: Aftermath
     recording: Recording | None = None
     frames: Frames | None = None
 
@@ -108,11 +111,14 @@ def deploy(
     with contextlib.suppress(UnstableError):
         log = dataclasses.replace(UNLIMITED, clock=robot.simulated_clock).run(robot, act, whole)
     observations, actions = np.stack(robot.observations), np.stack(robot.actions)
+    value, hit, outside, failed, steps = _outcome(observations)
+    left = robot.aftermath()
+    outcome = value, hit, outside, failed, steps, observations, actions, left.replace(failed=left.failed | failed)
     if not whole or log is None:
-        return Deployed(*_outcome(observations), observations, actions)
+        return Deployed(*outcome)
     frames = jax.tree.map(lambda *parts: np.concatenate(parts), *robot.film)
     recording = recording_of(log, robot.about)
-    return Deployed(*_outcome(observations), observations, actions, recording, frames)
+    return Deployed(*outcome, recording, frames)
 
 
 def _outcome(observations: Float[np.ndarray, "times 28"]) -> tuple[float, np.ndarray, bool, bool, int]:

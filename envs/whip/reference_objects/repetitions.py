@@ -19,7 +19,22 @@ from jaxlfi.io import files
 from jaxlfi.io.host_devices import processors
 from jaxlfi.rl import policy as policies
 
-COLUMNS = ("policy", "object", "place", "return", "hit", "clean_hit", "outside", "failed", "steps")
+RATES = ("hit", "clean_hit", "settled_hit", "settled_clean", "outside", "failed")
+"""Columns of which tables have means."""
+COLUMNS = (
+    "policy",
+    "object",
+    "place",
+    "return",
+    "hit",
+    "clean_hit",
+    "outside",
+    "failed",
+    "steps",
+    "settled_hit",
+    "settled_clean",
+    "displaced",
+)
 
 
 def acting(word: str) -> Callable[[], Act]:
@@ -115,6 +130,7 @@ def repeat(
 
 def _row(name: str, dlo: str, place: int, one: Deployed) -> dict[str, Any]:
     values = (name, dlo, place, one.value, one.hit[rules.TOP], one.clean_hit, one.outside, one.failed, one.steps)
+    values += (one.left.hit, one.left.clean, one.left.displaced.sum())
     return dict(zip(COLUMNS, (value.item() if hasattr(value, "item") else value for value in values), strict=True))
 
 
@@ -133,7 +149,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "return": returns.mean(),
                 "error": returns.std(ddof=1) / len(own) ** 0.5 if len(own) > 1 else float("nan"),
                 "worst": returns.min(),
-                **{name: column(name).mean() for name in ("hit", "clean_hit", "outside", "failed")},
+                **{name: column(name).mean() for name in RATES},
             }
         )
     return out

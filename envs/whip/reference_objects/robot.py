@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxlfi.envs.whip.aftermath import Aftermath, displaced, retreat
 from jaxlfi.envs.whip.observer import Observer
 from jaxlfi.envs.whip.reference_objects.objects import ReferenceObject
 from jaxlfi.envs.whip.reference_objects.observation import HEX, IMAGE_SIZE, SEEN_THROUGH, Sight, found
 from jaxlfi.envs.whip.reference_objects.scene import PLACE, SIMULATOR
-from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig, stacked
+from jaxlfi.envs.whip.reference_objects.simulation import ReferenceRig, UnstableError, stacked
 from jaxlfi.envs.whip.rig import START
 from jaxlfi.envs.whip.vision.camera import Camera, side_camera
 from jaxlfi.robots.clock import Simulated
@@ -90,6 +91,16 @@ class ReferenceRobot:
 
     def stop(self) -> None:
         """Nothing moves between commands."""
+
+    def aftermath(self) -> Aftermath:
+        """What the episode leaves behind once the gripper has retracted and the cubes have come to rest; ends it."""
+        before, now = self.film[0].cubes[0], self.film[-1].cubes[-1]
+        try:
+            for action in retreat(self._target, np):
+                now = self._rig.step(action).cubes[-1]
+        except UnstableError:
+            return Aftermath(displaced(before, now, float(self._side)), np.array(True))
+        return Aftermath(displaced(before, now, float(self._side)), np.array(False))
 
     def _see(self) -> None:
         frame = jax.tree.map(lambda leaf: leaf[-1], self.film[-1])

@@ -1,0 +1,103 @@
+"""The scene after an episode: the gripper retracts, the cubes come to rest, and those out of their places are counted.
+
+An episode ends the moment the top cube has moved, when those below may be about to fall. What a robot leaves behind is
+judged here, beside the paper's return.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip.frames import COLOURS
+from jaxlfi.envs.whip.parameters import WhipParameters
+from jaxlfi.envs.whip.physics import engine as physics
+from jaxlfi.envs.whip.physics.engine import Engine, State
+from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.rig import START
+
+RETRACTING = 5
+"""Control intervals in which the set-point goes back to its start: 0.8 s, within an action's limit from anywhere."""
+WAITING = 6
+"""Control intervals for which it then waits: 0.96 s."""
+FALLEN = 0.5
+"""Distance from its place, in sides, beyond which a cube counts as displaced."""
+
+
+class Aftermath(struct.PyTreeNode):
+    """What an episode leaves behind.
+
+    Attributes:
+        displaced: cubes that are out of their places, bottom-up, shape [6].
+        failed: whether the simulation became unstable, in the episode or after it.
+    """
+
+    displaced: Bool[Array | np.ndarray, "*batch 6"]
+    failed: Bool[Array | np.ndarray, "*batch"]
+
+    @property
+    def hit(self) -> Bool[Array | np.ndarray, "*batch"]:
+        """Whether the top cube is displaced."""
+        return self.displaced[..., rules.TOP] & ~self.failed
+
+    @property
+    def clean(self) -> Bool[Array | np.ndarray, "*batch"]:
+        """Whether it is, and no other."""
+        return self.hit & ~self.displaced[..., : rules.TOP].any(axis=-1)
+
+
+def retreat(target: Float[Array | np.ndarray, "2"], xp: Any = jnp) -> Float[Array | np.ndarray, "intervals 2"]:
+    """Displacements of the set-point, in m: straight back to where episodes begin, and none after that."""
+    back = (xp.asarray(START) - target) / RETRACTING
+    return xp.concatenate([xp.tile(back, (RETRACTING, 1)), xp.zeros((WAITING, 2))])
+
+
+def displaced(
+    before: Float[Array | np.ndarray, "*batch 6 3"],
+    after: Float[Array | np.ndarray, "*batch 6 3"],
+    side: Float[Array | np.ndarray, "*batch"] | float,
+) -> Bool[Array | np.ndarray, "*batch 6"]:
+    """Which cubes are more than half a side from their places.
+
+    Args:
+        before: the cubes' centres at the start of the episode, in m.
+        after: at its end, at rest.
+        side: of the cubes, in m.
+    """
+    return ((after - before) ** 2).sum(axis=-1) ** 0.5 > FALLEN * side
+
+
+def aftermath(engine: Engine, parameters: WhipParameters, state: State) -> Aftermath:
+    """What an episode that ended in this state leaves behind.
+
+    Args:
+        engine: the physics.
+        parameters: of the scene.
+        state: as the episode ended.
+    """
+    cubes = lambda state: frames(engine.scene, parameters, state.qpos).cubes
+    first = physics.reset(engine.scene, parameters)
+    last, _ = jax.lax.scan(
+        lambda state, action: (physics.act(engine, parameters, state, action), None), state, retreat(state.target)
+    )
+    return Aftermath(displaced(cubes(first), cubes(last), parameters.cube_side), last.failed)
+
+
+def sentence(found: Aftermath) -> str:
+    """In words, what one episode left behind.
+
+    Example:
+        >>> sentence(Aftermath(np.array([False, False, False, True, False, True]), np.array(False)))
+        'once settled: orange and yellow out of place'
+    """
+    if found.failed:
+        return "once settled: unstable"
+    names = [name for name, own in zip(COLOURS, np.asarray(found.displaced), strict=True) if own]
+    if not names:
+        return "once settled: every cube in its place"
+    listed = " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    return f"once settled: {listed} out of place" + (", and no other" if names == [COLOURS[rules.TOP]] else "")
