@@ -13,6 +13,10 @@ from jaxlfi.envs.mujoco.parameters import Edit, near
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """Time, positions, velocities and activations."""
+OF_SENSORS = {"gain": "gains", "bias": "biases", "delay": "lags", "noise": "deviations"}
+"""What parameters of sensors are called, and the effects that they are."""
+OF_CLOCKS = {"control/delay": "delay", "clock/jitter": "jitter"}
+"""The same of the clock that controls act by."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,16 +26,27 @@ class Effects:
     Attributes:
         edits: of the model.
         starts: places in the state that episodes begin in.
+        gains: signals that are multiplied by it, before an offset is added.
         biases: signals that an offset is added to.
+        lags: signals that are measured so many seconds after what they measure.
         deviations: signals whose noise it is the standard deviation of.
         delay: the parameter that is the controls' delay, if any is.
+        jitter: the parameter that is the standard deviation of the times at which controls act, if any is.
     """
 
     edits: tuple[tuple[Edit, int], ...] = ()
     starts: tuple[tuple[int, int], ...] = ()
+    gains: tuple[tuple[int, int], ...] = ()
     biases: tuple[tuple[int, int], ...] = ()
+    lags: tuple[tuple[int, int], ...] = ()
     deviations: tuple[tuple[int, int], ...] = ()
     delay: int | None = None
+    jitter: int | None = None
+
+    @property
+    def rescaled(self) -> frozenset[int]:
+        """Signals whose sensors have an offset or a gain that is inferred."""
+        return frozenset(signal for signal, _ in (*self.gains, *self.biases))
 
     def started(
         self, start: Float[np.ndarray, " state"], theta: Float[np.ndarray, "*n dim"]
@@ -62,26 +77,27 @@ def effects(
     Raises:
         ValueError: for names that match nothing or several numbers, and parameters without an effect, in one line.
     """
-    found: dict[str, list] = {"edits": [], "starts": [], "biases": [], "deviations": []}
-    delay = None
+    found: dict[str, list] = {"edits": [], "starts": [], **{what: [] for what in OF_SENSORS.values()}}
+    of_clock: dict[str, int] = {}
     for d, (name, support) in enumerate(zip(names, supports, strict=True)):
         kind, _, rest = name.partition("/")
         if kind == "sensor":
-            what, signal = _of_sensor(rest, name, signals)
-            found[what].append((signal, d))
+            what, several = _of_sensor(rest, name, signals)
+            found[what] += [(signal, d) for signal in several]
         elif kind == "initial":
             found["starts"].append((state_place(model, rest, name), d))
-        elif kind == "control":
-            if rest != "delay" or not model.nu:
-                raise ValueError(f"parameters: expected control/delay of a model with actuators, got {name!r}")
-            delay = d
+        elif kind in ("control", "clock"):
+            if name not in OF_CLOCKS or not model.nu:
+                expected = " or ".join(OF_CLOCKS)
+                raise ValueError(f"parameters: expected {expected} of a model with actuators, got {name!r}")
+            of_clock[OF_CLOCKS[name]] = d
         else:
             one = parameters.edit(spec, model, name)
             parameters.check_effect(spec, one, support)
             found["edits"].append((one, d))
     # A body's mass scales its inertia; whatever of it is inferred besides is meant as it is.
     found["edits"].sort(key=lambda pair: not pair[0].name.endswith("/mass"))
-    return Effects(**{what: tuple(several) for what, several in found.items()}, delay=delay)
+    return Effects(**{what: tuple(several) for what, several in found.items()}, **of_clock)
 
 
 def built(spec: mujoco.MjSpec, does: Effects, theta: Float[np.ndarray, " dim"]) -> mujoco.MjModel:
@@ -133,11 +149,13 @@ def sizes(joint: Any) -> tuple[int, int]:
     return several.get(mujoco.mjtJoint(joint.type[0]), (1, 1))
 
 
-def _of_sensor(rest: str, name: str, signals: Sequence[str]) -> tuple[str, int]:
+def _of_sensor(rest: str, name: str, signals: Sequence[str]) -> tuple[str, list[int]]:
+    """The effect, and the signals: one, or all numbers that a sensor of several measures."""
     signal, _, what = rest.rpartition("/")
     signal = f"sensor/{signal}" if f"sensor/{signal}" in signals else signal  # of a sensor without a name
-    if signal not in signals:
+    found = [i for i, one in enumerate(signals) if signal in (one, one.rpartition("[")[0])]
+    if not found:
         raise ValueError(f"parameters: {name!r}: expected a signal {near(signal, signals)}, got {signal!r}")
-    if what not in ("bias", "noise"):
-        raise ValueError(f"parameters: {name!r}: expected bias or noise, got {what!r}")
-    return {"bias": "biases", "noise": "deviations"}[what], signals.index(signal)
+    if what not in OF_SENSORS:
+        raise ValueError(f"parameters: {name!r}: expected {', '.join(OF_SENSORS)} of a sensor, got {what!r}")
+    return OF_SENSORS[what], found

@@ -92,7 +92,7 @@ class MujocoEnvironment:
         centre = self.space.box_to_inference(support).centre
         self.nominal = tuple(float(number) for number in np.asarray(self.space.to_natural(np.asarray(centre))))
 
-        signals = [*goal.signals, *_only_inferred(self.space.names, goal.signals)]
+        signals = [*goal.signals, *_only_inferred(self.space.names, goal.signals, spec)]
         add_sensors(spec, signals)
         compiled = compile_spec(spec)
         self._does = effects(spec, compiled, self.space.names, [one.support for one in parameters], signals)
@@ -154,6 +154,10 @@ class MujocoEnvironment:
         )
 
     def _check(self, compiled: mujoco.MjModel, goal: Goal) -> None:
+        late = [goal.signals[signal] for signal, _ in self._does.lags if signal < len(goal.signals)]
+        if late or self._does.jitter is not None:
+            got = "clock/jitter" if not late else f"sensor/{late[0].removeprefix('sensor/')}/delay"
+            raise ValueError(f"parameters: expected sensors and controls of policies that keep time, got {got}")
         ratio = goal.interval / compiled.opt.timestep
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:
             raise ValueError(
@@ -209,7 +213,10 @@ def environment(config: Path) -> MujocoEnvironment:
         raise ValueError(f"{config}: {error}") from error
 
 
-def _only_inferred(names: Sequence[str], signals: Sequence[str]) -> list[str]:
-    """Signals whose sensors' offset or noise was inferred, which policies do not see."""
+def _only_inferred(names: Sequence[str], signals: Sequence[str], spec: mujoco.MjSpec) -> list[str]:
+    """Signals of whose sensors something was inferred, and which policies do not see."""
     own = [name.partition("/")[2].rpartition("/")[0] for name in names if name.startswith("sensor/")]
-    return list(dict.fromkeys(signal for signal in own if signal not in signals))
+    seen = {*signals, *(signal.rpartition("[")[0] for signal in signals)}
+    several = {one.name: one.get_data_size() for one in spec.sensors}
+    first = lambda signal: f"{signal}[0]" if several.get(signal, 1) > 1 else signal
+    return list(dict.fromkeys(first(signal) for signal in own if signal not in seen))

@@ -19,7 +19,9 @@ def started(does: Effects, theta: Float[Array, " dim"], start: Float[np.ndarray,
 def biased(
     does: Effects, theta: Float[Array, " dim"], values: Float[Array, "*rows signals"]
 ) -> Float[Array, "*rows signals"]:
-    """Signals with the offsets of their sensors, but for signals beyond the last one."""
+    """Signals with the gains and offsets of their sensors, but for signals beyond the last one."""
+    for signal, d in does.gains:
+        values = values.at[..., signal].multiply(theta[d]) if signal < values.shape[-1] else values
     for signal, d in does.biases:
         values = values.at[..., signal].add(theta[d]) if signal < values.shape[-1] else values
     return values

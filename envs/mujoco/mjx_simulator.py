@@ -35,6 +35,8 @@ def by_mjx(task: Task) -> Task:
     native = simulator_of(task)
     nominal = np.asarray(task.space.to_natural(task.support().centre), float)
     try:
+        if native.does.jitter is not None:
+            raise ValueError("parameters: expected controls that act when the recording says, got clock/jitter")
         simulator = MjxSimulator(native, _models(native, task, nominal))
     except ValueError as error:
         reason = " ".join(str(error).split())
@@ -117,10 +119,20 @@ class MjxSimulator:
         episode = functools.partial(self._episode, self._physics.models.model(numbers))
         starts = jnp.stack([started(native.does, theta, start) for start in native.starts])
         values, stable = jax.vmap(episode)(starts, self._controls(theta))
-        rows = [between(self._grid, own, times) for own, times in zip(values, native.times, strict=True)]
+        rows = [self._measured(own, times, theta) for own, times in zip(values, native.times, strict=True)]
         unstable = jnp.any(self._needed & ~stable)
         outcome = jnp.where(refused, REFUSED, jnp.where(unstable, UNSTABLE, 0))
         return jnp.where(outcome == 0, native.aligned(biased(native.does, theta, jnp.concatenate(rows))), 0.0), outcome
+
+    def _measured(
+        self, values: Float[Array, "steps signals"], times: np.ndarray, theta: Float[Array, " dim"]
+    ) -> Float[Array, "rows signals"]:
+        """Signals at the times of rows, some of them as they were before."""
+        rows = between(self._grid, values, times)
+        for signal, d in self.native.does.lags:
+            late = jnp.interp(jnp.asarray(times, jnp.float32) - theta[d], self._grid, values[:, signal])
+            rows = rows.at[:, signal].set(late)
+        return rows
 
     def _drawn(self, key: jax.Array) -> Float[Array, " numbers"] | None:
         """The coefficients of the forces that the model lacks, of one simulation."""

@@ -244,8 +244,7 @@ def _check_starts(simulator: Simulator, parameters: Sequence[Parameter], noises:
         except ValueError:
             continue  # such simulations fail, and are counted
         begins.append(plausible.sensed(model, does.started(simulator.starts[0], theta)))
-    biased = {signal for signal, _ in does.biases}
-    compared = [name for number, name in enumerate(simulator.signals) if number not in biased]
+    compared = [name for number, name in enumerate(simulator.signals) if number not in does.rescaled]
     for log in simulator.logs if begins else ():
         plausible.check_start(simulator.model, log, compared, noises, begins)
 

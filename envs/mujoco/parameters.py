@@ -9,7 +9,9 @@
 | `option/gravity[0]` | of all of it |
 | `initial/hinge/qpos`, `initial/hinge/qvel`, `initial/box/qpos[2]` | the state that episodes begin in |
 | `sensor/angle/bias`, `sensor/angle/noise` | what a sensor adds: an offset, and the standard deviation of its noise |
+| `sensor/angle/gain`, `sensor/angle/delay` | what it multiplies by, and the seconds after which it measures |
 | `control/delay` | seconds after which a control acts |
+| `clock/jitter` | the standard deviation, in seconds, of the times at which controls act |
 
 Every simulation has a model of its own that is compiled anew, so that whatever depends on a number is derived from it.
 A body's mass changes its inertia alike, as for one of another density.
@@ -30,6 +32,8 @@ KINDS = ("body", "joint", "geom", "site", "actuator", "tendon", "equality", "pai
 """Elements of models whose attributes can be inferred."""
 INERTIAL = ("mass", "inertia", "ipos", "iquat")
 """Attributes of a body that its geoms may make up."""
+AT_LEAST_ZERO = re.compile(r"sensor/.+/(delay|noise)|clock/jitter")
+"""Parameters that are no numbers below 0."""
 FORM = re.compile(r"(?P<element>.+)/(?P<attribute>[a-z_]+)(?:\[(?P<index>\d+)\])?")
 
 
@@ -61,6 +65,8 @@ class Parameter:
             if not (len(bounds) == 2 and bounds[0] < bounds[1]):  # NaN is not, either
                 raise ValueError(f"parameters: {self.name!r}: {label}: expected LOW below HIGH, got {list(bounds)}")
         (low, high), (least, most) = self.support, self.feasible or self.support
+        if least < 0 and AT_LEAST_ZERO.fullmatch(self.name):
+            raise ValueError(f"parameters: {self.name!r}: expected bounds of at least 0, got [{least:g}, {most:g}]")
         if low < least or high > most:
             raise ValueError(
                 f"parameters: {self.name!r}: support: expected bounds within feasible, [{least:g}, {most:g}], "

@@ -192,7 +192,9 @@ class Simulator:
         self, rng: np.random.Generator, theta: Float[np.ndarray, "n dim"]
     ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
         """Measurements with their noise and what the model gets wrong, and 0 or why each simulation failed."""
-        clean, outcome = self.clean(theta, None if self.forces is None else self.forces.draws(rng, len(theta)))
+        theta = np.asarray(theta, float)
+        lacking = None if self.forces is None else self.forces.draws(rng, len(theta))
+        clean, outcome = self.clean(theta, lacking, self._late(rng, theta))
         deviation = np.tile(self.noise, (len(theta), 1))
         for signal, d in self.does.deviations:
             deviation[:, signal] = theta[:, d]
@@ -208,13 +210,17 @@ class Simulator:
         return orientations.aligned(rows, self.observation, self.orientations)
 
     def clean(
-        self, theta: Float[np.ndarray, "n dim"], lacking: Float[np.ndarray, "n numbers"] | None = None
+        self,
+        theta: Float[np.ndarray, "n dim"],
+        lacking: Float[np.ndarray, "n numbers"] | None = None,
+        late: Sequence[Float[np.ndarray, "n time"]] | None = None,
     ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
         """Measurements without noise, and 0 or why each simulation failed; those that failed are zero.
 
         Args:
             theta: in natural units.
             lacking: of the forces that the model lacks (`UnmodelledForces.add`); by default they are not there.
+            late: of each episode, by how much each row's controls act later than it says; by default nothing.
         """
         theta = np.asarray(theta, float)
         lacking = np.zeros((len(theta), 0)) if lacking is None else lacking
@@ -222,7 +228,10 @@ class Simulator:
         with _LOCK, quietly():
             for first in range(0, len(theta), self._chunk):
                 part = slice(first, first + self._chunk)
-                rows[part], outcome[part] = self._rolled(theta[part], lacking[part])
+                own = None if late is None else [several[part] for several in late]
+                rows[part], outcome[part] = self._rolled(theta[part], lacking[part], own)
+        for signal, d in self.does.gains:
+            rows[:, :, signal] *= theta[:, d, None]
         for signal, d in self.does.biases:
             rows[:, :, signal] += theta[:, d, None]
         rows = self.aligned(rows)
@@ -247,7 +256,9 @@ class Simulator:
             states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self.model), start, controls)
         return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
 
-    def _rolled(self, theta: np.ndarray, lacking: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _rolled(
+        self, theta: np.ndarray, lacking: np.ndarray, late: Sequence[np.ndarray] | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         models = [self._made(*rows) for rows in zip(theta, lacking, strict=True)]
         outcome = np.array([0 if model else REFUSED for model in models])
         good = np.flatnonzero(outcome == 0)
@@ -260,8 +271,9 @@ class Simulator:
         begin = 0
         for episode, (log, times) in enumerate(zip(self.logs, self.times, strict=True)):
             start, grid = self.does.started(self.starts[episode], theta[good]), self.grid(times)
+            own = None if late is None else late[episode][good]
             states, sensors = self._pool.rollout(
-                [models[row] for row in good], data, start, self.controls(log, theta[good], grid)
+                [models[row] for row in good], data, start, self.controls(log, theta[good], grid, own)
             )
             # MuJoCo begins anew where a simulation has become unstable, and its clock with it.
             step = self.model.opt.timestep
@@ -269,7 +281,11 @@ class Simulator:
             values = sensors[:, :, self.places]
             stopped |= ~np.isfinite(values).all(axis=(1, 2)) | ~np.isfinite(states[:, -1]).all(axis=1)
             outcome[good[stopped]] = UNSTABLE
-            rows[good, begin : begin + len(times)] = between(grid, values, times)
+            own = between(grid, values, times)
+            for signal, d in self.does.lags:
+                for row, delay in enumerate(theta[good, d]):
+                    own[row, :, signal] = np.interp(times - delay, grid, values[row, :, signal])
+            rows[good, begin : begin + len(times)] = own
             begin += len(times)
         return rows, outcome
 
@@ -278,12 +294,31 @@ class Simulator:
         step = self.model.opt.timestep
         return step * np.arange(max(int(np.ceil(times[-1] / step - 1e-9)), 1) + 1)
 
-    def controls(self, log: Log, theta: np.ndarray, grid: np.ndarray) -> np.ndarray:
-        """Controls of each model over each step, shape [N, steps, actuators]."""
+    def controls(self, log: Log, theta: np.ndarray, grid: np.ndarray, late: np.ndarray | None = None) -> np.ndarray:
+        """Controls of each model over each step, shape [N, steps, actuators].
+
+        Args:
+            log: of an episode.
+            theta: in natural units, shape [N, D].
+            grid: times of the steps.
+            late: by how much each row of the log acts later than it says, shape [N, T]; nothing by default.
+        """
         delays = np.zeros(len(theta)) if self.does.delay is None else theta[:, self.does.delay]
-        when = grid - delays[:, None]
-        held = [log.mean_held(name, when, self.model.opt.timestep) for name in self.actuators]
+        when, step = grid - delays[:, None], self.model.opt.timestep
+        held = [
+            log.mean_held(name, when, step)
+            if late is None
+            else np.stack([log.mean_held(name, *own, step, off) for *own, off in zip(when, late, strict=True)])
+            for name in self.actuators
+        ]
         return np.stack(held, axis=-1) if held else np.zeros((len(theta), len(grid), 0))
+
+    def _late(self, rng: np.random.Generator, theta: np.ndarray) -> list[np.ndarray] | None:
+        """Draws of how much later than it says each row of each log acts, if that is not certain; shape [N, T]."""
+        if self.does.jitter is None:
+            return None
+        deviation = theta[:, self.does.jitter, None]
+        return [deviation * rng.standard_normal((len(theta), len(log.times))) for log in self.logs]
 
     def made(self, theta: Float[np.ndarray, " dim"], lacking: Float[np.ndarray, " numbers"]) -> mujoco.MjModel:
         """The model of a parameter vector with forces that it lacks, if there are any.

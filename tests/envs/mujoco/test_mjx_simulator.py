@@ -118,6 +118,12 @@ def test_sensors_are_those_of_the_state_before_a_step():
     agree(task, np.array([[0.1, 0.0], [2.0, 0.033], [8.0, 0.06]], np.float32), atol=1e-4)
 
 
+def test_sensors_that_are_late_and_have_gains():
+    """One alone, and beside controls that are late, too."""
+    task = slide([LATE, Parameter("sensor/place/delay", (0.0, 0.2)), Parameter("sensor/felt[0]/gain", (0.5, 3.0))])
+    agree(task, np.array([[0.0, 0.033, 1.5], [0.05, 0.12, 2.0], [0.0, 0.0, 1.0]], np.float32), atol=1e-4)
+
+
 @pytest.fixture(scope="module")
 def noisy():
     """A task of two episodes with noise that is given and inferred, and an error of the model; and many simulations."""
