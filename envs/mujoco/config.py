@@ -15,8 +15,9 @@ log = true                          # infer its logarithm
 [noise]                             # standard deviations; of other signals it is estimated
 angle = 0.002
 
-[initial]                           # other than the model's
-"hinge/qpos" = 0.5
+[initial]                           # where episodes begin (`jaxlfi.envs.mujoco.starts`)
+from = "log"                        # or "model", or "keyframe NAME"
+"hinge/qpos" = 0.5                  # numbers win
 
 [discrepancy]                       # what the model gets wrong: a standard deviation, and for how long (s)
 angle = { deviation = 0.01, time = 0.2 }
@@ -78,22 +79,24 @@ def read(
     """
     path = Path(path)
     config = load(path)
-    given = [Path(one) for one in recorded] or [path.parent / str(one) for one in config.get("log", [])]
-    if not given:
+    several = [Path(one) for one in recorded] or [path.parent / str(one) for one in config.get("log", [])]
+    if not several:
         raise ValueError(f"{path}: expected recordings, as log = [FILE], or mujoco,config={path},log=FILE; got none")
     try:
+        begins, given = initial(config)
         return mujoco_task(
             path.parent / config["model"],
             parameters_of(config),
-            given,
+            several,
             config.get("measured"),
             numbers(config, "noise"),
-            numbers(config, "initial"),
+            given,
             {name: _discrepancy(name, table) for name, table in config.get("discrepancy", {}).items()},
             {label: _guess(label, table) for label, table in config.get("supports", {}).items()},
             summary=summary or config.get("summary", "samples"),
             unmodelled_force=config.get("unmodelled_force", 0.0),
             engine=engine,
+            begins=begins,
             design=config.get("design"),
             name=config.get("name", path.stem),
         )
@@ -142,6 +145,21 @@ def numbers(config: Mapping[str, Any], table: str) -> dict[str, float]:
     if not isinstance(found, dict):
         raise ValueError(f"{table}: expected a table of numbers, got {found!r}")
     return {name: number(value, f"{table}: {name}") for name, value in found.items()}
+
+
+def initial(config: Mapping[str, Any]) -> tuple[Any, dict[str, float | list[float]]]:
+    """What the table `initial` says: where episodes begin (`starts.modes`), and numbers, one for all or one for each.
+
+    Raises:
+        ValueError: for what is no table, or no number.
+    """
+    table = dict(config.get("initial", {}))
+    begins, given = table.pop("from", None), {}
+    for name, value in table.items():
+        where = f"initial: {name}"
+        several = isinstance(value, list)
+        given[name] = [number(one, where) for one in value] if several else number(value, where)
+    return begins, given
 
 
 def pair(value: Any, where: str) -> tuple[float, float]:

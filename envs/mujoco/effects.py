@@ -49,10 +49,10 @@ class Effects:
         return frozenset(signal for signal, _ in (*self.gains, *self.biases))
 
     def started(
-        self, start: Float[np.ndarray, " state"], theta: Float[np.ndarray, "*n dim"]
+        self, start: Float[np.ndarray, "*#n state"], theta: Float[np.ndarray, "*n dim"]
     ) -> Float[np.ndarray, "*n state"]:
-        """The states that the models of parameter vectors begin in, by the model's own."""
-        state = np.tile(start, (*theta.shape[:-1], 1)) if theta.ndim > 1 else start.copy()
+        """The states that the models of parameter vectors begin in, by those that they would begin in otherwise."""
+        state = np.array(np.broadcast_to(start, (*theta.shape[:-1], np.shape(start)[-1])))
         for place, d in self.starts:
             state[..., place] = theta[..., d]
         return state

@@ -19,7 +19,8 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
-from jaxlfi.envs.mujoco.effects import built, effects, initial_state, state_place
+from jaxlfi.envs.mujoco import starts
+from jaxlfi.envs.mujoco.effects import built, effects, state_place
 from jaxlfi.envs.mujoco.goal import Goal, Reading
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, started
@@ -64,8 +65,9 @@ class MujocoEnvironment:
         parameters: Sequence[Parameter],
         goal: Goal,
         noises: Mapping[str, float] | None = None,
-        initial: Mapping[str, float] | None = None,
+        initial: Mapping[str, float | Sequence[float]] | None = None,
         name: str | None = None,
+        begins: str | None = None,
     ):
         """An environment.
 
@@ -76,6 +78,7 @@ class MujocoEnvironment:
             noises: standard deviations of the observed signals' noise; 0 of others.
             initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
             name: of the environment; by default the model's.
+            begins: "keyframe NAME", for episodes that begin there; by default they begin as the model does.
 
         Raises:
             ValueError: for whatever does not fit together, or MJX cannot simulate, in one line.
@@ -104,7 +107,8 @@ class MujocoEnvironment:
         self._physics = Physics(self.models, compiled, self.reading.places)
         self._check(compiled, goal)
 
-        self._start = initial_state(compiled, initial or {})
+        first = {key: np.ravel(number)[:1].tolist() for key, number in (initial or {}).items()}
+        self._start = starts.state_of(compiled, begins, *starts.given(compiled, first, 1))
         self._drawn = [(state_place(compiled, key, f"initial/{key}"), bounds) for key, bounds in goal.initial.items()]
         self._timestep = compiled.opt.timestep
         self._substeps = round(goal.interval / self._timestep)
@@ -200,14 +204,16 @@ def environment(config: Path) -> MujocoEnvironment:
         raise ValueError(f"{config}: expected a table [policy] that says what policies are to do, got none")
     try:
         goal = goals.of_table(table["policy"])
+        begins, numbers = tables.initial(table)
         noises = {name: value for name, value in tables.numbers(table, "noise").items() if name in goal.signals}
         return MujocoEnvironment(
             config.parent / table["model"],
             tables.parameters_of(table),
             goal,
             noises,
-            tables.numbers(table, "initial"),
+            numbers,
             table.get("name", config.stem),
+            begins[0] if isinstance(begins, list) else begins,
         )
     except ValueError as error:
         raise ValueError(f"{config}: {error}") from error

@@ -8,8 +8,10 @@ from jaxlfi.envs.mujoco.effects import Effects
 from jaxlfi.envs.mujoco.logs import Log
 
 
-def started(does: Effects, theta: Float[Array, " dim"], start: Float[np.ndarray, " state"]) -> Float[Array, " state"]:
-    """The state (`effects.STATE`) that an episode begins in."""
+def started(
+    does: Effects, theta: Float[Array, " dim"], start: Float[Array | np.ndarray, " state"]
+) -> Float[Array, " state"]:
+    """The state (`effects.STATE`) that an episode begins in, by the one that it would begin in otherwise."""
     state = jnp.asarray(start, jnp.float32)
     for place, d in does.starts:
         state = state.at[place].set(theta[d])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -94,22 +95,27 @@ class MjxSimulator:
     ) -> tuple[Float[Array, "rows signals"], Int[Array, ""]]:
         """Measurements with their noise and discrepancies, and 0 or why the simulation failed."""
         native = self.native
-        key_noise, key_forces, *keys = jax.random.split(key, 2 + len(native.discrepancies))
-        rows, outcome = self.clean(theta, self._drawn(key_forces))
+        uncertain = any(start.uncertain for start in native.starts)
+        key_noise, key_forces, *keys = jax.random.split(key, 2 + len(native.discrepancies) + uncertain)
+        rows, outcome = self.clean(theta, self._drawn(key_forces), self._begun(keys[len(native.discrepancies) :]))
         rows += deviations(native.does, theta, native.noise) * jax.random.normal(key_noise, rows.shape)
-        for own, (signal, process) in zip(keys, native.discrepancies.items(), strict=True):
+        for own, (signal, process) in zip(keys, native.discrepancies.items(), strict=False):
             each = zip(jax.random.split(own, len(native.times)), native.times, strict=True)
             rows = rows.at[:, signal].add(jnp.concatenate([process.draw(one, times) for one, times in each]))
         return jnp.where(native.there, native.aligned(rows), 0.0), outcome
 
     def clean(
-        self, theta: Float[Array | np.ndarray, " dim"], lacking: Float[Array, " numbers"] | None = None
+        self,
+        theta: Float[Array | np.ndarray, " dim"],
+        lacking: Float[Array, " numbers"] | None = None,
+        begun: Float[Array, "episodes dofs 2"] | None = None,
     ) -> tuple[Float[Array, "rows signals"], Int[Array, ""]]:
         """Measurements without noise, and 0 or why the simulation failed; of one that failed they are zero.
 
         Args:
             theta: in natural units.
             lacking: of the forces that the model lacks (`UnmodelledForces.add`); by default they are not there.
+            begun: draws that starts take (`starts.Start.at`); by default they are the most likely ones.
         """
         native, theta = self.native, jnp.asarray(theta, jnp.float32)
         if native.forces is not None and lacking is None:
@@ -117,7 +123,9 @@ class MjxSimulator:
         given = theta if lacking is None else jnp.concatenate([theta, lacking])
         numbers, refused = self._physics.models.numbers(given)
         episode = functools.partial(self._episode, self._physics.models.model(numbers))
-        starts = jnp.stack([started(native.does, theta, start) for start in native.starts])
+        begun = jnp.zeros((len(native.starts), native.model.nv, 2)) if begun is None else begun
+        starts = [start.at(native.does, theta, own, jnp) for start, own in zip(native.starts, begun, strict=True)]
+        starts = jnp.stack([started(native.does, theta, start) for start in starts])
         values, stable = jax.vmap(episode)(starts, self._controls(theta))
         rows = [self._measured(own, times, theta) for own, times in zip(values, native.times, strict=True)]
         unstable = jnp.any(self._needed & ~stable)
@@ -133,6 +141,11 @@ class MjxSimulator:
             late = jnp.interp(jnp.asarray(times, jnp.float32) - theta[d], self._grid, values[:, signal])
             rows = rows.at[:, signal].set(late)
         return rows
+
+    def _begun(self, keys: Sequence[jax.Array]) -> Float[Array, "episodes dofs 2"] | None:
+        """Draws of where the episodes of one simulation begin, by a key where that is not certain."""
+        shape = (len(self.native.starts), self.native.model.nv, 2)
+        return jax.random.normal(keys[0], shape) if keys else None
 
     def _drawn(self, key: jax.Array) -> Float[Array, " numbers"] | None:
         """The coefficients of the forces that the model lacks, of one simulation."""

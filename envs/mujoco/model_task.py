@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, summaries
+from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, starts, summaries
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
-from jaxlfi.envs.mujoco.effects import built, effects, initial_state
+from jaxlfi.envs.mujoco.effects import built, effects
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -31,7 +31,7 @@ def mujoco_task(
     recorded: Sequence[Log | str | Path] | Log | str | Path,
     measured: Sequence[str] | None = None,
     noises: Mapping[str, float] | None = None,
-    initial: Mapping[str, float] | None = None,
+    initial: Mapping[str, float | Sequence[float]] | None = None,
     discrepancies: Mapping[str, Discrepancy] | None = None,
     supports: Mapping[str, Mapping[str, tuple[float, float]]] | None = None,
     summary: str | Callable[[jax.Array], jax.Array] = "samples",
@@ -39,14 +39,15 @@ def mujoco_task(
     unmodelled_force: float = 0.0,
     engine: Literal["native", "mjx"] = "native",
     design: Mapping[str, Any] | None = None,
+    begins: str | Sequence[str] | None = None,
     **others: Any,
 ) -> Task:
     """Infer numbers of a MuJoCo model from recordings of controls and sensors.
 
     A trajectory has a row for each time of the recordings at which something was measured, episodes one after another,
-    and a column for each measured signal; what was not sampled is 0, in simulations too. Every episode begins in the
-    same state and has the same parameters. Angles that wrap and orientations are put right first (`recordings`); that,
-    and what looks wrong (`plausible`), is said in a `logs.RecordingWarning`.
+    and a column for each measured signal; what was not sampled is 0, in simulations too. All episodes have the same
+    parameters, and each begins where its recording does (`starts`). Angles that wrap and orientations are put right
+    first (`recordings`); that, and what looks wrong (`plausible`), is said in a `logs.RecordingWarning`.
 
     Args:
         model: an MJCF file, its text, or a specification.
@@ -56,7 +57,8 @@ def mujoco_task(
         measured: signals that are compared: sensors of the model, and joint/NAME/qpos, joint/NAME/qvel,
             body/NAME/pos[0], body/NAME/quat[0]. By default all of the recording but its controls.
         noises: standard deviations of the signals' noise. Of others it is estimated from the first recording.
-        initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
+        initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel: one for all episodes or one
+            for each.
         discrepancies: what the model gets wrong of signals, beyond their noise; `least_squares` finds it.
         supports: other first guesses by name: the bounds of some parameters, those of others being their `support`.
         summary: what the network sees, by its name (`summaries`); or as for `jaxlfi.Task`.
@@ -68,6 +70,8 @@ def mujoco_task(
             precision and inside of compiled programs, where it can simulate the model (`mjx_simulator`).
         design: experiments that could be made next, as a table of the TOML file says (`played`); they are simulated by
             MuJoCo itself.
+        begins: where episodes begin (`starts`): "log", "model" or "keyframe NAME", for all episodes or for each; by
+            default where the recording does, if it measures all joints.
         **others: of `jaxlfi.Task`.
 
     Raises:
@@ -97,23 +101,30 @@ def mujoco_task(
     inferred = {signal for signal in measured if f"sensor/{signal.removeprefix('sensor/')}/noise" in names}
     _check_noises(episodes[0], measured, noises, inferred)
     add_sensors(spec, measured)
+    for sensor in spec.sensors:  # whose own delay a parameter takes the place of
+        sensor.delay = 0.0 if f"sensor/{sensor.name}/delay" in names else sensor.delay
     compiled = compile_spec(spec)
     does = effects(spec, compiled, names, [one.support for one in parameters], measured)
-    start = initial_state(compiled, initial or {})
-    begins = does.started(start, np.array([_centre(one) for one in parameters]))
-    episodes = [recordings.prepared(compiled, log, measured, begins) for log in episodes]
+    modes = starts.modes(begins, len(episodes))
+    given = starts.given(compiled, initial or {}, len(episodes))
+    own = [starts.state_of(compiled, *pair) for pair in zip(modes, given, strict=True)]
+    centre = np.array([_centre(one) for one in parameters])
+    episodes = [
+        recordings.prepared(compiled, log, measured, does.started(state, centre))
+        for log, state in zip(episodes, own, strict=True)
+    ]
     deviations = _deviations(episodes[0], measured, noises, inferred)
+    begun = starts.chosen(compiled, episodes, measured, deviations, own, given, modes, does)
 
     build = functools.partial(built, spec, does)
-    starts = [start] * len(episodes)
     if unknown := [name for name in discrepancies if name not in measured]:
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
-    simulator = Simulator(compiled, build, episodes, measured, deviations, starts, does, discrepancies, threads)
+    simulator = Simulator(compiled, build, episodes, measured, deviations, begun, does, discrepancies, threads)
     _check_starts(simulator, parameters, deviations)
     others = {"name": spec.modelname or "mujoco"} | others
     task = task_of(simulator, parameters, measured, summary, supports, unmodelled_force, **others)
     if design is not None:
-        task = played.with_design(task, simulator_of(task), design, initial or {})
+        task = played.with_design(task, simulator_of(task), design, own[0])
     if engine == "native":
         return task
     from jaxlfi.envs.mujoco.mjx_simulator import by_mjx  # MJX is not needed otherwise
@@ -184,16 +195,26 @@ def specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
         ValueError: where there is none, in one line.
     """
     if isinstance(model, mujoco.MjSpec):
-        return model.copy()
+        return named(model.copy())
     text = str(model)
     try:
         if text.lstrip().startswith("<"):
-            return mujoco.MjSpec.from_string(text)
+            return named(mujoco.MjSpec.from_string(text))
         if not Path(text).is_file():
             raise ValueError(f"model: expected an MJCF file, got none called {text!r}")
-        return mujoco.MjSpec.from_file(text)
+        return named(mujoco.MjSpec.from_file(text))
     except ValueError as error:
         raise ValueError(f"model: {' '.join(str(error).split()).removeprefix('model: ')}") from error
+
+
+def named(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """A specification whose elements without a name are called by their number, but for actuators and sensors."""
+    for several in (spec.bodies, spec.joints, spec.geoms, spec.sites, spec.tendons, spec.equalities, spec.pairs):
+        taken = {one.name for one in several}
+        for number, one in enumerate(several):
+            if not one.name and str(number) not in taken:
+                one.name = str(number)
+    return spec
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -236,16 +257,17 @@ def _deviations(log: Log, measured: Sequence[str], given: Mapping[str, float], i
 
 def _check_starts(simulator: Simulator, parameters: Sequence[Parameter], noises: Mapping[str, float]) -> None:
     """Say where recordings begin elsewhere than the model does for all parameters that are possible."""
-    does, begins = simulator.does, []
+    does, tried = simulator.does, []
     bounds = np.array([one.feasible or one.support for one in parameters])
     for theta in (np.array([_centre(one) for one in parameters]), *bounds.T):
         try:
             model = simulator.build(theta) if does.edits else simulator.model
         except ValueError:
             continue  # such simulations fail, and are counted
-        begins.append(plausible.sensed(model, does.started(simulator.starts[0], theta)))
+        tried.append((model, theta))
     compared = [name for number, name in enumerate(simulator.signals) if number not in does.rescaled]
-    for log in simulator.logs if begins else ():
+    for episode, log in enumerate(simulator.logs if tried else ()):
+        begins = [plausible.sensed(model, simulator.begun(episode, theta)) for model, theta in tried]
         plausible.check_start(simulator.model, log, compared, noises, begins)
 
 

@@ -18,6 +18,7 @@ from jaxlfi.envs.mujoco.forces import UnmodelledForces, typical
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.plausible import check
 from jaxlfi.envs.mujoco.quiet import quietly
+from jaxlfi.envs.mujoco.starts import Start, certain
 from jaxlfi.io.host_devices import processors
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.worker import OneOfBatch
@@ -35,6 +36,29 @@ _LOCK = threading.Lock()
 """Held while a pool of threads is in use, which does one rollout at a time."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Drawn:
+    """What N simulations differ in besides their parameters and noise, episode by episode.
+
+    Attributes:
+        late: by how much each row's controls act later than it says, in s, shape [N, T] each; None if none does.
+        starts: draws of a standard normal distribution that `Start.at` takes, shape [N, V, 2] each; None of starts
+            that are certain.
+    """
+
+    late: Sequence[Float[np.ndarray, "n time"]] | None
+    starts: Sequence[Float[np.ndarray, "n dofs 2"] | None]
+
+    def part(self, rows: slice | np.ndarray) -> "Drawn":
+        """That of some of the simulations."""
+        late = None if self.late is None else [own[rows] for own in self.late]
+        return Drawn(late, [None if own is None else own[rows] for own in self.starts])
+
+    def of(self, episode: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Both of an episode."""
+        return None if self.late is None else self.late[episode], self.starts[episode]
+
+
 class Simulator:
     """Simulates all episodes of parameter vectors; `jaxlfi.HostSimulator` calls it.
 
@@ -50,7 +74,8 @@ class Simulator:
         orientations: among the signals, whose quaternions are compared as rotations (`aligned`).
         discrepancies: what the model gets wrong, by the signal's number.
         forces: that the model lacks, if any are drawn (`lacking`).
-        model, build, does, logs, starts: as they are given, below.
+        starts: where each episode begins.
+        model, build, does, logs: as they are given, below.
     """
 
     def __init__(
@@ -60,7 +85,7 @@ class Simulator:
         logs: Sequence[Log],
         signals: Sequence[str],
         noise: Mapping[str, float],
-        starts: Sequence[np.ndarray],
+        starts: Sequence[np.ndarray | Start],
         does: Effects = Effects(),
         discrepancies: Mapping[str, Discrepancy] | None = None,
         threads: int | None = None,
@@ -73,7 +98,7 @@ class Simulator:
             logs: one for each episode, with the model's actuators and the measured signals.
             signals: that are measured (`measured`).
             noise: standard deviation of each signal's noise.
-            starts: the state (`effects.STATE`) that each episode begins in.
+            starts: where each episode begins, or the state (`effects.STATE`) that it certainly begins in.
             does: what parameters do besides.
             discrepancies: what the model gets wrong of signals; nothing of others.
             threads: by default as many as processors.
@@ -82,7 +107,8 @@ class Simulator:
             ValueError: for recordings that do not fit the model, in one line.
         """
         self.model, self.build, self.does = model, build, does
-        self.logs, self.signals, self.starts = tuple(logs), tuple(signals), tuple(starts)
+        self.logs, self.signals = tuple(logs), tuple(signals)
+        self.starts = tuple(one if isinstance(one, Start) else certain(model, np.asarray(one)) for one in starts)
         self.places = measured.places(model, signals)
         self.units = tuple(measured.unit(model, name).removeprefix("1") for name in signals)
         self.noise = np.array([noise[name] for name in signals])
@@ -194,7 +220,7 @@ class Simulator:
         """Measurements with their noise and what the model gets wrong, and 0 or why each simulation failed."""
         theta = np.asarray(theta, float)
         lacking = None if self.forces is None else self.forces.draws(rng, len(theta))
-        clean, outcome = self.clean(theta, lacking, self._late(rng, theta))
+        clean, outcome = self.clean(theta, lacking, self._drawn(rng, theta))
         deviation = np.tile(self.noise, (len(theta), 1))
         for signal, d in self.does.deviations:
             deviation[:, signal] = theta[:, d]
@@ -213,14 +239,14 @@ class Simulator:
         self,
         theta: Float[np.ndarray, "n dim"],
         lacking: Float[np.ndarray, "n numbers"] | None = None,
-        late: Sequence[Float[np.ndarray, "n time"]] | None = None,
+        drawn: Drawn | None = None,
     ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
         """Measurements without noise, and 0 or why each simulation failed; those that failed are zero.
 
         Args:
             theta: in natural units.
             lacking: of the forces that the model lacks (`UnmodelledForces.add`); by default they are not there.
-            late: of each episode, by how much each row's controls act later than it says; by default nothing.
+            drawn: what they differ in besides; by default controls keep time, and starts are the most likely ones.
         """
         theta = np.asarray(theta, float)
         lacking = np.zeros((len(theta), 0)) if lacking is None else lacking
@@ -228,7 +254,7 @@ class Simulator:
         with _LOCK, quietly():
             for first in range(0, len(theta), self._chunk):
                 part = slice(first, first + self._chunk)
-                own = None if late is None else [several[part] for several in late]
+                own = None if drawn is None else drawn.part(part)
                 rows[part], outcome[part] = self._rolled(theta[part], lacking[part], own)
         for signal, d in self.does.gains:
             rows[:, :, signal] *= theta[:, d, None]
@@ -250,15 +276,20 @@ class Simulator:
         """
         theta = np.asarray(theta, float)
         models, grid = [self.build(row) for row in theta], self.grid(self.times[episode])
-        start = self.does.started(self.starts[episode], theta)
+        start = self.begun(episode, theta)
         controls = self.controls(self.logs[episode], theta, grid)
         with _LOCK, quietly():
             states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self.model), start, controls)
         return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
 
-    def _rolled(
-        self, theta: np.ndarray, lacking: np.ndarray, late: Sequence[np.ndarray] | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def begun(
+        self, episode: int, theta: Float[np.ndarray, "*n dim"], draws: Float[np.ndarray, "*n dofs 2"] | None = None
+    ) -> Float[np.ndarray, "*n state"]:
+        """The states that an episode of parameter vectors begins in; by default the most likely ones."""
+        draws = np.zeros((*theta.shape[:-1], self.model.nv, 2)) if draws is None else draws
+        return self.does.started(self.starts[episode].at(self.does, theta, draws), theta)
+
+    def _rolled(self, theta: np.ndarray, lacking: np.ndarray, drawn: Drawn | None) -> tuple[np.ndarray, np.ndarray]:
         models = [self._made(*rows) for rows in zip(theta, lacking, strict=True)]
         outcome = np.array([0 if model else REFUSED for model in models])
         good = np.flatnonzero(outcome == 0)
@@ -268,12 +299,13 @@ class Simulator:
         if self._pool is None:
             self._pool = mujoco.rollout.Rollout(nthread=self._threads)
         data = [mujoco.MjData(self.model) for _ in range(self._threads)]
+        drawn = None if drawn is None else drawn.part(good)
         begin = 0
         for episode, (log, times) in enumerate(zip(self.logs, self.times, strict=True)):
-            start, grid = self.does.started(self.starts[episode], theta[good]), self.grid(times)
-            own = None if late is None else late[episode][good]
+            late, moved = (None, None) if drawn is None else drawn.of(episode)
+            start, grid = self.begun(episode, theta[good], moved), self.grid(times)
             states, sensors = self._pool.rollout(
-                [models[row] for row in good], data, start, self.controls(log, theta[good], grid, own)
+                [models[row] for row in good], data, start, self.controls(log, theta[good], grid, late)
             )
             # MuJoCo begins anew where a simulation has become unstable, and its clock with it.
             step = self.model.opt.timestep
@@ -313,12 +345,14 @@ class Simulator:
         ]
         return np.stack(held, axis=-1) if held else np.zeros((len(theta), len(grid), 0))
 
-    def _late(self, rng: np.random.Generator, theta: np.ndarray) -> list[np.ndarray] | None:
-        """Draws of how much later than it says each row of each log acts, if that is not certain; shape [N, T]."""
-        if self.does.jitter is None:
+    def _drawn(self, rng: np.random.Generator, theta: np.ndarray) -> Drawn | None:
+        jitter, late = self.does.jitter, None
+        if jitter is None and not any(start.uncertain for start in self.starts):
             return None
-        deviation = theta[:, self.does.jitter, None]
-        return [deviation * rng.standard_normal((len(theta), len(log.times))) for log in self.logs]
+        if jitter is not None:
+            late = [theta[:, [jitter]] * rng.standard_normal((len(theta), len(log.times))) for log in self.logs]
+        shape = (len(theta), self.model.nv, 2)
+        return Drawn(late, [rng.standard_normal(shape) if start.uncertain else None for start in self.starts])
 
     def made(self, theta: Float[np.ndarray, " dim"], lacking: Float[np.ndarray, " numbers"]) -> mujoco.MjModel:
         """The model of a parameter vector with forces that it lacks, if there are any.

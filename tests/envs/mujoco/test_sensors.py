@@ -53,7 +53,7 @@ def test_a_sensor_of_several_numbers_is_late_as_a_whole():
     np.testing.assert_allclose(rows[0, :, 0], recorded().signals["angle"], atol=1e-9)
 
 
-def pushed(forces, times, jitter, count=4000):
+def pushed(forces, times, jitter, count=1000):
     """Last velocities of a cart in many simulations."""
     log = Log(times, {"motor": np.array(forces), "joint/rail/qvel": np.zeros(len(times))})
     own = simulator([Parameter("clock/jitter", (0.0, 0.2))], CART, log, {"joint/rail/qvel": 0.0})
@@ -65,8 +65,8 @@ def pushed(forces, times, jitter, count=4000):
 def test_controls_act_at_times_that_spread():
     """A push that begins at 0.3 s and lasts until the end at 1 s: velocities are as the times are, normal."""
     last, own = pushed([0.0, np.nan, 1.2, np.nan, 1.2], [0.0, 0.15, 0.3, 0.65, 1.0], 0.03)
-    assert last.mean() == pytest.approx(1.2 * 0.7 / 0.4, abs=5 * 0.09 / np.sqrt(4000))
-    assert last.std() == pytest.approx(1.2 * 0.03 / 0.4, rel=5 / np.sqrt(2 * 4000))
+    assert last.mean() == pytest.approx(1.2 * 0.7 / 0.4, abs=5 * 0.09 / np.sqrt(1000))
+    assert last.std() == pytest.approx(1.2 * 0.03 / 0.4, rel=5 / np.sqrt(2 * 1000))
     clean, _ = own.clean([[0.03]])
     assert clean[0, -1, 0] == pytest.approx(1.2 * 0.7 / 0.4)
 
@@ -108,5 +108,5 @@ def test_a_clock_that_nothing_is_driven_by():
 
 def test_mjx_refuses_jitter_before_it_compiles():
     pytest.importorskip("mujoco.mjx")
-    with pytest.raises(ValueError, match="expected native for what MJX cannot simulate, got mjx: .* got clock/jitter"):
+    with pytest.raises(ValueError, match=r"expected native for what MJX cannot simulate, got mjx: .* got clock/jitter"):
         mujoco_task(ARM, [Parameter("clock/jitter", (0.0, 0.1))], recorded(), noises=QUIET, engine="mjx")
