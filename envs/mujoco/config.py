@@ -12,6 +12,10 @@ feasible = [0.0001, 0.1]            # Phi; by default Theta_0
 unit = "N m s/rad"
 log = true                          # infer its logarithm
 
+[parameters."joint/*/armature"]     # of all joints (`jaxlfi.envs.mujoco.ties`)
+support = [0.5, 2.0]
+tie = "scaled"                      # a factor of each one's own; or "shared", or "mirrored"
+
 [noise]                             # standard deviations; of other signals it is estimated
 angle = 0.002
 
@@ -57,7 +61,7 @@ KEYS: Mapping[str, type] = {
     "design": dict,
     "name": str,
 }
-PARAMETER = ("support", "feasible", "unit", "log", "truth")
+PARAMETER = ("support", "feasible", "unit", "log", "truth", "tie")
 
 
 def read(
@@ -195,7 +199,7 @@ def _parameter(name: str, table: Any) -> Parameter:
     if not isinstance(log, bool) or not isinstance(unit, str):
         raise ValueError(f"{where}: expected log = true or false and a unit in quotes, got {log!r} and {unit!r}")
     truth = None if truth is None else number(truth, f"{where}: truth")
-    return Parameter(name, bounds["support"], bounds["feasible"], unit, log, truth)
+    return Parameter(name, bounds["support"], bounds["feasible"], unit, log, truth, table.get("tie"))
 
 
 def _guess(label: str, table: Any) -> dict[str, tuple[float, float]]:

@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from jaxlfi.envs.mujoco import parameters
+from jaxlfi.envs.mujoco import parameters, ties
 from jaxlfi.envs.mujoco.parameters import Edit, near
+from jaxlfi.envs.mujoco.ties import Tie
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """Time, positions, velocities and activations."""
@@ -64,6 +65,7 @@ def effects(
     names: Sequence[str],
     supports: Sequence[tuple[float, float]],
     signals: Sequence[str],
+    tied: Sequence[Tie] | None = None,
 ) -> Effects:
     """The effects of parameters, by their names.
 
@@ -73,28 +75,39 @@ def effects(
         names: of the parameters (`parameters`).
         supports: of the parameters: the model has to differ between their bounds.
         signals: that are measured.
+        tied: what the number of each parameter means for each of several elements (`ties`); by default for one.
 
     Raises:
-        ValueError: for names that match nothing or several numbers, and parameters without an effect, in one line.
+        ValueError: for names that match nothing or several numbers, parameters without an effect, and two of one
+            number, in one line.
     """
     found: dict[str, list] = {"edits": [], "starts": [], **{what: [] for what in OF_SENSORS.values()}}
     of_clock: dict[str, int] = {}
-    for d, (name, support) in enumerate(zip(names, supports, strict=True)):
+    keys: list[tuple[str, list[tuple]]] = []
+    tied = [None] * len(names) if tied is None else tied
+    for d, (name, support, tie) in enumerate(zip(names, supports, tied, strict=True)):
         kind, _, rest = name.partition("/")
+        if kind in ("sensor", "initial", "control", "clock", "option") and tie not in (None, "shared"):
+            raise ValueError(f"parameters: {name!r}: tie: expected shared, as the model has no numbers of them")
         if kind == "sensor":
             what, several = _of_sensor(rest, name, signals)
             found[what] += [(signal, d) for signal in several]
+            keys.append((name, [("sensor", signals[signal], what) for signal in several]))
         elif kind == "initial":
-            found["starts"].append((state_place(model, rest, name), d))
+            places = [state_place(model, one, name) for one in _of_joints(model, rest, name)]
+            found["starts"] += [(place, d) for place in places]
+            keys.append((name, [("initial", place) for place in places]))
         elif kind in ("control", "clock"):
             if name not in OF_CLOCKS or not model.nu:
                 expected = " or ".join(OF_CLOCKS)
                 raise ValueError(f"parameters: expected {expected} of a model with actuators, got {name!r}")
             of_clock[OF_CLOCKS[name]] = d
         else:
-            one = parameters.edit(spec, model, name)
+            one, several = ties.edit(spec, model, name, tie)
             parameters.check_effect(spec, one, support)
             found["edits"].append((one, d))
+            keys.append((name, several))
+    ties.refuse_overlaps(keys)
     # A body's mass scales its inertia; whatever of it is inferred besides is meant as it is.
     found["edits"].sort(key=lambda pair: not pair[0].name.endswith("/mass"))
     return Effects(**{what: tuple(several) for what, several in found.items()}, **of_clock)
@@ -149,11 +162,31 @@ def sizes(joint: Any) -> tuple[int, int]:
     return several.get(mujoco.mjtJoint(joint.type[0]), (1, 1))
 
 
+def sensed_by(pattern: str, signals: Sequence[str]) -> list[int]:
+    """Signals that the sensors of a name, or of a pattern, measure, by their numbers."""
+    fits = ties.expression(pattern).fullmatch
+    plain = [one.removeprefix("sensor/") for one in signals]  # of sensors without a name
+    several = zip(signals, plain, strict=True)
+    return [i for i, (one, own) in enumerate(several) if fits(one) or fits(own) or fits(own.rpartition("[")[0])]
+
+
+def _of_joints(model: mujoco.MjModel, rest: str, name: str) -> list[str]:
+    """JOINT/qpos of all joints whose names a pattern matches."""
+    if not parameters.PATTERN.search(rest):
+        return [rest]
+    pattern, _, what = rest.rpartition("/")
+    joints = [model.joint(i).name for i in range(model.njnt)]
+    if not (found := [joint for joint in joints if ties.expression(pattern).fullmatch(joint)]):
+        raise ValueError(
+            f"parameters: {name!r}: expected a pattern that matches the name of a joint {near(rest, joints)}"
+        )
+    return [f"{joint}/{what}" for joint in found]
+
+
 def _of_sensor(rest: str, name: str, signals: Sequence[str]) -> tuple[str, list[int]]:
     """The effect, and the signals: one, or all numbers that a sensor of several measures."""
     signal, _, what = rest.rpartition("/")
-    signal = f"sensor/{signal}" if f"sensor/{signal}" in signals else signal  # of a sensor without a name
-    found = [i for i, one in enumerate(signals) if signal in (one, one.rpartition("[")[0])]
+    found = sensed_by(signal, signals)
     if not found:
         raise ValueError(f"parameters: {name!r}: expected a signal {near(signal, signals)}, got {signal!r}")
     if what not in OF_SENSORS:

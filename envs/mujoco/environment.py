@@ -27,7 +27,7 @@ from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, started
 from jaxlfi.envs.mujoco.mjx_models import Models, mjx
 from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable, state_of
 from jaxlfi.envs.mujoco.model_task import box, compile_spec, specification
-from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.envs.mujoco.parameters import PATTERN, Parameter
 from jaxlfi.rl.environment import EnvState
 
 
@@ -98,7 +98,14 @@ class MujocoEnvironment:
         signals = [*goal.signals, *_only_inferred(self.space.names, goal.signals, spec)]
         add_sensors(spec, signals)
         compiled = compile_spec(spec)
-        self._does = effects(spec, compiled, self.space.names, [one.support for one in parameters], signals)
+        self._does = effects(
+            spec,
+            compiled,
+            self.space.names,
+            [one.support for one in parameters],
+            signals,
+            [one.tie for one in parameters],
+        )
         self.reading = Reading(compiled, goal)
         self.observations, self.actions, self.steps = self.reading.observations, self.reading.actions, goal.steps
         self.models = Models(
@@ -221,7 +228,8 @@ def environment(config: Path) -> MujocoEnvironment:
 
 def _only_inferred(names: Sequence[str], signals: Sequence[str], spec: mujoco.MjSpec) -> list[str]:
     """Signals of whose sensors something was inferred, and which policies do not see."""
-    own = [name.partition("/")[2].rpartition("/")[0] for name in names if name.startswith("sensor/")]
+    sensors = [name for name in names if name.startswith("sensor/") and not PATTERN.search(name)]
+    own = [name.partition("/")[2].rpartition("/")[0] for name in sensors]
     seen = {*signals, *(signal.rpartition("[")[0] for signal in signals)}
     several = {one.name: one.get_data_size() for one in spec.sensors}
     first = lambda signal: f"{signal}[0]" if several.get(signal, 1) > 1 else signal

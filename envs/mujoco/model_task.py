@@ -13,7 +13,7 @@ import numpy as np
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, starts, summaries
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
-from jaxlfi.envs.mujoco.effects import built, effects
+from jaxlfi.envs.mujoco.effects import built, effects, sensed_by
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -98,13 +98,16 @@ def mujoco_task(
         raise ValueError(f"measured: expected at least one signal, each once, got {', '.join(measured) or 'none'}")
     names = [one.name for one in parameters]
     columns.require_measured(episodes[0], measured, actuators)
-    inferred = {signal for signal in measured if f"sensor/{signal.removeprefix('sensor/')}/noise" in names}
+    inferred = {measured[i] for name in _of_sensors(names, "noise") for i in sensed_by(name, measured)}
     _check_noises(episodes[0], measured, noises, inferred)
     add_sensors(spec, measured)
-    for sensor in spec.sensors:  # whose own delay a parameter takes the place of
-        sensor.delay = 0.0 if f"sensor/{sensor.name}/delay" in names else sensor.delay
+    late = [one.name for one in spec.sensors]
+    for number in (i for name in _of_sensors(names, "delay") for i in sensed_by(name, late)):
+        spec.sensors[number].delay = 0.0  # which the parameter takes the place of
     compiled = compile_spec(spec)
-    does = effects(spec, compiled, names, [one.support for one in parameters], measured)
+    does = effects(
+        spec, compiled, names, [one.support for one in parameters], measured, [one.tie for one in parameters]
+    )
     modes = starts.modes(begins, len(episodes))
     given = starts.given(compiled, initial or {}, len(episodes))
     own = [starts.state_of(compiled, *pair) for pair in zip(modes, given, strict=True)]
@@ -227,6 +230,12 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
         return spec.compile()
     except ValueError as error:
         raise ValueError(f"model: MuJoCo refuses it: {' '.join(str(error).split())}") from error
+
+
+def _of_sensors(names: Sequence[str], what: str) -> list[str]:
+    """The sensors that parameters sensor/NAME/what are of."""
+    parts = [name.removeprefix("sensor/").rpartition("/") for name in names if name.startswith("sensor/")]
+    return [sensor for sensor, _, own in parts if own == what]
 
 
 def _check_noises(log: Log, measured: Sequence[str], given: Mapping[str, float], inferred: set[str]) -> None:
