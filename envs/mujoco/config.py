@@ -16,6 +16,9 @@ log = true                          # infer its logarithm
 support = [0.5, 2.0]
 tie = "scaled"                      # a factor of each one's own; or "shared", or "mirrored"
 
+[parameters."body/link/inertial"]   # its whole inertia, ten numbers (`jaxlfi.envs.mujoco.inertia`)
+spread = 0.2                        # about the model's own
+
 [noise]                             # standard deviations; of other signals it is estimated
 angle = 0.002
 
@@ -41,6 +44,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from jaxlfi.envs.mujoco import inertia
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -62,6 +66,10 @@ KEYS: Mapping[str, type] = {
     "name": str,
 }
 PARAMETER = ("support", "feasible", "unit", "log", "truth", "tie")
+
+
+INERTIAL = ("spread", "feasible")
+"""Of a body's whole inertia."""
 
 
 def read(
@@ -136,7 +144,8 @@ def parameters_of(config: Mapping[str, Any]) -> list[Parameter]:
     Raises:
         ValueError: for parameters without bounds, or with other keys.
     """
-    return [_parameter(name, table) for name, table in config["parameters"].items()]
+    several = (_parameters(name, table) for name, table in config["parameters"].items())
+    return [one for own in several for one in own]
 
 
 def numbers(config: Mapping[str, Any], table: str) -> dict[str, float]:
@@ -186,6 +195,16 @@ def number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{where}: expected a number, got {value!r}")
     return float(value)
+
+
+def _parameters(name: str, table: Any) -> list[Parameter]:
+    if not isinstance(table, dict) or "spread" not in table:
+        return [_parameter(name, table)]
+    where = f"parameters: {name!r}"
+    if unknown := [key for key in table if key not in INERTIAL]:
+        raise ValueError(f"{where}: expected keys among {', '.join(INERTIAL)}, got {', '.join(unknown)}")
+    bounds = pair(table["feasible"], f"{where}: feasible") if "feasible" in table else None
+    return inertia.parameters(name, number(table["spread"], f"{where}: spread"), bounds)
 
 
 def _parameter(name: str, table: Any) -> Parameter:

@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from jaxlfi.envs.mujoco import parameters, ties
+from jaxlfi.envs.mujoco import inertia, parameters, ties
+from jaxlfi.envs.mujoco.inertia import Inertial
 from jaxlfi.envs.mujoco.parameters import Edit, near
 from jaxlfi.envs.mujoco.ties import Tie
 
@@ -26,6 +27,7 @@ class Effects:
 
     Attributes:
         edits: of the model.
+        inertials: bodies whose whole inertia changes, with which of its ten numbers are parameters.
         starts: places in the state that episodes begin in.
         gains: signals that are multiplied by it, before an offset is added.
         biases: signals that an offset is added to.
@@ -36,6 +38,7 @@ class Effects:
     """
 
     edits: tuple[tuple[Edit, int], ...] = ()
+    inertials: tuple[tuple[Inertial, tuple[tuple[int, int], ...]], ...] = ()
     starts: tuple[tuple[int, int], ...] = ()
     gains: tuple[tuple[int, int], ...] = ()
     biases: tuple[tuple[int, int], ...] = ()
@@ -83,6 +86,7 @@ def effects(
     """
     found: dict[str, list] = {"edits": [], "starts": [], **{what: [] for what in OF_SENSORS.values()}}
     of_clock: dict[str, int] = {}
+    bodies: dict[str, list[tuple[int, int]]] = {}
     keys: list[tuple[str, list[tuple]]] = []
     tied = [None] * len(names) if tied is None else tied
     for d, (name, support, tie) in enumerate(zip(names, supports, tied, strict=True)):
@@ -102,6 +106,16 @@ def effects(
                 expected = " or ".join(OF_CLOCKS)
                 raise ValueError(f"parameters: expected {expected} of a model with actuators, got {name!r}")
             of_clock[OF_CLOCKS[name]] = d
+        elif (of_body := inertia.component(name)) is not None:
+            body, number = of_body
+            own = inertia.inertial(model, body, name)
+            alone = Edit(
+                name, lambda spec, x, own=own, number=number: own.apply(spec, x * np.eye(inertia.COUNT)[number])
+            )
+            parameters.check_effect(spec, alone, support)
+            bodies.setdefault(body, []).append((number, d))
+            taken = [("body", body, attribute, i) for attribute in parameters.INERTIAL for i in range(4)]
+            keys.append((f"body/{body}/inertial", taken))
         else:
             one, several = ties.edit(spec, model, name, tie)
             parameters.check_effect(spec, one, support)
@@ -110,7 +124,8 @@ def effects(
     ties.refuse_overlaps(keys)
     # A body's mass scales its inertia; whatever of it is inferred besides is meant as it is.
     found["edits"].sort(key=lambda pair: not pair[0].name.endswith("/mass"))
-    return Effects(**{what: tuple(several) for what, several in found.items()}, **of_clock)
+    inertials = tuple((inertia.inertial(model, body, body), tuple(several)) for body, several in bodies.items())
+    return Effects(**{what: tuple(several) for what, several in found.items()}, **of_clock, inertials=inertials)
 
 
 def built(spec: mujoco.MjSpec, does: Effects, theta: Float[np.ndarray, " dim"]) -> mujoco.MjModel:
@@ -122,6 +137,11 @@ def built(spec: mujoco.MjSpec, does: Effects, theta: Float[np.ndarray, " dim"]) 
     own = spec.copy()
     for one, d in does.edits:
         one.apply(own, float(theta[d]))
+    for body, several in does.inertials:
+        coordinates = np.zeros(inertia.COUNT)
+        for number, d in several:
+            coordinates[number] = theta[d]
+        body.apply(own, coordinates)
     return own.compile()
 
 

@@ -270,7 +270,7 @@ def _check_starts(simulator: Simulator, parameters: Sequence[Parameter], noises:
     bounds = np.array([one.feasible or one.support for one in parameters])
     for theta in (np.array([_centre(one) for one in parameters]), *bounds.T):
         try:
-            model = simulator.build(theta) if does.edits else simulator.model
+            model = simulator.build(theta)
         except ValueError:
             continue  # such simulations fail, and are counted
         tried.append((model, theta))

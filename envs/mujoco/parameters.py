@@ -6,6 +6,7 @@
 | `actuator/0/gear[0]` | of the model's first actuator, which needs no name |
 | `actuator/servo/kp`, `actuator/servo/kv` | gains of position and velocity servos (`servos`) |
 | `body/link/mass`, `body/link/inertia[1]`, `body/link/ipos[0]` | of a body as a whole, though its geoms make it up |
+| `body/link/inertial[0]` to `[9]` | its whole inertia (`inertia`) |
 | `joint/*/damping` | of all joints, with a `tie` that says what one number means for them (`ties`) |
 | `option/gravity[0]` | of all of it |
 | `initial/hinge/qpos`, `initial/hinge/qvel`, `initial/box/qpos[2]` | the state that episodes begin in |
