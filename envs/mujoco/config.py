@@ -4,6 +4,8 @@ model = "pendulum.xml"              # beside this file
 log = ["swing.csv"]                 # recordings, one for each episode
 measured = ["angle"]                # by default all signals but the controls
 summary = "samples"                 # what the network sees of them (`jaxlfi.envs.mujoco.summaries`)
+windows = 12                        # of a long recording, each with a start of its own (`jaxlfi.envs.mujoco.windows`)
+window = 2.5                        # s
 unmodelled_force = 0.02             # forces that the model lacks, as a fraction of those that act on each joint
 
 [parameters."joint/hinge/damping"]
@@ -64,6 +66,8 @@ KEYS: Mapping[str, type] = {
     "policy": dict,
     "design": dict,
     "name": str,
+    "windows": int,
+    "window": float,
 }
 PARAMETER = ("support", "feasible", "unit", "log", "truth", "tie")
 
@@ -109,6 +113,8 @@ def read(
             unmodelled_force=config.get("unmodelled_force", 0.0),
             engine=engine,
             begins=begins,
+            windows=config.get("windows"),
+            window=config.get("window"),
             design=config.get("design"),
             name=config.get("name", path.stem),
         )

@@ -173,7 +173,10 @@ class MjxSimulator:
         """Controls of each episode over each step."""
         native = self.native
         if native.does.delay is None:  # they are the same for all
-            recorded = [native.controls(log, np.zeros((1, 0)), self._grid)[0] for log in native.logs]
+            episodes = range(len(native.logs))
+            recorded = [native.controls(episode, np.zeros((1, 0)), self._grid)[0] for episode in episodes]
             return jnp.asarray(np.stack(recorded), jnp.float32)
         when = jnp.asarray(self._grid, jnp.float32) - theta[native.does.delay]
-        return jnp.stack([jnp.stack([held(when) for held in several], axis=-1) for several in self._held])
+        begins = [start.time for start in native.starts]
+        pairs = zip(self._held, begins, strict=True)
+        return jnp.stack([jnp.stack([held(when + begin) for held in several], axis=-1) for several, begin in pairs])

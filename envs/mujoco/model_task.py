@@ -12,15 +12,19 @@ import numpy as np
 
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, starts, summaries
+from jaxlfi.envs.mujoco import windows as cuts
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
-from jaxlfi.envs.mujoco.effects import built, effects, sensed_by
+from jaxlfi.envs.mujoco.effects import Effects, built, effects, sensed_by
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.parameters import Parameter
 from jaxlfi.envs.mujoco.simulator import FAILURES, Simulator, simulator_of
+from jaxlfi.envs.mujoco.starts import Start
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.task import Task
 
+_JITTERS = 5
+"""Standard deviations by which a control may be late."""
 ENGINES = ("native", "mjx")
 """What simulates a model."""
 
@@ -40,6 +44,8 @@ def mujoco_task(
     engine: Literal["native", "mjx"] = "native",
     design: Mapping[str, Any] | None = None,
     begins: str | Sequence[str] | None = None,
+    windows: int | None = None,
+    window: float | None = None,
     **others: Any,
 ) -> Task:
     """Infer numbers of a MuJoCo model from recordings of controls and sensors.
@@ -72,6 +78,9 @@ def mujoco_task(
             MuJoCo itself.
         begins: where episodes begin (`starts`): "log", "model" or "keyframe NAME", for all episodes or for each; by
             default where the recording does, if it measures all joints.
+        windows: into how many each recording is cut, each an episode with a start of its own (`cuts`); by default only
+            recordings of many steps are.
+        window: how long each lasts, in s; by default a few periods of the motion.
         **others: of `jaxlfi.Task`.
 
     Raises:
@@ -117,13 +126,21 @@ def mujoco_task(
         for log, state in zip(episodes, own, strict=True)
     ]
     deviations = _deviations(episodes[0], measured, noises, inferred)
-    begun = starts.chosen(compiled, episodes, measured, deviations, own, given, modes, does)
+    parts, whole = None, episodes
+    if windows is not None or window is not None or cuts.wanted(compiled, episodes, measured):
+        parts = _windows(compiled, parameters, episodes, measured, deviations, does, (modes, given), windows, window)
+    if parts is None:
+        begun = starts.chosen(compiled, episodes, measured, deviations, own, given, modes, does)
+    else:
+        episodes, begun = parts
 
     build = functools.partial(built, spec, does)
     if unknown := [name for name in discrepancies if name not in measured]:
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
     simulator = Simulator(compiled, build, episodes, measured, deviations, begun, does, discrepancies, threads)
     _check_starts(simulator, parameters, deviations)
+    for log in whole:
+        columns.warn_of_clamped(log, compiled, names)
     others = {"name": spec.modelname or "mujoco"} | others
     task = task_of(simulator, parameters, measured, summary, supports, unmodelled_force, **others)
     if design is not None:
@@ -150,8 +167,6 @@ def task_of(
     if unmodelled_force:
         centre = np.array([_centre(one) for one in parameters])
         simulator = simulator.lacking(simulator.typical_forces(centre).times(unmodelled_force))
-    for log in simulator.logs:
-        columns.warn_of_clamped(log, simulator.model, [one.name for one in parameters])
     seen = summaries.fields(summary, simulator)
     others["settings"] = seen.pop("settings", {}) | dict(others.get("settings", {}))
     supports = {"initial": box([one.support for one in parameters])}
@@ -262,6 +277,53 @@ def _deviations(log: Log, measured: Sequence[str], given: Mapping[str, float], i
             except ValueError as error:
                 raise ValueError(f"noises: {name}: {error}") from error
     return found
+
+
+def _windows(
+    model: mujoco.MjModel,
+    parameters: Sequence[Parameter],
+    episodes: Sequence[Log],
+    measured: Sequence[str],
+    noises: Mapping[str, float],
+    does: Effects,
+    given: tuple[Sequence[str | None], Sequence[Mapping[int, float]]],
+    count: int | None,
+    duration: float | None,
+) -> tuple[list[Log], list[Start]] | None:
+    """Recordings and starts of windows; None of long recordings that cannot be cut, which is said.
+
+    Raises:
+        ValueError: for windows that somebody asks for and that cannot be, in one line.
+    """
+    modes, numbers = given
+    missing = starts.unmeasured(model, measured, [])
+    if missing:
+        reason = f"recordings that measure all joints, got none of {', '.join(missing)}"
+    elif any(mode not in (None, "log") for mode in modes) or any(numbers) or does.starts:
+        reason = "starts that recordings say, got others in [initial] or among the parameters"
+    else:
+        reason = None
+    if reason is not None and (count is not None or duration is not None):
+        raise ValueError(f"windows: expected {reason}")
+    if reason is not None:
+        plausible.say(
+            f"{episodes[0].name}: long recordings are cut into windows, which expect {reason}: simulated whole"
+        )
+        return None
+    windows = cuts.windows_of(model, episodes, measured, noises, count, duration)
+    bounds = [one.feasible or one.support for one in parameters]
+    lead = (0.0 if does.delay is None else max(bounds[does.delay][1], 0.0)) + (
+        0.0 if does.jitter is None else _JITTERS * bounds[does.jitter][1]
+    )
+    late = {measured[signal]: bounds[d][1] for signal, d in does.lags}
+    parts, times = cuts.cut(episodes, windows, measured, lead, late)
+    own = starts.state_of(model, None, {})
+    begun = [
+        starts.recorded(model, episodes[one.recording], measured, noises, own, {}, does, one.begin) for one in windows
+    ]
+    rows = sum(int(np.isfinite([log.signals[name] for name in measured]).any(axis=0).sum()) for log in parts)
+    cuts.said(episodes, windows, model.opt.timestep, rows)
+    return parts, [dataclasses.replace(start, time=time) for start, time in zip(begun, times, strict=True)]
 
 
 def _check_starts(simulator: Simulator, parameters: Sequence[Parameter], noises: Mapping[str, float]) -> None:

@@ -115,8 +115,9 @@ class Simulator:
         self.discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
         self.forces: UnmodelledForces | None = None
         self.actuators = controls_of(model)
-        rows = [self._measured_rows(log) for log in logs]
-        self.times = [log.times[own] for log, own in zip(logs, rows, strict=True)]
+        rows = [self._measured_rows(log, start.time) for log, start in zip(logs, self.starts, strict=True)]
+        several = zip(logs, rows, self.starts, strict=True)
+        self.times = [log.times[own] - start.time for log, own, start in several]
         recorded = np.concatenate(
             [
                 np.stack([log.signals[name] for name in signals], axis=1)[own]
@@ -132,6 +133,7 @@ class Simulator:
 
     def held(self, episode: int, times: Float[np.ndarray, " moments"]) -> Float[np.ndarray, "moments controls"]:
         """The recorded controls of an episode at some times, held from sample to sample."""
+        times = times + self.starts[episode].time
         columns = [self.logs[episode].held(name, times) for name in self.actuators]
         return np.stack(columns, axis=-1) if columns else np.zeros((len(times), 0))
 
@@ -196,8 +198,8 @@ class Simulator:
             )
         return int(taken)
 
-    def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
-        """Rows of a log with a sample of anything that is measured."""
+    def _measured_rows(self, log: Log, begin: float) -> Int[np.ndarray, " rows"]:
+        """Rows of a log with a sample of anything that is measured, from the time on at which its episode begins."""
         known = ", ".join(log.signals)
         if missing := [name for name in self.actuators if name not in log.signals]:
             raise ValueError(
@@ -206,13 +208,14 @@ class Simulator:
             )
         if missing := [name for name in self.signals if name not in log.signals]:
             raise ValueError(f"{log.name}: expected signals {', '.join(missing)}, got {known}")
-        if log.times[-1] < self.model.opt.timestep:
+        if log.times[-1] - begin < self.model.opt.timestep:
             raise ValueError(
                 f"{log.name}: expected more than a step of the model, {self.model.opt.timestep:g} s, "
-                f"got {log.times[-1]:g} s"
+                f"got {log.times[-1] - begin:g} s"
             )
         check(self.model, log, self.signals)
-        return np.flatnonzero(np.isfinite([log.signals[name] for name in self.signals]).any(axis=0))
+        there = np.isfinite([log.signals[name] for name in self.signals]).any(axis=0)
+        return np.flatnonzero(there & (log.times >= begin - 1e-9))
 
     def __call__(
         self, rng: np.random.Generator, theta: Float[np.ndarray, "n dim"]
@@ -277,7 +280,7 @@ class Simulator:
         theta = np.asarray(theta, float)
         models, grid = [self.build(row) for row in theta], self.grid(self.times[episode])
         start = self.begun(episode, theta)
-        controls = self.controls(self.logs[episode], theta, grid)
+        controls = self.controls(episode, theta, grid)
         with _LOCK, quietly():
             states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self.model), start, controls)
         return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
@@ -301,11 +304,11 @@ class Simulator:
         data = [mujoco.MjData(self.model) for _ in range(self._threads)]
         drawn = None if drawn is None else drawn.part(good)
         begin = 0
-        for episode, (log, times) in enumerate(zip(self.logs, self.times, strict=True)):
+        for episode, times in enumerate(self.times):
             late, moved = (None, None) if drawn is None else drawn.of(episode)
             start, grid = self.begun(episode, theta[good], moved), self.grid(times)
             states, sensors = self._pool.rollout(
-                [models[row] for row in good], data, start, self.controls(log, theta[good], grid, late)
+                [models[row] for row in good], data, start, self.controls(episode, theta[good], grid, late)
             )
             # MuJoCo begins anew where a simulation has become unstable, and its clock with it.
             step = self.model.opt.timestep
@@ -326,17 +329,18 @@ class Simulator:
         step = self.model.opt.timestep
         return step * np.arange(max(int(np.ceil(times[-1] / step - 1e-9)), 1) + 1)
 
-    def controls(self, log: Log, theta: np.ndarray, grid: np.ndarray, late: np.ndarray | None = None) -> np.ndarray:
+    def controls(self, episode: int, theta: np.ndarray, grid: np.ndarray, late: np.ndarray | None = None) -> np.ndarray:
         """Controls of each model over each step, shape [N, steps, actuators].
 
         Args:
-            log: of an episode.
+            episode: its number.
             theta: in natural units, shape [N, D].
             grid: times of the steps.
             late: by how much each row of the log acts later than it says, shape [N, T]; nothing by default.
         """
         delays = np.zeros(len(theta)) if self.does.delay is None else theta[:, self.does.delay]
-        when, step = grid - delays[:, None], self.model.opt.timestep
+        log, step = self.logs[episode], self.model.opt.timestep
+        when = self.starts[episode].time + grid - delays[:, None]
         held = [
             log.mean_held(name, when, step)
             if late is None

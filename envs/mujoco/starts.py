@@ -9,9 +9,10 @@
 Numbers beside it, and parameters `initial/JOINT/qpos`, win. By default an episode begins where its recording does, if
 that measures all joints of which nothing is given, and begins elsewhere than the model.
 
-A recording's first samples say position and velocity by a polynomial through them, of the third degree, over the first
-half of the longest time that it fits to within the noise. What they leave open, most of all of velocities, is drawn
-anew in each simulation, and so is no part of the answer but counts in its width.
+A recording's first samples say position and velocity by a polynomial through them, of the third degree, over half of
+the longest time that it fits to within the noise and in which it says the same as over shorter times (Lepskii 1991).
+What they leave open, most of all of velocities, is drawn anew in each simulation, and so is no part of the answer but
+counts in its width.
 """
 
 import dataclasses
@@ -35,10 +36,14 @@ DEGREE = 3
 KEYFRAME = "keyframe "
 FEWEST, MOST = 8, 1000
 """Samples that it goes through."""
+COUNTS = np.unique(np.round(np.geomspace(FEWEST, MOST, 24)).astype(int)).tolist()
+"""Those that are tried."""
 AGREES = 3.0
 """Standard deviations within which a recording begins where the model does."""
 STRAIGHT = {1: 1, 4: 0, 7: 3}
 """Positions of a joint that are no quaternion, by the number of all its positions."""
+APART = 2.5
+"""Standard deviations that a start by fewer samples may be from that by more."""
 _TINY = 1e-9
 _OF_FIRST_ORDER = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 
@@ -55,6 +60,7 @@ class Start:
         signals: that measure the position, by their numbers; -1 where none does, shape [V].
         fixed: numbers of the state that are given, by their places.
         joints: of each joint its places in `qpos` and `qvel`, and how many positions it has.
+        time: in s of the recording, at which the episode begins.
     """
 
     state: Float[np.ndarray, " state"]
@@ -63,6 +69,7 @@ class Start:
     signals: Int[np.ndarray, " dofs"]
     fixed: Mapping[int, float]
     joints: tuple[tuple[int, int, int], ...]
+    time: float = 0.0
 
     @property
     def uncertain(self) -> bool:
@@ -362,7 +369,7 @@ def recorded(
     for place, number in fixed.items():
         state[place] = number
     state[0] = 0.0
-    return Start(state, acceleration, root, measuring, dict(fixed), _joints(model))
+    return Start(state, acceleration, root, measuring, dict(fixed), _joints(model), at)
 
 
 def agrees(model: mujoco.MjModel, start: Start, own: Float[np.ndarray, " state"], does: Effects) -> bool:
@@ -391,18 +398,21 @@ def polynomial(
     Raises:
         ValueError: for fewer than two positions.
     """
+    series = [_near(*one, at) for one in series]
     away = np.sort(np.abs(series[0][0] - at))
     if len(away) < 2:
         raise ValueError(f"{where}: expected at least 2 samples to begin an episode by, got {len(away)}")
-    counts = [count for count in _COUNTS if count <= len(away)] or [len(away)]
-    longest, first, excess = 0, np.zeros(3), 0.0
+    counts = [count for count in COUNTS if count <= len(away)] or [len(away)]
+    longest, before = 0, []
     for count in counts:
-        found, _, excess = _least_squares(series, at, away[count - 1])
-        first = found if count == counts[0] else first
-        if excess > 2:
+        found, covariance, excess = _least_squares(series, at, away[count - 1])
+        apart = [np.abs(found[:2] - moments[:2]) / deviations for moments, deviations in before]
+        if excess > 2 or np.max(apart, initial=0.0) > APART:
             break
+        before.append((found, np.sqrt(np.diagonal(covariance))))
         longest = count if excess <= 1 else longest
     if longest == 0:  # the fewest samples are too many for a polynomial: how far it is off shows with fewer still
+        first, _, _ = _least_squares(series, at, away[counts[0] - 1])
         found, covariance, _ = _least_squares(series, at, away[min(counts[0], DEGREE + 2) - 1])
         off = (found - first)[:2]
         return found, covariance + np.outer(off, off)
@@ -410,8 +420,13 @@ def polynomial(
     return found, covariance
 
 
-_COUNTS = np.unique(np.round(np.geomspace(FEWEST, MOST, 24)).astype(int)).tolist()
-"""Samples that are tried."""
+def _near(
+    times: np.ndarray, values: np.ndarray, deviation: float, order: int, at: float
+) -> tuple[np.ndarray, np.ndarray, float, int]:
+    """What may matter of a series."""
+    middle = int(np.searchsorted(times, at))
+    part = slice(max(middle - MOST, 0), middle + MOST)
+    return times[part], values[part], deviation, order
 
 
 def _least_squares(
@@ -448,9 +463,11 @@ def _rotation(
     log: Log, names: Sequence[str], noises: Mapping[str, float], at: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Orientation, angular velocity and acceleration in the body's frame, and roots of their covariances [3, 2, 2]."""
-    rows = orientations.continuous(np.stack([log.signals[name] for name in names], axis=1))
-    there = np.isfinite(rows).all(axis=1)
-    times, rows = log.times[there], rows[there]
+    several = np.stack([log.signals[name] for name in names], axis=1)
+    there = np.flatnonzero(np.isfinite(several).all(axis=1))
+    middle = int(np.searchsorted(log.times[there], at))
+    there = there[max(middle - MOST, 0) : middle + MOST]
+    times, rows = log.times[there], orientations.continuous(several[there])
     deviation = 2 * float(np.mean([_deviation(log, name, noises) for name in names]))
     middle = rows[np.argmin(np.abs(times - at))].copy()
     for _ in range(2):  # angular velocities are derivatives of rotation vectors where those are small
