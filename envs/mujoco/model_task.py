@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, starts, summaries
+from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, starts, summaries, visuals
 from jaxlfi.envs.mujoco import windows as cuts
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import Effects, built, effects, sensed_by
@@ -117,6 +117,8 @@ def mujoco_task(
     does = effects(
         spec, compiled, names, [one.support for one in parameters], measured, [one.tie for one in parameters]
     )
+    bare = visuals.without(spec, compiled, names)
+    compiled = compiled if bare is spec else compile_spec(bare.copy())
     modes = starts.modes(begins, len(episodes))
     given = starts.given(compiled, initial or {}, len(episodes))
     own = [starts.state_of(compiled, *pair) for pair in zip(modes, given, strict=True)]
@@ -134,10 +136,11 @@ def mujoco_task(
     else:
         episodes, begun = parts
 
-    build = functools.partial(built, spec, does)
+    build = functools.partial(built, bare, does)
     if unknown := [name for name in discrepancies if name not in measured]:
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
     simulator = Simulator(compiled, build, episodes, measured, deviations, begun, does, discrepancies, threads)
+    simulator.look = functools.partial(built, spec, does)
     _check_starts(simulator, parameters, deviations)
     for log in whole:
         columns.warn_of_clamped(log, compiled, names)

@@ -74,6 +74,7 @@ class Simulator:
         orientations: among the signals, whose quaternions are compared as rotations (`aligned`).
         discrepancies: what the model gets wrong, by the signal's number.
         forces: that the model lacks, if any are drawn (`lacking`).
+        look: makes the model of a parameter vector that is drawn in films.
         starts: where each episode begins.
         model, build, does, logs: as they are given, below.
     """
@@ -106,7 +107,7 @@ class Simulator:
         Raises:
             ValueError: for recordings that do not fit the model, in one line.
         """
-        self.model, self.build, self.does = model, build, does
+        self.model, self.build, self.does, self.look = model, build, does, build
         self.logs, self.signals = tuple(logs), tuple(signals)
         self.starts = tuple(one if isinstance(one, Start) else certain(model, np.asarray(one)) for one in starts)
         self.places = measured.places(model, signals)

@@ -127,7 +127,7 @@ def test_sensors_that_are_late_and_have_gains():
 def test_windows_begin_in_starts_of_their_own():
     """Of a recording that begins in motion, with controls that are late, and states that are drawn."""
     times = 0.02 * np.arange(100)
-    place = 0.3 + 0.5 * np.sin(times) + 0.01 * np.random.default_rng(0).standard_normal(100)
+    place = 0.3 + 0.9 * np.sin(2 * times) + 0.01 * np.random.default_rng(0).standard_normal(100)
     log = Log(times, {"motor": np.cos(3 * times), "place": place})
     with pytest.warns(RecordingWarning, match="cut into 2 windows of 0.6 s"):
         task = slide([DAMPING, LATE], log, {"place": 0.01}, windows=2, window=0.6)
