@@ -124,6 +124,7 @@ def test_sensors_that_are_late_and_have_gains():
     agree(task, np.array([[0.0, 0.033, 1.5], [0.05, 0.12, 2.0], [0.0, 0.0, 1.0]], np.float32), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_windows_begin_in_starts_of_their_own():
     """Of a recording that begins in motion, with controls that are late, and states that are drawn."""
     times = 0.02 * np.arange(100)
