@@ -1,6 +1,7 @@
 """The effects of parameters: on the model, on the state that episodes begin in, on sensors or on controls."""
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,6 +18,8 @@ STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """Time, positions, velocities and activations."""
 OF_SENSORS = {"gain": "gains", "bias": "biases", "delay": "lags", "noise": "deviations"}
 """What parameters of sensors are called, and the effects that they are."""
+OF_EPISODE = re.compile(r"episode/(?P<episode>\d+)/initial/(?P<rest>[^*?]+)")
+"""A parameter of the start of one episode."""
 OF_CLOCKS = {"control/delay": "delay", "clock/jitter": "jitter"}
 """The same of the clock that controls act by."""
 
@@ -29,6 +32,7 @@ class Effects:
         edits: of the model.
         inertials: bodies whose whole inertia changes, with which of its ten numbers are parameters.
         starts: places in the state that episodes begin in.
+        own_starts: the same of one episode, whose number is the first of three.
         gains: signals that are multiplied by it, before an offset is added.
         biases: signals that an offset is added to.
         lags: signals that are measured so many seconds after what they measure.
@@ -40,6 +44,7 @@ class Effects:
     edits: tuple[tuple[Edit, int], ...] = ()
     inertials: tuple[tuple[Inertial, tuple[tuple[int, int], ...]], ...] = ()
     starts: tuple[tuple[int, int], ...] = ()
+    own_starts: tuple[tuple[int, int, int], ...] = ()
     gains: tuple[tuple[int, int], ...] = ()
     biases: tuple[tuple[int, int], ...] = ()
     lags: tuple[tuple[int, int], ...] = ()
@@ -53,13 +58,17 @@ class Effects:
         return frozenset(signal for signal, _ in (*self.gains, *self.biases))
 
     def started(
-        self, start: Float[np.ndarray, "*#n state"], theta: Float[np.ndarray, "*n dim"]
+        self, start: Float[np.ndarray, "*#n state"], theta: Float[np.ndarray, "*n dim"], episode: int
     ) -> Float[np.ndarray, "*n state"]:
         """The states that the models of parameter vectors begin in, by those that they would begin in otherwise."""
         state = np.array(np.broadcast_to(start, (*theta.shape[:-1], np.shape(start)[-1])))
-        for place, d in self.starts:
+        for place, d in self.starts_of(episode):
             state[..., place] = theta[..., d]
         return state
+
+    def starts_of(self, episode: int) -> tuple[tuple[int, int], ...]:
+        """Places in the state that an episode begins in."""
+        return (*self.starts, *((place, d) for own, place, d in self.own_starts if own == episode))
 
 
 def effects(
@@ -69,6 +78,7 @@ def effects(
     supports: Sequence[tuple[float, float]],
     signals: Sequence[str],
     tied: Sequence[Tie] | None = None,
+    episodes: int | None = None,
 ) -> Effects:
     """The effects of parameters, by their names.
 
@@ -79,12 +89,13 @@ def effects(
         supports: of the parameters: the model has to differ between their bounds.
         signals: that are measured.
         tied: what the number of each parameter means for each of several elements (`ties`); by default for one.
+        episodes: how many there are, where parameters may be of the start of one of them.
 
     Raises:
         ValueError: for names that match nothing or several numbers, parameters without an effect, and two of one
             number, in one line.
     """
-    found: dict[str, list] = {"edits": [], "starts": [], **{what: [] for what in OF_SENSORS.values()}}
+    found: dict[str, list] = {"edits": [], "starts": [], "own_starts": [], **{what: [] for what in OF_SENSORS.values()}}
     of_clock: dict[str, int] = {}
     bodies: dict[str, list[tuple[int, int]]] = {}
     keys: list[tuple[str, list[tuple]]] = []
@@ -100,7 +111,14 @@ def effects(
         elif kind == "initial":
             places = [state_place(model, one, name) for one in _of_joints(model, rest, name)]
             found["starts"] += [(place, d) for place in places]
-            keys.append((name, [("initial", place) for place in places]))
+            keys.append((name, [("initial", place, own) for place in places for own in range(episodes or 1)]))
+        elif (of_start := OF_EPISODE.fullmatch(name)) is not None:
+            own, rest = int(of_start["episode"]), of_start["rest"]
+            if episodes is not None and own >= episodes:
+                raise ValueError(f"parameters: {name!r}: expected an episode of 0 to {episodes - 1}, got {own}")
+            place = state_place(model, rest, name)
+            found["own_starts"].append((own, place, d))
+            keys.append((name, [("initial", place, own)]))
         elif kind in ("control", "clock"):
             if name not in OF_CLOCKS or not model.nu:
                 expected = " or ".join(OF_CLOCKS)

@@ -9,11 +9,14 @@ from jaxlfi.envs.mujoco.logs import Log
 
 
 def started(
-    does: Effects, theta: Float[Array, " dim"], start: Float[Array | np.ndarray, " state"]
+    does: Effects, theta: Float[Array, " dim"], start: Float[Array | np.ndarray, " state"], episode: int = -1
 ) -> Float[Array, " state"]:
-    """The state (`effects.STATE`) that an episode begins in, by the one that it would begin in otherwise."""
+    """The state (`effects.STATE`) that an episode begins in, by the one that it would begin in otherwise.
+
+    By default it is none of those that were recorded.
+    """
     state = jnp.asarray(start, jnp.float32)
-    for place, d in does.starts:
+    for place, d in does.starts_of(episode):
         state = state.at[place].set(theta[d])
     return state
 

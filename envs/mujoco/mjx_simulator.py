@@ -122,11 +122,11 @@ class MjxSimulator:
             lacking = jnp.zeros(len(native.forces.deviations))
         given = theta if lacking is None else jnp.concatenate([theta, lacking])
         numbers, refused = self._physics.models.numbers(given)
-        episode = functools.partial(self._episode, self._physics.models.model(numbers))
+        simulated = functools.partial(self._episode, self._physics.models.model(numbers))
         begun = jnp.zeros((len(native.starts), native.model.nv, 2)) if begun is None else begun
-        starts = [start.at(native.does, theta, own, jnp) for start, own in zip(native.starts, begun, strict=True)]
-        starts = jnp.stack([started(native.does, theta, start) for start in starts])
-        values, stable = jax.vmap(episode)(starts, self._controls(theta))
+        likely = [start.at(native.does, theta, own, jnp) for start, own in zip(native.starts, begun, strict=True)]
+        starts = [started(native.does, theta, start, episode) for episode, start in enumerate(likely)]
+        values, stable = jax.vmap(simulated)(jnp.stack(starts), self._controls(theta))
         rows = [self._measured(own, times, theta) for own, times in zip(values, native.times, strict=True)]
         unstable = jnp.any(self._needed & ~stable)
         outcome = jnp.where(refused, REFUSED, jnp.where(unstable, UNSTABLE, 0))
@@ -136,7 +136,7 @@ class MjxSimulator:
         self, values: Float[Array, "steps signals"], times: np.ndarray, theta: Float[Array, " dim"]
     ) -> Float[Array, "rows signals"]:
         """Signals at the times of rows, some of them as they were before."""
-        rows = between(self._grid, values, times)
+        rows = jnp.asarray(between(self._grid, values, times))
         for signal, d in self.native.does.lags:
             late = jnp.interp(jnp.asarray(times, jnp.float32) - theta[d], self._grid, values[:, signal])
             rows = rows.at[:, signal].set(late)

@@ -115,7 +115,13 @@ def mujoco_task(
         spec.sensors[number].delay = 0.0  # which the parameter takes the place of
     compiled = compile_spec(spec)
     does = effects(
-        spec, compiled, names, [one.support for one in parameters], measured, [one.tie for one in parameters]
+        spec,
+        compiled,
+        names,
+        [one.support for one in parameters],
+        measured,
+        [one.tie for one in parameters],
+        len(episodes),
     )
     bare = visuals.without(spec, compiled, names)
     compiled = compiled if bare is spec else compile_spec(bare.copy())
@@ -124,8 +130,8 @@ def mujoco_task(
     own = [starts.state_of(compiled, *pair) for pair in zip(modes, given, strict=True)]
     centre = np.array([_centre(one) for one in parameters])
     episodes = [
-        recordings.prepared(compiled, log, measured, does.started(state, centre))
-        for log, state in zip(episodes, own, strict=True)
+        recordings.prepared(compiled, log, measured, does.started(state, centre, number))
+        for number, (log, state) in enumerate(zip(episodes, own, strict=True))
     ]
     deviations = _deviations(episodes[0], measured, noises, inferred)
     parts, whole = None, episodes
@@ -302,7 +308,7 @@ def _windows(
     missing = starts.unmeasured(model, measured, [])
     if missing:
         reason = f"recordings that measure all joints, got none of {', '.join(missing)}"
-    elif any(mode not in (None, "log") for mode in modes) or any(numbers) or does.starts:
+    elif any(mode not in (None, "log") for mode in modes) or any(numbers) or does.starts or does.own_starts:
         reason = "starts that recordings say, got others in [initial] or among the parameters"
     else:
         reason = None
@@ -321,9 +327,7 @@ def _windows(
     late = {measured[signal]: bounds[d][1] for signal, d in does.lags}
     parts, times = cuts.cut(episodes, windows, measured, lead, late)
     own = starts.state_of(model, None, {})
-    begun = [
-        starts.recorded(model, episodes[one.recording], measured, noises, own, {}, does, one.begin) for one in windows
-    ]
+    begun = [starts.recorded(model, episodes[one.recording], measured, noises, own, at=one.begin) for one in windows]
     rows = sum(int(np.isfinite([log.signals[name] for name in measured]).any(axis=0).sum()) for log in parts)
     cuts.said(episodes, windows, model.opt.timestep, rows)
     return parts, [dataclasses.replace(start, time=time) for start, time in zip(begun, times, strict=True)]

@@ -10,6 +10,7 @@
 | `joint/*/damping` | of all joints, with a `tie` that says what one number means for them (`ties`) |
 | `option/gravity[0]` | of all of it |
 | `initial/hinge/qpos`, `initial/hinge/qvel`, `initial/box/qpos[2]` | the state that episodes begin in |
+| `episode/1/initial/hinge/qpos` | that of the second episode only |
 | `sensor/angle/bias`, `sensor/angle/noise` | what a sensor adds: an offset, and the standard deviation of its noise |
 | `sensor/angle/gain`, `sensor/angle/delay` | what it multiplies by, and the seconds after which it measures |
 | `control/delay` | seconds after which a control acts |

@@ -291,7 +291,7 @@ class Simulator:
     ) -> Float[np.ndarray, "*n state"]:
         """The states that an episode of parameter vectors begins in; by default the most likely ones."""
         draws = np.zeros((*theta.shape[:-1], self.model.nv, 2)) if draws is None else draws
-        return self.does.started(self.starts[episode].at(self.does, theta, draws), theta)
+        return self.does.started(self.starts[episode].at(self.does, theta, draws), theta, episode)
 
     def _rolled(self, theta: np.ndarray, lacking: np.ndarray, drawn: Drawn | None) -> tuple[np.ndarray, np.ndarray]:
         models = [self._made(*rows) for rows in zip(theta, lacking, strict=True)]

@@ -192,7 +192,9 @@ def modes(begins: str | Sequence[str] | None, count: int) -> list[str | None]:
     Raises:
         ValueError: for other words, and another number of them than of episodes.
     """
-    several = [begins] * count if begins is None or isinstance(begins, str) else list(begins)
+    if not isinstance(begins, str | list | tuple | None):
+        raise ValueError(f'initial: from: expected "log", "model" or "keyframe NAME", got {begins!r}')
+    several: list[str | None] = list(begins) if isinstance(begins, list | tuple) else [begins] * count
     if len(several) != count:
         raise ValueError(f"initial: from: expected one for all, or one for each of {count} episodes, got {begins!r}")
     for one in several:
@@ -241,19 +243,19 @@ def chosen(
         ValueError: where a recording is to say how its episode begins and does not, in one line.
     """
     found, said = [], []
-    for log, own, known, mode in zip(episodes, states, fixed, begins, strict=True):
-        start = certain(model, own, known)
+    for number, (log, own, known, mode) in enumerate(zip(episodes, states, fixed, begins, strict=True)):
+        start, inferred = certain(model, own, known), [place for place, _ in does.starts_of(number)]
         here = [name for name in signals if name in log.signals and np.isfinite(log.signals[name]).any()]
-        missing = unmeasured(model, here, [*known, *(place for place, _ in does.starts)])
+        missing = unmeasured(model, here, [*known, *inferred])
         if mode == "log" and missing:
             raise ValueError(
                 f"initial: from: expected a log that measures all joints, got none of {', '.join(missing)} in "
                 f"{log.name}: give {missing[0]}/qpos in [initial], or infer initial/{missing[0]}/qpos"
             )
         if mode == "log" or (mode is None and not missing and model.nq):
-            settled = [*known, *(place for place, _ in does.starts)] if mode is None else []
+            settled = [*known, *inferred] if mode is None else []
             without = [joint for joint in range(model.njnt) if not _places(model, joint).isdisjoint(settled)]
-            says = recorded(model, log, signals, noises, own, known, does, without=without)
+            says = recorded(model, log, signals, noises, own, known, inferred, without=without)
             if says.uncertain and (mode == "log" or not agrees(model, says, own, does)):
                 start = says
                 said.append(log.name)
@@ -309,8 +311,8 @@ def recorded(
     signals: Sequence[str],
     noises: Mapping[str, float],
     own: Float[np.ndarray, " state"],
-    fixed: Mapping[int, float],
-    does: Effects,
+    fixed: Mapping[int, float] = {},
+    inferred: Sequence[int] = (),
     at: float = 0.0,
     without: Sequence[int] = (),
 ) -> Start:
@@ -323,7 +325,7 @@ def recorded(
         noises: standard deviations of their noise; 0 where they are not known.
         own: the state that gives what the recording does not.
         fixed: numbers of the state that are given, by their places.
-        does: effects of parameters.
+        inferred: places in the state that parameters are of.
         at: when the episode begins, in s of the recording.
         without: joints that begin as they would otherwise, by their numbers.
 
@@ -332,7 +334,7 @@ def recorded(
     """
     state, numbers = own.copy(), poses.measured_positions(model, signals)
     acceleration, root = np.zeros(model.nv), np.zeros((model.nv, 2, 2))
-    measuring, inferred = np.full(model.nv, -1), {place for place, _ in does.starts}
+    measuring = np.full(model.nv, -1)
     speeds = _speeds(model, signals)
     for joint, (place, dof, count) in enumerate(_joints(model)):
         if joint in without:
@@ -364,10 +366,11 @@ def recorded(
                 root[dof, row] = 0.0
     first = 1 + model.nq + model.nv
     for i, name in enumerate(controls_of(model)):
-        if int(model.actuator_dyntype[i]) in _OF_FIRST_ORDER and model.actuator_actnum[i] == 1:
+        of_first_order = int(model.actuator_dyntype[i]) in _OF_FIRST_ORDER and model.actuator_actnum[i] == 1
+        if of_first_order and name in log.signals:
             state[first + int(model.actuator_actadr[i])] = log.held(name, np.array([at]))[0]
-    for place, number in fixed.items():
-        state[place] = number
+    for where, given in fixed.items():
+        state[where] = given
     state[0] = 0.0
     return Start(state, acceleration, root, measuring, dict(fixed), _joints(model), at)
 
@@ -403,7 +406,8 @@ def polynomial(
     if len(away) < 2:
         raise ValueError(f"{where}: expected at least 2 samples to begin an episode by, got {len(away)}")
     counts = [count for count in COUNTS if count <= len(away)] or [len(away)]
-    longest, before = 0, []
+    longest = 0
+    before: list[tuple[np.ndarray, np.ndarray]] = []
     for count in counts:
         found, covariance, excess = _least_squares(series, at, away[count - 1])
         apart = [np.abs(found[:2] - moments[:2]) / deviations for moments, deviations in before]
@@ -463,11 +467,11 @@ def _rotation(
     log: Log, names: Sequence[str], noises: Mapping[str, float], at: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Orientation, angular velocity and acceleration in the body's frame, and roots of their covariances [3, 2, 2]."""
-    several = np.stack([log.signals[name] for name in names], axis=1)
-    there = np.flatnonzero(np.isfinite(several).all(axis=1))
-    middle = int(np.searchsorted(log.times[there], at))
-    there = there[max(middle - MOST, 0) : middle + MOST]
-    times, rows = log.times[there], orientations.continuous(several[there])
+    recorded = np.stack([log.signals[name] for name in names], axis=1)
+    there = np.flatnonzero(np.isfinite(recorded).all(axis=1))
+    row = int(np.searchsorted(log.times[there], at))
+    there = there[max(row - MOST, 0) : row + MOST]
+    times, rows = log.times[there], orientations.continuous(recorded[there])
     deviation = 2 * float(np.mean([_deviation(log, name, noises) for name in names]))
     middle = rows[np.argmin(np.abs(times - at))].copy()
     for _ in range(2):  # angular velocities are derivatives of rotation vectors where those are small
@@ -476,7 +480,7 @@ def _rotation(
             mujoco.mju_subQuat(vector, own, middle)
         several = [polynomial([(times, column, deviation, 0)], at, f"{log.name}: {names[0]}") for column in away.T]
         moments = np.array([one for one, _ in several])
-        middle = turned(middle, moments[:, 0])
+        middle = np.asarray(turned(middle, moments[:, 0]))
     roots = np.array([np.linalg.cholesky(covariance + _TINY**2 * np.eye(2)) for _, covariance in several])
     return middle / np.linalg.norm(middle), moments[:, 1], moments[:, 2], roots
 

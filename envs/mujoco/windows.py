@@ -130,7 +130,8 @@ def cut(
     """
     rows = sum(len(_between(logs[one.recording], _rows(logs[one.recording], signals), one)) for one in windows)
     every = max(int(np.ceil(rows / ROWS)), 1)
-    found, begins = [], []
+    found: list[Log] = []
+    begins = []
     for one in windows:
         log = logs[one.recording]
         first = _first(log, signals, one.begin - lead)

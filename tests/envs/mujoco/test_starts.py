@@ -152,6 +152,29 @@ def test_a_number_that_is_inferred_is_not_read_off_the_recording():
     assert not simulator.starts[0].uncertain
 
 
+def test_a_start_of_one_episode_that_is_inferred():
+    parameters = [DAMPING, Parameter("episode/1/initial/hinge/qpos", (-2.0, 2.0))]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        simulator = simulator_of(task([swing(1.0, 0.0), swing(0.4, -1.5)], parameters, begins=["model", "log"]))
+        default = simulator_of(task([swing(0.4, -1.5), swing(1.0, 0.0)], parameters))
+    theta = np.array([[0.1, 1.7], [0.1, -0.3]])
+    assert simulator.begun(0, theta).tolist() == [[0, 0, 0], [0, 0, 0]]
+    np.testing.assert_allclose(simulator.begun(1, theta)[:, 1], [1.7, -0.3])
+    assert abs(simulator.begun(1, theta)[0, 2] + 1.5) < 0.5 and not simulator.starts[1].root[0, 0].any()
+    assert abs(default.begun(0, theta)[0, 1] - 0.4) < 0.01 and default.begun(1, theta)[1].tolist() == [0, -0.3, 0]
+    for name, expected in {
+        "episode/2/initial/hinge/qpos": "expected an episode of 0 to 1, got 2",
+        "episode/1/initial/hing/qpos": "expected a joint such as hinge",
+        "episode/one/initial/hinge/qpos": "expected one that begins with such as",
+    }.items():
+        with pytest.raises(ValueError, match=expected):
+            task([swing(1.0, 0.0), swing(0.4, -1.5)], [Parameter(name, (-2.0, 2.0))])
+    both = [Parameter("initial/hinge/qpos", (-2.0, 2.0)), parameters[1]]
+    with pytest.raises(ValueError, match="expected one for each number, got 'initial/hinge/qpos' and 'episode/1/"):
+        task([swing(1.0, 0.0), swing(0.4, -1.5)], both)
+
+
 def test_keyframes_by_name_and_number_and_one_for_each_episode():
     several = [swing(1.2, -0.4), swing(3.1, 0.0)]
     with warnings.catch_warnings():
@@ -166,6 +189,7 @@ def test_keyframes_by_name_and_number_and_one_for_each_episode():
     ("others", "expected"),
     [
         ({"begins": "start"}, 'initial: from: expected "log", "model" or "keyframe NAME", got \'start\''),
+        ({"begins": 3}, 'initial: from: expected "log", "model" or "keyframe NAME", got 3'),
         ({"begins": "keyframe upp"}, "initial: from: expected a keyframe such as up, got 'upp'"),
         ({"begins": "keyframe 2"}, "initial: from: expected a keyframe .*, got '2'"),
         ({"begins": ["log", "log"]}, "expected one for all, or one for each of 1 episodes"),

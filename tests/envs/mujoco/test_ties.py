@@ -125,7 +125,7 @@ def test_patterns_that_fit_nothing_are_one_line(name, tie, expected):
         ("actuator/0/gear[0]", "actuator/left_motor/gear", None),
         ("actuator/0/kp", "actuator/left_motor/kp", "actuator/left_motor/kp"),
         ("joint/left_hip/damping", "joint/left_hip/damping[0]", "joint/left_hip/damping"),
-        ("initial/left*/qpos", "initial/left_hip/qpos", "initial/8"),
+        ("initial/left*/qpos", "initial/left_hip/qpos", "initial/8/0"),
     ],
 )
 def test_two_parameters_of_one_number_are_refused(one, other, what):
