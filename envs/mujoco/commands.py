@@ -173,8 +173,10 @@ def _not_informed(task: Task, best: Fit) -> list[str]:
 
 
 def _noises(task: Task) -> list[str]:
-    """Parameters that are standard deviations of noise, which least squares has to be given."""
-    return [task.names[d] for _, d in simulator_of(task).does.deviations]
+    """Parameters that are standard deviations of noise and of times, which least squares has to be given."""
+    does = simulator_of(task).does
+    jitter = [] if does.jitter is None else [does.jitter]
+    return [task.names[d] for d in [*(d for _, d in does.deviations), *jitter]]
 
 
 def _as_good(fits: Sequence[Fit]) -> list[Fit]:

@@ -4,6 +4,8 @@ model = "pendulum.xml"              # beside this file
 log = ["swing.csv"]                 # recordings, one for each episode
 measured = ["angle"]                # by default all signals but the controls
 summary = "samples"                 # what the network sees of them (`jaxlfi.envs.mujoco.summaries`)
+windows = 12                        # of a long recording, each with a start of its own (`jaxlfi.envs.mujoco.windows`)
+window = 2.5                        # s
 unmodelled_force = 0.02             # forces that the model lacks, as a fraction of those that act on each joint
 
 [parameters."joint/hinge/damping"]
@@ -12,11 +14,19 @@ feasible = [0.0001, 0.1]            # Phi; by default Theta_0
 unit = "N m s/rad"
 log = true                          # infer its logarithm
 
+[parameters."joint/*/armature"]     # of all joints (`jaxlfi.envs.mujoco.ties`)
+support = [0.5, 2.0]
+tie = "scaled"                      # a factor of each one's own; or "shared", or "mirrored"
+
+[parameters."body/link/inertial"]   # its whole inertia, ten numbers (`jaxlfi.envs.mujoco.inertia`)
+spread = 0.2                        # about the model's own
+
 [noise]                             # standard deviations; of other signals it is estimated
 angle = 0.002
 
-[initial]                           # other than the model's
-"hinge/qpos" = 0.5
+[initial]                           # where episodes begin (`jaxlfi.envs.mujoco.starts`)
+from = "log"                        # or "model", or "keyframe NAME"
+"hinge/qpos" = 0.5                  # numbers win
 
 [discrepancy]                       # what the model gets wrong: a standard deviation, and for how long (s)
 angle = { deviation = 0.01, time = 0.2 }
@@ -36,6 +46,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from jaxlfi.envs.mujoco import inertia
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -55,8 +66,14 @@ KEYS: Mapping[str, type] = {
     "policy": dict,
     "design": dict,
     "name": str,
+    "windows": int,
+    "window": float,
 }
-PARAMETER = ("support", "feasible", "unit", "log", "truth")
+PARAMETER = ("support", "feasible", "unit", "log", "truth", "tie")
+
+
+INERTIAL = ("spread", "feasible")
+"""Of a body's whole inertia."""
 
 
 def read(
@@ -78,22 +95,26 @@ def read(
     """
     path = Path(path)
     config = load(path)
-    given = [Path(one) for one in recorded] or [path.parent / str(one) for one in config.get("log", [])]
-    if not given:
+    several = [Path(one) for one in recorded] or [path.parent / str(one) for one in config.get("log", [])]
+    if not several:
         raise ValueError(f"{path}: expected recordings, as log = [FILE], or mujoco,config={path},log=FILE; got none")
     try:
+        begins, given = initial(config)
         return mujoco_task(
             path.parent / config["model"],
             parameters_of(config),
-            given,
+            several,
             config.get("measured"),
             numbers(config, "noise"),
-            numbers(config, "initial"),
+            given,
             {name: _discrepancy(name, table) for name, table in config.get("discrepancy", {}).items()},
             {label: _guess(label, table) for label, table in config.get("supports", {}).items()},
             summary=summary or config.get("summary", "samples"),
             unmodelled_force=config.get("unmodelled_force", 0.0),
             engine=engine,
+            begins=begins,
+            windows=config.get("windows"),
+            window=config.get("window"),
             design=config.get("design"),
             name=config.get("name", path.stem),
         )
@@ -129,7 +150,8 @@ def parameters_of(config: Mapping[str, Any]) -> list[Parameter]:
     Raises:
         ValueError: for parameters without bounds, or with other keys.
     """
-    return [_parameter(name, table) for name, table in config["parameters"].items()]
+    several = (_parameters(name, table) for name, table in config["parameters"].items())
+    return [one for own in several for one in own]
 
 
 def numbers(config: Mapping[str, Any], table: str) -> dict[str, float]:
@@ -142,6 +164,21 @@ def numbers(config: Mapping[str, Any], table: str) -> dict[str, float]:
     if not isinstance(found, dict):
         raise ValueError(f"{table}: expected a table of numbers, got {found!r}")
     return {name: number(value, f"{table}: {name}") for name, value in found.items()}
+
+
+def initial(config: Mapping[str, Any]) -> tuple[Any, dict[str, float | list[float]]]:
+    """What the table `initial` says: where episodes begin (`starts.modes`), and numbers, one for all or one for each.
+
+    Raises:
+        ValueError: for what is no table, or no number.
+    """
+    table = dict(config.get("initial", {}))
+    begins, given = table.pop("from", None), {}
+    for name, value in table.items():
+        where = f"initial: {name}"
+        several = isinstance(value, list)
+        given[name] = [number(one, where) for one in value] if several else number(value, where)
+    return begins, given
 
 
 def pair(value: Any, where: str) -> tuple[float, float]:
@@ -166,6 +203,16 @@ def number(value: Any, where: str) -> float:
     return float(value)
 
 
+def _parameters(name: str, table: Any) -> list[Parameter]:
+    if not isinstance(table, dict) or "spread" not in table:
+        return [_parameter(name, table)]
+    where = f"parameters: {name!r}"
+    if unknown := [key for key in table if key not in INERTIAL]:
+        raise ValueError(f"{where}: expected keys among {', '.join(INERTIAL)}, got {', '.join(unknown)}")
+    bounds = pair(table["feasible"], f"{where}: feasible") if "feasible" in table else None
+    return inertia.parameters(name, number(table["spread"], f"{where}: spread"), bounds)
+
+
 def _parameter(name: str, table: Any) -> Parameter:
     where = f"parameters: {name!r}"
     if not isinstance(table, dict) or "support" not in table:
@@ -177,7 +224,7 @@ def _parameter(name: str, table: Any) -> Parameter:
     if not isinstance(log, bool) or not isinstance(unit, str):
         raise ValueError(f"{where}: expected log = true or false and a unit in quotes, got {log!r} and {unit!r}")
     truth = None if truth is None else number(truth, f"{where}: truth")
-    return Parameter(name, bounds["support"], bounds["feasible"], unit, log, truth)
+    return Parameter(name, bounds["support"], bounds["feasible"], unit, log, truth, table.get("tie"))
 
 
 def _guess(label: str, table: Any) -> dict[str, tuple[float, float]]:

@@ -1,6 +1,7 @@
 """The effects of parameters: on the model, on the state that episodes begin in, on sensors or on controls."""
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,11 +9,19 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from jaxlfi.envs.mujoco import parameters
+from jaxlfi.envs.mujoco import inertia, parameters, ties
+from jaxlfi.envs.mujoco.inertia import Inertial
 from jaxlfi.envs.mujoco.parameters import Edit, near
+from jaxlfi.envs.mujoco.ties import Tie
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """Time, positions, velocities and activations."""
+OF_SENSORS = {"gain": "gains", "bias": "biases", "delay": "lags", "noise": "deviations"}
+"""What parameters of sensors are called, and the effects that they are."""
+OF_EPISODE = re.compile(r"episode/(?P<episode>\d+)/initial/(?P<rest>[^*?]+)")
+"""A parameter of the start of one episode."""
+OF_CLOCKS = {"control/delay": "delay", "clock/jitter": "jitter"}
+"""The same of the clock that controls act by."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,26 +30,45 @@ class Effects:
 
     Attributes:
         edits: of the model.
+        inertials: bodies whose whole inertia changes, with which of its ten numbers are parameters.
         starts: places in the state that episodes begin in.
+        own_starts: the same of one episode, whose number is the first of three.
+        gains: signals that are multiplied by it, before an offset is added.
         biases: signals that an offset is added to.
+        lags: signals that are measured so many seconds after what they measure.
         deviations: signals whose noise it is the standard deviation of.
         delay: the parameter that is the controls' delay, if any is.
+        jitter: the parameter that is the standard deviation of the times at which controls act, if any is.
     """
 
     edits: tuple[tuple[Edit, int], ...] = ()
+    inertials: tuple[tuple[Inertial, tuple[tuple[int, int], ...]], ...] = ()
     starts: tuple[tuple[int, int], ...] = ()
+    own_starts: tuple[tuple[int, int, int], ...] = ()
+    gains: tuple[tuple[int, int], ...] = ()
     biases: tuple[tuple[int, int], ...] = ()
+    lags: tuple[tuple[int, int], ...] = ()
     deviations: tuple[tuple[int, int], ...] = ()
     delay: int | None = None
+    jitter: int | None = None
+
+    @property
+    def rescaled(self) -> frozenset[int]:
+        """Signals whose sensors have an offset or a gain that is inferred."""
+        return frozenset(signal for signal, _ in (*self.gains, *self.biases))
 
     def started(
-        self, start: Float[np.ndarray, " state"], theta: Float[np.ndarray, "*n dim"]
+        self, start: Float[np.ndarray, "*#n state"], theta: Float[np.ndarray, "*n dim"], episode: int
     ) -> Float[np.ndarray, "*n state"]:
-        """The states that the models of parameter vectors begin in, by the model's own."""
-        state = np.tile(start, (*theta.shape[:-1], 1)) if theta.ndim > 1 else start.copy()
-        for place, d in self.starts:
+        """The states that the models of parameter vectors begin in, by those that they would begin in otherwise."""
+        state = np.array(np.broadcast_to(start, (*theta.shape[:-1], np.shape(start)[-1])))
+        for place, d in self.starts_of(episode):
             state[..., place] = theta[..., d]
         return state
+
+    def starts_of(self, episode: int) -> tuple[tuple[int, int], ...]:
+        """Places in the state that an episode begins in."""
+        return (*self.starts, *((place, d) for own, place, d in self.own_starts if own == episode))
 
 
 def effects(
@@ -49,6 +77,8 @@ def effects(
     names: Sequence[str],
     supports: Sequence[tuple[float, float]],
     signals: Sequence[str],
+    tied: Sequence[Tie] | None = None,
+    episodes: int | None = None,
 ) -> Effects:
     """The effects of parameters, by their names.
 
@@ -58,30 +88,62 @@ def effects(
         names: of the parameters (`parameters`).
         supports: of the parameters: the model has to differ between their bounds.
         signals: that are measured.
+        tied: what the number of each parameter means for each of several elements (`ties`); by default for one.
+        episodes: how many there are, where parameters may be of the start of one of them.
 
     Raises:
-        ValueError: for names that match nothing or several numbers, and parameters without an effect, in one line.
+        ValueError: for names that match nothing or several numbers, parameters without an effect, and two of one
+            number, in one line.
     """
-    found: dict[str, list] = {"edits": [], "starts": [], "biases": [], "deviations": []}
-    delay = None
-    for d, (name, support) in enumerate(zip(names, supports, strict=True)):
+    found: dict[str, list] = {"edits": [], "starts": [], "own_starts": [], **{what: [] for what in OF_SENSORS.values()}}
+    of_clock: dict[str, int] = {}
+    bodies: dict[str, list[tuple[int, int]]] = {}
+    keys: list[tuple[str, list[tuple]]] = []
+    tied = [None] * len(names) if tied is None else tied
+    for d, (name, support, tie) in enumerate(zip(names, supports, tied, strict=True)):
         kind, _, rest = name.partition("/")
+        if kind in ("sensor", "initial", "control", "clock", "option") and tie not in (None, "shared"):
+            raise ValueError(f"parameters: {name!r}: tie: expected shared, as the model has no numbers of them")
         if kind == "sensor":
-            what, signal = _of_sensor(rest, name, signals)
-            found[what].append((signal, d))
+            what, several = _of_sensor(rest, name, signals)
+            found[what] += [(signal, d) for signal in several]
+            keys.append((name, [("sensor", signals[signal], what) for signal in several]))
         elif kind == "initial":
-            found["starts"].append((state_place(model, rest, name), d))
-        elif kind == "control":
-            if rest != "delay" or not model.nu:
-                raise ValueError(f"parameters: expected control/delay of a model with actuators, got {name!r}")
-            delay = d
+            places = [state_place(model, one, name) for one in _of_joints(model, rest, name)]
+            found["starts"] += [(place, d) for place in places]
+            keys.append((name, [("initial", place, own) for place in places for own in range(episodes or 1)]))
+        elif (of_start := OF_EPISODE.fullmatch(name)) is not None:
+            own, rest = int(of_start["episode"]), of_start["rest"]
+            if episodes is not None and own >= episodes:
+                raise ValueError(f"parameters: {name!r}: expected an episode of 0 to {episodes - 1}, got {own}")
+            place = state_place(model, rest, name)
+            found["own_starts"].append((own, place, d))
+            keys.append((name, [("initial", place, own)]))
+        elif kind in ("control", "clock"):
+            if name not in OF_CLOCKS or not model.nu:
+                expected = " or ".join(OF_CLOCKS)
+                raise ValueError(f"parameters: expected {expected} of a model with actuators, got {name!r}")
+            of_clock[OF_CLOCKS[name]] = d
+        elif (of_body := inertia.component(name)) is not None:
+            body, number = of_body
+            own = inertia.inertial(model, body, name)
+            alone = Edit(
+                name, lambda spec, x, own=own, number=number: own.apply(spec, x * np.eye(inertia.COUNT)[number])
+            )
+            parameters.check_effect(spec, alone, support)
+            bodies.setdefault(body, []).append((number, d))
+            taken = [("body", body, attribute, i) for attribute in parameters.INERTIAL for i in range(4)]
+            keys.append((f"body/{body}/inertial", taken))
         else:
-            one = parameters.edit(spec, model, name)
+            one, several = ties.edit(spec, model, name, tie)
             parameters.check_effect(spec, one, support)
             found["edits"].append((one, d))
+            keys.append((name, several))
+    ties.refuse_overlaps(keys)
     # A body's mass scales its inertia; whatever of it is inferred besides is meant as it is.
     found["edits"].sort(key=lambda pair: not pair[0].name.endswith("/mass"))
-    return Effects(**{what: tuple(several) for what, several in found.items()}, delay=delay)
+    inertials = tuple((inertia.inertial(model, body, body), tuple(several)) for body, several in bodies.items())
+    return Effects(**{what: tuple(several) for what, several in found.items()}, **of_clock, inertials=inertials)
 
 
 def built(spec: mujoco.MjSpec, does: Effects, theta: Float[np.ndarray, " dim"]) -> mujoco.MjModel:
@@ -93,6 +155,11 @@ def built(spec: mujoco.MjSpec, does: Effects, theta: Float[np.ndarray, " dim"]) 
     own = spec.copy()
     for one, d in does.edits:
         one.apply(own, float(theta[d]))
+    for body, several in does.inertials:
+        coordinates = np.zeros(inertia.COUNT)
+        for number, d in several:
+            coordinates[number] = theta[d]
+        body.apply(own, coordinates)
     return own.compile()
 
 
@@ -133,11 +200,33 @@ def sizes(joint: Any) -> tuple[int, int]:
     return several.get(mujoco.mjtJoint(joint.type[0]), (1, 1))
 
 
-def _of_sensor(rest: str, name: str, signals: Sequence[str]) -> tuple[str, int]:
+def sensed_by(pattern: str, signals: Sequence[str]) -> list[int]:
+    """Signals that the sensors of a name, or of a pattern, measure, by their numbers."""
+    fits = ties.expression(pattern).fullmatch
+    plain = [one.removeprefix("sensor/") for one in signals]  # of sensors without a name
+    several = zip(signals, plain, strict=True)
+    return [i for i, (one, own) in enumerate(several) if fits(one) or fits(own) or fits(own.rpartition("[")[0])]
+
+
+def _of_joints(model: mujoco.MjModel, rest: str, name: str) -> list[str]:
+    """JOINT/qpos of all joints whose names a pattern matches."""
+    if not parameters.PATTERN.search(rest):
+        return [rest]
+    pattern, _, what = rest.rpartition("/")
+    joints = [model.joint(i).name for i in range(model.njnt)]
+    if not (found := [joint for joint in joints if ties.expression(pattern).fullmatch(joint)]):
+        raise ValueError(
+            f"parameters: {name!r}: expected a pattern that matches the name of a joint {near(rest, joints)}"
+        )
+    return [f"{joint}/{what}" for joint in found]
+
+
+def _of_sensor(rest: str, name: str, signals: Sequence[str]) -> tuple[str, list[int]]:
+    """The effect, and the signals: one, or all numbers that a sensor of several measures."""
     signal, _, what = rest.rpartition("/")
-    signal = f"sensor/{signal}" if f"sensor/{signal}" in signals else signal  # of a sensor without a name
-    if signal not in signals:
+    found = sensed_by(signal, signals)
+    if not found:
         raise ValueError(f"parameters: {name!r}: expected a signal {near(signal, signals)}, got {signal!r}")
-    if what not in ("bias", "noise"):
-        raise ValueError(f"parameters: {name!r}: expected bias or noise, got {what!r}")
-    return {"bias": "biases", "noise": "deviations"}[what], signals.index(signal)
+    if what not in OF_SENSORS:
+        raise ValueError(f"parameters: {name!r}: expected {', '.join(OF_SENSORS)} of a sensor, got {what!r}")
+    return OF_SENSORS[what], found

@@ -19,14 +19,15 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
-from jaxlfi.envs.mujoco.effects import built, effects, initial_state, state_place
+from jaxlfi.envs.mujoco import starts
+from jaxlfi.envs.mujoco.effects import built, effects, state_place
 from jaxlfi.envs.mujoco.goal import Goal, Reading
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, started
 from jaxlfi.envs.mujoco.mjx_models import Models, mjx
 from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable, state_of
 from jaxlfi.envs.mujoco.model_task import box, compile_spec, specification
-from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.envs.mujoco.parameters import PATTERN, Parameter
 from jaxlfi.rl.environment import EnvState
 
 
@@ -64,8 +65,9 @@ class MujocoEnvironment:
         parameters: Sequence[Parameter],
         goal: Goal,
         noises: Mapping[str, float] | None = None,
-        initial: Mapping[str, float] | None = None,
+        initial: Mapping[str, float | Sequence[float]] | None = None,
         name: str | None = None,
+        begins: str | None = None,
     ):
         """An environment.
 
@@ -76,6 +78,7 @@ class MujocoEnvironment:
             noises: standard deviations of the observed signals' noise; 0 of others.
             initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
             name: of the environment; by default the model's.
+            begins: "keyframe NAME", for episodes that begin there; by default they begin as the model does.
 
         Raises:
             ValueError: for whatever does not fit together, or MJX cannot simulate, in one line.
@@ -92,10 +95,17 @@ class MujocoEnvironment:
         centre = self.space.box_to_inference(support).centre
         self.nominal = tuple(float(number) for number in np.asarray(self.space.to_natural(np.asarray(centre))))
 
-        signals = [*goal.signals, *_only_inferred(self.space.names, goal.signals)]
+        signals = [*goal.signals, *_only_inferred(self.space.names, goal.signals, spec)]
         add_sensors(spec, signals)
         compiled = compile_spec(spec)
-        self._does = effects(spec, compiled, self.space.names, [one.support for one in parameters], signals)
+        self._does = effects(
+            spec,
+            compiled,
+            self.space.names,
+            [one.support for one in parameters],
+            signals,
+            [one.tie for one in parameters],
+        )
         self.reading = Reading(compiled, goal)
         self.observations, self.actions, self.steps = self.reading.observations, self.reading.actions, goal.steps
         self.models = Models(
@@ -104,7 +114,8 @@ class MujocoEnvironment:
         self._physics = Physics(self.models, compiled, self.reading.places)
         self._check(compiled, goal)
 
-        self._start = initial_state(compiled, initial or {})
+        first = {key: np.ravel(number)[:1].tolist() for key, number in (initial or {}).items()}
+        self._start = starts.state_of(compiled, begins, *starts.given(compiled, first, 1))
         self._drawn = [(state_place(compiled, key, f"initial/{key}"), bounds) for key, bounds in goal.initial.items()]
         self._timestep = compiled.opt.timestep
         self._substeps = round(goal.interval / self._timestep)
@@ -154,6 +165,10 @@ class MujocoEnvironment:
         )
 
     def _check(self, compiled: mujoco.MjModel, goal: Goal) -> None:
+        late = [goal.signals[signal] for signal, _ in self._does.lags if signal < len(goal.signals)]
+        if late or self._does.jitter is not None:
+            got = "clock/jitter" if not late else f"sensor/{late[0].removeprefix('sensor/')}/delay"
+            raise ValueError(f"parameters: expected sensors and controls of policies that keep time, got {got}")
         ratio = goal.interval / compiled.opt.timestep
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:
             raise ValueError(
@@ -196,20 +211,26 @@ def environment(config: Path) -> MujocoEnvironment:
         raise ValueError(f"{config}: expected a table [policy] that says what policies are to do, got none")
     try:
         goal = goals.of_table(table["policy"])
+        begins, numbers = tables.initial(table)
         noises = {name: value for name, value in tables.numbers(table, "noise").items() if name in goal.signals}
         return MujocoEnvironment(
             config.parent / table["model"],
             tables.parameters_of(table),
             goal,
             noises,
-            tables.numbers(table, "initial"),
+            numbers,
             table.get("name", config.stem),
+            begins[0] if isinstance(begins, list) else begins,
         )
     except ValueError as error:
         raise ValueError(f"{config}: {error}") from error
 
 
-def _only_inferred(names: Sequence[str], signals: Sequence[str]) -> list[str]:
-    """Signals whose sensors' offset or noise was inferred, which policies do not see."""
-    own = [name.partition("/")[2].rpartition("/")[0] for name in names if name.startswith("sensor/")]
-    return list(dict.fromkeys(signal for signal in own if signal not in signals))
+def _only_inferred(names: Sequence[str], signals: Sequence[str], spec: mujoco.MjSpec) -> list[str]:
+    """Signals of whose sensors something was inferred, and which policies do not see."""
+    sensors = [name for name in names if name.startswith("sensor/") and not PATTERN.search(name)]
+    own = [name.partition("/")[2].rpartition("/")[0] for name in sensors]
+    seen = {*signals, *(signal.rpartition("[")[0] for signal in signals)}
+    several = {one.name: one.get_data_size() for one in spec.sensors}
+    first = lambda signal: f"{signal}[0]" if several.get(signal, 1) > 1 else signal
+    return list(dict.fromkeys(first(signal) for signal in own if signal not in seen))

@@ -84,7 +84,8 @@ def motion(run: Run, draws: int = 12, slower: float = 1.0, episode: int = 0) -> 
     good = outcome == 0
     if not good.any():
         raise ValueError(f"draws: expected some whose simulations do not fail, got {draws} that do")
-    models, grid, states = simulator.states(theta[good], episode)
+    _, grid, states = simulator.states(theta[good], episode)
+    models = [simulator.look(row) for row in theta[good]]
     steps = np.abs(grid - when[:, None]).argmin(axis=1)
     first = sum(len(own) for own in simulator.times[:episode])
     rows = slice(first, first + len(times))

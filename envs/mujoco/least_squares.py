@@ -7,7 +7,9 @@ that `discrepancy.estimated` reads off the residuals). What residuals cannot sho
 up for, as a pendulum's damping does for an integrator that damps. The integrator's own error is known, however: the
 point is found again with the difference that a finer one makes there (defect correction; Stetter, 1978). And forces
 that the model lacks (`forces`) are taken to be as large in the directions that parameters make up for as in those that
-residuals show. What a recording does not inform has no interval (`jaxlfi.diagnostics.identifiability`).
+residuals show. Where episodes begin in states that recordings leave open (`starts`), residuals count as far as other
+starts would not make up for them. What a recording does not inform has no interval
+(`jaxlfi.diagnostics.identifiability`).
 
 Time and memory grow with the length of the recording, and not with its square: of covariances of all that was measured
 only their products with the parameters' few directions are made.
@@ -25,13 +27,15 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import forces, noise
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy, estimated
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
-from jaxlfi.envs.mujoco.simulator import simulator_of
+from jaxlfi.envs.mujoco.simulator import Drawn, simulator_of
 from jaxlfi.tasks.task import Task
 
 STEP = 1e-4
 """Of central differences, as a fraction of the box's width."""
 FORCE_STEP = 1e-3
 """Of differences by forces, as a fraction of those that act on a joint."""
+START_STEP = 0.1
+"""Of differences by starts, in standard deviations."""
 CORRECTIONS = 2
 """How often the point is found again with the integrator's error there."""
 _NOISELESS = 1e-3
@@ -116,13 +120,26 @@ class Residuals:
                 f"got none of {', '.join(constant)}"
             )
         self.defect = np.zeros(self.observed.shape)
+        self._by_starts: list[tuple[slice, np.ndarray, np.ndarray]] = []
 
     def __call__(self, coordinates: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n rows"]:
         """Of all that was measured, for several points."""
         self.simulations += len(coordinates)
         clean, outcome = self.simulator.clean(self.natural(coordinates))
-        scaled = ((clean + self.defect - self.observed) / self.noise)[:, self.simulator.there]
+        scaled = self.measured(clean + self.defect - self.observed)
         scaled[outcome != 0] = _FAILED
+        return scaled
+
+    def measured(self, rows: Float[np.ndarray, "*n time signals"]) -> Float[np.ndarray, "*n rows"]:
+        """Differences of trajectories in standard deviations of the noise, of all that was measured.
+
+        Where episodes begin in states that are not certain (`starts`), differences that other starts would make count
+        the less the less certain those are: all are multiplied by the inverse root of their covariance.
+        """
+        scaled = (rows / self.noise)[..., self.simulator.there]
+        for part, directions, shrink in self._by_starts:
+            own = scaled[..., part]
+            scaled[..., part] = own + (own @ directions * shrink) @ directions.T
         return scaled
 
     def natural(self, coordinates: Float[np.ndarray, "*n dim"]) -> Float[np.ndarray, "*n dim"]:
@@ -130,8 +147,12 @@ class Residuals:
         return np.where(self._log, np.exp(np.where(self._log, coordinates, 0.0)), coordinates)
 
     def correct(self, point: Float[np.ndarray, " dim"]) -> None:
-        """Add from now on what a finer integrator changes at a point; nothing where either fails."""
+        """Add from now on what a finer integrator changes at a point, and allow for starts that are not certain.
+
+        Nothing of what fails.
+        """
         theta = self.natural(point[None])
+        self._by_starts = self._of_starts(theta[0])
         (coarse, failed), (fine, refused) = self.simulator.clean(theta), self.simulator.finer().clean(theta)
         self.simulations += 2
         self.defect = (fine - coarse)[0] if not (failed.any() or refused.any()) else np.zeros(self.observed.shape)
@@ -159,8 +180,31 @@ class Residuals:
         self.simulations += len(steps)
         theta = self.natural(np.tile(point, (len(steps), 1)))
         clean, failed = self.simulator.lacking(besides).clean(theta, steps)
-        changed = ((clean[1:] - clean[0]) / self.noise)[:, self.simulator.there] / FORCE_STEP
+        changed = self.measured(clean[1:] - clean[0]) / FORCE_STEP
         return np.where((failed[0] == 0) & (failed[1:, None] == 0), changed, 0.0).T
+
+    def _of_starts(self, theta: Float[np.ndarray, " dim"]) -> list[tuple[slice, np.ndarray, np.ndarray]]:
+        """Of each episode: where its residuals are, directions in which its start moves them, and how they shrink."""
+        begins, there = self.simulator.starts, self.simulator.there
+        used = np.argwhere(np.any([one.root.any(axis=1) for one in begins], axis=0))
+        if not len(used):
+            return []
+        steps = np.zeros((2 * len(used), *begins[0].root.shape[:2]))
+        for k, (dof, column) in enumerate(used):
+            steps[[k, k + len(used)], dof, column] = START_STEP, -START_STEP
+        self.simulations += len(steps)
+        several = Drawn(None, [steps] * len(begins))  # a start moves its own episode only
+        clean, failed = self.simulator.clean(np.tile(theta, (len(steps), 1)), drawn=several)
+        self._by_starts = []
+        ahead, behind = np.split(self.measured(clean), 2)
+        moved = np.where((failed == 0).all(), (ahead - behind) / (2 * START_STEP), 0.0)
+        counts = [int(own.sum()) for own in np.split(there, np.cumsum([len(own) for own in self.simulator.times])[:-1])]
+        found = []
+        for end, count in zip(np.cumsum(counts), counts, strict=True):
+            part = slice(int(end) - count, int(end))
+            directions, sizes, _ = np.linalg.svd(moved[:, part].T, full_matrices=False)
+            found.append((part, directions, 1 / np.sqrt(1 + sizes**2) - 1))
+        return found
 
 
 def fit(task: Task, start: Sequence[float], box: Support | None = None, observation: np.ndarray | None = None) -> Fit:
@@ -182,7 +226,7 @@ def fit(task: Task, start: Sequence[float], box: Support | None = None, observat
         residuals.correct(found.x)
         found = _solved(residuals, found.x, low, high)
     by_forces = residuals.of_forces(found.x, _typical_forces(task, residuals.natural(found.x)))
-    defect = (residuals.defect / residuals.noise)[residuals.simulator.there]
+    defect = residuals.measured(residuals.defect)
     covariance, uninformed, force = _uncertainty(residuals, found, defect, by_forces, high - low)
     discrepancies = _discrepancies(residuals, found.fun - defect)
     interval = intervals(residuals, found.x, np.sqrt(np.diagonal(covariance)), uninformed, low, high)

@@ -99,12 +99,20 @@ class Log:
         last = np.searchsorted(since, times + 1e-9, side="right") - 1
         return values[np.maximum(last, 0)]
 
-    def mean_held(self, name: str, times: np.ndarray, interval: float) -> np.ndarray:
+    def mean_held(self, name: str, times: np.ndarray, interval: float, late: np.ndarray | None = None) -> np.ndarray:
         """Means of a held signal over intervals that begin at other times; shape that of `times`.
 
         Unlike its values they are continuous in the times: a delay by a part of a step makes a difference.
+
+        Args:
+            name: of the signal.
+            times: in s.
+            interval: in s.
+            late: how much later than at its time each row acts, in s, shape [T]; none before the row before it.
         """
         since, values = self.samples(name)
+        if late is not None:
+            since = np.maximum.accumulate(since + late[np.isfinite(self.signals[name])])
         before = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(since))])
 
         def integral(to: np.ndarray) -> np.ndarray:

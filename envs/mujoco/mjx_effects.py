@@ -8,10 +8,15 @@ from jaxlfi.envs.mujoco.effects import Effects
 from jaxlfi.envs.mujoco.logs import Log
 
 
-def started(does: Effects, theta: Float[Array, " dim"], start: Float[np.ndarray, " state"]) -> Float[Array, " state"]:
-    """The state (`effects.STATE`) that an episode begins in."""
+def started(
+    does: Effects, theta: Float[Array, " dim"], start: Float[Array | np.ndarray, " state"], episode: int = -1
+) -> Float[Array, " state"]:
+    """The state (`effects.STATE`) that an episode begins in, by the one that it would begin in otherwise.
+
+    By default it is none of those that were recorded.
+    """
     state = jnp.asarray(start, jnp.float32)
-    for place, d in does.starts:
+    for place, d in does.starts_of(episode):
         state = state.at[place].set(theta[d])
     return state
 
@@ -19,7 +24,9 @@ def started(does: Effects, theta: Float[Array, " dim"], start: Float[np.ndarray,
 def biased(
     does: Effects, theta: Float[Array, " dim"], values: Float[Array, "*rows signals"]
 ) -> Float[Array, "*rows signals"]:
-    """Signals with the offsets of their sensors, but for signals beyond the last one."""
+    """Signals with the gains and offsets of their sensors, but for signals beyond the last one."""
+    for signal, d in does.gains:
+        values = values.at[..., signal].multiply(theta[d]) if signal < values.shape[-1] else values
     for signal, d in does.biases:
         values = values.at[..., signal].add(theta[d]) if signal < values.shape[-1] else values
     return values

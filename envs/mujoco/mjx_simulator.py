@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,8 @@ def by_mjx(task: Task) -> Task:
     native = simulator_of(task)
     nominal = np.asarray(task.space.to_natural(task.support().centre), float)
     try:
+        if native.does.jitter is not None:
+            raise ValueError("parameters: expected controls that act when the recording says, got clock/jitter")
         simulator = MjxSimulator(native, _models(native, task, nominal))
     except ValueError as error:
         reason = " ".join(str(error).split())
@@ -92,35 +95,57 @@ class MjxSimulator:
     ) -> tuple[Float[Array, "rows signals"], Int[Array, ""]]:
         """Measurements with their noise and discrepancies, and 0 or why the simulation failed."""
         native = self.native
-        key_noise, key_forces, *keys = jax.random.split(key, 2 + len(native.discrepancies))
-        rows, outcome = self.clean(theta, self._drawn(key_forces))
+        uncertain = any(start.uncertain for start in native.starts)
+        key_noise, key_forces, *keys = jax.random.split(key, 2 + len(native.discrepancies) + uncertain)
+        rows, outcome = self.clean(theta, self._drawn(key_forces), self._begun(keys[len(native.discrepancies) :]))
         rows += deviations(native.does, theta, native.noise) * jax.random.normal(key_noise, rows.shape)
-        for own, (signal, process) in zip(keys, native.discrepancies.items(), strict=True):
+        for own, (signal, process) in zip(keys, native.discrepancies.items(), strict=False):
             each = zip(jax.random.split(own, len(native.times)), native.times, strict=True)
             rows = rows.at[:, signal].add(jnp.concatenate([process.draw(one, times) for one, times in each]))
         return jnp.where(native.there, native.aligned(rows), 0.0), outcome
 
     def clean(
-        self, theta: Float[Array | np.ndarray, " dim"], lacking: Float[Array, " numbers"] | None = None
+        self,
+        theta: Float[Array | np.ndarray, " dim"],
+        lacking: Float[Array, " numbers"] | None = None,
+        begun: Float[Array, "episodes dofs 2"] | None = None,
     ) -> tuple[Float[Array, "rows signals"], Int[Array, ""]]:
         """Measurements without noise, and 0 or why the simulation failed; of one that failed they are zero.
 
         Args:
             theta: in natural units.
             lacking: of the forces that the model lacks (`UnmodelledForces.add`); by default they are not there.
+            begun: draws that starts take (`starts.Start.at`); by default they are the most likely ones.
         """
         native, theta = self.native, jnp.asarray(theta, jnp.float32)
         if native.forces is not None and lacking is None:
             lacking = jnp.zeros(len(native.forces.deviations))
         given = theta if lacking is None else jnp.concatenate([theta, lacking])
         numbers, refused = self._physics.models.numbers(given)
-        episode = functools.partial(self._episode, self._physics.models.model(numbers))
-        starts = jnp.stack([started(native.does, theta, start) for start in native.starts])
-        values, stable = jax.vmap(episode)(starts, self._controls(theta))
-        rows = [between(self._grid, own, times) for own, times in zip(values, native.times, strict=True)]
+        simulated = functools.partial(self._episode, self._physics.models.model(numbers))
+        begun = jnp.zeros((len(native.starts), native.model.nv, 2)) if begun is None else begun
+        likely = [start.at(native.does, theta, own, jnp) for start, own in zip(native.starts, begun, strict=True)]
+        starts = [started(native.does, theta, start, episode) for episode, start in enumerate(likely)]
+        values, stable = jax.vmap(simulated)(jnp.stack(starts), self._controls(theta))
+        rows = [self._measured(own, times, theta) for own, times in zip(values, native.times, strict=True)]
         unstable = jnp.any(self._needed & ~stable)
         outcome = jnp.where(refused, REFUSED, jnp.where(unstable, UNSTABLE, 0))
         return jnp.where(outcome == 0, native.aligned(biased(native.does, theta, jnp.concatenate(rows))), 0.0), outcome
+
+    def _measured(
+        self, values: Float[Array, "steps signals"], times: np.ndarray, theta: Float[Array, " dim"]
+    ) -> Float[Array, "rows signals"]:
+        """Signals at the times of rows, some of them as they were before."""
+        rows = jnp.asarray(between(self._grid, values, times))
+        for signal, d in self.native.does.lags:
+            late = jnp.interp(jnp.asarray(times, jnp.float32) - theta[d], self._grid, values[:, signal])
+            rows = rows.at[:, signal].set(late)
+        return rows
+
+    def _begun(self, keys: Sequence[jax.Array]) -> Float[Array, "episodes dofs 2"] | None:
+        """Draws of where the episodes of one simulation begin, by a key where that is not certain."""
+        shape = (len(self.native.starts), self.native.model.nv, 2)
+        return jax.random.normal(keys[0], shape) if keys else None
 
     def _drawn(self, key: jax.Array) -> Float[Array, " numbers"] | None:
         """The coefficients of the forces that the model lacks, of one simulation."""
@@ -148,7 +173,10 @@ class MjxSimulator:
         """Controls of each episode over each step."""
         native = self.native
         if native.does.delay is None:  # they are the same for all
-            recorded = [native.controls(log, np.zeros((1, 0)), self._grid)[0] for log in native.logs]
+            episodes = range(len(native.logs))
+            recorded = [native.controls(episode, np.zeros((1, 0)), self._grid)[0] for episode in episodes]
             return jnp.asarray(np.stack(recorded), jnp.float32)
         when = jnp.asarray(self._grid, jnp.float32) - theta[native.does.delay]
-        return jnp.stack([jnp.stack([held(when) for held in several], axis=-1) for several in self._held])
+        begins = [start.time for start in native.starts]
+        pairs = zip(self._held, begins, strict=True)
+        return jnp.stack([jnp.stack([held(when + begin) for held in several], axis=-1) for several, begin in pairs])

@@ -11,16 +11,20 @@ import mujoco
 import numpy as np
 
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, summaries
+from jaxlfi.envs.mujoco import columns, logs, noise, plausible, played, recordings, starts, summaries, visuals
+from jaxlfi.envs.mujoco import windows as cuts
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
-from jaxlfi.envs.mujoco.effects import built, effects, initial_state
+from jaxlfi.envs.mujoco.effects import Effects, built, effects, sensed_by
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.parameters import Parameter
 from jaxlfi.envs.mujoco.simulator import FAILURES, Simulator, simulator_of
+from jaxlfi.envs.mujoco.starts import Start
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.task import Task
 
+_JITTERS = 5
+"""Standard deviations by which a control may be late."""
 ENGINES = ("native", "mjx")
 """What simulates a model."""
 
@@ -31,7 +35,7 @@ def mujoco_task(
     recorded: Sequence[Log | str | Path] | Log | str | Path,
     measured: Sequence[str] | None = None,
     noises: Mapping[str, float] | None = None,
-    initial: Mapping[str, float] | None = None,
+    initial: Mapping[str, float | Sequence[float]] | None = None,
     discrepancies: Mapping[str, Discrepancy] | None = None,
     supports: Mapping[str, Mapping[str, tuple[float, float]]] | None = None,
     summary: str | Callable[[jax.Array], jax.Array] = "samples",
@@ -39,14 +43,17 @@ def mujoco_task(
     unmodelled_force: float = 0.0,
     engine: Literal["native", "mjx"] = "native",
     design: Mapping[str, Any] | None = None,
+    begins: str | Sequence[str] | None = None,
+    windows: int | None = None,
+    window: float | None = None,
     **others: Any,
 ) -> Task:
     """Infer numbers of a MuJoCo model from recordings of controls and sensors.
 
     A trajectory has a row for each time of the recordings at which something was measured, episodes one after another,
-    and a column for each measured signal; what was not sampled is 0, in simulations too. Every episode begins in the
-    same state and has the same parameters. Angles that wrap and orientations are put right first (`recordings`); that,
-    and what looks wrong (`plausible`), is said in a `logs.RecordingWarning`.
+    and a column for each measured signal; what was not sampled is 0, in simulations too. All episodes have the same
+    parameters, and each begins where its recording does (`starts`). Angles that wrap and orientations are put right
+    first (`recordings`); that, and what looks wrong (`plausible`), is said in a `logs.RecordingWarning`.
 
     Args:
         model: an MJCF file, its text, or a specification.
@@ -56,7 +63,8 @@ def mujoco_task(
         measured: signals that are compared: sensors of the model, and joint/NAME/qpos, joint/NAME/qvel,
             body/NAME/pos[0], body/NAME/quat[0]. By default all of the recording but its controls.
         noises: standard deviations of the signals' noise. Of others it is estimated from the first recording.
-        initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
+        initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel: one for all episodes or one
+            for each.
         discrepancies: what the model gets wrong of signals, beyond their noise; `least_squares` finds it.
         supports: other first guesses by name: the bounds of some parameters, those of others being their `support`.
         summary: what the network sees, by its name (`summaries`); or as for `jaxlfi.Task`.
@@ -68,6 +76,11 @@ def mujoco_task(
             precision and inside of compiled programs, where it can simulate the model (`mjx_simulator`).
         design: experiments that could be made next, as a table of the TOML file says (`played`); they are simulated by
             MuJoCo itself.
+        begins: where episodes begin (`starts`): "log", "model" or "keyframe NAME", for all episodes or for each; by
+            default where the recording does, if it measures all joints.
+        windows: into how many each recording is cut, each an episode with a start of its own (`cuts`); by default only
+            recordings of many steps are.
+        window: how long each lasts, in s; by default a few periods of the motion.
         **others: of `jaxlfi.Task`.
 
     Raises:
@@ -94,26 +107,53 @@ def mujoco_task(
         raise ValueError(f"measured: expected at least one signal, each once, got {', '.join(measured) or 'none'}")
     names = [one.name for one in parameters]
     columns.require_measured(episodes[0], measured, actuators)
-    inferred = {signal for signal in measured if f"sensor/{signal.removeprefix('sensor/')}/noise" in names}
+    inferred = {measured[i] for name in _of_sensors(names, "noise") for i in sensed_by(name, measured)}
     _check_noises(episodes[0], measured, noises, inferred)
     add_sensors(spec, measured)
+    late = [one.name for one in spec.sensors]
+    for number in (i for name in _of_sensors(names, "delay") for i in sensed_by(name, late)):
+        spec.sensors[number].delay = 0.0  # which the parameter takes the place of
     compiled = compile_spec(spec)
-    does = effects(spec, compiled, names, [one.support for one in parameters], measured)
-    start = initial_state(compiled, initial or {})
-    begins = does.started(start, np.array([_centre(one) for one in parameters]))
-    episodes = [recordings.prepared(compiled, log, measured, begins) for log in episodes]
+    does = effects(
+        spec,
+        compiled,
+        names,
+        [one.support for one in parameters],
+        measured,
+        [one.tie for one in parameters],
+        len(episodes),
+    )
+    bare = visuals.without(spec, compiled, names)
+    compiled = compiled if bare is spec else compile_spec(bare.copy())
+    modes = starts.modes(begins, len(episodes))
+    given = starts.given(compiled, initial or {}, len(episodes))
+    own = [starts.state_of(compiled, *pair) for pair in zip(modes, given, strict=True)]
+    centre = np.array([_centre(one) for one in parameters])
+    episodes = [
+        recordings.prepared(compiled, log, measured, does.started(state, centre, number))
+        for number, (log, state) in enumerate(zip(episodes, own, strict=True))
+    ]
     deviations = _deviations(episodes[0], measured, noises, inferred)
+    parts, whole = None, episodes
+    if windows is not None or window is not None or cuts.wanted(compiled, episodes, measured):
+        parts = _windows(compiled, parameters, episodes, measured, deviations, does, (modes, given), windows, window)
+    if parts is None:
+        begun = starts.chosen(compiled, episodes, measured, deviations, own, given, modes, does)
+    else:
+        episodes, begun = parts
 
-    build = functools.partial(built, spec, does)
-    starts = [start] * len(episodes)
+    build = functools.partial(built, bare, does)
     if unknown := [name for name in discrepancies if name not in measured]:
         raise ValueError(f"discrepancy: expected some of {', '.join(measured)}, got {', '.join(unknown)}")
-    simulator = Simulator(compiled, build, episodes, measured, deviations, starts, does, discrepancies, threads)
+    simulator = Simulator(compiled, build, episodes, measured, deviations, begun, does, discrepancies, threads)
+    simulator.look = functools.partial(built, spec, does)
     _check_starts(simulator, parameters, deviations)
+    for log in whole:
+        columns.warn_of_clamped(log, compiled, names)
     others = {"name": spec.modelname or "mujoco"} | others
     task = task_of(simulator, parameters, measured, summary, supports, unmodelled_force, **others)
     if design is not None:
-        task = played.with_design(task, simulator_of(task), design, initial or {})
+        task = played.with_design(task, simulator_of(task), design, own[0])
     if engine == "native":
         return task
     from jaxlfi.envs.mujoco.mjx_simulator import by_mjx  # MJX is not needed otherwise
@@ -136,8 +176,6 @@ def task_of(
     if unmodelled_force:
         centre = np.array([_centre(one) for one in parameters])
         simulator = simulator.lacking(simulator.typical_forces(centre).times(unmodelled_force))
-    for log in simulator.logs:
-        columns.warn_of_clamped(log, simulator.model, [one.name for one in parameters])
     seen = summaries.fields(summary, simulator)
     others["settings"] = seen.pop("settings", {}) | dict(others.get("settings", {}))
     supports = {"initial": box([one.support for one in parameters])}
@@ -184,16 +222,26 @@ def specification(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
         ValueError: where there is none, in one line.
     """
     if isinstance(model, mujoco.MjSpec):
-        return model.copy()
+        return named(model.copy())
     text = str(model)
     try:
         if text.lstrip().startswith("<"):
-            return mujoco.MjSpec.from_string(text)
+            return named(mujoco.MjSpec.from_string(text))
         if not Path(text).is_file():
             raise ValueError(f"model: expected an MJCF file, got none called {text!r}")
-        return mujoco.MjSpec.from_file(text)
+        return named(mujoco.MjSpec.from_file(text))
     except ValueError as error:
         raise ValueError(f"model: {' '.join(str(error).split()).removeprefix('model: ')}") from error
+
+
+def named(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """A specification whose elements without a name are called by their number, but for actuators and sensors."""
+    for several in (spec.bodies, spec.joints, spec.geoms, spec.sites, spec.tendons, spec.equalities, spec.pairs):
+        taken = {one.name for one in several}
+        for number, one in enumerate(several):
+            if not one.name and str(number) not in taken:
+                one.name = str(number)
+    return spec
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -206,6 +254,12 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
         return spec.compile()
     except ValueError as error:
         raise ValueError(f"model: MuJoCo refuses it: {' '.join(str(error).split())}") from error
+
+
+def _of_sensors(names: Sequence[str], what: str) -> list[str]:
+    """The sensors that parameters sensor/NAME/what are of."""
+    parts = [name.removeprefix("sensor/").rpartition("/") for name in names if name.startswith("sensor/")]
+    return [sensor for sensor, _, own in parts if own == what]
 
 
 def _check_noises(log: Log, measured: Sequence[str], given: Mapping[str, float], inferred: set[str]) -> None:
@@ -234,19 +288,64 @@ def _deviations(log: Log, measured: Sequence[str], given: Mapping[str, float], i
     return found
 
 
+def _windows(
+    model: mujoco.MjModel,
+    parameters: Sequence[Parameter],
+    episodes: Sequence[Log],
+    measured: Sequence[str],
+    noises: Mapping[str, float],
+    does: Effects,
+    given: tuple[Sequence[str | None], Sequence[Mapping[int, float]]],
+    count: int | None,
+    duration: float | None,
+) -> tuple[list[Log], list[Start]] | None:
+    """Recordings and starts of windows; None of long recordings that cannot be cut, which is said.
+
+    Raises:
+        ValueError: for windows that somebody asks for and that cannot be, in one line.
+    """
+    modes, numbers = given
+    missing = starts.unmeasured(model, measured, [])
+    if missing:
+        reason = f"recordings that measure all joints, got none of {', '.join(missing)}"
+    elif any(mode not in (None, "log") for mode in modes) or any(numbers) or does.starts or does.own_starts:
+        reason = "starts that recordings say, got others in [initial] or among the parameters"
+    else:
+        reason = None
+    if reason is not None and (count is not None or duration is not None):
+        raise ValueError(f"windows: expected {reason}")
+    if reason is not None:
+        plausible.say(
+            f"{episodes[0].name}: long recordings are cut into windows, which expect {reason}: simulated whole"
+        )
+        return None
+    windows = cuts.windows_of(model, episodes, measured, noises, count, duration)
+    bounds = [one.feasible or one.support for one in parameters]
+    lead = (0.0 if does.delay is None else max(bounds[does.delay][1], 0.0)) + (
+        0.0 if does.jitter is None else _JITTERS * bounds[does.jitter][1]
+    )
+    late = {measured[signal]: bounds[d][1] for signal, d in does.lags}
+    parts, times = cuts.cut(episodes, windows, measured, lead, late)
+    own = starts.state_of(model, None, {})
+    begun = [starts.recorded(model, episodes[one.recording], measured, noises, own, at=one.begin) for one in windows]
+    rows = sum(int(np.isfinite([log.signals[name] for name in measured]).any(axis=0).sum()) for log in parts)
+    cuts.said(episodes, windows, model.opt.timestep, rows)
+    return parts, [dataclasses.replace(start, time=time) for start, time in zip(begun, times, strict=True)]
+
+
 def _check_starts(simulator: Simulator, parameters: Sequence[Parameter], noises: Mapping[str, float]) -> None:
     """Say where recordings begin elsewhere than the model does for all parameters that are possible."""
-    does, begins = simulator.does, []
+    does, tried = simulator.does, []
     bounds = np.array([one.feasible or one.support for one in parameters])
     for theta in (np.array([_centre(one) for one in parameters]), *bounds.T):
         try:
-            model = simulator.build(theta) if does.edits else simulator.model
+            model = simulator.build(theta)
         except ValueError:
             continue  # such simulations fail, and are counted
-        begins.append(plausible.sensed(model, does.started(simulator.starts[0], theta)))
-    biased = {signal for signal, _ in does.biases}
-    compared = [name for number, name in enumerate(simulator.signals) if number not in biased]
-    for log in simulator.logs if begins else ():
+        tried.append((model, theta))
+    compared = [name for number, name in enumerate(simulator.signals) if number not in does.rescaled]
+    for episode, log in enumerate(simulator.logs if tried else ()):
+        begins = [plausible.sensed(model, simulator.begun(episode, theta)) for model, theta in tried]
         plausible.check_start(simulator.model, log, compared, noises, begins)
 
 

@@ -6,10 +6,15 @@
 | `actuator/0/gear[0]` | of the model's first actuator, which needs no name |
 | `actuator/servo/kp`, `actuator/servo/kv` | gains of position and velocity servos (`servos`) |
 | `body/link/mass`, `body/link/inertia[1]`, `body/link/ipos[0]` | of a body as a whole, though its geoms make it up |
+| `body/link/inertial[0]` to `[9]` | its whole inertia (`inertia`) |
+| `joint/*/damping` | of all joints, with a `tie` that says what one number means for them (`ties`) |
 | `option/gravity[0]` | of all of it |
 | `initial/hinge/qpos`, `initial/hinge/qvel`, `initial/box/qpos[2]` | the state that episodes begin in |
+| `episode/1/initial/hinge/qpos` | that of the second episode only |
 | `sensor/angle/bias`, `sensor/angle/noise` | what a sensor adds: an offset, and the standard deviation of its noise |
+| `sensor/angle/gain`, `sensor/angle/delay` | what it multiplies by, and the seconds after which it measures |
 | `control/delay` | seconds after which a control acts |
+| `clock/jitter` | the standard deviation, in seconds, of the times at which controls act |
 
 Every simulation has a model of its own that is compiled anew, so that whatever depends on a number is derived from it.
 A body's mass changes its inertia alike, as for one of another density.
@@ -18,7 +23,7 @@ A body's mass changes its inertia alike, as for one of another density.
 import dataclasses
 import difflib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -30,6 +35,10 @@ KINDS = ("body", "joint", "geom", "site", "actuator", "tendon", "equality", "pai
 """Elements of models whose attributes can be inferred."""
 INERTIAL = ("mass", "inertia", "ipos", "iquat")
 """Attributes of a body that its geoms may make up."""
+PATTERN = re.compile(r"[*?]")
+TIES = ("shared", "scaled", "mirrored")
+AT_LEAST_ZERO = re.compile(r"sensor/.+/(delay|noise)|clock/jitter")
+"""Parameters that are no numbers below 0."""
 FORM = re.compile(r"(?P<element>.+)/(?P<attribute>[a-z_]+)(?:\[(?P<index>\d+)\])?")
 
 
@@ -44,9 +53,10 @@ class Parameter:
         unit: for tables and plots.
         log: whether its logarithm is inferred.
         truth: where it is known.
+        tie: what the number means for each of several elements that the name matches (`ties`).
 
     Raises:
-        ValueError: for bounds that are reversed, or a support that is not within Phi.
+        ValueError: for bounds that are reversed, a support that is not within Phi, and another tie.
     """
 
     name: str
@@ -55,12 +65,18 @@ class Parameter:
     unit: str = ""
     log: bool = False
     truth: float | None = None
+    tie: str | Mapping[str, float] | None = None
 
     def __post_init__(self):
+        if (PATTERN.search(self.name) and not self.tie) or (self.tie not in (None, *TIES) and not _factors(self.tie)):
+            expected = f"{', '.join(TIES)} or a factor for each pattern"
+            raise ValueError(f"parameters: {self.name!r}: tie: expected {expected}, got {self.tie or 'none'}")
         for label, bounds in (("support", self.support), ("feasible", self.feasible or self.support)):
             if not (len(bounds) == 2 and bounds[0] < bounds[1]):  # NaN is not, either
                 raise ValueError(f"parameters: {self.name!r}: {label}: expected LOW below HIGH, got {list(bounds)}")
         (low, high), (least, most) = self.support, self.feasible or self.support
+        if least < 0 and AT_LEAST_ZERO.fullmatch(self.name):
+            raise ValueError(f"parameters: {self.name!r}: expected bounds of at least 0, got [{least:g}, {most:g}]")
         if low < least or high > most:
             raise ValueError(
                 f"parameters: {self.name!r}: support: expected bounds within feasible, [{least:g}, {most:g}], "
@@ -130,10 +146,46 @@ def _found(spec: mujoco.MjSpec, element: str, name: str) -> Any:
     if found is None and kind == "actuator" and own.isdecimal() and int(own) < len(spec.actuators):
         return spec.actuators[int(own)]  # which need not have a name
     if found is None:
-        several = {"body": "bodies", "equality": "equalities"}.get(kind, f"{kind}s")
-        names = [one.name for one in getattr(spec, several) if one.name]
+        names = [one.name for one in elements(spec, kind) if one.name]
         raise ValueError(f"parameters: {name!r}: expected a {kind} {near(own, names)}, got {own!r}")
     return found
+
+
+def elements(spec: mujoco.MjSpec, kind: str) -> Sequence[Any]:
+    """All elements of a kind."""
+    return getattr(spec, {"body": "bodies", "equality": "equalities"}.get(kind, f"{kind}s"))
+
+
+def value(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> float:
+    """The number that the model has where a parameter (`edit`, which refuses others) sets one."""
+    match = FORM.fullmatch(name)
+    if match is None:
+        raise ValueError(f"parameters: expected names as joint/hinge/damping, got {name!r}")
+    element, attribute, index = match["element"], match["attribute"], int(match["index"] or 0)
+    found = _found(spec, element, name)
+    if element.startswith("body/") and attribute in INERTIAL:
+        return float(np.ravel(getattr(model.body(found.name), attribute))[index])
+    if element.startswith("actuator/") and attribute in servos.GAINS:
+        own, where, sign = servos.places(found)[attribute][0]
+        return sign * float(getattr(found, own)[where])
+    return float(np.ravel(getattr(found, attribute))[index])
+
+
+def key(spec: mujoco.MjSpec, name: str) -> tuple:
+    """The number that a parameter (`edit`, which refuses others) sets, by whatever name it is called."""
+    match = FORM.fullmatch(name)
+    if match is None or match["element"] == "option":
+        return (name,)
+    kind, _, own = match["element"].partition("/")
+    names = [one.name for one in elements(spec, kind)]
+    number = names.index(own) if own in names else int(own)
+    return kind, names[number] or own, match["attribute"], int(match["index"] or 0)
+
+
+def _factors(tie: Any) -> bool:
+    return isinstance(tie, Mapping) and all(
+        isinstance(one, int | float) and not isinstance(one, bool) for one in tie.values()
+    )
 
 
 def _is_number(value: Any) -> bool:

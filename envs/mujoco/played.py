@@ -30,9 +30,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from jaxlfi.envs.mujoco.effects import initial_state
+from jaxlfi.envs.mujoco.effects import state_place
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.simulator import Simulator
+from jaxlfi.envs.mujoco.starts import certain
 from jaxlfi.tasks.design import Design
 from jaxlfi.tasks.host import HostSimulator
 from jaxlfi.tasks.task import Task
@@ -133,7 +134,7 @@ class Experiment:
         recorded: Simulator,
         played: tuple[Played, ...],
         starts: tuple[str, ...],
-        initial: Mapping[str, float],
+        own: Float[np.ndarray, " state"],
         times: Float[np.ndarray, " time"],
     ):
         """Nothing is simulated yet.
@@ -142,11 +143,11 @@ class Experiment:
             recorded: the simulator of the recordings, whose model, noise and forces are the same.
             played: what actuators play; others rest in the middle of their range.
             starts: names of numbers of the initial state that are chosen.
-            initial: numbers of the initial state that are not.
+            own: the state that an episode begins in otherwise.
             times: of an episode's samples.
         """
         self.played, self.starts, self.times = played, starts, times
-        self._initial, self._model = dict(initial), recorded.model
+        self._own, self._model = own, recorded.model
         rest = {name: np.full(len(times), _middle(recorded.model, name)) for name in recorded.actuators}
         signals = rest | {name: np.zeros(len(times)) for name in recorded.signals}
         known = functools.lru_cache(MODELS)(lambda numbers: recorded.build(np.frombuffer(numbers)))
@@ -158,7 +159,7 @@ class Experiment:
                 [Log(times, signals, "design")],
                 recorded.signals,
                 dict(zip(recorded.signals, recorded.noise, strict=True)),
-                recorded.starts[:1],
+                [own],
                 recorded.does,
                 {recorded.signals[place]: one for place, one in recorded.discrepancies.items()},
             )
@@ -179,8 +180,9 @@ class Experiment:
         (log,) = other.logs
         other.logs = (dataclasses.replace(log, signals=dict(log.signals) | self.controls(design)),)
         if self.starts:
-            chosen = dict(zip(self.starts, map(float, design[len(design) - len(self.starts) :]), strict=True))
-            other.starts = (initial_state(self._model, self._initial | chosen),)
+            chosen = zip(self.starts, map(float, design[len(design) - len(self.starts) :]), strict=True)
+            places = {state_place(self._model, name, f"initial/{name}"): number for name, number in chosen}
+            other.starts = (certain(self._model, self._own, places),)
         return other
 
     def __call__(self, rng: np.random.Generator, theta: Float[np.ndarray, "n dim"], design: np.ndarray) -> Any:
@@ -199,14 +201,14 @@ class Experiment:
         return ["time [s]", *controls], np.column_stack([self.times, *controls.values()])
 
 
-def with_design(task: Task, recorded: Simulator, table: Mapping[str, Any], initial: Mapping[str, float]) -> Task:
+def with_design(task: Task, recorded: Simulator, table: Mapping[str, Any], begins: Float[np.ndarray, " state"]) -> Task:
     """The task of recordings with the experiments that a table `design` allows.
 
     Args:
         task: of the recordings.
         recorded: their simulator.
         table: of the TOML file.
-        initial: numbers of the state that recorded episodes begin in.
+        begins: the state that an experiment begins in, but for what is chosen of it.
 
     Raises:
         ValueError: for what the model does not allow, in one line.
@@ -225,9 +227,8 @@ def with_design(task: Task, recorded: Simulator, table: Mapping[str, Any], initi
     given = table.get("controls", {name: {} for name in recorded.actuators})
     played = tuple(_played(recorded, name, one) for name, one in given.items())
     starts = {name: _bounds(bounds, f"initial: {name}") for name, bounds in table.get("initial", {}).items()}
-    for name, bounds in starts.items():
-        for value in bounds:
-            initial_state(recorded.model, dict(initial) | {name: value})  # refuses unknown names
+    for name in starts:
+        state_place(recorded.model, name, f"initial/{name}")  # refuses unknown names
     limits = {name: _bounds(bounds, f"limits: {name}") for name, bounds in table.get("limits", {}).items()}
     if unknown := [name for name in limits if name not in recorded.signals]:
         raise ValueError(f"design: limits: expected some of {', '.join(recorded.signals)}, got {', '.join(unknown)}")
@@ -236,7 +237,7 @@ def with_design(task: Task, recorded: Simulator, table: Mapping[str, Any], initi
     }
     if not variables:
         raise ValueError("design: expected controls or an initial state to choose, got none")
-    experiment = Experiment(recorded, played, tuple(starts), initial, times)
+    experiment = Experiment(recorded, played, tuple(starts), begins, times)
     design = Design(
         variables,
         response=experiment.response,

@@ -18,6 +18,7 @@ from jaxlfi.envs.mujoco.forces import UnmodelledForces, typical
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.plausible import check
 from jaxlfi.envs.mujoco.quiet import quietly
+from jaxlfi.envs.mujoco.starts import Start, certain
 from jaxlfi.io.host_devices import processors
 from jaxlfi.tasks.task import Task
 from jaxlfi.tasks.worker import OneOfBatch
@@ -35,6 +36,29 @@ _LOCK = threading.Lock()
 """Held while a pool of threads is in use, which does one rollout at a time."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Drawn:
+    """What N simulations differ in besides their parameters and noise, episode by episode.
+
+    Attributes:
+        late: by how much each row's controls act later than it says, in s, shape [N, T] each; None if none does.
+        starts: draws of a standard normal distribution that `Start.at` takes, shape [N, V, 2] each; None of starts
+            that are certain.
+    """
+
+    late: Sequence[Float[np.ndarray, "n time"]] | None
+    starts: Sequence[Float[np.ndarray, "n dofs 2"] | None]
+
+    def part(self, rows: slice | np.ndarray) -> "Drawn":
+        """That of some of the simulations."""
+        late = None if self.late is None else [own[rows] for own in self.late]
+        return Drawn(late, [None if own is None else own[rows] for own in self.starts])
+
+    def of(self, episode: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Both of an episode."""
+        return None if self.late is None else self.late[episode], self.starts[episode]
+
+
 class Simulator:
     """Simulates all episodes of parameter vectors; `jaxlfi.HostSimulator` calls it.
 
@@ -50,7 +74,9 @@ class Simulator:
         orientations: among the signals, whose quaternions are compared as rotations (`aligned`).
         discrepancies: what the model gets wrong, by the signal's number.
         forces: that the model lacks, if any are drawn (`lacking`).
-        model, build, does, logs, starts: as they are given, below.
+        look: makes the model of a parameter vector that is drawn in films.
+        starts: where each episode begins.
+        model, build, does, logs: as they are given, below.
     """
 
     def __init__(
@@ -60,7 +86,7 @@ class Simulator:
         logs: Sequence[Log],
         signals: Sequence[str],
         noise: Mapping[str, float],
-        starts: Sequence[np.ndarray],
+        starts: Sequence[np.ndarray | Start],
         does: Effects = Effects(),
         discrepancies: Mapping[str, Discrepancy] | None = None,
         threads: int | None = None,
@@ -73,7 +99,7 @@ class Simulator:
             logs: one for each episode, with the model's actuators and the measured signals.
             signals: that are measured (`measured`).
             noise: standard deviation of each signal's noise.
-            starts: the state (`effects.STATE`) that each episode begins in.
+            starts: where each episode begins, or the state (`effects.STATE`) that it certainly begins in.
             does: what parameters do besides.
             discrepancies: what the model gets wrong of signals; nothing of others.
             threads: by default as many as processors.
@@ -81,16 +107,18 @@ class Simulator:
         Raises:
             ValueError: for recordings that do not fit the model, in one line.
         """
-        self.model, self.build, self.does = model, build, does
-        self.logs, self.signals, self.starts = tuple(logs), tuple(signals), tuple(starts)
+        self.model, self.build, self.does, self.look = model, build, does, build
+        self.logs, self.signals = tuple(logs), tuple(signals)
+        self.starts = tuple(one if isinstance(one, Start) else certain(model, np.asarray(one)) for one in starts)
         self.places = measured.places(model, signals)
         self.units = tuple(measured.unit(model, name).removeprefix("1") for name in signals)
         self.noise = np.array([noise[name] for name in signals])
         self.discrepancies = {signals.index(name): one for name, one in (discrepancies or {}).items()}
         self.forces: UnmodelledForces | None = None
         self.actuators = controls_of(model)
-        rows = [self._measured_rows(log) for log in logs]
-        self.times = [log.times[own] for log, own in zip(logs, rows, strict=True)]
+        rows = [self._measured_rows(log, start.time) for log, start in zip(logs, self.starts, strict=True)]
+        several = zip(logs, rows, self.starts, strict=True)
+        self.times = [log.times[own] - start.time for log, own, start in several]
         recorded = np.concatenate(
             [
                 np.stack([log.signals[name] for name in signals], axis=1)[own]
@@ -106,6 +134,7 @@ class Simulator:
 
     def held(self, episode: int, times: Float[np.ndarray, " moments"]) -> Float[np.ndarray, "moments controls"]:
         """The recorded controls of an episode at some times, held from sample to sample."""
+        times = times + self.starts[episode].time
         columns = [self.logs[episode].held(name, times) for name in self.actuators]
         return np.stack(columns, axis=-1) if columns else np.zeros((len(times), 0))
 
@@ -170,8 +199,8 @@ class Simulator:
             )
         return int(taken)
 
-    def _measured_rows(self, log: Log) -> Int[np.ndarray, " rows"]:
-        """Rows of a log with a sample of anything that is measured."""
+    def _measured_rows(self, log: Log, begin: float) -> Int[np.ndarray, " rows"]:
+        """Rows of a log with a sample of anything that is measured, from the time on at which its episode begins."""
         known = ", ".join(log.signals)
         if missing := [name for name in self.actuators if name not in log.signals]:
             raise ValueError(
@@ -180,19 +209,22 @@ class Simulator:
             )
         if missing := [name for name in self.signals if name not in log.signals]:
             raise ValueError(f"{log.name}: expected signals {', '.join(missing)}, got {known}")
-        if log.times[-1] < self.model.opt.timestep:
+        if log.times[-1] - begin < self.model.opt.timestep:
             raise ValueError(
                 f"{log.name}: expected more than a step of the model, {self.model.opt.timestep:g} s, "
-                f"got {log.times[-1]:g} s"
+                f"got {log.times[-1] - begin:g} s"
             )
         check(self.model, log, self.signals)
-        return np.flatnonzero(np.isfinite([log.signals[name] for name in self.signals]).any(axis=0))
+        there = np.isfinite([log.signals[name] for name in self.signals]).any(axis=0)
+        return np.flatnonzero(there & (log.times >= begin - 1e-9))
 
     def __call__(
         self, rng: np.random.Generator, theta: Float[np.ndarray, "n dim"]
     ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
         """Measurements with their noise and what the model gets wrong, and 0 or why each simulation failed."""
-        clean, outcome = self.clean(theta, None if self.forces is None else self.forces.draws(rng, len(theta)))
+        theta = np.asarray(theta, float)
+        lacking = None if self.forces is None else self.forces.draws(rng, len(theta))
+        clean, outcome = self.clean(theta, lacking, self._drawn(rng, theta))
         deviation = np.tile(self.noise, (len(theta), 1))
         for signal, d in self.does.deviations:
             deviation[:, signal] = theta[:, d]
@@ -208,13 +240,17 @@ class Simulator:
         return orientations.aligned(rows, self.observation, self.orientations)
 
     def clean(
-        self, theta: Float[np.ndarray, "n dim"], lacking: Float[np.ndarray, "n numbers"] | None = None
+        self,
+        theta: Float[np.ndarray, "n dim"],
+        lacking: Float[np.ndarray, "n numbers"] | None = None,
+        drawn: Drawn | None = None,
     ) -> tuple[Float[np.ndarray, "n rows signals"], Int[np.ndarray, " n"]]:
         """Measurements without noise, and 0 or why each simulation failed; those that failed are zero.
 
         Args:
             theta: in natural units.
             lacking: of the forces that the model lacks (`UnmodelledForces.add`); by default they are not there.
+            drawn: what they differ in besides; by default controls keep time, and starts are the most likely ones.
         """
         theta = np.asarray(theta, float)
         lacking = np.zeros((len(theta), 0)) if lacking is None else lacking
@@ -222,7 +258,10 @@ class Simulator:
         with _LOCK, quietly():
             for first in range(0, len(theta), self._chunk):
                 part = slice(first, first + self._chunk)
-                rows[part], outcome[part] = self._rolled(theta[part], lacking[part])
+                own = None if drawn is None else drawn.part(part)
+                rows[part], outcome[part] = self._rolled(theta[part], lacking[part], own)
+        for signal, d in self.does.gains:
+            rows[:, :, signal] *= theta[:, d, None]
         for signal, d in self.does.biases:
             rows[:, :, signal] += theta[:, d, None]
         rows = self.aligned(rows)
@@ -241,13 +280,20 @@ class Simulator:
         """
         theta = np.asarray(theta, float)
         models, grid = [self.build(row) for row in theta], self.grid(self.times[episode])
-        start = self.does.started(self.starts[episode], theta)
-        controls = self.controls(self.logs[episode], theta, grid)
+        start = self.begun(episode, theta)
+        controls = self.controls(episode, theta, grid)
         with _LOCK, quietly():
             states, _ = mujoco.rollout.rollout(models, mujoco.MjData(self.model), start, controls)
         return models, grid, np.concatenate([start[:, None], states[:, :-1]], axis=1)
 
-    def _rolled(self, theta: np.ndarray, lacking: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def begun(
+        self, episode: int, theta: Float[np.ndarray, "*n dim"], draws: Float[np.ndarray, "*n dofs 2"] | None = None
+    ) -> Float[np.ndarray, "*n state"]:
+        """The states that an episode of parameter vectors begins in; by default the most likely ones."""
+        draws = np.zeros((*theta.shape[:-1], self.model.nv, 2)) if draws is None else draws
+        return self.does.started(self.starts[episode].at(self.does, theta, draws), theta, episode)
+
+    def _rolled(self, theta: np.ndarray, lacking: np.ndarray, drawn: Drawn | None) -> tuple[np.ndarray, np.ndarray]:
         models = [self._made(*rows) for rows in zip(theta, lacking, strict=True)]
         outcome = np.array([0 if model else REFUSED for model in models])
         good = np.flatnonzero(outcome == 0)
@@ -257,11 +303,13 @@ class Simulator:
         if self._pool is None:
             self._pool = mujoco.rollout.Rollout(nthread=self._threads)
         data = [mujoco.MjData(self.model) for _ in range(self._threads)]
+        drawn = None if drawn is None else drawn.part(good)
         begin = 0
-        for episode, (log, times) in enumerate(zip(self.logs, self.times, strict=True)):
-            start, grid = self.does.started(self.starts[episode], theta[good]), self.grid(times)
+        for episode, times in enumerate(self.times):
+            late, moved = (None, None) if drawn is None else drawn.of(episode)
+            start, grid = self.begun(episode, theta[good], moved), self.grid(times)
             states, sensors = self._pool.rollout(
-                [models[row] for row in good], data, start, self.controls(log, theta[good], grid)
+                [models[row] for row in good], data, start, self.controls(episode, theta[good], grid, late)
             )
             # MuJoCo begins anew where a simulation has become unstable, and its clock with it.
             step = self.model.opt.timestep
@@ -269,7 +317,11 @@ class Simulator:
             values = sensors[:, :, self.places]
             stopped |= ~np.isfinite(values).all(axis=(1, 2)) | ~np.isfinite(states[:, -1]).all(axis=1)
             outcome[good[stopped]] = UNSTABLE
-            rows[good, begin : begin + len(times)] = between(grid, values, times)
+            own = between(grid, values, times)
+            for signal, d in self.does.lags:
+                for row, delay in enumerate(theta[good, d]):
+                    own[row, :, signal] = np.interp(times - delay, grid, values[row, :, signal])
+            rows[good, begin : begin + len(times)] = own
             begin += len(times)
         return rows, outcome
 
@@ -278,12 +330,34 @@ class Simulator:
         step = self.model.opt.timestep
         return step * np.arange(max(int(np.ceil(times[-1] / step - 1e-9)), 1) + 1)
 
-    def controls(self, log: Log, theta: np.ndarray, grid: np.ndarray) -> np.ndarray:
-        """Controls of each model over each step, shape [N, steps, actuators]."""
+    def controls(self, episode: int, theta: np.ndarray, grid: np.ndarray, late: np.ndarray | None = None) -> np.ndarray:
+        """Controls of each model over each step, shape [N, steps, actuators].
+
+        Args:
+            episode: its number.
+            theta: in natural units, shape [N, D].
+            grid: times of the steps.
+            late: by how much each row of the log acts later than it says, shape [N, T]; nothing by default.
+        """
         delays = np.zeros(len(theta)) if self.does.delay is None else theta[:, self.does.delay]
-        when = grid - delays[:, None]
-        held = [log.mean_held(name, when, self.model.opt.timestep) for name in self.actuators]
+        log, step = self.logs[episode], self.model.opt.timestep
+        when = self.starts[episode].time + grid - delays[:, None]
+        held = [
+            log.mean_held(name, when, step)
+            if late is None
+            else np.stack([log.mean_held(name, *own, step, off) for *own, off in zip(when, late, strict=True)])
+            for name in self.actuators
+        ]
         return np.stack(held, axis=-1) if held else np.zeros((len(theta), len(grid), 0))
+
+    def _drawn(self, rng: np.random.Generator, theta: np.ndarray) -> Drawn | None:
+        jitter, late = self.does.jitter, None
+        if jitter is None and not any(start.uncertain for start in self.starts):
+            return None
+        if jitter is not None:
+            late = [theta[:, [jitter]] * rng.standard_normal((len(theta), len(log.times))) for log in self.logs]
+        shape = (len(theta), self.model.nv, 2)
+        return Drawn(late, [rng.standard_normal(shape) if start.uncertain else None for start in self.starts])
 
     def made(self, theta: Float[np.ndarray, " dim"], lacking: Float[np.ndarray, " numbers"]) -> mujoco.MjModel:
         """The model of a parameter vector with forces that it lacks, if there are any.

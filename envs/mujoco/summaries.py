@@ -2,7 +2,7 @@
 
 | name | what, of each episode and signal |
 |---|---|
-| `samples` | up to 30 rows at about equal intervals, as they are |
+| `samples` | up to 30 rows at about equal intervals, as they are; fewer of more than four episodes |
 | `cross-correlation` | correlations with the controls and with itself, at some lags; means and standard deviations |
 | `spectrum` | the mean, and the logarithm of the power in bands of frequency |
 | `learnt` | all rows, through convolutions that are trained with the density in every round |
@@ -28,6 +28,8 @@ from jaxlfi.tasks import summaries
 
 SAMPLES = 30
 """Rows of an episode that the network sees, at most, of `samples`."""
+FEW, NUMBERS = 4, 360
+"""Episodes that it sees so many rows of; of more it sees about so many numbers in all, and at least three rows each."""
 LAGS = (0.0, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4)
 """Of correlations, as fractions of an episode's duration."""
 BANDS = 12
@@ -230,11 +232,13 @@ def _rows(there: Sequence[np.ndarray]) -> tuple[int, ...]:
         there: whether there is a sample, shape [T, C] for each episode.
     """
     rows, begin = [], 0
+    of_many = int(np.clip(NUMBERS // (len(there) * there[0].shape[1]), 3, SAMPLES))
+    most = SAMPLES if len(there) <= FEW else of_many
     for own in there:
         known = np.flatnonzero(own.all(axis=1))
-        if len(known) < min(SAMPLES, len(own)):
+        if len(known) < min(most, len(own)):
             known = np.arange(len(own))
-        wanted = np.linspace(known[0], known[-1], min(SAMPLES, len(own)))
+        wanted = np.linspace(known[0], known[-1], min(most, len(own)))
         nearest = known[np.argmin(np.abs(known[:, None] - wanted.round()), axis=0)]
         rows += [begin + int(row) for row in np.unique(nearest)]
         begin += len(own)

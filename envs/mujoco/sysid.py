@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxlfi.envs.mujoco import noise as noises
 from jaxlfi.envs.mujoco import plausible, recordings
-from jaxlfi.envs.mujoco.columns import controls_of
+from jaxlfi.envs.mujoco.columns import controls_of, warn_of_clamped
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import signals_of
 from jaxlfi.envs.mujoco.model_task import task_of
@@ -92,6 +92,8 @@ def from_sysid(
     summary, threads = others.pop("summary", "samples"), others.pop("threads", None)
     unmodelled_force = others.pop("unmodelled_force", 0.0)
     simulator = Simulator(model, build, episodes, signals, deviations, starts, threads=threads)
+    for log in episodes:
+        warn_of_clamped(log, model, names)
     others = {"name": sequences.name} | others
     return task_of(simulator, doubted, signals, summary, unmodelled_force=unmodelled_force, **others)
 

@@ -18,7 +18,7 @@ import jaxlfi
 from jaxlfi.envs.mujoco import config
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.least_squares import best_fits
-from jaxlfi.envs.mujoco.logs import Log, read
+from jaxlfi.envs.mujoco.logs import Log, RecordingWarning, read
 from jaxlfi.envs.mujoco.mjx_effects import Held
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -116,6 +116,27 @@ def test_sensors_are_those_of_the_state_before_a_step():
     """Accelerations among them, of a model without constraints, and between steps; Runge-Kutta looks ahead."""
     task = slide([DAMPING, LATE], integrator="RK4")
     agree(task, np.array([[0.1, 0.0], [2.0, 0.033], [8.0, 0.06]], np.float32), atol=1e-4)
+
+
+def test_sensors_that_are_late_and_have_gains():
+    """One alone, and beside controls that are late, too."""
+    task = slide([LATE, Parameter("sensor/place/delay", (0.0, 0.2)), Parameter("sensor/felt[0]/gain", (0.5, 3.0))])
+    agree(task, np.array([[0.0, 0.033, 1.5], [0.05, 0.12, 2.0], [0.0, 0.0, 1.0]], np.float32), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_windows_begin_in_starts_of_their_own():
+    """Of a recording that begins in motion, with controls that are late, and states that are drawn."""
+    times = 0.02 * np.arange(100)
+    place = 0.3 + 0.9 * np.sin(2 * times) + 0.01 * np.random.default_rng(0).standard_normal(100)
+    log = Log(times, {"motor": np.cos(3 * times), "place": place})
+    with pytest.warns(RecordingWarning, match="cut into 2 windows of 0.6 s"):
+        task = slide([DAMPING, LATE], log, {"place": 0.01}, windows=2, window=0.6)
+    agree(task, np.array([[0.1, 0.0], [2.0, 0.033], [8.0, 0.06]], np.float32), atol=1e-4)
+    (start, other), theta = simulator_of(task).starts, np.array([0.1, 0.0], np.float32)
+    rows, _ = jax.jit(jax.vmap(task.simulate, in_axes=(0, None)))(jax.random.split(jax.random.key(1), 2000), theta)
+    for row, own in ((0, start), (len(task.observation) // 2, other)):
+        assert np.std(rows[:, row, 0]) == pytest.approx(np.hypot(0.01, own.root[0, 0, 0]), rel=5 / np.sqrt(2 * 2000))
 
 
 @pytest.fixture(scope="module")

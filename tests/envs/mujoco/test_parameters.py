@@ -100,7 +100,7 @@ def test_names_that_match_nothing_or_several_numbers(name, expected):
     ("name", "expected"),
     [
         ("sensor/angel/bias", "expected a signal such as angle, got 'angel'"),
-        ("sensor/angle/scale", "expected bias or noise, got 'scale'"),
+        ("sensor/angle/scale", "expected gain, bias, delay, noise of a sensor, got 'scale'"),
         ("initial/elbow/pos", "expected initial/JOINT/qpos or initial/JOINT/qvel"),
         ("initial/wrist/qpos", "expected a joint such as"),
         ("control/gain", "expected control/delay"),

@@ -189,7 +189,7 @@ def test_an_encoder_without_a_unit_of_a_joint_with_limits():
 
 def test_a_beginning_elsewhere_is_said_once_for_each_signal():
     with pytest.warns(RecordingWarning) as caught:
-        task([log(), log(angle=RECORDED["angle"] + 0.5, place=RECORDED["place"] - 0.1)])
+        task([log(), log(angle=RECORDED["angle"] + 0.5, place=RECORDED["place"] - 0.1)], begins="model")
     lines = sorted(str(one.message) for one in caught)
     assert len(lines) == 2
     assert "angle: the recording begins at 0.5003 rad, the model at 0 rad: 250 standard deviations of the" in lines[0]
@@ -246,7 +246,8 @@ def test_what_rests_or_is_coarse_does_not_only_repeat(values):
 def test_a_warning_of_the_command_line_is_one_line(tmp_path, capsys):
     (tmp_path / "wheel.xml").write_text(WHEEL)
     (tmp_path / "wheel.toml").write_text(
-        'model = "wheel.xml"\nlog = ["a.csv"]\n[parameters."joint/axle/damping"]\nsupport = [0.001, 0.05]\n'
+        'model = "wheel.xml"\nlog = ["a.csv"]\n[initial]\nfrom = "model"\n'
+        '[parameters."joint/axle/damping"]\nsupport = [0.001, 0.05]\n'
     )
     with (tmp_path / "a.csv").open("w", newline="") as file:
         writer = csv.writer(file)
