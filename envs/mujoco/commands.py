@@ -24,8 +24,6 @@ from jaxlfi.registry import TASKS
 from jaxlfi.runs.run import Run
 from jaxlfi.tasks.task import Task
 
-AS_GOOD = 1.1
-"""Points whose misfit is within this factor of the best one's explain the recording as well."""
 DRAWS = 1000
 SYSID = "mujoco.sysid"
 SHOWN = 6
@@ -84,7 +82,7 @@ def draw(
         other: what `mujoco.sysid` finds.
         posterior: draws in natural units, shape [n, D].
     """
-    several = _as_good(fits)[:SHOWN]
+    several = least_squares.as_good(fits)[:SHOWN]
     called = {f"point {number + 1}, 90 %": one for number, one in enumerate(several)}
     sets = {label: _drawn(task, one) for label, one in called.items()}
     points = {label: (one.theta, one.interval) for label, one in called.items()}
@@ -132,8 +130,10 @@ def task_of(run: Run) -> Task:
 def said(task: Task, fits: Sequence[Fit]) -> list[str]:
     """The findings of the points in sentences, and the lines that the task's file can take from them."""
     best, lines = fits[0], []
-    if len(_as_good(fits)) > 1:
-        lines.append(f"{len(_as_good(fits))} points explain the recording as well: it does not tell which is right.")
+    if len(least_squares.as_good(fits)) > 1:
+        lines.append(
+            f"{len(least_squares.as_good(fits))} points explain the recording as well: it does not tell which is right."
+        )
     for name, bound in zip(task.names, best.at_bound, strict=True):
         if bound:
             lines.append(f"{name} ended on a bound of Phi: widen Phi if it can be.")
@@ -177,10 +177,6 @@ def _noises(task: Task) -> list[str]:
     does = simulator_of(task).does
     jitter = [] if does.jitter is None else [does.jitter]
     return [task.names[d] for d in [*(d for _, d in does.deviations), *jitter]]
-
-
-def _as_good(fits: Sequence[Fit]) -> list[Fit]:
-    return [one for one in fits if one.misfit <= AS_GOOD * fits[0].misfit]
 
 
 def _over_feasible(task: Task, count: int) -> np.ndarray:

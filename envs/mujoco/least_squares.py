@@ -38,6 +38,8 @@ START_STEP = 0.1
 """Of differences by starts, in standard deviations."""
 CORRECTIONS = 2
 """How often the point is found again with the integrator's error there."""
+AS_GOOD = 1.1
+"""Points whose misfit is within this factor of the best one's explain the recording as well."""
 _NOISELESS = 1e-3
 """Standard deviation, as a fraction of the signal's own, that stands for the noise of a signal that has none."""
 _FAILED = 1e3
@@ -318,6 +320,11 @@ def best_fits(
             different.append(one)
     spent = len(starts) + sum(one.simulations for one in fits)
     return [dataclasses.replace(one, simulations=spent) for one in different]
+
+
+def as_good(fits: Sequence[Fit]) -> list[Fit]:
+    """The points that explain the recording as well as the best one, which is the first."""
+    return [one for one in fits if one.misfit <= AS_GOOD * fits[0].misfit]
 
 
 def _same(task: Task, residuals: Residuals, one: Fit, other: Fit) -> bool:

@@ -18,6 +18,7 @@ from jaxlfi.envs.mujoco.effects import Effects, built, effects, sensed_by
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.envs.mujoco.polish import polish
 from jaxlfi.envs.mujoco.simulator import FAILURES, Simulator, simulator_of
 from jaxlfi.envs.mujoco.starts import Start
 from jaxlfi.tasks.host import HostSimulator
@@ -193,6 +194,7 @@ def task_of(
         truth=None if None in truth else np.asarray(truth, np.float32),
         observation=simulator.observation,
         failures=FAILURES,
+        polish=polish,
         channels=[f"{name} [{unit}]" if unit else name for name, unit in zip(measured, simulator.units, strict=True)],
         record_label="time [s]" if len(simulator.times) == 1 else None,
         times=simulator.times[0] if len(simulator.times) == 1 else None,

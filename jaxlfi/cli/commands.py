@@ -36,6 +36,7 @@ from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import CheckpointError
 from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
+from jaxlfi.runs.polishing import polished
 from jaxlfi.studies import calibration, grid
 from jaxlfi.studies.calibration.widths import sentence
 from jaxlfi.studies.grid import Work
@@ -139,7 +140,8 @@ def _begun(
         workfolder.refuse_occupied(arguments.out)
     observation = choices.observation_of(arguments, task, lambda line: _say(output.notes, line))
     task = with_gaps_of(task, observation, settings.estimator.embedding != "none")
-    plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network)
+    polish = kind != COMPARE and arguments.polish  # heuristics are compared by their own posteriors
+    plan = BatchPlan(kind, arguments.task, task, arguments.preset, settings, specs, arguments.keep_network, polish)
     observed = executing.prepare(plan, observation, first, processes)
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
         if (mass := priors.require_mass(plan.task.inference.prior, box, name)) < priors.LOW_INSIDE:
@@ -319,6 +321,8 @@ def run(folder: Path, work: tuple[BatchPlan, Observed] | Work, arguments: argpar
         runs = executing.execute(plan, observed, folder, on_round, progress.compiled, progress.simulated, processes)
     if not processes.writes:
         return
+    if plan.polish:
+        runs = [polished(run, output.notes) for run in runs]
     executing.finish(folder, plan, runs)
     if arguments.json:
         _print_json(folder, folders.read_config(folder))

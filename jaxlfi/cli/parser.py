@@ -173,6 +173,12 @@ def _infer(command: argparse.ArgumentParser, families: Families) -> None:
     )
     add("--support-high", nargs="+", type=float, metavar="X", help="upper bounds of that support")
     add(
+        "--polish",
+        action="store_true",
+        help="sharpen the posterior by what the task knows besides simulations, where it does: of a MuJoCo model, by "
+        "least squares from its draws",
+    )
+    add(
         "--simulations",
         type=Path,
         metavar="FILE",

@@ -24,6 +24,7 @@ ALL = ""
 """The name of all numbers of an observation together."""
 EDGE = "A support that can grow: `--heuristic edge`, or `heuristic=jaxlfi.Edge()`."
 LOOK = "Look at the misfit: `jaxlfi report FOLDER` draws simulations of the posterior beside the observation."
+POLISH = "Sharper intervals by least squares, where motion is smooth: `--polish`, or `polish=True`."
 DIAGNOSE = "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER`."
 DIAGNOSE_OWN = (
     "Check the widths of the intervals: `run.save(FOLDER)`, then `jaxlfi diagnose FOLDER --task MODULE:TASK`, where "
@@ -50,10 +51,18 @@ def account(run: Result, found: RunSummary) -> RunSummary:
     """The summary of a run's parameters with sentences on the run as a whole, and all that there is to do next."""
     strange, (fit, fits) = _observation(run), _fit(run)
     settled, more = _settled(run)
+    polish, sharper = _polish(run)
     first = [LOOK] * bool(strange or not fits) + [EDGE] * _held_back(run, found) + more
-    steps = (*first, *found.next_steps, *[_diagnose(run)] * (not first))  # widths are measured of what may be kept
-    sentences = (*found.sentences, strange, fit, _failures(run), settled)
+    steps = (*first, *found.next_steps, *sharper, *[_diagnose(run)] * (not first and run.polish is None))
+    sentences = (*found.sentences, *polish, strange, fit, _failures(run), settled)
     return RunSummary(found.parameters, tuple(filter(None, sentences)), steps)
+
+
+def _polish(run: Result) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """How the posterior was polished, and what there is to do; or that it could be."""
+    if run.polish is not None:
+        return run.polish.sentences, run.polish.steps
+    return (), () if run.task is None or run.task.polish is None else (POLISH,)
 
 
 def _diagnose(run: Result) -> str:

@@ -59,6 +59,7 @@ class BatchPlan:
     settings: Settings  # all of them
     specs: tuple[RunSpec, ...]  # the runs
     keep_network: bool = False  # leave the trained networks in the folder
+    polish: bool = False  # sharpen posteriors by what the task knows besides (`jaxlfi.runs.polishing`)
 
     def folders(self) -> list[str]:
         """Each run's folder, relative to the plan's."""
@@ -276,6 +277,7 @@ def begin(folder: Path, plan: BatchPlan, observed: Observed, processes: Processe
         "devices": devices_of(len(plan.specs), processes),
         "processes": processes.count,
         "keep_network": plan.keep_network,
+        "polish": plan.polish,
         "executor": plan.task.one_by_one and plan.task.simulate.executor is not None,
         "runs": [
             {"folder": name} | {field: run[field] for field in OWN}
@@ -320,6 +322,7 @@ def reopen(folder: Path, task: Task | None = None) -> tuple[BatchPlan, Observed]
             settings=describe.settings_from_json(config["settings"]),
             specs=tuple(_spec(run) for run in config["runs"]),
             keep_network=config["keep_network"],
+            polish=config.get("polish", False),
         )
         labels = config["names"]
         if config.get("one_by_one", False):

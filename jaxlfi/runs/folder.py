@@ -1,7 +1,8 @@
 """Run folders: what a run leaves behind, in plain files (JSON, .npz without pickles, CSV).
 
 One run:        config.json ledger.jsonl posterior.npz dataset.npz history.npz observation.npz
-                summary.json; failures.jsonl, where simulations say why they failed
+                summary.json; failures.jsonl, where simulations say why they failed; polish.json, where the posterior
+                was polished
 Several seeds:  config.json seed_000/ seed_001/ ...                   each one per run folder
 A comparison:   config.json table.csv CONFIGURATION/seed_000/ ...     each one per run folder
 
@@ -9,6 +10,7 @@ While a command runs its folder also holds `checkpoint/` (`jaxlfi.runs.checkpoin
 """
 
 import contextlib
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,8 +35,13 @@ from jaxlfi.tasks.task import Task
 OF_RUN = (
     "config.json", "ledger.jsonl", "posterior.npz", "dataset.npz", "history.npz", "observation.npz", "network.npz",
     "samples.csv", "report.html", "figures", "diagnostics", "checkpoint", run_summary.NAME, failures.FILE,
+    "polish.json",
 )  # fmt: skip
 """What the folder of a run may hold that commands wrote."""
+POLISH = "polish.json"
+"""How a posterior was polished (`jaxlfi.runs.result.PolishNotes`), where it was."""
+UNPOLISHED = "unpolished_"
+"""Beginning of the names in posterior.npz of the posterior before."""
 TABLE_COLUMNS = ("configuration", "seed", "theta_error", "trajectory_error", "success_rate", "seconds")
 
 
@@ -79,9 +86,12 @@ def write_run(folder: Path, run: Result, keep_network: bool = False) -> None:
             "parameters": np.asarray(run.space.names),
             "log": np.asarray(run.space.log),
             "names": labels,
-        },
+        }
+        | _unpolished(run),
         durable=True,
     )
+    if run.polish is not None:
+        atomic.write_json(folder / POLISH, dataclasses.asdict(run.polish))
     atomic.write_json(folder / run_summary.NAME, account.summary(run, draws).at(run_summary.FOLDER).to_dict())
     dataset = jax.device_get(run.dataset)
     rows = slice(int(dataset.size))
@@ -109,6 +119,16 @@ def write_run(folder: Path, run: Result, keep_network: bool = False) -> None:
     )
     if keep_network or run.amortised or not run.settings.estimator.closed_form:
         atomic.write_arrays(folder / "network.npz", trees.named_leaves(run.network), durable=True)
+
+
+def _unpolished(run: Result) -> dict[str, Any]:
+    """The posterior before it was polished, as arrays of names of their own."""
+    if run.unpolished is None:
+        return {}
+    mixture, support = jax.device_get((run.unpolished.mixture, run.unpolished.support))
+    arrays = {name: getattr(mixture, name) for name in ("logits", "means", "scale_tril")}
+    arrays |= {"support_low": support.low, "support_high": support.high}
+    return {UNPOLISHED + name: array for name, array in arrays.items()}
 
 
 def save(run: Result, folder: Path, exist_ok: bool = False) -> Path:

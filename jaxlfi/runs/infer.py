@@ -36,6 +36,7 @@ from jaxlfi.runs import folder as folders
 from jaxlfi.runs.checkpoint import EXTENDED
 from jaxlfi.runs.execute import BatchPlan, Observed
 from jaxlfi.runs.load import load
+from jaxlfi.runs.polishing import polished
 from jaxlfi.runs.result import Origin
 from jaxlfi.runs.run import Run
 from jaxlfi.tasks.executors import one_by_one
@@ -67,14 +68,15 @@ def infer(
     out: str | Path | None = None,
     executor: Executor | None = None,
     simulation_timeout: float | None = None,
+    polish: bool = False,
 ) -> Run:
     """Infer a task's parameters from one observed trajectory, adapting the support (Algorithm 1).
 
     The same numbers as `jaxlfi infer` gives for the seed that the key was made from. Compiled on first use for a task
     and the static part of `settings`; further calls reuse the program. It can be traced: jitted, and vmapped over keys,
     observations, supports, and the leaves of `heuristic` and `settings`. A traced run is one scan over its rounds, and
-    takes neither a host simulator nor the last six arguments. A scan has a fixed length: once a traced run has settled
-    (`min_rounds`) its state stays as it is and its further rounds count no simulations, but they are computed.
+    takes neither a host simulator nor the last seven arguments. A scan has a fixed length: once a traced run has
+    settled (`min_rounds`) its state stays as it is and its further rounds count no simulations, but they are computed.
 
     Args:
         key: consumed; or a seed, as `--first-seed` of the command line.
@@ -101,6 +103,8 @@ def infer(
             `concurrent.futures.Executor`. One that fails, crashes or hangs is counted by its reason. The result is the
             same for any executor.
         simulation_timeout: seconds after which a simulation of a host simulator is given up.
+        polish: sharpen the posterior by what the task knows besides simulations, where it does (`Task.polish`): by
+            least squares for models of MuJoCo.
 
     Returns:
         The run: `run.posterior`, `run.belief.support`, `run.warnings`, `run.save(folder)`.
@@ -145,7 +149,7 @@ def infer(
         box = task.support(support, space)
         name = next(iter(task.supports)) if support is None else name
     spec = RunSpec("own", name, box, heuristic, seed_of(key))
-    plan = BatchPlan(formats.RUN, None, task, None, settings, (spec,))
+    plan = BatchPlan(formats.RUN, None, task, None, settings, (spec,), polish=polish)
     run = _run(plan, observation, first, progress, callback, None if out is None else Path(out))
     for category, text in run.findings():
         python_warnings.warn(text, category, stacklevel=2)
@@ -191,7 +195,7 @@ def executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Call
                 callback(index, {name: np.array(value) for name, value in own.items()})  # theirs to change
 
         (run,) = executing.execute(plan, observed, out, each, bar.compiled, bar.simulated)
-    return run
+    return polished(run, console) if plan.polish else run
 
 
 def _require_same(out: Path, config: dict[str, Any], plan: BatchPlan) -> BatchPlan:

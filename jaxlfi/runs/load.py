@@ -27,7 +27,7 @@ from jaxlfi.io.workfolder import StoreError
 from jaxlfi.registry import TASKS
 from jaxlfi.runs import describe
 from jaxlfi.runs import folder as folders
-from jaxlfi.runs.result import Origin
+from jaxlfi.runs.result import Origin, PolishNotes
 from jaxlfi.runs.run import Run
 from jaxlfi.tasks import failures
 from jaxlfi.tasks.executors import one_by_one
@@ -102,6 +102,8 @@ def _read(folder: Path, config: dict[str, Any], task: Task | None) -> Run:
     layout = tuple(map(int, observation.get("layout", (len(x), 1))))
     return Run(
         belief=_belief(folder / "posterior.npz", space),
+        polish=(polish := _polish(folder / folders.POLISH)),
+        unpolished=None if polish is None else _belief(folder / "posterior.npz", space, folders.UNPOLISHED),
         history=_records(history),
         dataset=_dataset(folder / "dataset.npz", settings),
         network=_network(folder / "network.npz", settings, layout, feasible, space, prior, config["version"]),
@@ -164,9 +166,22 @@ def _prior(folder: Path, config: dict[str, Any], task: Task | None, settings: Se
     return None
 
 
-def _belief(path: Path, space: Space) -> Belief:
+def _polish(path: Path) -> PolishNotes | None:
+    if not path.exists():
+        return None
+    try:
+        found = atomic.read_json(path)
+        return PolishNotes(
+            tuple(map(str, found["sentences"])), tuple(map(str, found["steps"])), int(found["simulations"])
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"{path}: expected how the posterior was polished, got a damaged file: {error}") from error
+
+
+def _belief(path: Path, space: Space, prefix: str = "") -> Belief:
     names = ("logits", "means", "scale_tril", "support_low", "support_high")
-    arrays = _arrays(path, names)
+    arrays = _arrays(path, tuple(prefix + name for name in names))
+    arrays = {name: arrays[prefix + name] for name in names}
     components, dim = arrays["logits"].size, space.dim
     shapes = (components,), (components, dim), (components, dim, dim), (dim,), (dim,)
     for name, shape in zip(names, shapes, strict=True):

@@ -52,6 +52,15 @@ class Origin:
     given_simulations: int | None = 0
 
 
+@dataclasses.dataclass(frozen=True)
+class PolishNotes:
+    """How a run's posterior was polished (`jaxlfi.tasks.polish.Polished`), in words, and the simulations it took."""
+
+    sentences: tuple[str, ...]
+    steps: tuple[str, ...]
+    simulations: int
+
+
 class Result(struct.PyTreeNode):
     """What a run found. A pytree: under `vmap`, every array has a leading axis.
 
@@ -75,6 +84,8 @@ class Result(struct.PyTreeNode):
         failure_log: what its simulations say of their failures (`failures`).
         reference: what the network's summaries are counted from, shape [S], in double precision; None for zero
             (`jaxlfi.tasks.reference`). `x` and those of the dataset are counted from zero.
+        polish: how the posterior was polished; None where it is the rounds' own.
+        unpolished: the belief before, or None.
     """
 
     belief: Belief
@@ -94,6 +105,8 @@ class Result(struct.PyTreeNode):
     units: tuple[str, ...] | None = struct.field(pytree_node=False, default=None)
     failure_log: FailureLog = struct.field(pytree_node=False, default=FailureLog())
     reference: np.ndarray | None = None
+    polish: PolishNotes | None = struct.field(pytree_node=False, default=None)
+    unpolished: Belief | None = None
 
     @property
     def posterior(self) -> Posterior:

@@ -85,6 +85,8 @@ class Task:
         design: what can be chosen of an experiment (`jaxlfi.tasks.design.Design`, or a mapping of its variables such
             as `{"amplitude": (0.1, 1.0, "N m")}`), for `Run.design` to say which experiment tells most. The simulator
             is then `simulate(key, theta, design[K])`, and the task that of its nominal design.
+        polish: a function that sharpens a run's posterior by more than simulations (`jaxlfi.tasks.polish`), as least
+            squares does for models of MuJoCo; None where there is none.
 
     Raises:
         ValueError: for numbers of names, units and bounds that do not agree, reversed bounds, unknown names in `log`,
@@ -120,6 +122,7 @@ class Task:
     name: str = "task"
     channel_noise: Any = None
     design: Any = None
+    polish: Any = None
 
     def __post_init__(self):
         store = lambda field, value: object.__setattr__(self, field, value)

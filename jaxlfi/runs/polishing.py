@@ -1,0 +1,76 @@
+"""Polishing: the posterior of a finished run, replaced by the sharper one that its task can find from it."""
+
+from collections.abc import Iterator, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from jaxlfi.bayessim.keys import run_keys
+from jaxlfi.bayessim.record import FINAL
+from jaxlfi.diagnostics.discrepancy import compared
+from jaxlfi.distributions.belief import Belief
+from jaxlfi.io.progress import RoundProgress
+from jaxlfi.runs.result import PolishNotes
+from jaxlfi.runs.run import Run
+from jaxlfi.tasks.simulation import simulate_batch
+
+STARTS = 64
+"""Draws of the posterior that a task begins from."""
+REACH = 4.0
+"""Standard deviations of the sharper posterior that a support which can grow is made to hold."""
+
+
+def polished(run: Run, console: Console) -> Run:
+    """The run with its task's sharper posterior, or as it is where there is none.
+
+    A support that can grow is made to hold the posterior within Phi; another one truncates it, as before. Simulations
+    of the posterior are made anew, so that whether the model fits is said of what is reported.
+
+    Args:
+        run: one finished run, on the host.
+        console: for a progress bar.
+    """
+    task = run.task
+    if task is None or task.polish is None or not run.settings.estimator.closed_form:
+        return run
+
+    def counted(places: Sequence[int]) -> Iterator[int]:
+        with RoundProgress(console, len(places), 0, f"{task.name}: polishing", "step") as progress:
+            for place in places:
+                yield place
+                progress.advance()
+
+    box = run.feasible if run.heuristic.grows else run.belief.support
+    found = task.polish(
+        task, np.asarray(run.observed), np.asarray(run.draws(STARTS)), run.space.box_to_natural(box), counted
+    )
+    if found is None:
+        return run
+    mixture = jax.tree.map(jnp.asarray, found.mixture)
+    support = run.belief.support
+    if run.heuristic.grows:
+        reach = REACH * jnp.sqrt(jnp.diagonal(mixture.covariance))
+        support = support.replace(
+            low=jnp.maximum(jnp.minimum(support.low, mixture.mean - reach), run.feasible.low),
+            high=jnp.minimum(jnp.maximum(support.high, mixture.mean + reach), run.feasible.high),
+        )
+    notes = PolishNotes(found.sentences, found.steps, found.simulations)
+    run = run.replace(belief=Belief(mixture, support, jnp.asarray(True)), polish=notes, unpolished=run.belief)
+    return run.replace(history=run.history | _predicted(run))
+
+
+def _predicted(run: Run) -> dict[str, np.ndarray]:
+    """What the history says of the last round's posterior, of the polished one."""
+    count = run.history["sample_theta"].shape[1]
+    key_draw, key_simulate = run_keys(run.key).of_predictive(run.settings.rounds + 1)
+    theta = run.posterior.sample(key_draw, count, "inference")
+    simulated = simulate_batch(key_simulate, run.task, theta, np.shape(run.observed))
+    seen = compared(run.task, theta, *simulated, np.asarray(run.observed))
+    changed = {}
+    for name in ("theta", "theta_error", "trajectory_error"):
+        rows = np.array(run.history[f"sample_{name}"])
+        rows[-1] = getattr(seen, name)
+        changed[f"sample_{name}"] = rows
+    return changed | {FINAL + "trajectory": np.asarray(seen.trajectory), FINAL + "x": np.asarray(seen.x)}

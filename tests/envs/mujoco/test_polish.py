@@ -1,0 +1,88 @@
+"""Polish: a run's posterior by least squares, beside the exact one on a grid, and by what it leaves to simulations."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+from envs_mujoco import ARM, recorded
+
+from jaxlfi.envs.mujoco import least_squares
+from jaxlfi.envs.mujoco import polish as polishing
+from jaxlfi.envs.mujoco.least_squares import Fit
+from jaxlfi.envs.mujoco.logs import Log
+from jaxlfi.envs.mujoco.model_task import mujoco_task
+from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.envs.mujoco.polish import polish
+from jaxlfi.envs.mujoco.simulator import simulator_of
+
+NOISE = 0.02
+DAMPING = Parameter("joint/shoulder/damping", (0.01, 0.5), unit="N m s/rad", log=True)
+GEAR = Parameter("actuator/motor/gear[0]", (0.5, 3.0))
+
+
+@pytest.fixture(scope="module")
+def task():
+    """An arm's recording with noise: damping 0.08 N m s/rad, a gear of 1.5."""
+    log = recorded()
+    angle = log.signals["angle"] + NOISE * np.random.default_rng(0).standard_normal(len(log.times))
+    return mujoco_task(ARM, [DAMPING, GEAR], Log(log.times, {"motor": log.signals["motor"], "angle": angle}),
+                       noises={"angle": NOISE})  # fmt: skip
+
+
+def exact(task, low, high, points=60):
+    """Mean and covariance over (ln damping, gear) by the likelihood of white noise on a grid."""
+    axes = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    clean, _ = simulator_of(task).clean(np.stack([np.exp(places[:, 0]), places[:, 1]], axis=1))
+    misfit = 0.5 * np.sum((clean - np.asarray(task.observation)) ** 2, axis=(1, 2)) / NOISE**2
+    weights = np.exp(misfit.min() - misfit)
+    weights /= weights.sum()
+    mean = weights @ places
+    return mean, (places - mean).T @ (weights[:, None] * (places - mean))
+
+
+def test_it_is_the_exact_posterior_where_the_model_is_right(task, monkeypatch):
+    monkeypatch.setattr(least_squares, "CORRECTIONS", 0)  # the recording was made by the model's own integrator
+    draws = np.stack([np.random.default_rng(1).uniform(0.04, 0.2, 8), np.linspace(1.0, 2.2, 8)], axis=1)
+    found = polish(task, np.asarray(task.observation), draws, task.feasible)
+    assert len(found.mixture.logits) == 1 and found.simulations > 8
+    mean, covariance = (np.asarray(value, float) for value in (found.mixture.mean, found.mixture.covariance))
+    reach = 5 * np.sqrt(np.diagonal(covariance))
+    expected, spread = exact(task, mean - reach, mean + reach)
+    deviations = np.sqrt(np.diagonal(spread))
+    assert (np.abs(mean - expected) < 0.2 * deviations).all()
+    # It allows for errors of the model, which white noise may look like: it may be wider, and hardly narrower.
+    assert (np.sqrt(np.diagonal(covariance)) / deviations > 0.8).all()
+    assert (np.sqrt(np.diagonal(covariance)) / deviations < 1.6).all()
+    correlation = covariance[0, 1] / np.sqrt(np.prod(np.diagonal(covariance)))
+    assert abs(correlation - spread[0, 1] / np.prod(deviations)) < 0.25
+
+
+def made(task, uninformed):
+    """A point at damping 0.08, a gear of 1.5."""
+    box = task.inference.feasible
+    covariance = np.diag((np.array([0.02, 0.05]) * np.asarray(box.width, float)) ** 2)
+    nothing = np.zeros(2, bool)
+    return Fit(np.array([0.08, 1.5]), 1.0, covariance, np.zeros((2, 2)), uninformed, nothing, (), 0.0, 0.0, 1)
+
+
+def test_what_a_recording_does_not_determine_is_left_to_the_simulations(task, monkeypatch):
+    box = task.inference.feasible
+    low, width = np.asarray(box.low, float), np.asarray(box.width, float)
+    places = np.random.default_rng(2).normal([0.3, 0.6], [0.05, 0.1], (4000, 2))
+    draws = np.asarray(task.space.to_natural(low + width * places))
+    own = made(task, (width * np.array([0.0, 1.0]))[:, None])  # the gear is not informed
+    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given: [own])
+    found = polish(task, np.asarray(task.observation), draws, task.feasible).mixture
+    mean = (np.asarray(found.mean, float) - low) / width
+    deviations = np.sqrt(np.diagonal(np.asarray(found.covariance, float))) / width
+    np.testing.assert_allclose(mean, [(np.log(0.08) - low[0]) / width[0], places[:, 1].mean()], atol=2e-3)
+    np.testing.assert_allclose(deviations, [0.02, places[:, 1].std()], rtol=1e-2)
+
+
+def test_without_a_point_there_is_none(task, monkeypatch):
+    lost = made(task, np.zeros((2, 0)))
+    lost.covariance[:] = np.nan
+    monkeypatch.setattr(polishing.least_squares, "best_fits", lambda *given: [lost])
+    assert polish(task, np.asarray(task.observation), np.array([[0.08, 1.5]]), task.feasible) is None

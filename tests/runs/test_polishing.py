@@ -1,0 +1,74 @@
+"""Runs whose task sharpens their posterior: what is reported, kept, read back and said."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlfi
+from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.runs.account import POLISH
+from jaxlfi.tasks.polish import Polished
+from tests.small import SETTINGS, gaussian, whole_runs  # noqa: F401 - a fixture
+
+SHARP = GaussianMixture(jnp.zeros(1), jnp.array([[0.5, -0.3]]), jnp.array([[[0.02, 0.0], [0.01, 0.03]]]))
+SAID = "The posterior was polished by a closed form."
+
+
+def sharpened(task, observed, draws, box, counted):
+    """A posterior that is known, of two steps."""
+    assert draws.shape == (64, 2) and np.isfinite(observed).all()
+    assert np.all(np.asarray(box.contains(draws)))
+    return Polished(SHARP, (SAID,), ("Go on.",), len(list(counted([0, 1]))))
+
+
+@pytest.fixture(scope="module")
+def polished(tmp_path_factory, whole_runs):  # noqa: F811 - the fixture
+    """A polished run whose support can grow, its folder and its task."""
+    own, folder = dataclasses.replace(gaussian(), polish=sharpened), tmp_path_factory.mktemp("polish") / "run"
+    arguments = {"support": "misspecified", "heuristic": "edge", "settings": SETTINGS}
+    return jaxlfi.infer(3, own, **arguments, polish=True, out=folder), folder, own
+
+
+def test_the_sharper_posterior_is_reported(polished):
+    run, _, _ = polished
+    draws = np.asarray(run.posterior.sample(0, 20_000))
+    covariance = np.asarray(SHARP.scale_tril[0] @ SHARP.scale_tril[0].T)
+    np.testing.assert_allclose(draws.mean(axis=0), SHARP.means[0], atol=1e-3)
+    np.testing.assert_allclose(np.cov(draws.T), covariance, rtol=0.05, atol=2e-5)
+    assert run.belief.support.contains(SHARP.means[0])  # the first guess ended at 0
+    assert np.asarray(run.history["sample_theta"])[-1].std() < np.asarray(run.history["sample_theta"])[0].std()
+    assert np.abs(run.history["sample_theta"][-1].mean(axis=0) - SHARP.means[0]).max() < 0.05
+    assert SAID in run.summary().sentences and "Go on." in run.summary().next_steps
+    assert run.polish.simulations == 2 and len(run.unpolished.mixture.logits) == 4
+
+
+def test_it_is_kept_with_the_posterior_before(polished, tmp_path):
+    run, folder, own = polished
+    for one in (jaxlfi.load(folder, own), jaxlfi.load(run.save(tmp_path / "copy"), own)):
+        assert one.polish == run.polish
+        for name in ("belief", "unpolished"):
+            jax.tree.map(np.testing.assert_array_equal, getattr(one, name), getattr(run, name))
+    again = jaxlfi.infer(3, own, support="misspecified", heuristic="edge", settings=SETTINGS, polish=True, out=folder)
+    np.testing.assert_array_equal(again.draws(), run.draws())
+    damaged = tmp_path / "copy" / "polish.json"
+    damaged.write_text('{"sentences": 3}')
+    with pytest.raises(ValueError, match="expected how the posterior was polished"):
+        jaxlfi.load(damaged.parent, own)
+
+
+def test_what_was_not_asked_for_is_named_as_a_step(polished):
+    _, _, own = polished
+    run = jaxlfi.infer(3, own, support="misspecified", heuristic="edge", settings=SETTINGS)
+    assert run.polish is None and POLISH in run.summary().next_steps
+    plain = jaxlfi.infer(3, gaussian(), support="misspecified", heuristic="edge", settings=SETTINGS, polish=True)
+    assert plain.polish is None and POLISH not in plain.summary().next_steps
+    np.testing.assert_allclose(plain.draws(), run.draws(), atol=1e-4)
+
+
+def test_a_support_that_cannot_grow_cuts_it(polished):
+    _, _, own = polished
+    run = jaxlfi.infer(3, own, support="misspecified", heuristic="none", settings=SETTINGS, polish=True)
+    assert float(run.belief.support.high[0]) == 0.0 and np.asarray(run.draws()).max(axis=0)[0] <= 0.0
