@@ -34,7 +34,7 @@ from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.commands import sights
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
-from jaxlfi.robots.loop import Log
+from jaxlfi.robots.episode import Log
 from jaxlfi.robots.robot import RobotError
 
 POLICIES = ("explore", "random", "plan")

@@ -23,7 +23,8 @@ from jaxlfi.registry import ROBOTS
 from jaxlfi.rl import deployment
 from jaxlfi.rl.policy import Policy
 from jaxlfi.robots.client import SocketRobot
-from jaxlfi.robots.loop import Act, Log, Loop
+from jaxlfi.robots.episode import Act, Log
+from jaxlfi.robots.loop import Loop
 from jaxlfi.robots.robot import Robot
 
 ABOUT = {

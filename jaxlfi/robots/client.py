@@ -1,7 +1,7 @@
 """A robot in another process, behind a socket (`jaxlfi.robots.wire`)."""
 
 import socket
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxlfi.robots import wire
@@ -27,6 +27,8 @@ class SocketRobot:
         remote: bool = False,
         timeout: float = TIMEOUT,
         clock: Clock | None = None,
+        token: str | None = None,
+        units: Mapping[str, Sequence[str]] | None = None,
     ):
         """Connect.
 
@@ -37,20 +39,28 @@ class SocketRobot:
             remote: let the driver be on another host.
             timeout: for each reply, in s.
             clock: the loop's, for simulated robots that live in its time.
+            token: that the driver asks for; needed where it is on another host.
+            units: of the observations and of the actions, which drivers need to know (`jaxlfi.robots.driver`).
 
         Raises:
-            ValueError: for what is no address, or one of another host.
+            ValueError: for what is no address, or one of another host that is not let, or without a token.
             RobotError: where no driver answers, or one of another protocol.
         """
         host, port = wire.address(address, remote)
+        if token is None and not wire.is_local(host):
+            raise ValueError(f"token: expected the one that the robot at {host}, another host, shares; got none")
         self._name, self._clock = f"robot {host}:{port}", Monotonic() if clock is None else clock
         try:
             self._lines = wire.Lines(socket.create_connection((host, port), timeout))
         except OSError as error:
             raise RobotError(f"{self._name}: expected a driver that listens, got: {error}") from error
         hello = {"protocol": wire.PROTOCOL, "version": wire.VERSION}
+        hello |= {"observations": list(observations), "actions": list(actions)}
+        hello |= {} if units is None else {"units": {what: list(each) for what, each in units.items()}}
         try:
-            reply = self._asked("hello", ("hello",), **hello, observations=list(observations), actions=list(actions))
+            reply = self._asked("hello", ("hello", "challenge"), **hello)
+            if reply["type"] == "challenge":
+                reply = self._asked("hello", ("hello",), **hello, proof=self._checked(lambda: _proof(token, reply)))
             self._checked(lambda: wire.check_hello(reply))
             self.about: dict[str, Any] = self._checked(lambda: wire.mapping(reply, "about"))
         except RobotError:
@@ -80,7 +90,7 @@ class SocketRobot:
     def stop(self) -> None:
         """Have the robot stop, and end the connection, upon which it stops in any case."""
         try:
-            self._lines.send("stop")
+            self._lines.send("stop")  # which needs no other call to have returned
             while self._lines.receive()["type"] not in ("stopped", "error"):
                 pass  # a reply that came too late
         except OSError as error:
@@ -93,9 +103,9 @@ class SocketRobot:
             self._lines.send(kind, **contents)
             reply = self._lines.receive()
             if reply["type"] == "error":
-                raise RobotError(f"its driver refused {kind}: {str(reply.get('message'))[:200]}")
+                raise RobotError(f"its driver refused {kind}: {wire.short(reply.get('message'), 200)}")
             if reply["type"] not in replies:
-                raise RobotError(f"expected {' or '.join(replies)} as the reply to {kind}, got {reply['type']!r}")
+                raise RobotError(f"expected {' or '.join(replies)} as the reply to {kind}, got {wire.short(reply['type'])!r}")
             return reply
 
         return self._checked(ask)
@@ -106,3 +116,9 @@ class SocketRobot:
             return work()
         except (OSError, OverflowError, ValueError) as error:
             raise RobotError(f"{self._name}: {error}") from error
+
+
+def _proof(token: str | None, challenge: Mapping[str, Any]) -> str:
+    if token is None:
+        raise RobotError("it asks for a shared token, got none")
+    return wire.proof(token, wire.texts({"nonce": [challenge.get("nonce")]}, "nonce")[0])
