@@ -28,6 +28,7 @@ from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable, state_of
 from jaxlfi.envs.mujoco.model_task import box, compile_spec, specification
 from jaxlfi.envs.mujoco.parameters import Parameter
 from jaxlfi.rl.environment import EnvState
+from jaxlfi.rl.preparation import Memory
 
 
 class Inner(struct.PyTreeNode):
@@ -36,6 +37,7 @@ class Inner(struct.PyTreeNode):
     Attributes:
         state: positions and velocities.
         controls: the last ones, the latest at the end, shape [B, A].
+        memory: of the observations (`jaxlfi.rl.preparation`).
         numbers: of the model, that depend on its parameters (`Models`).
         theta: in natural units, shape [D].
         refused: whether MuJoCo refuses the model.
@@ -44,6 +46,7 @@ class Inner(struct.PyTreeNode):
 
     state: State
     controls: Float[Array, "*batch before act"]
+    memory: Memory
     numbers: Float[Array, "*batch numbers"]
     theta: Float[Array, "*batch dim"]
     refused: Bool[Array, "*batch"]
@@ -56,6 +59,7 @@ class MujocoEnvironment:
     Attributes:
         models: MJX models of parameters.
         reading: what the policy sees, may do and is rewarded for.
+        preparation: of what it sees and does, as a robot needs it.
     """
 
     def __init__(
@@ -98,6 +102,7 @@ class MujocoEnvironment:
         self._does = effects(spec, compiled, self.space.names, [one.support for one in parameters], signals)
         self.reading = Reading(compiled, goal)
         self.observations, self.actions, self.steps = self.reading.observations, self.reading.actions, goal.steps
+        self.preparation = self.reading.preparation
         self.models = Models(
             functools.partial(built, spec, self._does), self.space.names, np.asarray(self.nominal), self.feasible
         )
@@ -110,9 +115,8 @@ class MujocoEnvironment:
         self._substeps = round(goal.interval / self._timestep)
         self._noise = np.array([(noises or {}).get(name, 0.0) for name in goal.signals])
         longest = 0.0 if self._does.delay is None else float(self.feasible.high[self._does.delay])
+        self._rest = np.array([min(max(0.0, one.low), one.high) for one in self.preparation.controls], np.float32)
         self._before = int(np.ceil(longest / goal.interval - 1e-6)) + 1
-        low, high = (np.asarray(self.actions.centre) + sign * np.asarray(self.actions.scale) for sign in (-1, 1))
-        self._rest = np.tile(np.clip(np.zeros_like(low), low, high), (self._before, 1)).astype(np.float32)
 
     def reset(self, key: jax.Array, theta: Float[Array, " dim"]) -> EnvState:
         """The start of an episode with these parameters."""
@@ -123,18 +127,27 @@ class MujocoEnvironment:
         ):
             start = start.at[place].set(jax.random.uniform(one, minval=low, maxval=high))
         numbers, refused = self.models.numbers(theta)
-        inner = Inner(self._physics.state(start), jnp.asarray(self._rest), numbers, theta, refused, key)
-        values = self._physics.values(*self._loaded(inner, inner.controls[-1]))
-        no = jnp.asarray(False)
-        seen, reward = self._seen(key_noise, theta, values), jnp.asarray(0.0, jnp.float32)  # not of a weak type
+        state = self._physics.state(start)
+        model = self.models.model(numbers)
+        values = self._physics.values(model, self._physics.data(state, jnp.asarray(self._rest)))
+        if any(one.begins is not None for one in self.preparation.controls):  # forces are those of the first targets
+            known = self._measured(jax.random.clone(key_noise), theta, values)
+            first = self.preparation.start(known, jnp).controls[0]
+            values = self._physics.values(model, self._physics.data(state, first))
+        measured = self._measured(key_noise, theta, values)
+        memory, seen = self.preparation.observed(self.preparation.start(measured, jnp), measured, jnp)
+        controls = jnp.tile(memory.controls[0], (self._before, 1))
+        inner = Inner(state, controls, memory, numbers, theta, refused, key)
+        no, reward = jnp.asarray(False), jnp.asarray(0.0, jnp.float32)  # not of a weak type
         return EnvState(inner, seen, reward, no, no, self._facts(values, no))
 
     def step(self, state: EnvState, action: Float[Array, " act"]) -> EnvState:
         """One control interval. Where the simulation becomes unstable the episode ends, as it was seen last."""
         before = state.inner
         key, key_noise = jax.random.split(before.key)
-        controls = jnp.concatenate([before.controls[1:], action[None]])
-        model, data = self._loaded(before, action)
+        memory, control = self.preparation.commanded(before.memory, action, jnp)
+        controls = jnp.concatenate([before.controls[1:], control[None]])
+        model, data = self.models.model(before.numbers), self._physics.data(before.state, control)
 
         def substep(data, index):
             return mjx.step(model, data.replace(ctrl=self._control(controls, before.theta, index))), None
@@ -143,11 +156,12 @@ class MujocoEnvironment:
         # MuJoCo's sensors are those of the state before a step: of the state after it they are read besides.
         values = self._physics.values(model, data)
         failed = before.refused | ~stable(data.qpos, data.qvel, values)
-        after = before.replace(state=state_of(data), controls=controls, key=key)
+        memory, seen = self.preparation.observed(memory, self._measured(key_noise, before.theta, values), jnp)
+        after = before.replace(state=state_of(data), controls=controls, memory=memory, key=key)
         return EnvState(
             inner=after,
-            observation=jnp.where(failed, state.observation, self._seen(key_noise, before.theta, values)),
-            reward=jnp.where(failed, 0.0, self.reading.reward(values, action)),
+            observation=jnp.where(failed, state.observation, seen),
+            reward=jnp.where(failed, 0.0, self.reading.reward(values, control)),
             terminated=jnp.asarray(False),
             truncated=failed,
             facts=self._facts(values, failed),
@@ -161,10 +175,6 @@ class MujocoEnvironment:
                 f"got {goal.interval:g} s"
             )
 
-    def _loaded(self, inner: Inner, control: Float[Array, " act"]) -> tuple[mjx.Model, mjx.Data]:
-        """The model and its data in this state."""
-        return self.models.model(inner.numbers), self._physics.data(inner.state, control)
-
     def _control(self, controls: Float[Array, "before act"], theta: Array, index: Array) -> Float[Array, " act"]:
         """What acts in a substep: with a delay, a control that was given before."""
         if self._does.delay is None:
@@ -172,10 +182,10 @@ class MujocoEnvironment:
         since = (index * self._timestep - theta[self._does.delay]) / self.reading.goal.interval
         return controls[jnp.clip(self._before - 1 + jnp.floor(since + 1e-5).astype(int), 0, self._before - 1)]
 
-    def _seen(self, key: jax.Array, theta: Float[Array, " dim"], values: Float[Array, " signals"]) -> Array:
-        """An observation: with offsets and noise of the sensors."""
+    def _measured(self, key: jax.Array, theta: Float[Array, " dim"], values: Float[Array, " signals"]) -> Array:
+        """The observed signals, with offsets and noise of their sensors."""
         noise = deviations(self._does, theta, self._noise) * jax.random.normal(key, values.shape)
-        return self.reading.seen(biased(self._does, theta, values) + noise)
+        return (biased(self._does, theta, values) + noise)[: len(self.preparation.signals)]
 
     def _facts(self, values: Float[Array, " signals"], failed: Array) -> dict[str, Array]:
         """How far the episode's last state is from its targets, and whether it failed."""

@@ -33,7 +33,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from jaxlfi.rl import deployment, policy
+    from jaxlfi.rl import deployment, policy, preparation
 
     out, suffix = arguments.out, SUFFIXES[arguments.format]
     if out.exists() or out.suffix != suffix:
@@ -42,6 +42,7 @@ def _export(arguments: argparse.Namespace) -> None:
     trained = policy.load(path)
     if deployment.KEY in trained.schema:
         deployment.of_schema(trained.schema)
+    preparation.of_schema(trained.schema)
     if arguments.format == "numpy":
         save = lambda policy, path: policy.save(path)
     elif arguments.format == "stablehlo":

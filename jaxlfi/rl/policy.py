@@ -42,7 +42,8 @@ class Policy:
         biases: likewise, shapes [out].
         schema: what the numbers are: `environment`, and `observations` and `actions` with their `names`, `units`,
             `centre` and `scale` (`jaxlfi.rl.environment.Signals`); `deployment`, what a robot must keep to
-            (`jaxlfi.rl.deployment`); whatever else was recorded with the policy, as `versions`.
+            (`jaxlfi.rl.deployment`); `preparation`, how observations are made of signals, and controls of actions
+            (`jaxlfi.rl.preparation`); whatever else was recorded with the policy, as `versions`.
 
     Raises:
         ValueError: for layers that do not fit together or to the schema, numbers that are not finite, and a schema

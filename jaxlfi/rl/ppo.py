@@ -18,7 +18,7 @@ import optax
 from flax import linen, struct
 from jaxtyping import Array, Float, Int
 
-from jaxlfi.rl import deployment
+from jaxlfi.rl import deployment, preparation
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.environment import Environment
 from jaxlfi.rl.episodes import Batch, Ended, Episodes
@@ -247,7 +247,7 @@ def as_file(environment: Environment, params: losses.PPONetworkParams, **recorde
     """The policy as a file that needs neither JAX nor Brax.
 
     Args:
-        environment: that it was trained on; what it declares as `deployment` is written, too.
+        environment: that it was trained on; what it declares as `deployment` and `preparation` is written, too.
         params: of its training.
         recorded: what else its schema is to say.
     """
@@ -260,7 +260,7 @@ def as_file(environment: Environment, params: losses.PPONetworkParams, **recorde
         "actions": dataclasses.asdict(environment.actions),
         **recorded,
     }
-    declared = getattr(environment, deployment.KEY, None)
-    if declared is not None:
-        schema[deployment.KEY] = dataclasses.asdict(declared)
+    for key in (deployment.KEY, preparation.KEY):
+        if (declared := getattr(environment, key, None)) is not None:
+            schema[key] = dataclasses.asdict(declared)
     return Policy(tuple(layer["kernel"] for layer in every), tuple(layer["bias"] for layer in every), schema)
