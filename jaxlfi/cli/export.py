@@ -38,7 +38,7 @@ def _export(arguments: argparse.Namespace) -> None:
     out, suffix = arguments.out, SUFFIXES[arguments.format]
     if out.exists() or out.suffix != suffix:
         raise ValueError(f"out: expected a new {suffix} file, got {out}")
-    path = _policy_of(arguments.policy)
+    path = policy_of(arguments.policy)
     trained = policy.load(path)
     if deployment.KEY in trained.schema:
         deployment.of_schema(trained.schema)
@@ -54,7 +54,7 @@ def _export(arguments: argparse.Namespace) -> None:
     print(f"wrote {out}, the policy {path}")
 
 
-def _policy_of(path: Path) -> Path:
+def policy_of(path: Path) -> Path:
     """The file of a policy, or the only one in the folder of a training."""
     if not path.is_dir():
         return path

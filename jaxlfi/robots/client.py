@@ -1,15 +1,22 @@
 """A robot in another process, behind a socket (`jaxlfi.robots.wire`)."""
 
+import dataclasses
 import socket
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from jaxlfi.robots import wire
-from jaxlfi.robots.clock import Clock, Monotonic
+from jaxlfi.robots.clock import Clock, Monotonic, Simulated
 from jaxlfi.robots.robot import Command, Observation, RobotError
 
 TIMEOUT = 0.5
 """Seconds that a reply may take."""
+PATIENCE = 20.0
+"""The same of a robot that lives in the loop's time, for which nobody waits."""
+SIMULATED = "simulated"
+"""What such a robot says of itself."""
 
 
 class SocketRobot:
@@ -98,6 +105,11 @@ class SocketRobot:
         finally:
             self._lines.close()
 
+    def live_in(self, clock: Clock) -> None:
+        """From now on the robot lives in the time of a loop, which waits for each reply."""
+        self._clock = clock
+        self._lines.wait_for(PATIENCE)
+
     def _asked(self, kind: str, replies: Sequence[str], **contents: Any) -> dict[str, Any]:
         def ask() -> dict[str, Any]:
             self._lines.send(kind, **contents)
@@ -116,6 +128,74 @@ class SocketRobot:
             return work()
         except (OSError, OverflowError, ValueError) as error:
             raise RobotError(f"{self._name}: {error}") from error
+
+
+class SocketDriver:
+    """A driver in another process (`jaxlfi.robots.driver`), which `jaxlfi.robots.server.serve_driver` serves.
+
+    One that says that it is `simulated` lives in the loop's time: it has a `simulated_clock`.
+    """
+
+    def __init__(self, address: str, remote: bool = False, token: str | None = None, timeout: float = TIMEOUT):
+        """It is not connected yet.
+
+        Args:
+            address: socket://HOST:PORT.
+            remote: let the driver be on another host.
+            token: that the driver asks for; needed where it is on another host.
+            timeout: for each reply, in s.
+        """
+        self._address, self._remote, self._token, self._timeout = address, remote, token, timeout
+        self._robot: SocketRobot | None = None
+        self._names: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+        self._given: np.ndarray | None = None
+        self._slot = 0
+
+    def connect(self, signals: Mapping[str, str], controls: Mapping[str, str]) -> Mapping[str, Any]:
+        """Connect to the driver, which may refuse; its own words about itself are returned.
+
+        Raises:
+            ValueError: for what is no address, or one of another host that is not let, or without a token.
+            RobotError: where no driver answers, or it refuses.
+        """
+        self._names = tuple(signals), tuple(controls)
+        units = {"observations": list(signals.values()), "actions": list(controls.values())}
+        robot = SocketRobot(self._address, *self._names, self._remote, self._timeout, token=self._token, units=units)
+        if robot.about.get(SIMULATED) is True:
+            self.simulated_clock = Simulated()
+            robot.live_in(self.simulated_clock)
+        self._robot = robot
+        return robot.about
+
+    def observe(self) -> Observation | None:
+        """The latest observation, by name."""
+        found = self._connected.observe()
+        if found is None:
+            return None
+        signals, controls = self._names
+        if len(found.values) != len(signals):
+            raise RobotError(f"robot: expected {len(signals)} numbers, got {len(found.values)}")
+        values = dict(zip(signals, found.values.tolist(), strict=True))
+        target = None if found.target is None else dict(zip(controls, found.target.tolist(), strict=False))
+        return dataclasses.replace(found, values=values, target=target)
+
+    def act(self, controls: Mapping[str, float]) -> None:
+        """Send the controls."""
+        given = np.array([controls[name] for name in self._names[1]], float)
+        change = np.zeros(len(given)) if self._given is None else given - self._given
+        self._connected.act(Command(self._slot, change, given))
+        self._given, self._slot = given, self._slot + 1
+
+    def stop(self) -> None:
+        """Have the robot stop, if there is one."""
+        if self._robot is not None:
+            self._robot.stop()
+
+    @property
+    def _connected(self) -> SocketRobot:
+        if self._robot is None:
+            raise RobotError("robot: expected connect before anything else, got none")
+        return self._robot
 
 
 def _proof(token: str | None, challenge: Mapping[str, Any]) -> str:

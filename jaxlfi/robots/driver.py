@@ -134,20 +134,28 @@ class Driven:
             ValueError: for units that do not fit.
         """
         self._driver, self._watching, self._number = driver, watching, -1
-        called = {name: (called or {}).get(name, Called(name)) for name in {**signals, **controls}}
-        self._signals = {name: (called[name].name, *called[name].factors(unit)) for name, unit in signals.items()}
-        self._controls = {name: (called[name].name, *called[name].factors(unit)) for name, unit in controls.items()}
-        own_unit = lambda name, unit: called[name].unit or unit
-        asked = {called[name].name: own_unit(name, unit) for name, unit in signals.items()}
-        given = {called[name].name: own_unit(name, unit) for name, unit in controls.items()}
         try:
-            self.about = dict(driver.connect(asked | given if watching else asked, {} if watching else given) or {})
+            self.about = self._connect(signals, controls, called or {})
         except BaseException:
             driver.stop()
             raise
         clock = getattr(driver, "simulated_clock", None)
         if clock is not None:
             self.simulated_clock: Clock = clock
+
+    def _connect(
+        self, signals: Mapping[str, str], controls: Mapping[str, str], called: Mapping[str, Called]
+    ) -> dict[str, Any]:
+        known = {name: called.get(name, Called(name)) for name in {**signals, **controls}}
+        rows = lambda several: {name: (known[name].name, *known[name].factors(unit)) for name, unit in several.items()}
+        self._signals, self._controls = rows(signals), rows(controls)
+        asked, given = (
+            {known[name].name: known[name].unit or unit for name, unit in several.items()}
+            for several in (signals, controls)
+        )
+        if self._watching:
+            asked, given = asked | given, {}
+        return dict(self._driver.connect(asked, given) or {})
 
     def observe(self) -> Observation | None:
         """The latest observation, in the order of the signals."""

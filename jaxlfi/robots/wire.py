@@ -98,6 +98,10 @@ class Lines:
             raise RobotError(f"expected an object with a type, got {line[:40]!r}")
         return message
 
+    def wait_for(self, seconds: float) -> None:
+        """Let each message take so long from now on."""
+        self._socket.settimeout(seconds)
+
     def close(self) -> None:
         """End the connection."""
         self._socket.close()
