@@ -155,7 +155,8 @@ def _robot(arguments: argparse.Namespace) -> Any:
     if arguments.address is None:
         if arguments.remote or arguments.token:
             raise ValueError("--remote, --token: expected with --address only, got --robot")
-        family = ROBOTS if ":" in arguments.robot else DRIVERS  # which may be of either kind
+        own = ":" in arguments.robot.partition(",")[0]
+        family = ROBOTS if own else DRIVERS  # one's own may be of either kind
         return family.load(arguments.robot)
     token = None if arguments.token is None else wire.token_of(arguments.token)
     return SocketDriver(arguments.address, arguments.remote, token)

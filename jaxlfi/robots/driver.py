@@ -153,8 +153,11 @@ class Driven:
             {known[name].name: known[name].unit or unit for name, unit in several.items()}
             for several in (signals, controls)
         )
-        if self._watching:
-            asked, given = asked | given, {}
+        if self._watching:  # a name that is a signal's, too, does not tell what is commanded
+            self._controls = {
+                name: (own if own not in asked else "", *row) for name, (own, *row) in self._controls.items()
+            }
+            asked, given = {**asked, **given, **asked}, {}
         return dict(self._driver.connect(asked, given) or {})
 
     def observe(self) -> Observation | None:

@@ -88,6 +88,10 @@ class Session:
         else:
             names, units, controls = tuple(_measured(self.policy)), _measured(self.policy), _set_points(self.policy)
         estimated = set(self.settings.velocities)
+        if both := set(names) & set(controls):  # which recordings tell apart by what stands before
+            names = tuple(f"sensor/{name}" if name in both else name for name in names)
+            controls = {f"actuator/{name}" if name in both else name: unit for name, unit in controls.items()}
+            units = dict(zip(names, units.values(), strict=True))
         signals = {name: log.observations[:, i] for i, name in enumerate(names) if name not in estimated}
         sent = np.isfinite(log.lateness)
         given, rows = np.flatnonzero(sent) * log.period + log.lateness[sent], log.targets[sent]

@@ -315,7 +315,7 @@ def test_a_driver_that_dies_is_stopped_and_what_happened_is_kept(tmp_path):
 
 
 def test_a_driver_that_sends_nan_is_held_and_then_stopped(tmp_path):
-    driver = Wheel(given={i: nan for i in (3, 6, 7, 8, 9)})
+    driver = Wheel(angle=0.2, given={i: nan for i in (3, 6, 7, 8, 9)})
     why = ends(driver, tmp_path, "robot: stopped after 9 of 100 controls: 4 observations in a row could not be used")
     assert why.endswith("the last one was non-finite")
     assert report_of(tmp_path)["faults"] == {"missing": 0, "late": 0, "non-finite": 5}
