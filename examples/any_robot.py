@@ -1,4 +1,4 @@
-"""A driver for a robot of your own, for any policy: one class of four methods, here of a pretended motor with an encoder.
+"""A driver for a robot of your own and any policy: one class of four methods, here of a pretended motor and encoder.
 
     python examples/any_robot.py
     cd examples && jaxlfi control POLICY --robot any_robot:Driver --dry-run --out ../dry.csv

@@ -1,5 +1,4 @@
-"""What is found by name: tasks, heuristics, estimators, environments, robots, their drivers and
-commands.
+"""What is found by name: tasks, heuristics, estimators, environments, robots, drivers and commands.
 
 A name is an entry point of an installed package, or "module:name" in a module that can be imported from the current
 folder; ours are registered in pyproject.toml as a third party's are. Nothing is imported before it is named, so that

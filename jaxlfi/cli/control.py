@@ -118,7 +118,7 @@ def _control(arguments: argparse.Namespace) -> None:
     path = policy_of(arguments.policy)
     trained = policy.load(path)
     settings = _settings(arguments.config, trained)
-    mode = "dry run" if arguments.dry_run else "shadow" if arguments.shadow else "control"
+    mode: sessions.Mode = "dry run" if arguments.dry_run else "shadow" if arguments.shadow else "control"
     changes: dict[str, Any] = {name: getattr(arguments, name) for name in ("rate", "holds", "max_age", "watchdog")}
     changes = {name: value for name, value in changes.items() if value is not None}
     session = sessions.of(trained, settings, dict(arguments.command), mode, arguments.duration, changes)

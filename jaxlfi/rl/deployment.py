@@ -187,7 +187,9 @@ class ControlLimits:
         if bounds is not None and not low <= bounds[0] < bounds[1] <= high:
             raise ValueError(f"limits: {name}: expected LOW below HIGH within the policy's {[low, high]}, got {bounds}")
         if rate is not None and not 0 < rate <= most:
-            raise ValueError(f"limits: {name}: expected a rate of more than 0 and at most the policy's {most}, got {rate}")
+            raise ValueError(
+                f"limits: {name}: expected a rate of more than 0 and at most the policy's {most}, got {rate}"
+            )
         low, high = (low, high) if bounds is None else bounds
         put = lambda values, value: (*values[:place], value, *values[place + 1 :])
         most = most if rate is None else rate

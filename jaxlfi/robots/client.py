@@ -117,7 +117,9 @@ class SocketRobot:
             if reply["type"] == "error":
                 raise RobotError(f"its driver refused {kind}: {wire.short(reply.get('message'), 200)}")
             if reply["type"] not in replies:
-                raise RobotError(f"expected {' or '.join(replies)} as the reply to {kind}, got {wire.short(reply['type'])!r}")
+                raise RobotError(
+                    f"expected {' or '.join(replies)} as the reply to {kind}, got {wire.short(reply['type'])!r}"
+                )
             return reply
 
         return self._checked(ask)

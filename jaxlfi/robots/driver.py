@@ -147,16 +147,18 @@ class Driven:
         self, signals: Mapping[str, str], controls: Mapping[str, str], called: Mapping[str, Called]
     ) -> dict[str, Any]:
         known = {name: called.get(name, Called(name)) for name in {**signals, **controls}}
-        rows = lambda several: {name: (known[name].name, *known[name].factors(unit)) for name, unit in several.items()}
+
+        def rows(several: Mapping[str, str]) -> dict[str, tuple[str, float, float]]:
+            return {name: (known[name].name, *known[name].factors(unit)) for name, unit in several.items()}
+
         self._signals, self._controls = rows(signals), rows(controls)
         asked, given = (
             {known[name].name: known[name].unit or unit for name, unit in several.items()}
             for several in (signals, controls)
         )
         if self._watching:  # a name that is a signal's, too, does not tell what is commanded
-            self._controls = {
-                name: (own if own not in asked else "", *row) for name, (own, *row) in self._controls.items()
-            }
+            for name, (own, factor, offset) in self._controls.items():
+                self._controls[name] = ("" if own in asked else own), factor, offset
             asked, given = {**asked, **given, **asked}, {}
         return dict(self._driver.connect(asked, given) or {})
 

@@ -1,7 +1,7 @@
-"""Loops of policies that drive actuators: torques, target angles or speeds, each by name and within its own limits.
+"""Loops of policies that drive actuators: torques, angles or speeds, each by name and within its own limits.
 
-What lies between a robot's signals and the policy, history, rates and displacements, is what the policy was trained with
-(`jaxlfi.rl.preparation`). What a robot allows besides is in its settings (`jaxlfi.robots.settings`).
+What lies between a robot's signals and the policy, history, rates and displacements, is what the policy was trained
+with (`jaxlfi.rl.preparation`). What a robot allows besides is in its settings (`jaxlfi.robots.settings`).
 """
 
 import dataclasses
@@ -15,12 +15,11 @@ from jaxlfi.rl import preparation as preparations
 from jaxlfi.rl.deployment import ControlLimits
 from jaxlfi.rl.policy import Policy
 from jaxlfi.rl.preparation import Control, Memory, Preparation, Signal
-from jaxlfi.robots.clock import Clock
 from jaxlfi.robots.driver import DONE, Driven, Driver
 from jaxlfi.robots.episode import Log, Paced
 from jaxlfi.robots.robot import Command, Observation, Robot, RobotError
-from jaxlfi.robots.settings import Settings, of_table
 from jaxlfi.robots.settings import KEY as SETTINGS
+from jaxlfi.robots.settings import Settings, of_table
 from jaxlfi.robots.velocities import Estimated, WithVelocities
 
 WATCHDOG = 0.1
@@ -67,6 +66,7 @@ class Drive(Paced):
 
     def __post_init__(self):
         super().__post_init__()
+        object.__setattr__(self, "size", len(self.signals))
         if unknown := [name for name in self.bounds if name not in self.signals]:
             raise ValueError(f"limits: expected signals among {', '.join(self.signals)}, got {', '.join(unknown)}")
         if len(self.commands) != len(self.preparation.commands):
@@ -117,11 +117,6 @@ class Drive(Paced):
             _commands(own, commands or {}),
             **({"steps": own.steps} | {name: value for name, value in given.items() if value is not None} | changes),
         )
-
-    @property
-    def size(self) -> int:
-        """Of an observation."""
-        return len(self.signals)
 
     @property
     def count(self) -> int:

@@ -65,7 +65,7 @@ class Log:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Paced(abc.ABC):
-    """How a robot is controlled: its periods and what is done without an observation; what is commanded is abstract.
+    """How a robot is controlled: its periods, and what is done without an observation. What is commanded is abstract.
 
     An observation is of no use if there is none that is new ("missing"), it is older than `max_age` ("late"), or has
     numbers that are not finite. Then the set-points are held. After more than `holds` such slots in a row the robot is
@@ -78,7 +78,7 @@ class Paced(abc.ABC):
         max_age: of an observation when it is asked for, in s; by default a control period.
         over: whether an observation ends the episode; from then on the set-points are held.
         clock: by which time passes.
-        watchdog: seconds that a call of the robot or of the policy may take before the robot is stopped; any by default.
+        watchdog: seconds that a call of the robot or the policy may take before the robot is stopped; any by default.
 
     Raises:
         ValueError: for numbers that are not positive.
@@ -206,8 +206,9 @@ class _Episode:
     def run(self, whole: bool) -> None:
         """From the first observation to the end."""
         loop, clock = self.loop, self.clock
-        observation = self._first()
-        state = loop.begin(observation)
+        first = self._first()
+        observation: Observation | None = first
+        state = loop.begin(first)
         start = clock.now()
         sent, slot, unusable, fault = start - loop.period, 0, 0, None
         while True:
@@ -225,8 +226,9 @@ class _Episode:
                 self.stopped = self.began_anew
             if self.stopped or slot == loop.steps or (self.over is not None and not whole):
                 return
-            asking = observation is not None and self.over is None
-            state, asked = self._asked(state, observation) if asking else (state, None)
+            asked = None
+            if observation is not None and self.over is None:
+                state, asked = self._asked(state, observation)
             self.interrupts.check()
             now = clock.now()
             seconds = min(loop.period, now - sent)
@@ -260,24 +262,21 @@ class _Episode:
 
     def _look(self) -> tuple[Observation | None, str]:
         """The latest observation if it can be used, and else what is wrong with it."""
-        loop, fault = self.loop, ""
+        loop = self.loop
         with self.interrupts.calling(), self.watchdog.watching("observe"):
             observation = self.robot.observe()
-        if observation is None or (self.last is not None and observation.number <= self.last):
-            fault = "missing"
-            if observation is not None:
-                self._count(observation.number)
-        else:
-            values = np.array(observation.values)  # a driver may measure into the same array again
-            if values.shape != (loop.size,):
-                raise ValueError(f"robot: expected observations of {loop.size} numbers, got shape {list(values.shape)}")
-            if not observation.age <= (loop.period if loop.max_age is None else loop.max_age):  # NaN is late, too
-                fault = "late"
-            elif not np.isfinite(values).all():
-                fault = "non-finite"
-        if fault:
-            self.faults[fault] += 1
-            return None, fault
+        if observation is None:
+            return self._unusable("missing")
+        if self.last is not None and observation.number <= self.last:
+            self._count(observation.number, self.last)
+            return self._unusable("missing")
+        values = np.array(observation.values)  # a driver may measure into the same array again
+        if values.shape != (loop.size,):
+            raise ValueError(f"robot: expected observations of {loop.size} numbers, got shape {list(values.shape)}")
+        if not observation.age <= (loop.period if loop.max_age is None else loop.max_age):  # NaN is late, too
+            return self._unusable("late")
+        if not np.isfinite(values).all():
+            return self._unusable("non-finite")
         shapes = {name: np.shape(value) for name, value in observation.extras.items()}
         if self.seen and shapes != (first := {name: np.shape(value) for name, value in self.seen[0][2].items()}):
             raise ValueError(f"robot: expected extras of shapes {first} as before, got {shapes}")
@@ -285,11 +284,15 @@ class _Episode:
         extras = {name: np.array(value) for name, value in observation.extras.items()}
         return dataclasses.replace(observation, values=values, extras=extras), ""
 
-    def _count(self, number: int) -> None:
-        """Notice a robot that counts its measurements anew: it was restarted, and knows nothing of what was commanded."""
-        if self.behind is not None and self.behind < number < self.last:
-            self.began_anew = f"it began anew: its measurement {number} came after {self.last}"
-        self.behind = number if number < self.last else None
+    def _unusable(self, fault: str) -> tuple[None, str]:
+        self.faults[fault] += 1
+        return None, fault
+
+    def _count(self, number: int, last: int) -> None:
+        """Notice a robot that counts its measurements anew: it was restarted, and knows of no command."""
+        if self.behind is not None and self.behind < number < last:
+            self.began_anew = f"it began anew: its measurement {number} came after {last}"
+        self.behind = number if number < last else None
 
     def _asked(self, state: Any, observation: Observation) -> tuple[Any, np.ndarray]:
         state, seen = self.loop.observed(state, observation)

@@ -59,7 +59,7 @@ class Interrupts:
         """From another thread, interrupt what is being called by a `RobotError`; where signals are handled only."""
         if self._before:
             self._broken_off = why
-            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
     @contextlib.contextmanager
     def _let(self, patience: int) -> Iterator[None]:

@@ -2,9 +2,9 @@
 
     jaxlfi control policy.npz --robot lerobot,robot=my_lab:arm --config task.toml --out runs/real
 
-`my_lab:arm` returns the robot, made as LeRobot makes it. What it calls its numbers, and in which unit they are, is in the
-table `[robot.names]`: "shoulder angle" = { name = "shoulder_pan.pos", unit = "deg" }. LeRobot measures when it is asked,
-so a call takes as long as its bus does; cameras are not asked for where the robot has none.
+`my_lab:arm` returns the robot, made as LeRobot makes it. What it calls its numbers, and in which unit they are, is in
+the table `[robot.names]`: "shoulder angle" = { name = "shoulder_pan.pos", unit = "deg" }. LeRobot measures when it is
+asked, so a call takes as long as its bus and its cameras do.
 
 LeRobot itself is imported by whoever makes the robot. Tested against a robot that pretends to be one.
 """

@@ -1,7 +1,7 @@
 """Loops of policies that displace set-points: a gripper's, for example, as the whipping task does.
 
-Policies of other kinds are driven by `jaxlfi.robots.driving`. Both keep to the same periods, and stop the robot whatever
-happens (`jaxlfi.robots.episode`).
+Policies of other kinds are driven by `jaxlfi.robots.driving`. Both keep to the same periods, and stop the robot
+whatever happens (`jaxlfi.robots.episode`).
 """
 
 import dataclasses

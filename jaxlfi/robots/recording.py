@@ -2,8 +2,8 @@
 
 | file | what |
 |---|---|
-| NAME.csv, NAME.npz, NAME.mcap, or the folder NAME of a LeRobot data set | measured signals and controls, by name, with units |
-| NAME.json | why it ended, how the rate was kept, faults, limits, and what the robot says of itself |
+| NAME.csv, .npz, .mcap, or the folder of a LeRobot data set | measured signals and controls, by name, with units |
+| NAME.json | why it ended, how the rate was kept, faults, limits, what the robot says of itself |
 | NAME.loop.npz | what the policy asked for, what was commanded and seen, period by period |
 
 Signals have the times at which they were measured, controls those at which they were given, in s since the first
@@ -84,7 +84,9 @@ def write(path: Path, recording: Recording, log: Log, report: Mapping[str, Any])
         files.write_bytes(path, _table(recording).encode())
     elif path.suffix == ".npz":
         times, columns = merged(recording)
-        files.write_arrays(path, {"times [s]": times} | {_heading(recording, name): one for name, one in columns.items()})
+        files.write_arrays(
+            path, {"times [s]": times} | {_heading(recording, name): one for name, one in columns.items()}
+        )
     elif path.suffix == ".mcap":
         mcap.write(path, rollout(recording, report))
     else:

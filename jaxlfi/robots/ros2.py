@@ -52,7 +52,9 @@ class Ros2Driver:
             self._joint_state = importlib.import_module("sensor_msgs.msg").JointState
             self._array = importlib.import_module("std_msgs.msg").Float64MultiArray
         except ImportError as error:
-            raise ImportError(f"a ROS 2 robot needs rclpy: source the setup of a ROS 2 installation ({error})") from error
+            raise ImportError(
+                f"a ROS 2 robot needs rclpy: source the setup of a ROS 2 installation ({error})"
+            ) from error
         self._topics, self._joints, self._quantity, self._timeout = (states, commands), joints, quantity, timeout
         self._heard = threading.Condition()
         self._states: tuple[int, float, dict[str, float]] | None = None
@@ -70,10 +72,13 @@ class Ros2Driver:
         if unknown := [name for name in controls if name not in self._joints]:
             raise ValueError(f"robot: expected controls among {', '.join(self._joints)}, got {', '.join(unknown)}")
         if controls and len(controls) < len(self._joints):
-            raise ValueError(f"robot: expected a control for each of {', '.join(self._joints)}, got {', '.join(controls)}")
+            raise ValueError(
+                f"robot: expected a control for each of {', '.join(self._joints)}, got {', '.join(controls)}"
+            )
         if unknown := [name for name in signals if _field(name) is None and name not in self._joints]:
             raise ValueError(
-                f"robot: expected signals joint/NAME/qpos, joint/NAME/qvel or joint/NAME/effort, got {', '.join(unknown)}"
+                "robot: expected signals joint/NAME/qpos, joint/NAME/qvel or joint/NAME/effort, "
+                f"got {', '.join(unknown)}"
             )
         if not self._rclpy.ok():
             self._rclpy.init()
@@ -92,7 +97,7 @@ class Ros2Driver:
         with self._heard:
             if not self._heard.wait_for(lambda: self._states is not None, self._timeout):
                 raise RobotError(f"robot: expected states on {states}, got none in {self._timeout:g} s")
-            measured = self._states[2]
+            measured = self._latest()[2]
         if missing := [name for name in signals if name not in measured and name not in self._joints]:
             raise RobotError(f"robot: expected {', '.join(missing)} on {states}, got {', '.join(measured)}")
         return {"source": "ROS 2", "states": states, "commands": commands, "quantity": self._quantity}
@@ -100,7 +105,7 @@ class Ros2Driver:
     def observe(self) -> Observation:
         """The latest states, and where somebody else commands the latest commands."""
         with self._heard:
-            number, received, values = self._states
+            number, received, values = self._latest()
             commanded = dict(self._commanded)
         return Observation({**commanded, **values}, number, time.monotonic() - received)
 
@@ -126,6 +131,11 @@ class Ros2Driver:
             node.destroy_node()
             if self._initialised:
                 self._rclpy.shutdown()
+
+    def _latest(self) -> tuple[int, float, dict[str, float]]:
+        if self._states is None:
+            raise RobotError("robot: expected connect before anything else, got none")
+        return self._states
 
     def _take_states(self, message: Any) -> None:
         """Keep a message; its age is that of its stamp, where the robot's clock and this one's agree to a second."""

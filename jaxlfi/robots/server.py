@@ -150,7 +150,9 @@ class _Kind(abc.ABC):
 class _Displaced(_Kind):
     """A robot whose set-points are displaced: all of its numbers, in their order."""
 
-    def __init__(self, make: Callable[[Clock], Robot], names: Mapping[str, list[str]], moved: list[int], limits: Limits):
+    def __init__(
+        self, make: Callable[[Clock], Robot], names: Mapping[str, list[str]], moved: list[int], limits: Limits
+    ):
         self.make, self.names, self.moved, self.limits = make, names, moved, limits
 
     def opened(self, hello: Mapping[str, Any], clock: Clock) -> tuple[Robot, Limits]:

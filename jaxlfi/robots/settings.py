@@ -155,6 +155,6 @@ def _called(value: Any, where: str) -> Called:
         raise ValueError(f"{where}: expected name = NAME of the driver and its unit, got {value!r}")
     numbers = {key: _number(value[key], f"{where}: {key}") for key in ("scale", "offset") if key in value}
     try:
-        return Called(**texts, **numbers)
+        return Called(texts["name"], texts.get("unit", ""), **numbers)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error

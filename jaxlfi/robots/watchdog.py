@@ -116,7 +116,7 @@ class Watchdog:
         return f"robot: {what} took longer than the {self._seconds:g} s of the watchdog, which stopped it"
 
     def _watch(self) -> None:
-        while not self._end.wait(self._seconds / LOOKS):
+        while not self._end.wait((self._seconds or 0.0) / LOOKS):
             due = self._due
             if due is not None and time.monotonic() > due[0]:
                 self._bit = self._why(due[1])

@@ -21,10 +21,10 @@ class PretendedLeRobot:
     """A wheel by the interface of LeRobot's `Robot`, with a camera."""
 
     name, id = "wheel_follower", "black"
-    observation_features = {"pan.pos": float, "joint/wheel/qvel": float, "front": (480, 640, 3)}
-    action_features = {"pan.goal": float}
 
     def __init__(self):
+        self.observation_features = {"pan.pos": float, "joint/wheel/qvel": float, "front": (480, 640, 3)}
+        self.action_features = {"pan.goal": float}
         self.wheel, self.calls, self.is_connected = Wheel(), [], False
 
     def connect(self, calibrate=True):
@@ -61,7 +61,9 @@ def test_a_lerobot_robot_is_driven_in_its_own_names_and_units(tmp_path):
 
 def test_a_lerobot_robot_is_held_where_it_is_and_disconnected():
     class Arm(PretendedLeRobot):
-        observation_features = {"pan.goal": float}
+        def __init__(self):
+            super().__init__()
+            self.observation_features = {"pan.goal": float}
 
         def get_observation(self):
             return {"pan.goal": 12.5}
@@ -93,7 +95,9 @@ def test_what_is_no_lerobot_robot_is_refused(word, expected):
 
 def test_names_that_a_lerobot_robot_does_not_have_are_refused():
     driver = lerobot.driver(f"{__name__}:pretended")
-    with pytest.raises(ValueError, match="expected signals among pan.pos, joint/wheel/qvel of LeRobot's wheel_follower"):
+    with pytest.raises(
+        ValueError, match=r"expected signals among pan.pos, joint/wheel/qvel of LeRobot's wheel_follower"
+    ):
         driver.connect({"angle": "rad"}, {})
     with pytest.raises(ValueError, match=r"expected controls among pan.goal .*, got motor: say in \[robot.names\]"):
         driver.connect({"pan.pos": "rad"}, {"motor": "N m"})
@@ -206,10 +210,14 @@ def test_a_ros_robot_that_is_not_there_is_refused(monkeypatch):
         ros2.driver("/commands", ("arm",))
     PretendedRos(monkeypatch, silent=True)
     driver = ros2.driver("/commands", ("arm",), timeout=0.05)
-    with pytest.raises(RobotError, match="robot: expected states on /joint_states, got none in 0.05 s"):
+    with pytest.raises(RobotError, match=r"robot: expected states on /joint_states, got none in 0.05 s"):
         driver.connect({"joint/arm/qpos": "rad"}, {"arm": "N m"})
     for signals, controls, expected_error in (
-        ({"arm angle": "rad"}, {"arm": "N m"}, "expected signals joint/NAME/qpos, joint/NAME/qvel or .*, got arm angle"),
+        (
+            {"arm angle": "rad"},
+            {"arm": "N m"},
+            "expected signals joint/NAME/qpos, joint/NAME/qvel or .*, got arm angle",
+        ),
         ({"joint/arm/qpos": "rad"}, {"leg": "N m"}, "expected controls among arm, got leg"),
     ):
         with pytest.raises(ValueError, match=expected_error):

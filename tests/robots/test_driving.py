@@ -165,7 +165,7 @@ def test_names_and_units_of_a_driver_are_converted(tmp_path):
     np.testing.assert_allclose(log.targets[:, 0], torques, atol=1e-5)
     np.testing.assert_allclose([torque for _, torque in driver.torques], torques, atol=1e-5)
     np.testing.assert_allclose(log.observations, seen, atol=1e-5)
-    with pytest.raises(ValueError, match="pan.pos: expected a unit of rad, got mm"):
+    with pytest.raises(ValueError, match=r"pan.pos: expected a unit of rad, got mm"):
         run(Other(), tmp_path, {"names": {"angle": {"name": "pan.pos", "unit": "mm"}}}, name="mm.csv")
     assert Called("t", "degC").factors("K") == (1.0, 273.15)
 
@@ -246,18 +246,18 @@ def test_settings_that_a_policy_carries_are_used():
 @pytest.mark.parametrize(
     ("table", "expected"),
     [
-        ({"limit": {}}, "robot: expected keys among controls, holds, limits, max_age, names, record, velocities, watchdog"),
+        ({"limit": {}}, "robot: expected keys among controls, holds, limits, max_age, names, record, velocities"),
         ({"limits": {"angle": [1, -1]}}, r"robot: limits: angle: expected LOW below HIGH, got \[1, -1\]"),
         ({"limits": {"angle": [0, "x"]}}, "robot: limits: angle: expected a number, got 'x'"),
         ({"limits": 3}, "robot: limits: expected a table, got 3"),
         ({"controls": {"motor": {"rate": 0}}}, "robot: controls: motor: rate: expected a number above 0, got 0"),
         ({"controls": {"motor": [0, 1]}}, r"robot: controls: motor: expected a table, got \[0, 1\]"),
         ({"controls": {"motor": {"limits": [-3, 1]}}}, r"limits: motor: expected LOW below HIGH within the policy's"),
-        ({"controls": {"motor": {"rate": 61.0}}}, "limits: motor: expected a rate of more than 0 and at most the policy"),
+        ({"controls": {"motor": {"rate": 61.0}}}, "limits: motor: expected a rate of more than 0 and at most"),
         ({"controls": {"rotor": {"rate": 1.0}}}, "limits: expected some of motor, got rotor"),
-        ({"velocities": {"v": {"filter": 1}}}, "robot: velocities: v: expected the signal that it is the derivative of"),
-        ({"velocities": {"v": {"of": "a", "filter": -1}}}, "robot: velocities: v: filter: expected at least 0 s, got -1"),
-        ({"velocities": {"v": {"of": "w"}, "w": {"of": "a"}}}, "velocities: v: expected a signal that is measured, got w"),
+        ({"velocities": {"v": {"filter": 1}}}, "robot: velocities: v: expected the signal that it is"),
+        ({"velocities": {"v": {"of": "a", "filter": -1}}}, "robot: velocities: v: filter: expected at least 0 s"),
+        ({"velocities": {"v": {"of": "w"}, "w": {"of": "a"}}}, "velocities: v: expected a signal that is measured"),
         ({"names": {"a": {"name": "b", "unit": "furlong"}}}, "robot: names: a: expected a unit such as rad"),
         ({"names": {"a": {"name": "b", "scale": 0}}}, "robot: names: a: b: expected a scale other than 0, got 0"),
         ({"names": {"a": {"unit": "deg"}}}, "robot: names: a: expected name = NAME of the driver"),
@@ -315,7 +315,7 @@ def test_a_driver_that_dies_is_stopped_and_what_happened_is_kept(tmp_path):
 
 
 def test_a_driver_that_sends_nan_is_held_and_then_stopped(tmp_path):
-    driver = Wheel(angle=0.2, given={i: nan for i in (3, 6, 7, 8, 9)})
+    driver = Wheel(angle=0.2, given=dict.fromkeys((3, 6, 7, 8, 9), nan))
     why = ends(driver, tmp_path, "robot: stopped after 9 of 100 controls: 4 observations in a row could not be used")
     assert why.endswith("the last one was non-finite")
     assert report_of(tmp_path)["faults"] == {"missing": 0, "late": 0, "non-finite": 5}

@@ -30,7 +30,7 @@ class Served:
 
     def __init__(self, make=Wheel, clock=Simulated, watchdog=5.0, **more):
         self.listener, self.made, self.events = server.listen(0), [], []
-        self.address = "socket://127.0.0.1:%d" % self.listener.getsockname()[1]
+        self.address = f"socket://127.0.0.1:{self.listener.getsockname()[1]}"
         words = {"limits": LIMITS, "watchdog": watchdog, "journal": self.events.append, "clock": clock, **more}
         threading.Thread(target=self.serve, args=(make, words), daemon=True).start()
 
@@ -133,9 +133,12 @@ def hello(**more):
 
 def test_a_robot_that_other_hosts_reach_needs_a_token_on_both_sides():
     listener = server.listen(0, "0.0.0.0")
-    with listener, pytest.raises(ValueError, match="token: expected one for 0.0.0.0, an address that other hosts reach"):
+    with (
+        listener,
+        pytest.raises(ValueError, match=r"token: expected one for 0.0.0.0, an address that other hosts reach"),
+    ):
         server.serve_driver(listener, Wheel)
-    with pytest.raises(ValueError, match="token: expected the one that the robot at 10.0.0.7, another host, shares"):
+    with pytest.raises(ValueError, match=r"token: expected the one that the robot at 10.0.0.7, another host, shares"):
         SocketRobot("socket://10.0.0.7:5005", ["a"], ["b"], remote=True)
 
 
@@ -146,7 +149,7 @@ def test_tokens_that_are_easily_guessed_are_refused(tmp_path):
         (tmp_path / "token").write_text(text)
         with pytest.raises(ValueError, match=got):
             wire.token_of(tmp_path / "token")
-    with pytest.raises(ValueError, match="token: expected a file with a token, got .*none, which cannot be read"):
+    with pytest.raises(ValueError, match=r"token: expected a file with a token, got .*none, which cannot be read"):
         wire.token_of(tmp_path / "none")
 
 
@@ -154,7 +157,7 @@ def test_a_second_client_is_refused_and_the_robot_is_stopped(served):
     process = served(watchdog=20.0)
     first = connected(process.address)
     first.observe()
-    with pytest.raises(RobotError, match="its driver refused hello: busy: another client came|reset by peer|closed"):
+    with pytest.raises(RobotError, match=r"its driver refused hello: busy: another client came|reset by peer|closed"):
         connected(process.address)
     with pytest.raises(RobotError, match="its driver refused act: busy: another client came while one had the robot"):
         first.act({"motor": 0.5})
@@ -180,7 +183,7 @@ def test_a_driver_that_must_be_stopped_in_another_thread_hears_of_it_while_a_cal
     loop = driving.Drive.of(a_policy(), watchdog=0.2)
     robot, loop, _ = driving.connected(loop, SocketDriver(process.address, timeout=5.0), Settings())
     began = time.monotonic()
-    with pytest.raises(RobotError, match="observe took longer than the 0.2 s of the watchdog"):
+    with pytest.raises(RobotError, match=r"observe took longer than the 0.2 s of the watchdog"):
         loop.run(robot, a_policy())
     assert time.monotonic() - began < 4.0
     process.why()
