@@ -51,7 +51,7 @@ class Loop(Paced):
             ValueError: for a policy that does not say how it was trained, and changes that make no loop.
         """
         facts, names = deployment.of_schema(policy.schema), list(policy.observed["names"])
-        own = {
+        own: dict[str, Any] = {
             "limits": facts.limits,
             "moved": tuple(names.index(name) for name in facts.moved),
             "size": len(names),

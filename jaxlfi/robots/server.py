@@ -128,7 +128,11 @@ def write_to(path: Path) -> Journal:
         OSError: for a file that cannot be written.
     """
     file = path.open("a", buffering=1)
-    return lambda event: file.write(json.dumps(event) + "\n")
+
+    def write(event: Mapping[str, Any]) -> None:
+        file.write(json.dumps(event) + "\n")
+
+    return write
 
 
 class _Kind(abc.ABC):
@@ -275,6 +279,8 @@ class _Session:
     def _answer(self, message: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
         if message["type"] not in ("observe", "act"):
             raise RobotError(f"expected observe, act or stop, got {wire.short(message['type'])!r}")
+        if self.robot is None:
+            raise RobotError("expected hello before anything else, got none")
         now = self._now(wire.number(message, "now"))
         if message["type"] == "observe":
             seen = self.robot.observe()
