@@ -20,15 +20,19 @@ from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
 from jaxlfi.envs.mujoco.effects import built, effects, initial_state, state_place
-from jaxlfi.envs.mujoco.goal import Goal, Reading
+from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, started
 from jaxlfi.envs.mujoco.mjx_models import Models, mjx
 from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable, state_of
 from jaxlfi.envs.mujoco.model_task import box, compile_spec, specification
 from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.envs.mujoco.reading import Reading, add_signals
 from jaxlfi.rl.environment import EnvState
 from jaxlfi.rl.preparation import Memory
+
+OF_COMMANDS = 1
+"""Folded into an episode's key."""
 
 
 class Inner(struct.PyTreeNode):
@@ -38,6 +42,7 @@ class Inner(struct.PyTreeNode):
         state: positions and velocities.
         controls: the last ones, the latest at the end, shape [B, A].
         memory: of the observations (`jaxlfi.rl.preparation`).
+        commands: of the episode, shape [C].
         numbers: of the model, that depend on its parameters (`Models`).
         theta: in natural units, shape [D].
         refused: whether MuJoCo refuses the model.
@@ -47,6 +52,7 @@ class Inner(struct.PyTreeNode):
     state: State
     controls: Float[Array, "*batch before act"]
     memory: Memory
+    commands: Float[Array, "*batch commands"]
     numbers: Float[Array, "*batch numbers"]
     theta: Float[Array, "*batch dim"]
     refused: Bool[Array, "*batch"]
@@ -96,6 +102,7 @@ class MujocoEnvironment:
         centre = self.space.box_to_inference(support).centre
         self.nominal = tuple(float(number) for number in np.asarray(self.space.to_natural(np.asarray(centre))))
 
+        add_signals(spec, goal)
         signals = [*goal.signals, *_only_inferred(self.space.names, goal.signals)]
         add_sensors(spec, signals)
         compiled = compile_spec(spec)
@@ -111,6 +118,7 @@ class MujocoEnvironment:
 
         self._start = initial_state(compiled, initial or {})
         self._drawn = [(state_place(compiled, key, f"initial/{key}"), bounds) for key, bounds in goal.initial.items()]
+        self._ends = tuple(goal.terminations)
         self._timestep = compiled.opt.timestep
         self._substeps = round(goal.interval / self._timestep)
         self._noise = np.array([(noises or {}).get(name, 0.0) for name in goal.signals])
@@ -134,12 +142,13 @@ class MujocoEnvironment:
             known = self._measured(jax.random.clone(key_noise), theta, values)
             first = self.preparation.start(known, jnp).controls[0]
             values = self._physics.values(model, self._physics.data(state, first))
-        measured = self._measured(key_noise, theta, values)
+        commands = self._commanded(key_start)
+        measured = jnp.append(self._measured(key_noise, theta, values), commands)
         memory, seen = self.preparation.observed(self.preparation.start(measured, jnp), measured, jnp)
         controls = jnp.tile(memory.controls[0], (self._before, 1))
-        inner = Inner(state, controls, memory, numbers, theta, refused, key)
+        inner = Inner(state, controls, memory, commands, numbers, theta, refused, key)
         no, reward = jnp.asarray(False), jnp.asarray(0.0, jnp.float32)  # not of a weak type
-        return EnvState(inner, seen, reward, no, no, self._facts(values, no))
+        return EnvState(inner, seen, reward, no, no, self._facts(values, commands, no))
 
     def step(self, state: EnvState, action: Float[Array, " act"]) -> EnvState:
         """One control interval. Where the simulation becomes unstable the episode ends, as it was seen last."""
@@ -156,15 +165,18 @@ class MujocoEnvironment:
         # MuJoCo's sensors are those of the state before a step: of the state after it they are read besides.
         values = self._physics.values(model, data)
         failed = before.refused | ~stable(data.qpos, data.qvel, values)
-        memory, seen = self.preparation.observed(memory, self._measured(key_noise, before.theta, values), jnp)
+        measured = jnp.append(self._measured(key_noise, before.theta, values), before.commands)
+        memory, seen = self.preparation.observed(memory, measured, jnp)
+        reward = self.reading.reward(values, control, before.controls[-1], before.commands)
+        facts = self._facts(values, before.commands, failed)
         after = before.replace(state=state_of(data), controls=controls, memory=memory, key=key)
         return EnvState(
             inner=after,
             observation=jnp.where(failed, state.observation, seen),
-            reward=jnp.where(failed, 0.0, self.reading.reward(values, control)),
-            terminated=jnp.asarray(False),
+            reward=jnp.where(failed, 0.0, reward),
+            terminated=functools.reduce(jnp.logical_or, (facts[name] for name in self._ends), jnp.asarray(False)),
             truncated=failed,
-            facts=self._facts(values, failed),
+            facts=facts,
         )
 
     def _check(self, compiled: mujoco.MjModel, goal: Goal) -> None:
@@ -187,9 +199,20 @@ class MujocoEnvironment:
         noise = deviations(self._does, theta, self._noise) * jax.random.normal(key, values.shape)
         return (biased(self._does, theta, values) + noise)[: len(self.preparation.signals)]
 
-    def _facts(self, values: Float[Array, " signals"], failed: Array) -> dict[str, Array]:
-        """How far the episode's last state is from its targets, and whether it failed."""
-        return {f"{name} off": jnp.abs(off) for name, off in self.reading.off(values).items()} | {"failed": failed}
+    def _commanded(self, key: jax.Array) -> Float[Array, " commands"]:
+        """The commands of an episode, whose first state is drawn with the same key."""
+        bounds = [(one.low, one.high) for one in self.preparation.commands]
+        if not bounds:
+            return jnp.zeros(0)
+        low, high = np.asarray(bounds, np.float32).T
+        key = jax.random.fold_in(jax.random.clone(key), OF_COMMANDS)
+        return jax.random.uniform(key, low.shape, minval=low, maxval=high)
+
+    def _facts(self, values: Float[Array, " signals"], commands: Array, failed: Array) -> dict[str, Array]:
+        """How far the episode's last state is from its targets, how it ended, and whether it failed."""
+        off = {f"{name} off": jnp.abs(off) for name, off in self.reading.off(values, commands).items()}
+        ended = {name: holds & ~failed for name, holds in self.reading.ended(values).items()}
+        return off | ended | {"failed": failed}
 
 
 def environment(config: Path) -> MujocoEnvironment:

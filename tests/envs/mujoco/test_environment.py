@@ -218,7 +218,7 @@ def test_first_states_are_drawn_and_noise_is_added():
     assert 0.2 <= start.min() < 0.22 and 0.68 < start.max() <= 0.7
     angle = jnp.arctan2(state.observation[:, 1], state.observation[:, 0])
     assert (angle - start).std() == pytest.approx(0.08, rel=0.15)
-    assert env.reading.reward(np.array([0.5, 0.1]), np.array([0.2]), np) == pytest.approx(0.3)
+    assert env.reading.reward(np.array([0.5, 0.1]), np.array([0.2]), np.array([0.0]), (), np) == pytest.approx(0.3)
 
 
 SLIDE = """
@@ -255,7 +255,7 @@ def test_a_policy_is_trained_on_it():
         ({"limits": {"engine": (0, 1), "motor": (0, 1)}}, "policy: limits: expected actuators of the model"),
         ({"limits": {"motor": (1, 0)}}, "policy: limits: motor: expected LOW below HIGH"),
         ({"interval": 0.021}, "policy: interval: expected a multiple of the model's time step, 0.004 s"),
-        ({"observed": ("angel",)}, "measured: expected a sensor such as angle"),
+        ({"observed": ("angel",)}, "policy: observed: expected a sensor such as angle"),
         ({"initial": {"hinge/qpos": (0, 1)}}, "expected a joint"),
         ({"xml": ARM.replace("implicitfast", "implicit")}, "model: MJX cannot simulate it"),
     ],
@@ -298,7 +298,7 @@ def test_a_table_is_a_goal():
         ("duration = 1.0", "", "policy: expected duration, got none"),
         ('["angle"]', '"angle"', "policy: observed: expected names of signals"),
         ("[-1, 1]", "[-1]", "policy: limits: motor: expected [LOW, HIGH]"),
-        ("value = 0.4", "weight = 0.4", "policy: targets: angle: expected value and weight"),
+        ("value = 0.4", "weight = 0.4", "policy: targets: angle: expected value or command"),
         ("value = 0.4", "value = 0.4\nweight = -1", "policy: targets: angle: expected a weight of at least 0"),
         ("0.02", '"20 ms"', "policy: interval: expected a number"),
         ("0.02", "2.0", "policy: interval: expected one of more than 0 s, and at most the duration"),
