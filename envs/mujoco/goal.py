@@ -47,6 +47,15 @@ history = 3                         # how many times signals are seen: now, one 
 actions = 2                         # how many of the last controls are seen
 rates = { motor = 0.5 }             # of a control, its largest change per second
 displacing = ["motor"]              # actions are added to the last control, by as much as the rate allows, at most
+
+What it has to put up with, besides the noise of `[noise]`:
+
+[policy]
+action_delay = 0.01                 # s from an action to when the actuators get it, besides an inferred control/delay
+observation_delay = [0.0, 0.02]     # s, the age of a measurement when the policy acts on it; drawn for each episode
+noises = { "joint/arm/qvel" = 0.1 } # standard deviations of signals that `[noise]` does not have
+bias = 0.5                          # offset of a signal, drawn for each episode, as a fraction of its noise
+model_error = true                  # `unmodelled_force`, `[discrepancy]` and the noise of recordings, as in inference
 """
 
 import dataclasses
@@ -63,11 +72,26 @@ from jaxlfi.envs.mujoco.termination import Termination
 
 NEEDED = ("interval", "duration", "observed")
 BOUNDS = ("limits", "initial", "commands")
-NUMBERS = ("scales", "costs", "change_costs", "rates")
+NUMBERS = ("scales", "costs", "change_costs", "rates", "noises")
+SINGLE = ("alive", "bias")
+DELAYS = ("action_delay", "observation_delay")
+MODEL_ERROR = "model_error"
 NAMES = {"observed": "signals", "turns": "signals", "displacing": "actuators"}
 COUNTS = {"history": 1, "actions": 0}
 """The least of each."""
-KEYS = (*NEEDED, *BOUNDS, *NUMBERS, "targets", "alive", "terminations", "turns", "displacing", *COUNTS)
+KEYS = (
+    *NEEDED,
+    *BOUNDS,
+    *NUMBERS,
+    "targets",
+    "terminations",
+    *SINGLE,
+    "turns",
+    "displacing",
+    *COUNTS,
+    *DELAYS,
+    MODEL_ERROR,
+)
 MOST_BEFORE = 100
 """Control intervals that a policy looks back, at most."""
 RESERVED = ("return", "value", "steps", "theta", "length", "episodes", "seconds", "failed")
@@ -113,6 +137,10 @@ class Goal:
         alive: reward of a second that does not end the episode.
         commands: bounds by name.
         terminations: by name.
+        action_delay: least and largest one, in s.
+        observation_delay: likewise.
+        noises: standard deviations, by signal.
+        bias: standard deviation of offsets, as a fraction of those of the noise.
 
     Raises:
         ValueError: for numbers that are no such, and a goal without a reward.
@@ -136,6 +164,10 @@ class Goal:
     alive: float = 0.0
     commands: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     terminations: Mapping[str, Termination] = dataclasses.field(default_factory=dict)
+    action_delay: tuple[float, float] = (0.0, 0.0)
+    observation_delay: tuple[float, float] = (0.0, 0.0)
+    noises: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    bias: float = 0.0
 
     def __post_init__(self):
         object.__setattr__(self, "targets", {name: Target(*one) for name, one in self.targets.items()})
@@ -152,8 +184,18 @@ class Goal:
         for name, (low, high) in self.initial.items():
             if not -math.inf < low <= high < math.inf:
                 raise ValueError(f"initial: {name}: expected LOW up to HIGH, got {[low, high]}")
-        if unknown := [name for name in self.scales if name not in self.observed]:
-            raise ValueError(f"scales: expected signals that are observed, got {', '.join(unknown)}")
+        for what in ("scales", "noises"):
+            if unknown := [name for name in getattr(self, what) if name not in self.observed]:
+                raise ValueError(f"{what}: expected signals that are observed, got {', '.join(unknown)}")
+        for what, deviation in (
+            {f"noises: {name}": one for name, one in self.noises.items()} | {"bias": self.bias}
+        ).items():
+            if not 0 <= deviation < math.inf:
+                raise ValueError(f"{what}: expected a standard deviation of at least 0, got {deviation:g}")
+        for what in DELAYS:
+            low, high = getattr(self, what)
+            if not 0 <= low <= high <= self.duration:
+                raise ValueError(f"{what}: expected 0 s up to the duration, LOW up to HIGH, got {[low, high]}")
         for name in self.terminations:
             if name in RESERVED or name.endswith(" off"):
                 raise ValueError(f"terminations: expected a name that has no other meaning, got {name!r}")
@@ -217,7 +259,8 @@ def of_table(table: Mapping[str, Any]) -> Goal:
     made |= {key: tuple(table[key]) for key in NAMES if key in table} | {
         key: table[key] for key in COUNTS if key in table
     }
-    made["alive"] = tables.number(table.get("alive", 0.0), "policy: alive")
+    made |= {key: tables.number(table.get(key, 0.0), f"policy: {key}") for key in SINGLE}
+    made |= {key: _range(table.get(key, 0.0), f"policy: {key}") for key in DELAYS}
     made["targets"] = {name: _target(name, one) for name, one in table.get("targets", {}).items()}
     made["terminations"] = {name: _termination(name, one) for name, one in table.get("terminations", {}).items()}
     for key in BOUNDS:
@@ -226,6 +269,11 @@ def of_table(table: Mapping[str, Any]) -> Goal:
         return Goal(**made, **{key: tables.numbers(table, key) for key in NUMBERS})
     except ValueError as error:
         raise ValueError(f"policy: {error}") from error
+
+
+def _range(value: Any, where: str) -> tuple[float, float]:
+    """Two bounds, or one number for both."""
+    return tables.pair(value if isinstance(value, list) else [value, value], where)
 
 
 def _target(name: str, table: Any) -> Target:

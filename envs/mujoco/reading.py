@@ -104,7 +104,17 @@ class Reading:
                 raise ValueError(f"policy: {'displacing' if rate is None else 'rates'}: {error}") from error
         units = {one.value: measured.unit(model, name) for name, one in goal.targets.items()}
         commands = tuple(Command(name, *bounds, units.get(name, "")) for name, bounds in goal.commands.items())
-        return Preparation(signals, tuple(controls), goal.interval, goal.steps, goal.history, goal.actions, commands)
+        return Preparation(
+            signals=signals,
+            controls=tuple(controls),
+            interval=goal.interval,
+            steps=goal.steps,
+            history=goal.history,
+            actions=goal.actions,
+            commands=commands,
+            observation_delay=goal.observation_delay,
+            action_delay=goal.action_delay,
+        )
 
     def _signals(self, owners: Sequence["_Owner"]) -> tuple[Signals, Signals]:
         """Observations and actions as the policy scales them."""

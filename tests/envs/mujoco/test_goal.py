@@ -20,6 +20,10 @@ displacing = ["motor"]
 limits = { motor = [-1, 1] }
 change_costs = { motor = 0.2 }
 alive = 0.5
+action_delay = 0.01
+observation_delay = [0.0, 0.02]
+noises = { speed = 0.1 }
+bias = 2
 [targets]
 place = { value = 0.4, weight = 2 }
 speed = { command = "pace", within = 0.3 }
@@ -45,6 +49,10 @@ def test_a_table_is_a_goal():
         displacing=("motor",),
         change_costs={"motor": 0.2},
         alive=0.5,
+        action_delay=(0.01, 0.01),
+        observation_delay=(0.0, 0.02),
+        noises={"speed": 0.1},
+        bias=2.0,
         commands={"pace": (-1.0, 2.0)},
         terminations={
             "fallen": Termination("body/torso/pos[2]", "<", 0.2, cost=10.0),
@@ -102,6 +110,12 @@ def test_what_is_no_condition_is_refused(text):
         ("cost = 10", "coast = 10", "policy: terminations: fallen: expected { when ="),
         ("cost = 10", "cost = nan", "policy: terminations: fallen: expected finite numbers, got 0.2 and a cost of nan"),
         ("fallen =", "failed =", "policy: terminations: expected a name that has no other meaning, got 'failed'"),
+        ("action_delay = 0.01", "action_delay = -0.01", "policy: action_delay: expected 0 s up to the duration"),
+        ("[0.0, 0.02]", "[0.0, 2.0]", "policy: observation_delay: expected 0 s up to the duration"),
+        ("[0.0, 0.02]", '"late"', "policy: observation_delay: expected a number, got 'late'"),
+        ("{ speed = 0.1 }", "{ place = nan }", "policy: noises: place: expected a standard deviation of at least 0"),
+        ("{ speed = 0.1 }", "{ sped = 0.1 }", "policy: noises: expected signals that are observed, got sped"),
+        ("bias = 2", "bias = -2", "policy: bias: expected a standard deviation of at least 0, got -2"),
         ("alive = 0.5", "live = 0.5", "policy: expected keys among interval"),
     ],
 )  # fmt: skip
