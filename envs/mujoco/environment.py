@@ -7,6 +7,7 @@ mujoco,config=FILE` is a domain of `jaxlfi train mujoco,config=FILE`, with the s
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
+from jaxlfi.envs.mujoco import machine
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import built, effects, initial_state, state_place
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
@@ -72,6 +74,7 @@ class MujocoEnvironment:
         models: MJX models of parameters.
         reading: what the policy sees, may do and is rewarded for.
         preparation: of what it sees and does, as a robot needs it.
+        robot: what a robot keeps to besides, which policies carry (`jaxlfi.robots.settings`).
     """
 
     def __init__(
@@ -100,6 +103,7 @@ class MujocoEnvironment:
         Raises:
             ValueError: for whatever does not fit together, or MJX cannot simulate, in one line.
         """
+        self.robot: Mapping[str, Any] = {}
         if not parameters:
             raise ValueError("parameters: expected at least one, got none")
         spec = specification(model)
@@ -268,7 +272,7 @@ def environment(config: Path) -> MujocoEnvironment:
             noises = dict(zip(learnt.signals, np.asarray(learnt.noise).tolist(), strict=True))
             discrepancies = {learnt.signals[place]: process for place, process in learnt.discrepancies.items()}
             known = {"forces": learnt.forces, "discrepancies": discrepancies}
-        return MujocoEnvironment(
+        made = MujocoEnvironment(
             config.parent / table["model"],
             tables.parameters_of(table),
             goal,
@@ -277,6 +281,9 @@ def environment(config: Path) -> MujocoEnvironment:
             table.get("name", config.stem),
             **known,
         )
+        if "robot" in table:
+            made.robot = machine.carried(table["robot"], config.parent / table["model"], made.preparation)
+        return made
     except ValueError as error:
         raise ValueError(f"{config}: {error}") from error
 

@@ -235,6 +235,7 @@ def serve(arguments: argparse.Namespace) -> None:
     token = None if arguments.token is None else wire.token_of(arguments.token)
     journal = server.write_to(arguments.journal) if arguments.journal else lambda event: None
     with contextlib.closing(server.listen(arguments.port, arguments.host)) as listener:
+        server.require_token(listener, token)
         print(f"listening on socket://{arguments.host}:{listener.getsockname()[1]}", flush=True)
         clock = Monotonic if arguments.real_time else Simulated
         watchdog = server.WATCHDOG if arguments.real_time else PATIENCE

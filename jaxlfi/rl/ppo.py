@@ -271,7 +271,8 @@ def as_file(environment: Environment, params: losses.PPONetworkParams, **recorde
     """The policy as a file that needs neither JAX nor Brax.
 
     Args:
-        environment: that it was trained on; what it declares as `deployment` and `preparation` is written, too.
+        environment: that it was trained on; what it declares as `deployment`, `preparation` and `robot`, a mapping of
+            what robots are to keep to (`jaxlfi.robots.settings`), is written, too.
         params: of its training.
         recorded: what else its schema is to say.
     """
@@ -286,6 +287,8 @@ def as_file(environment: Environment, params: losses.PPONetworkParams, **recorde
     for key in (deployment.KEY, preparation.KEY):
         if (declared := getattr(environment, key, None)) is not None:
             schema[key] = dataclasses.asdict(declared)
+    if robot := getattr(environment, "robot", None):
+        schema["robot"] = dict(robot)
     return Policy(tuple(layer["kernel"] for layer in every), tuple(layer["bias"] for layer in every), schema)
 
 

@@ -52,6 +52,7 @@ class Drive(Paced):
         bounds: least and largest value by signal.
         commands: what the operator asks for, as the policy was trained with, in the order of the preparation.
         follows: somebody else commands, and observations say what.
+        units: of signals that the policy does not see, where they are known.
 
     Raises:
         ValueError: for bounds and commands of others.
@@ -63,6 +64,7 @@ class Drive(Paced):
     bounds: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     commands: tuple[float, ...] = ()
     follows: bool = False
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         super().__post_init__()
@@ -97,12 +99,6 @@ class Drive(Paced):
         own = preparation_of(policy, rate)
         settings = settings_of(policy) if settings is None else settings
         names = tuple(one.name for one in own.signals)
-        limits = limits_of(own)
-        for name, (bounds, most) in settings.controls.items():
-            limits = limits.tightened(name, bounds, most)
-        for name, one in settings.velocities.items():
-            if one.of in settings.velocities:
-                raise ValueError(f"velocities: {name}: expected a signal that is measured, got {one.of}")
         given = {
             "rate": 1 / own.interval if rate is None else rate,
             "watchdog": settings.watchdog or WATCHDOG,
@@ -111,10 +107,11 @@ class Drive(Paced):
         }
         return Drive(
             own,
-            limits,
+            limits_within(own, settings),
             (*names, *(name for name in settings.further if name not in names)),
             settings.limits,
             _commands(own, commands or {}),
+            units=settings.units,
             **({"steps": own.steps} | {name: value for name, value in given.items() if value is not None} | changes),
         )
 
@@ -124,9 +121,9 @@ class Drive(Paced):
         return len(self.preparation.controls)
 
     @property
-    def units(self) -> dict[str, str]:
-        """Of the signals; "" where they are not known."""
-        known = {one.name: one.unit for one in self.preparation.signals}
+    def asked(self) -> dict[str, str]:
+        """The signals with their units; "" where they are not known."""
+        known = {**self.units, **{one.name: one.unit for one in self.preparation.signals}}
         return {name: known.get(name, "") for name in self.signals}
 
     def begin(self, observation: Observation) -> Driving:
@@ -219,7 +216,7 @@ def connected(loop: Drive, driver: Driver, settings: Settings) -> tuple[Robot, D
         for name, one in settings.velocities.items()
         if name in loop.signals
     }
-    measured = {name: unit for name, unit in loop.units.items() if name not in estimated}
+    measured = {name: unit for name, unit in loop.asked.items() if name not in estimated}
     controls = {one.name: one.unit for one in loop.preparation.controls}
     robot = Driven(driver, measured, controls, settings.names, loop.follows)
     loop = dataclasses.replace(loop, clock=getattr(robot, "simulated_clock", loop.clock))
@@ -264,6 +261,21 @@ def limits_of(preparation: Preparation) -> ControlLimits:
     return ControlLimits(
         tuple(one.name for one in each), tuple(one.low for one in each), tuple(one.high for one in each), rates
     )
+
+
+def limits_within(preparation: Preparation, settings: Settings) -> ControlLimits:
+    """What a robot lets a policy command.
+
+    Raises:
+        ValueError: for settings of other actuators, those that would loosen a limit, and velocities of velocities.
+    """
+    limits = limits_of(preparation)
+    for name, (bounds, most) in settings.controls.items():
+        limits = limits.tightened(name, bounds, most)
+    for name, one in settings.velocities.items():
+        if one.of in settings.velocities:
+            raise ValueError(f"velocities: {name}: expected a signal that is measured, got {one.of}")
+    return limits
 
 
 def settings_of(policy: Policy) -> Settings:

@@ -104,9 +104,7 @@ def _serve(
     clock: Callable[[], Clock],
     token: str | None,
 ) -> None:
-    host = listener.getsockname()[0]
-    if token is None and not wire.is_local(host):
-        raise ValueError(f"token: expected one for {host}, an address that other hosts reach, got none")
+    require_token(listener, token)
     with Interrupts() as interrupts:
         while True:
             with interrupts.waiting():
@@ -119,6 +117,17 @@ def _serve(
 def listen(port: int, host: str = "127.0.0.1") -> socket.socket:
     """A socket that connections can come to; by default from this very host only. Port 0 is any that is free."""
     return socket.create_server((host, port))
+
+
+def require_token(listener: socket.socket, token: str | None) -> None:
+    """Refuse to serve where other hosts reach without a token.
+
+    Raises:
+        ValueError: naming the address.
+    """
+    host = listener.getsockname()[0]
+    if token is None and not wire.is_local(host):
+        raise ValueError(f"token: expected one for {host}, an address that other hosts reach, got none")
 
 
 def write_to(path: Path) -> Journal:

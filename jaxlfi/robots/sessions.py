@@ -83,7 +83,7 @@ class Session:
         """What was measured, and given by whoever commanded."""
         if isinstance(self.loop, Drive):
             own = self.loop.preparation
-            names, units = self.loop.signals, self.loop.units
+            names, units = self.loop.signals, self.loop.asked
             controls = {one.name: one.unit for one in own.controls}
         else:
             names, units, controls = tuple(_measured(self.policy)), _measured(self.policy), _set_points(self.policy)

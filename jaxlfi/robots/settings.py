@@ -5,6 +5,7 @@ watchdog = 0.1                      # s that a call of the driver may take befor
 holds = 3                           # control periods in a row without a usable observation; then the robot is stopped
 max_age = 0.02                      # s, of an observation; by default a control period
 record = ["tip"]                    # signals that the policy does not see, and inference is to have
+units = { tip = "m" }               # of such signals; those of a MuJoCo model are known
 
 [robot.limits]                      # of signals: beyond them, in the workspace or elsewhere, the robot is stopped
 "arm angle" = [-2.0, 2.0]
@@ -24,6 +25,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from jaxlfi.io import units
 from jaxlfi.robots.driver import Called
 
 KEY = "robot"
@@ -53,6 +55,7 @@ class Settings:
         velocities: by the name of the estimated signal.
         names: of the driver, by the task's.
         record: further signals.
+        units: of signals that policies do not see.
         watchdog: in s.
         holds: in control periods.
         max_age: in s.
@@ -63,6 +66,7 @@ class Settings:
     velocities: Mapping[str, Velocity] = dataclasses.field(default_factory=dict)
     names: Mapping[str, Called] = dataclasses.field(default_factory=dict)
     record: tuple[str, ...] = ()
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)
     watchdog: float | None = None
     holds: int | None = None
     max_age: float | None = None
@@ -90,6 +94,7 @@ def of_table(table: Mapping[str, Any]) -> Settings:
     found["controls"] = _each(table, "controls", _control)
     found["velocities"] = _each(table, "velocities", _velocity)
     found["names"] = _each(table, "names", _called)
+    found["units"] = _each(table, "units", _unit)
     for name in ("watchdog", "max_age"):
         if name in table:
             found[name] = _number(table[name], f"robot: {name}", above=0.0)
@@ -146,6 +151,12 @@ def _velocity(value: Any, where: str) -> Velocity:
     if seconds is not None and _number(seconds, f"{where}: filter") < 0:
         raise ValueError(f"{where}: filter: expected at least 0 s, got {seconds!r}")
     return Velocity(value["of"], None if seconds is None else float(seconds))
+
+
+def _unit(value: Any, where: str) -> str:
+    if not isinstance(value, str) or not units.is_unit(value):
+        raise ValueError(f"{where}: expected a unit such as rad, deg/s, mm, N m or ms, got {value!r}")
+    return value
 
 
 def _called(value: Any, where: str) -> Called:

@@ -246,7 +246,7 @@ def test_settings_that_a_policy_carries_are_used():
 @pytest.mark.parametrize(
     ("table", "expected"),
     [
-        ({"limit": {}}, "robot: expected keys among controls, holds, limits, max_age, names, record, velocities"),
+        ({"limit": {}}, "robot: expected keys among controls, holds, limits, max_age, names, record, units"),
         ({"limits": {"angle": [1, -1]}}, r"robot: limits: angle: expected LOW below HIGH, got \[1, -1\]"),
         ({"limits": {"angle": [0, "x"]}}, "robot: limits: angle: expected a number, got 'x'"),
         ({"limits": 3}, "robot: limits: expected a table, got 3"),
@@ -262,6 +262,7 @@ def test_settings_that_a_policy_carries_are_used():
         ({"names": {"a": {"name": "b", "scale": 0}}}, "robot: names: a: b: expected a scale other than 0, got 0"),
         ({"names": {"a": {"unit": "deg"}}}, "robot: names: a: expected name = NAME of the driver"),
         ({"record": "tip"}, "robot: record: expected names of signals, got 'tip'"),
+        ({"units": {"tip": "furlong"}}, "robot: units: tip: expected a unit such as rad"),
         ({"watchdog": 0}, "robot: watchdog: expected a number above 0, got 0"),
         ({"holds": True}, "robot: holds: expected a whole number of at least 0, got True"),
     ],
