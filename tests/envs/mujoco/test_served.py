@@ -1,5 +1,6 @@
 """The machine that stands for a real one: another integrator, unmodelled effects, and a recording that is inferred from."""
 
+import json
 import subprocess
 import sys
 
@@ -17,6 +18,7 @@ from jaxlfi.rl.preparation import Control, Preparation, Signal
 from jaxlfi.robots import driving, sessions
 from jaxlfi.robots.client import SocketDriver
 from jaxlfi.robots.clock import Simulated
+from jaxlfi.robots.robot import RobotError
 from jaxlfi.robots.settings import Settings
 
 MODEL = """
@@ -125,11 +127,27 @@ def test_a_machine_in_another_process_is_controlled_and_its_recording_is_a_task(
         address = process.stdout.readline().split()[-1]
         policy = a_policy(PREPARATION, weights=[[-12.0], [-2.0]])
         log = sessions.of(policy, Settings()).run(SocketDriver(address), tmp_path / "real.csv", {})
+
+        class Dying(SocketDriver):
+            """Its process is killed before the sixth observation."""
+
+            seen = 0
+
+            def observe(self):
+                self.seen += 1
+                if self.seen == 6:
+                    process.kill()
+                    process.wait()
+                return super().observe()
+
+        with pytest.raises(RobotError, match=r"^robot 127.0.0.1:\d+: .*; and stopping the robot failed: "):
+            sessions.of(policy, Settings()).run(Dying(address), tmp_path / "died.csv", {})
     finally:
-        process.terminate()
+        process.kill()
         process.wait()
         process.stdout.close()
-    assert process.returncode == 130 and len(log.targets) == 100
+    assert len(log.targets) == 100 and logs.read(tmp_path / "died.csv").signals["push"].shape == (5,)
+    assert "closed" in (told := json.loads((tmp_path / "died.json").read_text())["stopped"]) or "reset" in told
     assert abs(log.observations[-1, 0]) < abs(log.observations[0, 0]) / 3
     read = logs.read(tmp_path / "real.csv")
     assert set(read.signals) == {"place", "joint/rail/qvel", "push"}
