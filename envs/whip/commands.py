@@ -36,7 +36,6 @@ from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
 from jaxlfi.robots import wire
 from jaxlfi.robots.episode import Log
-from jaxlfi.robots.recording import timing_line
 from jaxlfi.robots.robot import RobotError
 
 POLICIES = ("explore", "random", "plan")
@@ -177,7 +176,6 @@ def _write_log(out: Path, log: Log, about: Mapping[str, Any]) -> None:
         atomic.write_arrays(out, others)
         print(f"{out} cannot be inferred from, as it is no recording of an object: {error}")
     print(f"{controlling.summary(log)}, wrote {out}")
-    print(timing_line(log))
 
 
 def _parameters(arguments: argparse.Namespace) -> WhipParameters:

@@ -68,7 +68,6 @@ class Drive(Paced):
 
     def __post_init__(self):
         super().__post_init__()
-        object.__setattr__(self, "size", len(self.signals))
         if unknown := [name for name in self.bounds if name not in self.signals]:
             raise ValueError(f"limits: expected signals among {', '.join(self.signals)}, got {', '.join(unknown)}")
         if len(self.commands) != len(self.preparation.commands):
@@ -114,6 +113,11 @@ class Drive(Paced):
             units=settings.units,
             **({"steps": own.steps} | {name: value for name, value in given.items() if value is not None} | changes),
         )
+
+    @property
+    def measured(self) -> int:
+        """Number of the numbers that are measured."""
+        return len(self.signals)
 
     @property
     def count(self) -> int:

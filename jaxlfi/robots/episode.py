@@ -92,9 +92,6 @@ class Paced(abc.ABC):
     clock: Clock = dataclasses.field(default_factory=Monotonic)
     watchdog: float | None = None
 
-    size: int = dataclasses.field(init=False)
-    """Of an observation."""
-
     def __post_init__(self):
         for name in ("rate", "max_age", "watchdog"):
             if getattr(self, name) is not None:
@@ -102,6 +99,11 @@ class Paced(abc.ABC):
         for name, least in (("steps", 1), ("holds", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+
+    @property
+    @abc.abstractmethod
+    def measured(self) -> int:
+        """Number of the numbers that are measured."""
 
     @property
     @abc.abstractmethod
@@ -271,8 +273,8 @@ class _Episode:
             self._count(observation.number, self.last)
             return self._unusable("missing")
         values = np.array(observation.values)  # a driver may measure into the same array again
-        if values.shape != (loop.size,):
-            raise ValueError(f"robot: expected observations of {loop.size} numbers, got shape {list(values.shape)}")
+        if values.shape != ((size := loop.measured),):
+            raise ValueError(f"robot: expected observations of {size} numbers, got shape {list(values.shape)}")
         if not observation.age <= (loop.period if loop.max_age is None else loop.max_age):  # NaN is late, too
             return self._unusable("late")
         if not np.isfinite(values).all():
@@ -316,7 +318,7 @@ class _Episode:
         table = lambda rows: np.reshape(np.array(rows, float), (len(rows), self.loop.count))
         return Log(
             times=np.array(times),
-            observations=np.reshape(np.array(observations), (len(times), self.loop.size)),
+            observations=np.reshape(np.array(observations), (len(times), self.loop.measured)),
             extras={
                 name: np.stack([np.asarray(row[name]) for row in extras]) for name in (extras[0] if extras else ())
             },

@@ -61,6 +61,11 @@ class Loop(Paced):
         return Loop(**(own | changes))
 
     @property
+    def measured(self) -> int:
+        """Number of the numbers that are measured."""
+        return self.size
+
+    @property
     def count(self) -> int:
         """Number of set-points."""
         return len(self.moved)
