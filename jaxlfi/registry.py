@@ -228,6 +228,7 @@ ROBOTS = Objects("robot", "", "jaxlfi.robots.robot:Robot", gives="have observe, 
 DRIVERS = Objects(
     "driver", "jaxlfi.drivers", "jaxlfi.robots.driver:Driver", gives="have connect, observe, act and stop"
 )
+LOOPS = Family("loop", "jaxlfi.loops", own="module:command")
 COMMANDS = Family("command", "jaxlfi.commands")
 
 

@@ -87,7 +87,6 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="also find the point estimate of mujoco.sysid (pip install 'mujoco[sysid]')",
     )
 
-
     serve = commands.add_parser(
         "serve",
         help="simulate a machine for `jaxlfi control` in a process of its own",

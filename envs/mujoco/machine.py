@@ -32,4 +32,7 @@ def carried(table: Mapping[str, Any], model: str | Path, preparation: Preparatio
         raise ValueError(f"robot: {str(error).removeprefix('measured: ')}") from error
     own = {name: measured.unit(compiled, name).removeprefix("1") for name in found.further}
     known = {one.name for one in preparation.signals}
-    return {**table, "units": {name: unit for name, unit in own.items() if unit and name not in known} | dict(found.units)}
+    return {
+        **table,
+        "units": {name: unit for name, unit in own.items() if unit and name not in known} | dict(found.units),
+    }

@@ -95,7 +95,9 @@ class Machine:
         model = compile_spec(specification(self.config.parent / self.table["model"]))
         names = [model.actuator(i).name or f"actuator/{i}" for i in range(model.nu)]
         free = [not limited for limited in model.actuator_ctrllimited]
-        low, high = (np.where(free, sign * math.inf, column) for sign, column in zip((-1, 1), model.actuator_ctrlrange.T))
+        low, high = (
+            np.where(free, sign * math.inf, column) for sign, column in zip((-1, 1), model.actuator_ctrlrange.T, strict=True)
+        )
         return ControlLimits(tuple(names), tuple(low), tuple(high), (math.inf,) * model.nu)
 
     def driver(self, clock: Clock) -> "MachineDriver":
@@ -229,7 +231,7 @@ def serve(arguments: argparse.Namespace) -> None:
     machine = Machine.of(
         arguments.config, truth, unmodelled=arguments.unmodelled, seed=arguments.seed, scattered=arguments.scattered
     )
-    MachineDriver(machine, Simulated()).connect({}, {name: "" for name in machine.limits().names})
+    MachineDriver(machine, Simulated()).connect({}, dict.fromkeys(machine.limits().names, ""))
     if not 0 <= arguments.port < 65536:
         raise ValueError(f"port: expected a number from 0 to 65535, got {arguments.port}")
     token = None if arguments.token is None else wire.token_of(arguments.token)

@@ -13,7 +13,7 @@ command. What was estimated is no measurement, and only in NAME.loop.npz.
 import dataclasses
 import importlib.util
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,13 +70,22 @@ def beside(path: Path) -> tuple[Path, Path]:
     return path.with_name(f"{stem}.json"), path.with_name(f"{stem}.loop.npz")
 
 
-def write(path: Path, recording: Recording, log: Log, report: Mapping[str, Any]) -> None:
-    """Write the files of an episode; where nothing was measured, the report and the loop only."""
+def write(path: Path, recording: Recording, log: Log, report: Mapping[str, Any], names: Sequence[str]) -> None:
+    """Write the files of an episode; where nothing was measured, the report and the loop only.
+
+    Args:
+        path: a new recording.
+        recording: what was measured and given.
+        log: what happened.
+        report: of it.
+        names: of the numbers of an observation.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     report_file, loop_file = beside(path)
     kept = ("times", "observations", "asked", "actions", "targets", "held", "lateness")
     extras = {f"extras/{name}": value for name, value in log.extras.items()}
-    files.write_arrays(loop_file, {name: getattr(log, name) for name in kept} | extras)
+    arrays = {name: getattr(log, name) for name in kept} | {"signals": np.array(list(names))}
+    files.write_arrays(loop_file, arrays | extras)
     files.write_json(report_file, {**report, "recording": path.name if len(recording.times) else None})
     if not len(recording.times):
         return

@@ -59,7 +59,8 @@ class Session:
             made = Idle(made)
 
         def ended(log: Log) -> None:
-            recording.write(out, self.recorded(log), log, {**about, **self.report(log), "robot": itself})
+            report = {**about, **self.report(log), "robot": itself}
+            recording.write(out, self.recorded(log), log, report, self._signals)
             say(f"{recording.timing_line(log)}; wrote {out}")
 
         log = loop.run(made, self.policy, on_end=ended)
@@ -78,6 +79,11 @@ class Session:
             robot = Driven(robot, _measured(self.policy), _set_points(self.policy), self.settings.names)
         loop = dataclasses.replace(self.loop, clock=getattr(robot, "simulated_clock", self.loop.clock))
         return robot, loop, dict(getattr(robot, "about", {}))
+
+    @property
+    def _signals(self) -> tuple[str, ...]:
+        """Names of the numbers of an observation."""
+        return self.loop.signals if isinstance(self.loop, Drive) else tuple(self.policy.observed["names"])
 
     def recorded(self, log: Log) -> Recording:
         """What was measured, and given by whoever commanded."""
