@@ -107,7 +107,7 @@ def sines(
 
 
 def measured_of(table: Mapping[str, Any], goal: Goal) -> list[str]:
-    """Signals that inference is to have: those that the task measures, or whose noise it knows, or that policies see."""
+    """Signals that inference is to have: those that the task measures, whose noise it knows, or that policies see."""
     return list(table.get("measured") or table.get("noise") or goal.observed)
 
 

@@ -95,9 +95,8 @@ class Machine:
         model = compile_spec(specification(self.config.parent / self.table["model"]))
         names = [model.actuator(i).name or f"actuator/{i}" for i in range(model.nu)]
         free = [not limited for limited in model.actuator_ctrllimited]
-        low, high = (
-            np.where(free, sign * math.inf, column) for sign, column in zip((-1, 1), model.actuator_ctrlrange.T, strict=True)
-        )
+        ranges = zip((-math.inf, math.inf), model.actuator_ctrlrange.T, strict=True)
+        low, high = (np.where(free, far, column) for far, column in ranges)
         return ControlLimits(tuple(names), tuple(low), tuple(high), (math.inf,) * model.nu)
 
     def driver(self, clock: Clock) -> "MachineDriver":
