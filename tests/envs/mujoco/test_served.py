@@ -1,4 +1,4 @@
-"""The machine that stands for a real one: another integrator, unmodelled effects, and a recording that is inferred from."""
+"""The machine that stands for a real one: another integrator, unmodelled effects, and recordings to infer from."""
 
 import json
 import subprocess
@@ -97,7 +97,7 @@ def test_without_unmodelled_effects_it_is_the_model_of_its_truths(task):
 
 
 def test_unmodelled_effects_are_those_that_are_described(task):
-    """Where a constant force leads: the loss of the motor, damping and drag balance it; friction has fallen to nothing."""
+    """Where a constant force leads: loss, damping and drag balance it; friction has fallen to nothing."""
     found = driven(Machine.of(task()), [3.0] * 250, ("joint/rail/qvel",))
     speed = np.roots([0.1 * 5.0, 5.0, -0.98 * 3.0]).max()
     np.testing.assert_allclose(found[-1], speed, rtol=2e-3)
@@ -180,7 +180,7 @@ def test_what_is_no_machine_is_refused(words, expected, task, capsys):
 def test_a_task_without_truths_needs_them(task):
     path = task()
     path.write_text(path.read_text().replace("truth = 2.5\n", ""))
-    with pytest.raises(ValueError, match="truth: expected one of each parameter, as --truth NAME=VALUE, got none of body"):
+    with pytest.raises(ValueError, match="truth: expected one of each parameter, as --truth NAME=VALUE, got none"):
         Machine.of(path)
     assert Machine.of(path, {"body/cart/mass": 2.0}).truth == {"body/cart/mass": 2.0, "control/delay": 0.04}
     with pytest.raises(ValueError, match="robot: expected controls among push, got pull"):
