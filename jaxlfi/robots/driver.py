@@ -11,12 +11,14 @@ another process, `SocketDriver` is the other end of that.
 """
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from jaxlfi.io import units
+from jaxlfi.io.serialise import json_safe
 from jaxlfi.robots.clock import Clock
 from jaxlfi.robots.robot import Command, Observation, RobotError
 
@@ -160,7 +162,14 @@ class Driven:
             for name, (own, factor, offset) in self._controls.items():
                 self._controls[name] = ("" if own in asked else own), factor, offset
             asked, given = {**asked, **given, **asked}, {}
-        return dict(self._driver.connect(asked, given) or {})
+        about = self._driver.connect(asked, given) or {}
+        try:
+            json.dumps(json_safe(about), allow_nan=False)
+            return dict(about)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"robot: expected a mapping that JSON can hold as what it says of itself, got {str(about)[:60]}"
+            ) from error
 
     def observe(self) -> Observation | None:
         """The latest observation, in the order of the signals."""

@@ -21,6 +21,7 @@ import numpy as np
 
 from jaxlfi.io import files, lerobot, mcap
 from jaxlfi.io.rollout import Rollout, Signal
+from jaxlfi.io.serialise import json_safe
 from jaxlfi.robots.episode import Log
 
 STATE, ACTION = "observation.state", "action"
@@ -86,9 +87,12 @@ def write(path: Path, recording: Recording, log: Log, report: Mapping[str, Any],
     extras = {f"extras/{name}": value for name, value in log.extras.items()}
     arrays = {name: getattr(log, name) for name in kept} | {"signals": np.array(list(names))}
     files.write_arrays(loop_file, arrays | extras)
+    if len(recording.times):
+        _write(path, recording, report, 1 / log.period)
     files.write_json(report_file, {**report, "recording": path.name if len(recording.times) else None})
-    if not len(recording.times):
-        return
+
+
+def _write(path: Path, recording: Recording, report: Mapping[str, Any], rate: float) -> None:
     if path.suffix == ".csv":
         files.write_bytes(path, _table(recording).encode())
     elif path.suffix == ".npz":
@@ -99,7 +103,7 @@ def write(path: Path, recording: Recording, log: Log, report: Mapping[str, Any],
     elif path.suffix == ".mcap":
         mcap.write(path, rollout(recording, report))
     else:
-        fps = round(float(1 / np.median(np.diff(recording.times))), 6) if len(recording.times) > 1 else 1 / log.period
+        fps = round(float(1 / np.median(np.diff(recording.times))), 6) if len(recording.times) > 1 else rate
         lerobot.write(path, [rollout(recording, report)], STATE, fps)
 
 
@@ -158,7 +162,7 @@ def rollout(recording: Recording, report: Mapping[str, Any]) -> Rollout:
         if several and len(times):
             units = tuple(recording.units[name] for name in several)
             signals[topic] = Signal(times, np.stack(list(several.values()), axis=1), tuple(several), units)
-    return Rollout(signals, dict(report), str(report.get("environment", "")))
+    return Rollout(signals, json_safe(dict(report)), str(report.get("environment", "")))
 
 
 def _heading(recording: Recording, name: str) -> str:

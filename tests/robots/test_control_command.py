@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -26,6 +27,20 @@ class Failing(Wheel):
 
     def connect(self, signals, controls):
         raise OSError("no such port")
+
+
+class Hanging(Wheel):
+    """By the system's clock; its bus hangs at the fourth observation."""
+
+    def __init__(self):
+        super().__init__(given={3: lambda plain: time.sleep(5.0)})
+        self.simulated_clock = None
+
+    def advance(self):
+        pass
+
+    def act(self, controls):
+        pass
 
 
 class Armed(Wheel):
@@ -69,6 +84,15 @@ def test_a_robot_that_leaves_its_bounds_is_an_error_with_a_recording(folder, cap
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "angle was measured at -0.2" in error and "robot: stopped after" in error
     assert (folder / "log.csv").exists()
+
+
+def test_a_driver_that_hangs_is_an_error_with_a_recording(folder, capsys):
+    began = time.monotonic()
+    assert main(words(folder, robot="robots.test_control_command:Hanging")) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "observe took longer than the 0.1 s of the watchdog" in error
+    assert time.monotonic() - began < 4.0 and len((folder / "log.csv").read_text().splitlines()) >= 4
+    assert "watchdog" in json.loads((folder / "log.json").read_text())["stopped"]
 
 
 @pytest.mark.parametrize(

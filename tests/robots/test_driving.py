@@ -186,6 +186,14 @@ def test_what_is_no_number_of_each_signal_is_refused(found, expected, tmp_path):
     assert driver.stops == 1 and len(driver.torques) == 2
 
 
+def test_what_a_robot_says_of_itself_is_refused_where_it_could_not_be_recorded(tmp_path):
+    driver = Wheel()
+    driver.connect = lambda signals, controls: {"bus": object()}
+    with pytest.raises(ValueError, match="robot: expected a mapping that JSON can hold as what it says of itself"):
+        run(driver, tmp_path)
+    assert driver.stops == 1 and not list(tmp_path.iterdir())
+
+
 def test_numbers_alone_are_measured_now_and_more_of_them_are_let(tmp_path):
     driver = Wheel(given={i: lambda plain: plain.values for i in range(200)})
     np.testing.assert_allclose(run(driver, tmp_path).targets[:, 0], expected(100)[0], atol=1e-5)
@@ -412,8 +420,9 @@ def test_every_format_has_the_same_numbers(name, tmp_path):
     if name == "log":
         pytest.importorskip("pyarrow")
     logs = pytest.importorskip("jaxlfi.envs.mujoco.logs")
-    run(Wheel(), tmp_path, name="plain.csv")
-    run(Wheel(), tmp_path, name=name)
+    free = a_policy(prepared(controls=(dataclasses.replace(MOTOR, rate=None),)))  # which JSON has no number for
+    run(Wheel(), tmp_path, name="plain.csv", policy=free)
+    run(Wheel(), tmp_path, name=name, policy=free)
     plain, other = logs.read(tmp_path / "plain.csv"), logs.read(tmp_path / name)
     of = lambda log: {signal: log.units[signal] for signal in log.signals}
     assert of(plain) == of(other) == {"motor": "N m", "angle": "rad", "joint/wheel/qvel": "rad/s"}
