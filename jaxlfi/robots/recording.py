@@ -31,7 +31,7 @@ SUFFIXES = (".csv", ".npz", ".mcap", "")
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """What was measured and given.
+    """What was measured and given, in the order of time to the nanosecond; of several at one time the last counts.
 
     Attributes:
         times: of the measurements, shape [N].
@@ -46,6 +46,14 @@ class Recording:
     given: np.ndarray
     controls: Mapping[str, np.ndarray]
     units: Mapping[str, str]
+
+    def __post_init__(self):
+        for clock, columns in (("times", "signals"), ("given", "controls")):
+            times, several = np.round(np.asarray(getattr(self, clock), float), 9), getattr(self, columns)
+            own, last = np.unique(times[::-1], return_index=True)  # the first of each from the end
+            rows = len(times) - 1 - last
+            object.__setattr__(self, clock, own)
+            object.__setattr__(self, columns, {name: np.asarray(values)[rows] for name, values in several.items()})
 
 
 def require_new(path: Path) -> None:

@@ -434,6 +434,16 @@ def test_every_format_has_the_same_numbers(name, tmp_path):
         recording.require_new(tmp_path / name)
 
 
+def test_measurements_that_came_in_another_order_are_recorded_in_that_of_time():
+    """As of a driver whose measurements are older at one time than at another; the last one of a moment counts."""
+    kept = recording.Recording(
+        np.array([0.0, 0.3, 0.1, 0.3]), {"a": np.array([1.0, 2.0, 3.0, 4.0])}, np.zeros(0), {}, {"a": "m"}
+    )
+    assert kept.times.tolist() == [0.0, 0.1, 0.3] and kept.signals["a"].tolist() == [1.0, 3.0, 4.0]
+    assert recording.rollout(kept, {}).signals["observation.state"].times.tolist() == [0.0, 0.1, 0.3]
+    assert recording.merged(kept)[1]["a"].tolist() == [1.0, 3.0, 4.0]
+
+
 def test_only_recordings_that_are_known_are_written(tmp_path):
     with pytest.raises(ValueError, match=r"out: expected a new NAME.csv, NAME.npz, NAME.mcap or folder"):
         recording.require_new(tmp_path / "log.bag")
