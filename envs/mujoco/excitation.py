@@ -130,7 +130,7 @@ def achieved(config: Path, path: Path) -> dict[str, float]:
     log = np.load(loop)
     names = [str(name) for name in log["signals"]]
     rows = log["observations"][:, [names.index(name) for name in goal.signals]]
-    commands = [0.5 * (one.low + one.high) for one in reading.preparation.commands]
+    commands = np.array([0.5 * (one.low + one.high) for one in reading.preparation.commands])
     controls = np.concatenate([log["targets"][:1], log["targets"]])
     total = 0.0
     for after, last, control in zip(rows[1:], controls[:-1], controls[1:], strict=False):

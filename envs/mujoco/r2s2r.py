@@ -281,11 +281,15 @@ def _machine(
         yield lambda: SocketDriver(arguments.address, arguments.remote, token)
         return
     words = [sys.executable, "-m", "jaxlfi.envs.mujoco.cli", "serve", str(config), "--seed", str(seed)]
-    process = subprocess.Popen([*words, *(["--scattered"] if scattered else [])], stdout=subprocess.PIPE, text=True)
+    words += ["--scattered"] if scattered else []
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     try:
         line = process.stdout.readline() if process.stdout else ""
         if not line:
-            raise ValueError("robot: expected a simulated machine that listens, got one that ended at once")
+            raise ValueError(
+                f"robot: expected a simulated machine that listens, got one that ended: jaxlfi mujoco serve {config} "
+                "says why"
+            )
         yield lambda: SocketDriver(line.split()[-1])
     finally:
         process.terminate()

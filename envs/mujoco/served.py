@@ -152,7 +152,7 @@ class MachineDriver:
         self._order = [actuators.index(name) for name in controls]
         self._given: list[tuple[float, np.ndarray]] = [(-math.inf, self._rest())]
         self._reach = self._forces()
-        self._began = self._clock.now()
+        self._began: float | None = None
         simulated = isinstance(self._clock, Simulated)
         return {"description": "a simulated machine", "simulated": simulated, "truth": dict(machine.truth)}
 
@@ -178,6 +178,8 @@ class MachineDriver:
         """Nothing is simulated any longer."""
 
     def _now(self) -> float:
+        """Seconds since it was first asked for anything."""
+        self._began = self._clock.now() if self._began is None else self._began
         return self._clock.now() - self._began
 
     def _rest(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from jaxlfi.robots.robot import Command, Observation, RobotError
 TIMEOUT = 0.5
 """Seconds that a reply may take."""
 PATIENCE = 20.0
-"""The same of a robot that lives in the loop's time, for which nobody waits."""
+"""The same of the first one, as a robot gets ready, and of a robot that lives in the loop's time."""
 SIMULATED = "simulated"
 """What such a robot says of itself."""
 
@@ -44,7 +44,7 @@ class SocketRobot:
             observations: names of the numbers that are expected; the driver refuses others than its own.
             actions: names of the set-points' displacements, likewise.
             remote: let the driver be on another host.
-            timeout: for each reply, in s.
+            timeout: for each reply but the first, in s.
             clock: the loop's, for simulated robots that live in its time.
             token: that the driver asks for; needed where it is on another host.
             units: of the observations and of the actions, which drivers need to know (`jaxlfi.robots.driver`).
@@ -63,6 +63,7 @@ class SocketRobot:
             raise RobotError(f"{self._name}: expected a driver that listens, got: {error}") from error
         hello = {"protocol": wire.PROTOCOL, "version": wire.VERSION}
         hello |= {"observations": list(observations), "actions": list(actions)}
+        self._lines.wait_for(max(timeout, PATIENCE))
         hello |= {} if units is None else {"units": {what: list(each) for what, each in units.items()}}
         try:
             reply = self._asked("hello", ("hello", "challenge"), **hello)
@@ -70,6 +71,7 @@ class SocketRobot:
                 reply = self._asked("hello", ("hello",), **hello, proof=self._checked(lambda: _proof(token, reply)))
             self._checked(lambda: wire.check_hello(reply))
             self.about: dict[str, Any] = self._checked(lambda: wire.mapping(reply, "about"))
+            self._lines.wait_for(timeout)
         except RobotError:
             self._lines.close()
             raise

@@ -23,6 +23,8 @@ WATCHDOG = 1.0
 """Seconds without a request after which a robot is stopped."""
 MOST = 10_000
 """Signals and controls that a client may ask for, at most."""
+LEAP = 3600.0
+"""Seconds by which the time of a loop may go on between two requests, for robots that live in it."""
 FREE = (-np.inf, np.inf, np.inf)
 """Limits of a control that has none."""
 Journal = Callable[[Mapping[str, Any]], None]
@@ -221,6 +223,7 @@ class _Session:
         self.seen = False  # whether there was an observation
         self.target: np.ndarray | None = None  # where the set-points are, once it is known
         self.sent: float | None = None
+        self.told: float | None = None  # the loop's time
 
     def run(self, lines: wire.Lines) -> None:
         """From hello to the stop."""
@@ -314,6 +317,9 @@ class _Session:
     def _now(self, of_loop: float) -> float:
         """The time, which for a simulated robot is that of the loop."""
         if isinstance(self.clock, Simulated):
+            if self.told is not None and of_loop > self.told + LEAP:
+                raise RobotError(f"expected a time within {LEAP:g} s of {self.told:g} s, got {of_loop:g} s")
+            self.told = of_loop
             self.clock.sleep_until(of_loop)
         return self.clock.now()
 

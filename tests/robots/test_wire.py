@@ -297,6 +297,20 @@ def test_damaged_requests_are_refused_and_the_robot_is_stopped_each_time(monkeyp
     assert len(seen) == len(KINDS) and min(seen.values()) > COUNT / len(KINDS) / 2
 
 
+def test_a_robot_in_the_loops_time_does_not_leap_ahead_for_hours():
+    made, far = [], {**SEE, "now": 1e12}
+    kind = server._Named(lambda clock: made.append(Wheel(clock)) or made[0], LIMITS)
+    ours, theirs = socket.socketpair()
+    with ours, theirs, server.listen(0) as listener, Interrupts() as interrupts:
+        theirs.sendall(b"".join(json.dumps(one).encode() + b"\n" for one in (hello(), SEE, far)))
+        theirs.shutdown(socket.SHUT_WR)
+        ours.settimeout(5.0)
+        server._Session(kind, Simulated(), lambda event: None, interrupts, listener, None).run(wire.Lines(ours))
+        ours.shutdown(socket.SHUT_WR)
+        last = [json.loads(line) for line in theirs.makefile("rb")][-1]
+    assert last["message"] == "expected a time within 3600 s of 0 s, got 1e+12 s" and made[0].stops == 1
+
+
 def test_a_message_that_is_not_damaged_is_taken_so(monkeypatch):
     """The requests above are refused for what is wrong with them."""
     made = []
