@@ -1,4 +1,4 @@
-"""What is found by name: tasks, heuristics, estimators, environments, robots and commands.
+"""What is found by name: tasks, heuristics, estimators, environments, robots, drivers and commands.
 
 A name is an entry point of an installed package, or "module:name" in a module that can be imported from the current
 folder; ours are registered in pyproject.toml as a third party's are. Nothing is imported before it is named, so that
@@ -225,6 +225,10 @@ ENVIRONMENTS = Objects(
     gives="give a jaxlfi.rl.environment.Environment",
 )
 ROBOTS = Objects("robot", "", "jaxlfi.robots.robot:Robot", gives="have observe, act and stop")
+DRIVERS = Objects(
+    "driver", "jaxlfi.drivers", "jaxlfi.robots.driver:Driver", gives="have connect, observe, act and stop"
+)
+LOOPS = Family("loop", "jaxlfi.loops", own="module:command")
 COMMANDS = Family("command", "jaxlfi.commands")
 
 

@@ -1,4 +1,4 @@
-"""The command line of tasks of MuJoCo models: `jaxlfi mujoco film | fit`.
+"""The command line of tasks of MuJoCo models: `jaxlfi mujoco film | fit | serve`.
 
 This module imports neither jax nor numpy, so that `--help` answers at once.
 """
@@ -18,6 +18,7 @@ examples:
   jaxlfi mujoco film runs/arm --draws 30 --slower 4 --out runs/arm-slowly.gif
   jaxlfi mujoco fit runs/arm --out runs/arm-fit                    sharper numbers, from the posterior's draws
   jaxlfi mujoco fit examples/mujoco/arm.toml --starts 256          without a run, from draws of Phi
+  jaxlfi mujoco serve examples/mujoco/furuta.toml --port 5005      a machine for jaxlfi control --address 127.0.0.1:5005
 
 """
 
@@ -86,6 +87,50 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="also find the point estimate of mujoco.sysid (pip install 'mujoco[sysid]')",
     )
 
+    serve = commands.add_parser(
+        "serve",
+        help="simulate a machine for `jaxlfi control` in a process of its own",
+        description="Simulate a task's model with another integrator, the parameters' truths, noise, and effects that "
+        "no parameter is for, and serve it as a driver until the process is ended. It stands for the real machine.",
+    )
+    serve.add_argument("config", type=Path, metavar="FILE", help="the TOML file of a task")
+    serve.add_argument("--port", type=int, default=0, metavar="N", help="port (default: any that is free)")
+    serve.add_argument(
+        "--truth",
+        action="append",
+        default=[],
+        type=_named,
+        metavar="NAME=VALUE",
+        help="a parameter of the machine (default: its truth in the file)",
+    )
+    serve.add_argument(
+        "--unmodelled",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="size of the effects that no parameter is for: friction, drag, loss (default: 1)",
+    )
+    serve.add_argument("--seed", type=int, default=0, metavar="N", help="seed of noise and starts (default: 0)")
+    serve.add_argument(
+        "--scattered", action="store_true", help="begin episodes where [policy.initial] does, and not in [initial]"
+    )
+    serve.add_argument(
+        "--real-time", action="store_true", help="live by the system's clock, and not in the time of the loop"
+    )
+    serve.add_argument(
+        "--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: this host only)"
+    )
+    serve.add_argument("--token", type=Path, metavar="FILE", help="a file with the token that clients have to know")
+    serve.add_argument("--journal", type=Path, metavar="FILE", help="a file for what was asked of it: lines of JSON")
+
+
+def _named(text: str) -> tuple[str, float]:
+    name, _, value = text.rpartition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected NAME=VALUE, got {text!r}") from None
+
 
 def _count(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
@@ -107,6 +152,8 @@ def _run(arguments: argparse.Namespace) -> None:
     compile_cache.enable()
     if arguments.command == "film":
         from jaxlfi.envs.mujoco.film import film as command
+    elif arguments.command == "serve":
+        from jaxlfi.envs.mujoco.served import serve as command
     else:
         from jaxlfi.envs.mujoco.commands import fit as command
     command(arguments)
@@ -114,10 +161,10 @@ def _run(arguments: argparse.Namespace) -> None:
 
 main = Command(
     "mujoco",
-    "film and refine the posterior of a MuJoCo model",
+    "film and refine the posterior of a MuJoCo model, or serve it as a machine",
     _arguments,
     _run,
-    description="Film the posterior of a MuJoCo model, and find least-squares estimates from it.",
+    description="Film the posterior of a MuJoCo model, find least-squares estimates from it, or simulate a machine.",
     epilog=EXAMPLES,
 )
 parser = main.parser

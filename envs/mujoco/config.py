@@ -39,6 +39,9 @@ duration = 3.0
 
 [policy]                            # what policies are to do (`jaxlfi.envs.mujoco.goal`); inference does not read it
 interval = 0.02
+
+[robot.limits]                      # what they keep to on a robot (`jaxlfi.robots.settings`); neither is this
+angle = [-1.0, 1.0]
 """
 
 import tomllib
@@ -64,6 +67,7 @@ KEYS: Mapping[str, type] = {
     "discrepancy": dict,
     "supports": dict,
     "policy": dict,
+    "robot": dict,
     "design": dict,
     "name": str,
     "windows": int,

@@ -7,6 +7,7 @@ mujoco,config=FILE` is a domain of `jaxlfi train mujoco,config=FILE`, with the s
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +20,25 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
-from jaxlfi.envs.mujoco import starts
+from jaxlfi.envs.mujoco import machine, starts
+from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.effects import built, effects, state_place
-from jaxlfi.envs.mujoco.goal import Goal, Reading
+from jaxlfi.envs.mujoco.forces import UnmodelledForces
+from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, started
-from jaxlfi.envs.mujoco.mjx_models import Models, mjx
-from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable, state_of
+from jaxlfi.envs.mujoco.mjx_models import with_forces
+from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable
 from jaxlfi.envs.mujoco.model_task import box, compile_spec, specification
+from jaxlfi.envs.mujoco.nuisances import Drawn, Nuisances
 from jaxlfi.envs.mujoco.parameters import PATTERN, Parameter
+from jaxlfi.envs.mujoco.reading import Reading, add_signals
+from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.rl.environment import EnvState
+from jaxlfi.rl.preparation import Memory
+
+OF_NUISANCES, OF_FORCES, OF_ERRORS = 1, 2, 3
+"""Folded into keys of episodes."""
 
 
 class Inner(struct.PyTreeNode):
@@ -37,6 +47,9 @@ class Inner(struct.PyTreeNode):
     Attributes:
         state: positions and velocities.
         controls: the last ones, the latest at the end, shape [B, A].
+        memory: of the observations (`jaxlfi.rl.preparation`).
+        drawn: for the episode.
+        trace: the signals at the end of the last steps of the model, the latest at the end, shape [T, S].
         numbers: of the model, that depend on its parameters (`Models`).
         theta: in natural units, shape [D].
         refused: whether MuJoCo refuses the model.
@@ -45,6 +58,9 @@ class Inner(struct.PyTreeNode):
 
     state: State
     controls: Float[Array, "*batch before act"]
+    memory: Memory
+    drawn: Drawn
+    trace: Float[Array, "*batch steps signals"]
     numbers: Float[Array, "*batch numbers"]
     theta: Float[Array, "*batch dim"]
     refused: Bool[Array, "*batch"]
@@ -57,6 +73,8 @@ class MujocoEnvironment:
     Attributes:
         models: MJX models of parameters.
         reading: what the policy sees, may do and is rewarded for.
+        preparation: of what it sees and does, as a robot needs it.
+        robot: what a robot keeps to besides, which policies carry (`jaxlfi.robots.settings`).
     """
 
     def __init__(
@@ -68,6 +86,8 @@ class MujocoEnvironment:
         initial: Mapping[str, float | Sequence[float]] | None = None,
         name: str | None = None,
         begins: str | None = None,
+        forces: UnmodelledForces | None = None,
+        discrepancies: Mapping[str, Discrepancy] | None = None,
     ):
         """An environment.
 
@@ -79,10 +99,13 @@ class MujocoEnvironment:
             initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
             name: of the environment; by default the model's.
             begins: "keyframe NAME", for episodes that begin there; by default they begin as the model does.
+            forces: that the model lacks, drawn anew for each episode.
+            discrepancies: what the model gets wrong of signals, likewise.
 
         Raises:
             ValueError: for whatever does not fit together, or MJX cannot simulate, in one line.
         """
+        self.robot: Mapping[str, Any] = {}
         if not parameters:
             raise ValueError("parameters: expected at least one, got none")
         spec = specification(model)
@@ -95,6 +118,7 @@ class MujocoEnvironment:
         centre = self.space.box_to_inference(support).centre
         self.nominal = tuple(float(number) for number in np.asarray(self.space.to_natural(np.asarray(centre))))
 
+        add_signals(spec, goal)
         signals = [*goal.signals, *_only_inferred(self.space.names, goal.signals, spec)]
         add_sensors(spec, signals)
         compiled = compile_spec(spec)
@@ -108,22 +132,25 @@ class MujocoEnvironment:
         )
         self.reading = Reading(compiled, goal)
         self.observations, self.actions, self.steps = self.reading.observations, self.reading.actions, goal.steps
-        self.models = Models(
-            functools.partial(built, spec, self._does), self.space.names, np.asarray(self.nominal), self.feasible
-        )
+        self.preparation = self.reading.preparation
+        build, nominal = functools.partial(built, spec, self._does), np.asarray(self.nominal)
+        self.models = with_forces(build, forces, self.space.names, nominal, self.feasible)
+        self._lacking = np.zeros(0) if forces is None else forces.deviations
         self._physics = Physics(self.models, compiled, self.reading.places)
         self._check(compiled, goal)
 
         first = {key: np.ravel(number)[:1].tolist() for key, number in (initial or {}).items()}
         self._start = starts.state_of(compiled, begins, *starts.given(compiled, first, 1))
         self._drawn = [(state_place(compiled, key, f"initial/{key}"), bounds) for key, bounds in goal.initial.items()]
+        self._goal, self._ends = goal, tuple(goal.terminations)
         self._timestep = compiled.opt.timestep
         self._substeps = round(goal.interval / self._timestep)
-        self._noise = np.array([(noises or {}).get(name, 0.0) for name in goal.signals])
-        longest = 0.0 if self._does.delay is None else float(self.feasible.high[self._does.delay])
-        self._before = int(np.ceil(longest / goal.interval - 1e-6)) + 1
-        low, high = (np.asarray(self.actions.centre) + sign * np.asarray(self.actions.scale) for sign in (-1, 1))
-        self._rest = np.tile(np.clip(np.zeros_like(low), low, high), (self._before, 1)).astype(np.float32)
+        self._noise = np.array([({**(noises or {}), **goal.noises}).get(name, 0.0) for name in goal.signals])
+        self._nuisances = Nuisances(goal, discrepancies or {})
+        self._rest = np.array([min(max(0.0, one.low), one.high) for one in self.preparation.controls], np.float32)
+        inferred = 0.0 if self._does.delay is None else float(self.feasible.high[self._does.delay])
+        self._before = int(np.ceil((inferred + goal.action_delay[1]) / goal.interval - 1e-6)) + 1
+        self._kept = 1 + int(np.ceil(goal.observation_delay[1] / self._timestep - 1e-6))
 
     def reset(self, key: jax.Array, theta: Float[Array, " dim"]) -> EnvState:
         """The start of an episode with these parameters."""
@@ -133,35 +160,58 @@ class MujocoEnvironment:
             self._drawn, jax.random.split(key_start, max(len(self._drawn), 1)), strict=False
         ):
             start = start.at[place].set(jax.random.uniform(one, minval=low, maxval=high))
-        numbers, refused = self.models.numbers(theta)
-        inner = Inner(self._physics.state(start), jnp.asarray(self._rest), numbers, theta, refused, key)
-        values = self._physics.values(*self._loaded(inner, inner.controls[-1]))
-        no = jnp.asarray(False)
-        seen, reward = self._seen(key_noise, theta, values), jnp.asarray(0.0, jnp.float32)  # not of a weak type
-        return EnvState(inner, seen, reward, no, no, self._facts(values, no))
+        numbers, refused = self.models.numbers(jnp.append(theta, self._forces(key_start)))
+        state = self._physics.state(start)
+        model = self.models.model(numbers)
+        values = self._physics.values(model, self._physics.data(state, jnp.asarray(self._rest)))
+        drawn = self._nuisances.draw(
+            _folded(key_start, OF_NUISANCES), self._deviations(theta)[: len(self._goal.observed)]
+        )
+        if any(one.begins is not None for one in self.preparation.controls):  # forces are those of the first targets
+            known = self._measured(jax.random.clone(key_noise), theta, values, drawn)
+            first = self.preparation.start(known, jnp).controls[0]
+            values = self._physics.values(model, self._physics.data(state, first))
+        measured = self._measured(key_noise, theta, values, drawn)
+        memory, seen = self.preparation.observed(self.preparation.start(measured, jnp), measured, jnp)
+        controls = jnp.tile(memory.controls[0], (self._before, 1))
+        trace = jnp.tile(values, (self._kept, 1))
+        inner = Inner(state, controls, memory, drawn, trace, numbers, theta, refused, key)
+        no, reward = jnp.asarray(False), jnp.asarray(0.0, jnp.float32)  # not of a weak type
+        return EnvState(inner, seen, reward, no, no, self._facts(values, drawn.commands, no))
 
     def step(self, state: EnvState, action: Float[Array, " act"]) -> EnvState:
         """One control interval. Where the simulation becomes unstable the episode ends, as it was seen last."""
         before = state.inner
         key, key_noise = jax.random.split(before.key)
-        controls = jnp.concatenate([before.controls[1:], action[None]])
-        model, data = self._loaded(before, action)
+        memory, control = self.preparation.commanded(before.memory, action, jnp)
+        controls = jnp.concatenate([before.controls[1:], control[None]])
+        model = self.models.model(before.numbers)
 
-        def substep(data, index):
-            return mjx.step(model, data.replace(ctrl=self._control(controls, before.theta, index))), None
+        def substep(state, index):
+            after, values, _ = self._physics.step(model, state, self._control(controls, before, index))
+            return after, values
 
-        data, _ = jax.lax.scan(substep, data, jnp.arange(self._substeps))
+        last, passed = jax.lax.scan(substep, before.state, jnp.arange(self._substeps))
         # MuJoCo's sensors are those of the state before a step: of the state after it they are read besides.
-        values = self._physics.values(model, data)
-        failed = before.refused | ~stable(data.qpos, data.qvel, values)
-        after = before.replace(state=state_of(data), controls=controls, key=key)
+        values = self._physics.values(
+            model, self._physics.data(last, self._control(controls, before, self._substeps - 1))
+        )
+        trace = jnp.concatenate([before.trace, passed[1:], values[None]])[-self._kept :]
+        failed = before.refused | ~stable(last.qpos, last.qvel, values)
+        drawn = self._nuisances.later(_folded(key_noise, OF_ERRORS), before.drawn)
+        late = jnp.round(drawn.observation_delay / self._timestep).astype(int)
+        measured = self._measured(key_noise, before.theta, trace[self._kept - 1 - late], drawn)
+        memory, seen = self.preparation.observed(memory, measured, jnp)
+        reward = self.reading.reward(values, control, before.controls[-1], drawn.commands)
+        facts = self._facts(values, drawn.commands, failed)
+        after = before.replace(state=last, controls=controls, memory=memory, drawn=drawn, trace=trace, key=key)
         return EnvState(
             inner=after,
-            observation=jnp.where(failed, state.observation, self._seen(key_noise, before.theta, values)),
-            reward=jnp.where(failed, 0.0, self.reading.reward(values, action)),
-            terminated=jnp.asarray(False),
+            observation=jnp.where(failed, state.observation, seen),
+            reward=jnp.where(failed, 0.0, reward),
+            terminated=functools.reduce(jnp.logical_or, (facts[name] for name in self._ends), jnp.asarray(False)),
             truncated=failed,
-            facts=self._facts(values, failed),
+            facts=facts,
         )
 
     def _check(self, compiled: mujoco.MjModel, goal: Goal) -> None:
@@ -176,25 +226,41 @@ class MujocoEnvironment:
                 f"got {goal.interval:g} s"
             )
 
-    def _loaded(self, inner: Inner, control: Float[Array, " act"]) -> tuple[mjx.Model, mjx.Data]:
-        """The model and its data in this state."""
-        return self.models.model(inner.numbers), self._physics.data(inner.state, control)
-
-    def _control(self, controls: Float[Array, "before act"], theta: Array, index: Array) -> Float[Array, " act"]:
+    def _control(self, controls: Float[Array, "before act"], inner: Inner, index: Array | int) -> Float[Array, " act"]:
         """What acts in a substep: with a delay, a control that was given before."""
-        if self._does.delay is None:
+        if self._before == 1:
             return controls[-1]
-        since = (index * self._timestep - theta[self._does.delay]) / self.reading.goal.interval
+        inferred = 0.0 if self._does.delay is None else inner.theta[self._does.delay]
+        since = (index * self._timestep - inferred - inner.drawn.action_delay) / self._goal.interval
         return controls[jnp.clip(self._before - 1 + jnp.floor(since + 1e-5).astype(int), 0, self._before - 1)]
 
-    def _seen(self, key: jax.Array, theta: Float[Array, " dim"], values: Float[Array, " signals"]) -> Array:
-        """An observation: with offsets and noise of the sensors."""
-        noise = deviations(self._does, theta, self._noise) * jax.random.normal(key, values.shape)
-        return self.reading.seen(biased(self._does, theta, values) + noise)
+    def _forces(self, key: jax.Array) -> Float[Array, " numbers"]:
+        """Coefficients of the forces that the model lacks, of an episode whose first state is drawn with this key."""
+        if not len(self._lacking):
+            return jnp.zeros(0)
+        deviations = jnp.asarray(self._lacking, jnp.float32)
+        return deviations * jax.random.normal(_folded(key, OF_FORCES), deviations.shape)
 
-    def _facts(self, values: Float[Array, " signals"], failed: Array) -> dict[str, Array]:
-        """How far the episode's last state is from its targets, and whether it failed."""
-        return {f"{name} off": jnp.abs(off) for name, off in self.reading.off(values).items()} | {"failed": failed}
+    def _deviations(self, theta: Float[Array, " dim"]) -> Float[Array, " signals"]:
+        """Standard deviations of the signals' noise."""
+        return deviations(self._does, theta, self._noise)
+
+    def _measured(self, key: jax.Array, theta: Array, values: Float[Array, " signals"], drawn: Drawn) -> Array:
+        """The observed signals with offsets, errors and noise of their sensors, and the commands."""
+        noise = self._deviations(theta) * jax.random.normal(key, values.shape)
+        seen = (biased(self._does, theta, values) + noise)[: len(self._goal.observed)]
+        return jnp.append(seen + drawn.offsets + drawn.errors, drawn.commands)
+
+    def _facts(self, values: Float[Array, " signals"], commands: Array, failed: Array) -> dict[str, Array]:
+        """How far the episode's last state is from its targets, how it ended, and whether it failed."""
+        off = {f"{name} off": jnp.abs(off) for name, off in self.reading.off(values, commands).items()}
+        ended = {name: holds & ~failed for name, holds in self.reading.ended(values).items()}
+        return off | ended | {"failed": failed}
+
+
+def _folded(key: jax.Array, number: int) -> jax.Array:
+    """Another key; the first one can still be used."""
+    return jax.random.fold_in(jax.random.clone(key), number)
 
 
 def environment(config: Path) -> MujocoEnvironment:
@@ -209,19 +275,31 @@ def environment(config: Path) -> MujocoEnvironment:
     table = tables.load(config)
     if "policy" not in table:
         raise ValueError(f"{config}: expected a table [policy] that says what policies are to do, got none")
+    policy = table["policy"]
+    if not isinstance(wanted := policy.get(goals.MODEL_ERROR, False), bool):
+        raise ValueError(f"{config}: policy: {goals.MODEL_ERROR}: expected true or false, got {wanted!r}")
+    learnt = simulator_of(tables.read(config)) if wanted else None
     try:
-        goal = goals.of_table(table["policy"])
+        goal = goals.of_table(policy)
         begins, numbers = tables.initial(table)
-        noises = {name: value for name, value in tables.numbers(table, "noise").items() if name in goal.signals}
-        return MujocoEnvironment(
+        noises, known = tables.numbers(table, "noise"), {}
+        if learnt is not None:
+            noises = dict(zip(learnt.signals, np.asarray(learnt.noise).tolist(), strict=True))
+            discrepancies = {learnt.signals[place]: process for place, process in learnt.discrepancies.items()}
+            known = {"forces": learnt.forces, "discrepancies": discrepancies}
+        made = MujocoEnvironment(
             config.parent / table["model"],
             tables.parameters_of(table),
             goal,
-            noises,
+            {name: value for name, value in noises.items() if name in goal.signals},
             numbers,
             table.get("name", config.stem),
             begins[0] if isinstance(begins, list) else begins,
+            **known,
         )
+        if "robot" in table:
+            made.robot = machine.carried(table["robot"], config.parent / table["model"], made.preparation)
+        return made
     except ValueError as error:
         raise ValueError(f"{config}: {error}") from error
 

@@ -1,4 +1,4 @@
-"""The goal of a policy: the signals it sees, their targets, and the cost of its controls.
+"""The goal of a policy: what it sees and does, what it is rewarded for, and when an episode ends.
 
 [policy]
 interval = 0.02                     # s between two controls
@@ -6,41 +6,112 @@ duration = 4.0                      # s of an episode
 observed = ["arm angle", "joint/arm/qvel"]      # sensors, and joints and bodies as under `measured`
 scales = { "joint/arm/qvel" = 5.0 } # what is a large number of a signal; 1 by default
 limits = { motor = [-0.05, 0.05] }  # of the actuators; by default their ctrlrange
-costs = { motor = 0.02 }            # of a control at its limit for a second; half as large ones cost a quarter
-
-[policy.targets."arm angle"]
-value = 0.0
-weight = 1.0                        # what a difference of 1 costs a second; of half that, a quarter
 
 [policy.initial]                    # drawn anew for each episode, uniformly; else as for inference
 "arm/qpos" = [-1.0, 1.0]
 
+The reward of a control interval is its length times the sum of these terms, per second, at its end:
+
+[policy.targets."arm angle"]        # - weight times the squared difference
+value = 0.0
+weight = 1.0                        # what a difference of 1 costs a second; of half that, a quarter
+
+[policy.targets."joint/arm/qvel"]   # + weight times exp(-(difference / within)^2)
+command = "speed"                   # in place of a value: what is commanded
+weight = 2.0                        # what there is to be had a second
+within = 0.5                        # at a difference of that, 1/e of it
+
+[policy]
+costs = { motor = 0.02 }            # - of a control at its limit; half as large ones cost a quarter
+change_costs = { motor = 0.1 }      # - of a control that has changed by half its range since the last interval
+alive = 0.5                         # + for every second that does not end the episode
+
+[policy.commands]                   # drawn anew for each episode, uniformly; a policy sees them
+speed = [-1.0, 2.0]
+
+[policy.terminations]               # besides the duration; `jaxlfi.envs.mujoco.termination`
+fallen = { when = "body/torso/pos[2] < 0.2", cost = 10.0 }      # - once, whatever the interval
+away = "abs(arm angle) > 2.5"       # at no cost
+
+Costs alone make it worth while to end an episode early, unless the end costs more than the rest of the episode, or what
+is `within` and `alive` makes up for them.
+
 Positions of hinges without a range are angles: a policy sees their cosine and sine, and a difference d from a target
-costs 2 (1 - cos d), which is d squared while it is small.
+costs 2 (1 - cos d), which is d squared while it is small. Conditions compare them as numbers, turns and all.
+
+What a policy sees and does besides (`jaxlfi.rl.preparation`):
+
+[policy]
+turns = ["winch angle"]             # angles of which turns count: they are seen, and cost, as numbers
+history = 3                         # how many times signals are seen: now, one control interval before, two before
+actions = 2                         # how many of the last controls are seen
+rates = { motor = 0.5 }             # of a control, its largest change per second
+displacing = ["motor"]              # actions are added to the last control, by as much as the rate allows, at most
+
+What it has to put up with, besides the noise of `[noise]`:
+
+[policy]
+action_delay = 0.01                 # s from an action to when the actuators get it, besides an inferred control/delay
+observation_delay = [0.0, 0.02]     # s, the age of a measurement when the policy acts on it; drawn for each episode
+noises = { "joint/arm/qvel" = 0.1 } # standard deviations of signals that `[noise]` does not have
+bias = 0.5                          # offset of a signal, drawn for each episode, as a fraction of its noise
+model_error = true                  # `unmodelled_force`, `[discrepancy]` and the noise of recordings, as in inference
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-import jax.numpy as jnp
-import mujoco
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jaxlfi.envs.mujoco import config as tables
-from jaxlfi.envs.mujoco import measured
-from jaxlfi.envs.mujoco.columns import require_one_control_each
-from jaxlfi.rl.environment import Signals
+from jaxlfi.envs.mujoco import termination
+from jaxlfi.envs.mujoco.parameters import near
+from jaxlfi.envs.mujoco.termination import Termination
 
-KEYS = ("interval", "duration", "observed", "scales", "limits", "costs", "targets", "initial")
+NEEDED = ("interval", "duration", "observed")
+BOUNDS = ("limits", "initial", "commands")
+NUMBERS = ("scales", "costs", "change_costs", "rates", "noises")
+SINGLE = ("alive", "bias")
+DELAYS = ("action_delay", "observation_delay")
+MODEL_ERROR = "model_error"
+NAMES = {"observed": "signals", "turns": "signals", "displacing": "actuators"}
+COUNTS = {"history": 1, "actions": 0}
+"""The least of each."""
+KEYS = (
+    *NEEDED,
+    *BOUNDS,
+    *NUMBERS,
+    "targets",
+    "terminations",
+    *SINGLE,
+    "turns",
+    "displacing",
+    *COUNTS,
+    *DELAYS,
+    MODEL_ERROR,
+)
+MOST_BEFORE = 100
+"""Control intervals that a policy looks back, at most."""
+RESERVED = ("return", "value", "steps", "theta", "length", "episodes", "seconds", "failed")
+"""What is recorded of episodes under these names is something else than that one ended so."""
 Reward = Callable[[Mapping[str, Array], Mapping[str, Array]], Array]
 """From signals and controls by name, each one number, to the reward of a control interval."""
-_JOINTS = {
-    int(mujoco.mjtSensor.mjSENS_JOINTPOS): ("rad", "m"),
-    int(mujoco.mjtSensor.mjSENS_JOINTVEL): ("rad/s", "m/s"),
-}
-"""Units of sensors of hinges and slides."""
+
+
+class Target(NamedTuple):
+    """What a signal should be; see above.
+
+    Attributes:
+        value: in the signal's unit, or the name of a command.
+        weight: per second.
+        within: a difference at which 1/e of the weight is left as a reward; None where differences cost.
+    """
+
+    value: float | str
+    weight: float = 1.0
+    within: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,47 +122,107 @@ class Goal:
         observed: signals that a policy sees.
         interval: between two controls, in s.
         duration: of an episode, in s.
-        targets: value and weight by signal.
+        targets: by signal; value and weight will do for one.
         costs: by actuator.
         limits: by actuator.
         scales: by signal.
         initial: bounds by JOINT/qpos and JOINT/qvel.
-        reward: in place of targets and costs, in JAX.
+        reward: in place of targets and costs, in JAX; commands are among the signals, as "command NAME".
+        turns: signals that are angles of which turns count.
+        history: how many times signals are seen.
+        actions: how many of the last controls are seen.
+        rates: largest change per second, by actuator.
+        displacing: actuators whose actions are added to the last control.
+        change_costs: by actuator.
+        alive: reward of a second that does not end the episode.
+        commands: bounds by name.
+        terminations: by name.
+        action_delay: least and largest one, in s.
+        observation_delay: likewise.
+        noises: standard deviations, by signal.
+        bias: standard deviation of offsets, as a fraction of those of the noise.
 
     Raises:
-        ValueError: for intervals and weights that are not positive, and a goal without a target or a reward.
+        ValueError: for numbers that are no such, and a goal without a reward.
     """
 
     observed: Sequence[str]
     interval: float
     duration: float
-    targets: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    targets: Mapping[str, Target | tuple[float, float]] = dataclasses.field(default_factory=dict)
     costs: Mapping[str, float] = dataclasses.field(default_factory=dict)
     limits: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     scales: Mapping[str, float] = dataclasses.field(default_factory=dict)
     initial: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     reward: Reward | None = None
+    turns: Sequence[str] = ()
+    history: int = 1
+    actions: int = 0
+    rates: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    displacing: Sequence[str] = ()
+    change_costs: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    alive: float = 0.0
+    commands: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    terminations: Mapping[str, Termination] = dataclasses.field(default_factory=dict)
+    action_delay: tuple[float, float] = (0.0, 0.0)
+    observation_delay: tuple[float, float] = (0.0, 0.0)
+    noises: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    bias: float = 0.0
 
     def __post_init__(self):
+        object.__setattr__(self, "targets", {name: Target(*one) for name, one in self.targets.items()})
         if not self.observed or len(set(self.observed)) < len(self.observed):
             raise ValueError(f"observed: expected at least one signal, each once, got {list(self.observed)}")
-        if not 0 < self.interval <= self.duration:
+        if not 0 < self.interval <= self.duration < math.inf:
             raise ValueError(
                 f"interval: expected one of more than 0 s, and at most the duration, got {self.interval:g} s "
                 f"and {self.duration:g} s"
             )
-        if not self.targets and self.reward is None:
+        if not self.targets and self.reward is None and not self.alive:
             raise ValueError("targets: expected at least one, or a reward; got none")
-        weights = {f"targets: {name}": weight for name, (_, weight) in self.targets.items()}
-        costs = {f"costs: {name}": cost for name, cost in self.costs.items()}
-        for name, number in (weights | costs).items():
-            if not number >= 0:
-                raise ValueError(f"{name}: expected a weight of at least 0, got {number:g}")
+        self._check_rewards()
         for name, (low, high) in self.initial.items():
-            if not low <= high:
+            if not -math.inf < low <= high < math.inf:
                 raise ValueError(f"initial: {name}: expected LOW up to HIGH, got {[low, high]}")
-        if unknown := [name for name in self.scales if name not in self.observed]:
-            raise ValueError(f"scales: expected signals that are observed, got {', '.join(unknown)}")
+        for what in ("scales", "noises"):
+            if unknown := [name for name in getattr(self, what) if name not in self.observed]:
+                raise ValueError(f"{what}: expected signals that are observed, got {', '.join(unknown)}")
+        for what, deviation in (
+            {f"noises: {name}": one for name, one in self.noises.items()} | {"bias": self.bias}
+        ).items():
+            if not 0 <= deviation < math.inf:
+                raise ValueError(f"{what}: expected a standard deviation of at least 0, got {deviation:g}")
+        for what in DELAYS:
+            low, high = getattr(self, what)
+            if not 0 <= low <= high <= self.duration:
+                raise ValueError(f"{what}: expected 0 s up to the duration, LOW up to HIGH, got {[low, high]}")
+        for name in self.terminations:
+            if name in RESERVED or name.endswith(" off"):
+                raise ValueError(f"terminations: expected a name that has no other meaning, got {name!r}")
+
+    def _check_rewards(self) -> None:
+        weights = {f"targets: {name}": one.weight for name, one in self.targets.items()}
+        weights |= {f"costs: {name}": cost for name, cost in self.costs.items()}
+        weights |= {f"change_costs: {name}": cost for name, cost in self.change_costs.items()}
+        for name, number in weights.items():
+            if not 0 <= number < math.inf:
+                raise ValueError(f"{name}: expected a weight of at least 0, got {number:g}")
+        if not math.isfinite(self.alive):
+            raise ValueError(f"alive: expected a finite number, got {self.alive:g}")
+        for name, (low, high) in self.commands.items():
+            if not -math.inf < low < high < math.inf:
+                raise ValueError(f"commands: {name}: expected LOW below HIGH, got {[low, high]}")
+        for name, one in self.targets.items():
+            if isinstance(one.value, str) and one.value not in self.commands:
+                known = near(one.value, [*self.commands])
+                raise ValueError(f"targets: {name}: expected a command {known}, got {one.value!r}")
+            if not isinstance(one.value, str) and not math.isfinite(one.value):
+                raise ValueError(f"targets: {name}: expected a finite value, got {one.value:g}")
+            if one.within is not None and not 0 < one.within < math.inf:
+                raise ValueError(f"targets: {name}: within: expected more than 0, got {one.within:g}")
+        followed = [one.value for one in self.targets.values()]
+        if self.reward is None and (idle := [name for name in self.commands if name not in followed]):
+            raise ValueError(f"commands: expected each to be a target of a signal, got no target of {', '.join(idle)}")
 
     @property
     def steps(self) -> int:
@@ -100,8 +231,9 @@ class Goal:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The observed signals, and further ones that have a target."""
-        return (*self.observed, *(name for name in self.targets if name not in self.observed))
+        """The observed signals, and further ones that have a target or end episodes."""
+        further = (*self.targets, *(one.signal for one in self.terminations.values()))
+        return tuple(dict.fromkeys((*self.observed, *further)))
 
 
 def of_table(table: Mapping[str, Any]) -> Goal:
@@ -112,134 +244,56 @@ def of_table(table: Mapping[str, Any]) -> Goal:
     """
     if unknown := [key for key in table if key not in KEYS]:
         raise ValueError(f"policy: expected keys among {', '.join(KEYS)}, got {', '.join(unknown)}")
-    if missing := [key for key in ("interval", "duration", "observed", "targets") if key not in table]:
+    if missing := [key for key in NEEDED if key not in table]:
         raise ValueError(f"policy: expected {', '.join(missing)}, got none")
-    if not isinstance(table["observed"], list) or not all(isinstance(one, str) for one in table["observed"]):
-        raise ValueError(f"policy: observed: expected names of signals, got {table['observed']!r}")
-    for key in ("targets", "limits", "initial"):
+    for key, what in NAMES.items():
+        if not isinstance(table.get(key, []), list) or not all(isinstance(one, str) for one in table.get(key, [])):
+            raise ValueError(f"policy: {key}: expected names of {what}, got {table[key]!r}")
+    for key, least in COUNTS.items():
+        if type(number := table.get(key, least)) is not int or not least <= number <= MOST_BEFORE:
+            raise ValueError(f"policy: {key}: expected a whole number from {least} to {MOST_BEFORE}, got {number!r}")
+    for key in (*BOUNDS, "targets", "terminations"):
         if not isinstance(table.get(key, {}), dict):
             raise ValueError(f"policy: {key}: expected a table, got {table[key]!r}")
-    targets = {}
-    for name, target in table["targets"].items():
-        if not isinstance(target, dict) or set(target) - {"value", "weight"} or "value" not in target:
-            raise ValueError(f"policy: targets: {name}: expected value and weight, got {target!r}")
-        where = f"policy: targets: {name}"
-        targets[name] = tuple(tables.number(target.get(key, 1.0), f"{where}: {key}") for key in ("value", "weight"))
-    bounds = {
-        key: {name: tables.pair(value, f"policy: {key}: {name}") for name, value in table.get(key, {}).items()}
-        for key in ("limits", "initial")
+    made: dict[str, Any] = {key: tables.number(table[key], f"policy: {key}") for key in ("interval", "duration")}
+    made |= {key: tuple(table[key]) for key in NAMES if key in table} | {
+        key: table[key] for key in COUNTS if key in table
     }
-    plain = {key: tables.numbers(table, key) for key in ("costs", "scales")}
-    times = {key: tables.number(table[key], f"policy: {key}") for key in ("interval", "duration")}
+    made |= {key: tables.number(table.get(key, 0.0), f"policy: {key}") for key in SINGLE}
+    made |= {key: _range(table.get(key, 0.0), f"policy: {key}") for key in DELAYS}
+    made["targets"] = {name: _target(name, one) for name, one in table.get("targets", {}).items()}
+    made["terminations"] = {name: _termination(name, one) for name, one in table.get("terminations", {}).items()}
+    for key in BOUNDS:
+        made[key] = {name: tables.pair(value, f"policy: {key}: {name}") for name, value in table.get(key, {}).items()}
     try:
-        return Goal(tuple(table["observed"]), targets=targets, **times, **bounds, **plain)
+        return Goal(**made, **{key: tables.numbers(table, key) for key in NUMBERS})
     except ValueError as error:
         raise ValueError(f"policy: {error}") from error
 
 
-class Reading:
-    """A goal in terms of a model's sensors and actuators. Works on JAX's arrays and on NumPy's.
-
-    Attributes:
-        goal: what is read for.
-        places: of its signals among the sensor data, S of them.
-        observations: of a policy.
-        actions: of a policy: the controls.
-    """
-
-    def __init__(self, model: mujoco.MjModel, goal: Goal):
-        """Look up signals and actuators.
-
-        Args:
-            model: with a sensor for each signal.
-            goal: of the policy.
-
-        Raises:
-            ValueError: for names that the model does not have, and actuators without limits, in one line.
-        """
-        self.goal = goal
-        self.places = np.asarray(measured.places(model, goal.signals))
-        self._owners = [_owner(model, place) for place in self.places]
-        names, units, scales = [], [], []
-        for name, (unit, turning) in zip(goal.observed, self._owners, strict=False):
-            names += [f"cos {name}", f"sin {name}"] if turning else [name]
-            units += ["", ""] if turning else [unit]
-            scales += [1.0, 1.0] if turning else [goal.scales.get(name, 1.0)]
-        self.observations = Signals(tuple(names), tuple(units), (0.0,) * len(names), tuple(scales))
-        require_one_control_each(model)
-        self._actuators = [model.actuator(i).name or f"actuator/{i}" for i in range(model.nu)]
-        limits = np.array([_limits(model, i, name, goal) for i, name in enumerate(self._actuators)]).reshape(-1, 2)
-        if not len(limits):
-            raise ValueError("policy: expected a model with actuators, got one without")
-        for key in ("limits", "costs"):
-            if unknown := [name for name in getattr(goal, key) if name not in self._actuators]:
-                raise ValueError(
-                    f"policy: {key}: expected actuators of the model ({', '.join(self._actuators)}), "
-                    f"got {', '.join(unknown)}"
-                )
-        centre, scale = limits.mean(axis=1), (limits[:, 1] - limits[:, 0]) / 2
-        blank = ("",) * len(limits)
-        self.actions = Signals(tuple(self._actuators), blank, tuple(centre.tolist()), tuple(scale.tolist()))
-
-    def seen(self, values: Float[Array | np.ndarray, " signals"], xp: Any = jnp) -> Float[Array | np.ndarray, " obs"]:
-        """A policy's observations of signals."""
-        parts = []
-        for place in range(len(self.goal.observed)):
-            value, turning = values[place], self._owners[place][1]
-            parts += [xp.cos(value), xp.sin(value)] if turning else [value]
-        return xp.stack(parts)
-
-    def reward(self, values: Float[Array | np.ndarray, " signals"], control: Float[Array | np.ndarray, " act"], xp=jnp):
-        """The reward of a control interval, at whose end signals have these values."""
-        goal = self.goal
-        if goal.reward is not None:
-            signals = {name: values[place] for place, name in enumerate(goal.signals)}
-            return goal.reward(signals, {name: control[i] for i, name in enumerate(self._actuators)})
-        cost = 0.0
-        for name, off in self.off(values, xp).items():
-            turning = self._owners[goal.signals.index(name)][1]
-            cost += goal.targets[name][1] * (2 * (1 - xp.cos(off)) if turning else off**2)
-        for i, name in enumerate(self._actuators):
-            fraction = (control[i] - self.actions.centre[i]) / self.actions.scale[i]
-            cost += goal.costs.get(name, 0.0) * fraction**2
-        return -goal.interval * cost
-
-    def off(self, values: Float[Array | np.ndarray, " signals"], xp: Any = jnp) -> dict[str, Any]:
-        """Distances of signals from their targets; for angles, the shorter way round."""
-        found = {}
-        for name, (target, _) in self.goal.targets.items():
-            place = self.goal.signals.index(name)
-            difference = values[place] - target
-            turning = self._owners[place][1]
-            found[name] = xp.arctan2(xp.sin(difference), xp.cos(difference)) if turning else difference
-        return found
+def _range(value: Any, where: str) -> tuple[float, float]:
+    """Two bounds, or one number for both."""
+    return tables.pair(value if isinstance(value, list) else [value, value], where)
 
 
-def _owner(model: mujoco.MjModel, place: int) -> tuple[str, bool]:
-    """Unit of a number of the sensor data, and whether it is an angle without a range."""
-    sensor = int(np.searchsorted(model.sensor_adr, place, side="right") - 1)
-    kind, joint = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
-    if kind not in _JOINTS:
-        return "", False
-    hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
-    position = kind == int(mujoco.mjtSensor.mjSENS_JOINTPOS)
-    return _JOINTS[kind][0 if hinge else 1], bool(hinge and position and not model.jnt_limited[joint])
+def _target(name: str, table: Any) -> Target:
+    where = f"policy: targets: {name}"
+    known = {"value", "command", "weight", "within"}
+    if not isinstance(table, dict) or set(table) - known or ("value" in table) == ("command" in table):
+        raise ValueError(f"{where}: expected value or command, and weight, within where they matter, got {table!r}")
+    if not isinstance(command := table.get("command", ""), str):
+        raise ValueError(f"{where}: command: expected the name of one, got {command!r}")
+    number = lambda key, other: tables.number(table[key], f"{where}: {key}") if key in table else other
+    return Target(number("value", command), number("weight", 1.0), number("within", None))
 
 
-def _limits(model: mujoco.MjModel, i: int, name: str, goal: Goal) -> tuple[float, float]:
-    if name in goal.limits:
-        low, high = goal.limits[name]
-    elif model.actuator_ctrllimited[i]:
-        low, high = model.actuator_ctrlrange[i]
-    else:
-        raise ValueError(f"policy: limits: expected those of {name}, whose actuator has no ctrlrange; got none")
-    if not low < high:
-        raise ValueError(f"policy: limits: {name}: expected LOW below HIGH, got {[float(low), float(high)]}")
-    least, most = model.actuator_ctrlrange[i]
-    clamps = model.actuator_ctrllimited[i] and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-    if clamps and (low < least or high > most):
-        raise ValueError(
-            f"policy: limits: {name}: expected limits within the actuator's ctrlrange, beyond which MuJoCo clamps: "
-            f"{[float(least), float(most)]}; got {[float(low), float(high)]}"
-        )
-    return float(low), float(high)
+def _termination(name: str, given: Any) -> Termination:
+    where = f"policy: terminations: {name}"
+    table = {"when": given} if isinstance(given, str) else given
+    if not isinstance(table, dict) or set(table) - {"when", "cost"} or not isinstance(table.get("when"), str):
+        raise ValueError(f'{where}: expected {{ when = "SIGNAL < NUMBER", cost = NUMBER }}, got {given!r}')
+    cost = tables.number(table.get("cost", 0.0), f"{where}: cost")
+    try:
+        return termination.parsed(table["when"], cost)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error

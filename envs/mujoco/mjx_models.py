@@ -9,6 +9,7 @@ more implementation of MuJoCo's compiler: inverse weights alone are rational fun
 """
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import io
@@ -23,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlfi.distributions.support import Support
+from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.mjx_ignored import OPTIONS, refuse_ignored, warn_of_saturation
 from jaxlfi.envs.mujoco.parameters import saved
 
@@ -44,6 +46,10 @@ OF_HEIGHT_FIELDS = {"geom_rbound_hfield"}
 """What MJX holds fixed, and needs for height fields only."""
 LEAST_FRICTION = 1e-9
 """N, or N m: in place of none."""
+MOST = 4.0
+"""Standard deviations within which the forces that a model lacks are probed."""
+KEPT = 256
+"""Compiled models that such forces are added to."""
 PROBES = 4
 """Models at random parameters that are compared besides."""
 
@@ -172,6 +178,41 @@ class Models:
             return self._numbers(self._build(np.frombuffer(theta, np.float32))), False
         except ValueError:
             return self._nominal, True
+
+
+def with_forces(
+    build: Callable[[np.ndarray], mujoco.MjModel],
+    forces: UnmodelledForces | None,
+    names: Sequence[str],
+    nominal: Float[np.ndarray, " dim"],
+    feasible: Support,
+) -> Models:
+    """Models of parameters and, after them, of the forces that the model lacks, where there are any.
+
+    Args:
+        build: makes the model of a parameter vector.
+        forces: that the model lacks.
+        names: of the parameters.
+        nominal: parameters whose model can be compiled.
+        feasible: Phi.
+
+    Raises:
+        ValueError: see `Models`.
+    """
+    if forces is None:
+        return Models(build, names, nominal, feasible)
+    least, most, dim = LEAST_FRICTION * (forces.friction > 0), MOST * forces.deviations, len(names)
+    known = functools.lru_cache(KEPT)(lambda theta: build(np.frombuffer(theta, float)))
+
+    def lacking(numbers: np.ndarray) -> mujoco.MjModel:
+        numbers = np.asarray(numbers, float)
+        model = forces.add(copy.copy(known(numbers[:dim].tobytes())), numbers[dim:])
+        # MJX lays out its solver for the degrees of freedom that have friction: here always the same ones.
+        model.dof_frictionloss[:] = np.maximum(model.dof_frictionloss, least)
+        return model
+
+    box = Support(np.append(feasible.low, -most), np.append(feasible.high, most))
+    return Models(lacking, (*names, *forces.names), np.append(nominal, 0.0 * most), box)
 
 
 def _probes(names: Sequence[str], nominal: np.ndarray, feasible: Support) -> list[tuple[np.ndarray, str]]:

@@ -6,19 +6,14 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco.mjx_effects import Held, biased, deviations, started
-from jaxlfi.envs.mujoco.mjx_models import LEAST_FRICTION, Models, mjx
+from jaxlfi.envs.mujoco.mjx_models import Models, mjx, with_forces
 from jaxlfi.envs.mujoco.mjx_physics import Physics, State
 from jaxlfi.envs.mujoco.simulator import REFUSED, UNSTABLE, Simulator, between, simulator_of
 from jaxlfi.tasks.task import Task
-
-MOST = 4.0
-"""Standard deviations within which the forces that a model lacks are probed."""
 
 
 def by_mjx(task: Task) -> Task:
@@ -38,28 +33,11 @@ def by_mjx(task: Task) -> Task:
     try:
         if native.does.jitter is not None:
             raise ValueError("parameters: expected controls that act when the recording says, got clock/jitter")
-        simulator = MjxSimulator(native, _models(native, task, nominal))
+        simulator = MjxSimulator(native, with_forces(native.build, native.forces, task.names, nominal, task.feasible))
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"engine: expected native for what MJX cannot simulate, got mjx: {reason}") from error
     return dataclasses.replace(task, simulate=simulator)
-
-
-def _models(native: Simulator, task: Task, nominal: np.ndarray) -> Models:
-    """Models of parameters and, where there are any, of the forces that the model lacks."""
-    forces = native.forces
-    if forces is None:
-        return Models(native.build, task.names, nominal, task.feasible)
-    least, most = LEAST_FRICTION * (forces.friction > 0), MOST * forces.deviations
-
-    def build(numbers: np.ndarray) -> mujoco.MjModel:
-        model = native.made(numbers[: task.dim], numbers[task.dim :])
-        # MJX lays out its solver for the degrees of freedom that have friction: here always the same ones.
-        model.dof_frictionloss[:] = np.maximum(model.dof_frictionloss, least)
-        return model
-
-    box = Support(np.append(task.feasible.low, -most), np.append(task.feasible.high, most))
-    return Models(build, (*task.names, *forces.names), np.append(nominal, 0.0 * most), box)
 
 
 class MjxSimulator:

@@ -124,7 +124,14 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="limits of the set-point's x and z, in m. Limits can be tightened, not loosened (default: the policy's)",
     )
     options.add_detector(control)
-    control.add_argument("--remote", action="store_true", help="allow a driver on another host")
+    control.add_argument(
+        "--watchdog",
+        type=float,
+        metavar="S",
+        help="time that a call of the robot may take before it is stopped (default: any)",
+    )
+    control.add_argument("--remote", action="store_true", help="allow a driver on another host; needs --token")
+    control.add_argument("--token", type=Path, metavar="FILE", help="a file with the token that the driver asks for")
     options.add_seed(control, "seed of a reference object's camera (default: 0)")
     options.add_out(
         control, "FILE", "the new .npz file for the recording; metadata go into a .json file of the same name"

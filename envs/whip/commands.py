@@ -35,7 +35,8 @@ from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.commands import sights
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.io import files as atomic
-from jaxlfi.robots.loop import Log
+from jaxlfi.robots import wire
+from jaxlfi.robots.episode import Log
 from jaxlfi.robots.robot import RobotError
 
 POLICIES = ("explore", "random", "plan")
@@ -152,10 +153,11 @@ def control(arguments: argparse.Namespace) -> None:
         raise ValueError(f"out: expected a new .npz file beside which there is no .json, got {out}")
     act = repetitions.acting(arguments.policy)()
     loop = controlling.loop_of(act, arguments)
+    token = None if arguments.token is None else wire.token_of(arguments.token)
     seen_by = sights(arguments.detector, arguments.renderer, arguments.weights)
     with interrupts.orderly(), seen_by as seeing:  # a robot that has been found is stopped
         sight = seeing(jax.random.fold_in(jax.random.key(arguments.seed), 2**31 - 1))
-        robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote, sight)
+        robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote, sight, token)
         loop = dataclasses.replace(loop, clock=getattr(robot, "simulated_clock", loop.clock))
         try:
             log = loop.run(robot, act, on_end=lambda log: _write_log(out, log, about))

@@ -23,7 +23,8 @@ from jaxlfi.registry import ROBOTS
 from jaxlfi.rl import deployment
 from jaxlfi.rl.policy import Policy
 from jaxlfi.robots.client import SocketRobot
-from jaxlfi.robots.loop import Act, Log, Loop
+from jaxlfi.robots.episode import Act, Log
+from jaxlfi.robots.loop import Loop
 from jaxlfi.robots.robot import Robot
 
 ABOUT = {
@@ -104,12 +105,14 @@ def loop_of(act: Act, arguments: argparse.Namespace) -> Loop:
     loop = Loop.of(act, over=is_over) if says else LOOP
     low, high = (None, None) if arguments.workspace is None else np.reshape(arguments.workspace, (2, 2)).T.tolist()
     limits = loop.limits.tightened(arguments.max_step, arguments.max_speed, low, high)
-    given = {"rate": arguments.rate, "max_age": arguments.max_age}
+    given = {"rate": arguments.rate, "max_age": arguments.max_age, "watchdog": arguments.watchdog}
     changes = {name: value for name, value in given.items() if value is not None}
     return dataclasses.replace(loop, limits=limits, holds=arguments.holds, **changes)
 
 
-def robot_of(word: str, seed: int, remote: bool, sight: Any = None) -> tuple[Robot, dict[str, Any]]:
+def robot_of(
+    word: str, seed: int, remote: bool, sight: Any = None, token: str | None = None
+) -> tuple[Robot, dict[str, Any]]:
     """The robot that a word stands for, and what a recording is to say of it.
 
     Args:
@@ -117,13 +120,14 @@ def robot_of(word: str, seed: int, remote: bool, sight: Any = None) -> tuple[Rob
         seed: the seed of a reference object's camera.
         remote: whether other hosts than this one are let.
         sight: what finds keypoints in a reference object's frames; by default `observation.found`.
+        token: that a driver asks for; needed where it is on another host.
 
     Raises:
         ValueError: for other words, and for what is no robot.
         RobotError: where no driver answers.
     """
     if word.startswith("socket:"):
-        robot = SocketRobot(word, OBSERVATIONS.names, ACTIONS.names, remote)
+        robot = SocketRobot(word, OBSERVATIONS.names, ACTIONS.names, remote, token=token)
     elif ":" in word:
         robot = ROBOTS.load(word)
     else:

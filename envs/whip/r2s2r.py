@@ -13,22 +13,19 @@ module imports neither jax nor numpy before it has to, so that `--help` answers 
 """
 
 import argparse
-import json
 import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jaxlfi import flags
+from jaxlfi.cli import loops, train
 from jaxlfi.cli import parser as command_line
-from jaxlfi.cli import train
 from jaxlfi.cli.command import Command
-from jaxlfi.cli.interrupts import INTERRUPTED
 from jaxlfi.envs.whip import cli as whip
 from jaxlfi.envs.whip import require_mujoco
 from jaxlfi.envs.whip.vision import options
-from jaxlfi.io.formats import CONFIG, FORMATS, LOOP
-from jaxlfi.io.shell import quoted
+from jaxlfi.io.formats import CONFIG
 from jaxlfi.registry import HEURISTICS
 
 EXAMPLES = """\
@@ -37,16 +34,9 @@ examples:
   jaxlfi r2s2r --object dlo-3 --policy runs/uniform/uniform/seed_000/policy.npz --iterations 2 --out runs/twice
   jaxlfi r2s2r --object dlo-0 --recording my-rollout.npz --out runs/recorded
   jaxlfi r2s2r --object dlo-0 --detector learnt --out runs/seen
+  jaxlfi r2s2r mujoco,config=examples/mujoco/furuta.toml --out runs/loop      any machine: jaxlfi r2s2r mujoco --help
 
 """
-
-
-class StageError(Exception):
-    """A stage that ended with an exit status other than 0."""
-
-    def __init__(self, status: int):
-        super().__init__(status)
-        self.status = status
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -84,7 +74,7 @@ def _loop(arguments: argparse.Namespace) -> int:
         try:
             policies = _round_and_round(arguments)
             _deploy(arguments, policies)
-        except StageError as stage:  # which has said why
+        except loops.StageError as stage:  # which has said why
             return stage.status
         print(f"wrote {write(arguments, policies)}")
         return 0
@@ -100,8 +90,6 @@ def _begin(arguments: argparse.Namespace) -> None:
     from jaxlfi.envs.whip.real2sim import recorded
     from jaxlfi.envs.whip.reference_objects import objects
     from jaxlfi.envs.whip.vision.commands import sights
-    from jaxlfi.io import files, workfolder
-    from jaxlfi.io.provenance import environment
     from jaxlfi.rl import policy
     from jaxlfi.rl.settings import PRESETS
 
@@ -120,18 +108,7 @@ def _begin(arguments: argparse.Namespace) -> None:
         domain(make(), str(arguments.posterior))
     with sights(arguments.detector, arguments.renderer, arguments.weights):
         pass
-    asked = {
-        name: None if value is None else str(value)
-        for name, value in vars(arguments).items()
-        if name not in ("out", "debug")
-    }
-    path = arguments.out / CONFIG
-    if workfolder.begun(arguments.out, CONFIG, "a new folder, or one of the same command"):
-        found = json.loads(path.read_text()).get("asked")
-        if found != asked:
-            raise ValueError(f"out: expected a new folder, or one of the same command, got {arguments.out} of {found}")
-        return
-    files.write_json(path, {"format": LOOP, "version": FORMATS[LOOP].version, "asked": asked, **environment()})
+    loops.begin(arguments.out, loops.asked_of(arguments))
 
 
 def _round_and_round(arguments: argparse.Namespace) -> list[Path]:
@@ -161,12 +138,7 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
 
 def _begin_or_resume(run: Callable[[list[str]], int], words: list[str], out: Path, what: str) -> None:
     """A stage by a command of these words, or what is missing of it."""
-    if (out / CONFIG).exists():
-        run, words = command_line.main, ["resume", str(out)]
-    else:
-        for left in out.parent.glob(f".{out.name}-*"):  # of one that was killed while its folder was created
-            shutil.rmtree(left)
-    _command(run, words, what)
+    loops.begin_or_resume(run, command_line.main, words, out, lambda run, words: _command(run, words, what))
 
 
 def _whip(arguments: argparse.Namespace) -> str:
@@ -186,7 +158,7 @@ def _rollout(arguments: argparse.Namespace, policy: Path, path: Path, iteration:
     from jaxlfi.envs.whip.vision.commands import sights
     from jaxlfi.rl import policy as policies
 
-    _say(f"a rollout of {policy} on {arguments.object}")
+    loops.say(f"a rollout of {policy} on {arguments.object}")
     key = jax.random.fold_in(jax.random.key(arguments.seed), iteration)
     with sights(arguments.detector, arguments.renderer, arguments.weights) as sight:
         act, dlo = policies.load(policy), load(arguments.object)
@@ -222,14 +194,7 @@ def _deploy(arguments: argparse.Namespace, policies: Sequence[Path]) -> None:
 
 
 def _command(run: Callable[[list[str]], int], words: list[str], what: str) -> None:
-    prefix = {train.main: ["train"], whip.main: ["whip"]}.get(run, [])
-    _say(f"{what}: {quoted('jaxlfi', *prefix, *words)}")
-    if status := run(words):
-        raise KeyboardInterrupt if status == INTERRUPTED else StageError(status)
-
-
-def _say(text: str) -> None:
-    print(f"\n== {text}", flush=True)
+    loops.done(run, {train.main: ["train"], whip.main: ["whip"]}.get(run, []), words, what)
 
 
 main = Command(

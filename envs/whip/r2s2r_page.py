@@ -3,12 +3,13 @@
 import argparse
 import csv
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from jaxlfi.cli.loops import believed
 from jaxlfi.envs.whip import render
 from jaxlfi.envs.whip.reference_objects import film
 from jaxlfi.envs.whip.reference_objects.deployment import deploy
@@ -64,12 +65,14 @@ def write(arguments: argparse.Namespace, policies: Sequence[Path]) -> Path:
         f"<p>Heuristic {html.escape(arguments.heuristic)}, preset {arguments.preset}, seed {arguments.seed}, "
         f"seen by the detector {arguments.detector}.</p>",
         "<h2>What was believed</h2>",
-        _table([row for folder, run in posteriors.items() for row in believed(folder, run)]),
+        web_page.table([row for folder, run in posteriors.items() for row in believed(folder, run)]),
         "<h2>What was trained on</h2>",
-        _table([{"policy": str(path), "domain": policy.load(path).schema.get("domain", "")} for path in policies]),
+        web_page.table(
+            [{"policy": str(path), "domain": policy.load(path).schema.get("domain", "")} for path in policies]
+        ),
         f"<h2>How it fared on the object</h2><p>At {REPETITIONS} places; the first is nominal, at the others stack and "
         "camera are displaced as in training. All policies meet the same places.</p>",
-        _table(fared),
+        web_page.table(fared),
         *(_figure(path.relative_to(out)) for path in pictures),
     )
     page = web_page.document(f"{arguments.object}: from the object to a policy, and back", parts)
@@ -83,34 +86,11 @@ def predicted(out: Path, runs: Sequence[Run]) -> list[Path]:
     return [render.save_predictive(out / f"predictive_{i}.png", run) for i, run in enumerate(simulated, 1)]
 
 
-def believed(folder: Path, run: Run) -> list[dict[str, str]]:
-    """Median and 90 % interval of each parameter, and the support that the run ended with, in natural units."""
-    quantiles = np.quantile(np.asarray(run.draws()), (0.05, 0.5, 0.95), axis=0)
-    box = run.final_support()
-    return [
-        {
-            "run": str(folder),
-            "parameter": name,
-            "median": f"{middle:.4g}",
-            "90 % interval": f"{low:.4g} to {high:.4g}",
-            "last support": f"{float(box.low[place]):.4g} to {float(box.high[place]):.4g}",
-        }
-        for place, (name, low, middle, high) in enumerate(zip(run.space.names, *quantiles, strict=True))
-    ]
-
-
 def _short(value: str) -> str:
     try:
         return f"{float(value):.2f}"
     except ValueError:
         return value
-
-
-def _table(rows: Sequence[Mapping[str, str]]) -> str:
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in rows[0])
-    lines = ("".join(f"<td>{html.escape(value)}</td>" for value in row.values()) for row in rows)
-    body = "".join(f"<tr>{line}</tr>" for line in lines)
-    return web_page.wide(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
 
 
 def _figure(path: Path) -> str:

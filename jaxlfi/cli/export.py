@@ -33,15 +33,16 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from jaxlfi.rl import deployment, policy
+    from jaxlfi.rl import deployment, policy, preparation
 
     out, suffix = arguments.out, SUFFIXES[arguments.format]
     if out.exists() or out.suffix != suffix:
         raise ValueError(f"out: expected a new {suffix} file, got {out}")
-    path = _policy_of(arguments.policy)
+    path = policy_of(arguments.policy)
     trained = policy.load(path)
     if deployment.KEY in trained.schema:
         deployment.of_schema(trained.schema)
+    preparation.of_schema(trained.schema)
     if arguments.format == "numpy":
         save = lambda policy, path: policy.save(path)
     elif arguments.format == "stablehlo":
@@ -53,7 +54,7 @@ def _export(arguments: argparse.Namespace) -> None:
     print(f"wrote {out}, the policy {path}")
 
 
-def _policy_of(path: Path) -> Path:
+def policy_of(path: Path) -> Path:
     """The file of a policy, or the only one in the folder of a training."""
     if not path.is_dir():
         return path

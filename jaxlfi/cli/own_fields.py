@@ -116,6 +116,9 @@ PPO: dict[str, Field[Any]] = {
     "epochs": option(default=10, help="epochs per update", low=1),
     "total_steps": option(default=60000, help="total environment steps, rounded up to whole updates", low=1),
     "hidden": option(default=(64, 64), help="widths of the hidden layers of both networks", low=1),
+    "critic": option(default="observations",
+        help="what the value function sees: what the policy does, or theta besides; the policy never sees theta",
+        choices=("observations", "theta")),
     "redrawn": option(default=False,
         help="draw a new theta for every episode; otherwise each environment keeps its own, as in the paper"),
 }  # fmt: skip
@@ -175,19 +178,20 @@ POLICIES: dict[str, dict[str, Any]] = {
     "quick": {"learning_rate": 0.0005, "annealing": 0.0, "discount": 0.99, "gae_lambda": 0.95, "entropy": 0.01,
         "clipping": 0.2, "value_weight": 0.5, "max_gradient_norm": 0.5, "adam_epsilon": 1e-05, "initial_deviation": 1.0,
         "environments": 12, "unroll": 16, "segments": 1, "minibatches": 12, "epochs": 10, "total_steps": 60000,
-        "hidden": (64, 64), "redrawn": False},
+        "hidden": (64, 64), "critic": "observations", "redrawn": False},
     "paper": {"learning_rate": 0.0003, "annealing": 0.0, "discount": 0.99, "gae_lambda": 0.95, "entropy": 0.0,
         "clipping": 0.2, "value_weight": 0.5, "max_gradient_norm": 0.5, "adam_epsilon": 1e-05, "initial_deviation": 1.0,
         "environments": 12, "unroll": 16, "segments": 1, "minibatches": 1536, "epochs": 10, "total_steps": 60000,
-        "hidden": (64, 64), "redrawn": False},
+        "hidden": (64, 64), "critic": "observations", "redrawn": False},
 }  # fmt: skip
 """Settings of a training of policies, likewise."""
 HELP = {
+    "jaxlfi.cli.control:main": "let a policy control a robot",
     "jaxlfi.cli.design:main": "which experiment to make next",
     "jaxlfi.cli.evaluate:main": "evaluate saved policies on other domains",
     "jaxlfi.cli.export:main": "write a policy as one file for a robot's computer",
-    "jaxlfi.envs.mujoco.cli:main": "film and refine the posterior of a MuJoCo model",
-    "jaxlfi.envs.whip.r2s2r:main": "run the full Real2Sim2Real loop on a reference object",
+    "jaxlfi.envs.mujoco.cli:main": "film and refine the posterior of a MuJoCo model, or serve it as a machine",
+    "jaxlfi.cli.r2s2r:main": "run the full Real2Sim2Real loop on a machine or a reference object",
     "jaxlfi.cli.train:main": "train policies by PPO on domains, such as a posterior",
     "jaxlfi.envs.whip.cli:main": "the whipping task: render, plan, deploy, control, record, see",
 }

@@ -43,6 +43,9 @@ examples:
   jaxlfi train whip --domain uniform --seeds 4 --out runs/uniform
   jaxlfi train whip --domain runs/dlo-0 uniform median --seeds 4 --out runs/policies
   jaxlfi train whip,detector=clean --domain point:200,1e5 --total-steps 30000 --out runs/point
+  jaxlfi train whip --domain runs/dlo-0 --start runs/uniform/uniform/seed_000/policy.npz \\
+    --initial-deviation 0.2 --out runs/tuned     fine-tune an earlier policy
+  jaxlfi train whip --domain uniform --critic theta --out runs/privileged    the value function sees theta
   jaxlfi train whip --domain uniform --seeds 2 --tensorboard --out runs/watched
   jaxlfi train whip --domain uniform --seeds 16 --out runs/many --coordinator 10.0.0.5:1234 --processes 2 \\
     --process-id 0                               on 10.0.0.5; and on another host with --process-id 1
@@ -72,6 +75,12 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="trainings of each domain (default: 1)")
     parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first one's seed (default: 0)")
+    parser.add_argument(
+        "--start",
+        type=Path,
+        metavar="POLICY",
+        help="a policy.npz of the same signals and actions that all trainings begin with",
+    )
     parser.add_argument(
         "--tensorboard", action="store_true", help="write learning curves while training: tensorboard --logdir DIR"
     )
@@ -219,6 +228,7 @@ def _plan(arguments: argparse.Namespace) -> Any:
     if arguments.seeds > MAX_SEEDS:
         raise ValueError(f"seeds: expected at most {MAX_SEEDS}, got {arguments.seeds}")
     check_seeds(arguments.first_seed, arguments.seeds, "first_seed")
+    from jaxlfi.rl.policy import load
     from jaxlfi.rl.settings import PRESETS as SETTINGS_OF
     from jaxlfi.rl.training import Plan
 
@@ -231,6 +241,7 @@ def _plan(arguments: argparse.Namespace) -> Any:
         domains=domains_of(environment, arguments.domain),
         seeds=tuple(range(arguments.first_seed, arguments.first_seed + arguments.seeds)),
         tensorboard=arguments.tensorboard,
+        start=None if arguments.start is None else load(arguments.start),
     )
 
 

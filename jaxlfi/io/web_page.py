@@ -5,7 +5,7 @@ A page needs no other file but its pictures, and can be read without JavaScript.
 
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 CSS = """
 :root { color-scheme: light dark; --paper: #fff; --ink: #1d2329; --soft: #5b6670; --line: #e2e6ea; --tint: #f6f8fa;
@@ -151,6 +151,14 @@ def figure(source: str, alternative: str, caption: str, width: int | None = None
         f'<figure><img{size} alt="{html.escape(alternative)}" src="{html.escape(source)}">'
         f"<figcaption>{prose(caption)}</figcaption></figure>"
     )
+
+
+def table(rows: Sequence[Mapping[str, str]]) -> str:
+    """A table of rows, all with the headings of the first one."""
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in rows[0])
+    lines = ("".join(f"<td>{html.escape(value)}</td>" for value in row.values()) for row in rows)
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    return wide(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
 
 
 def wide(table: str) -> str:

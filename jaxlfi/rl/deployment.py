@@ -13,6 +13,8 @@ import numpy as np
 
 KEY = "deployment"
 """Where it lies in a policy's schema."""
+ROUNDING = 1e-6
+"""By which commands may exceed limits: of controls, a fraction of what is between them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +114,122 @@ class Limits:
         after = target + moved
         inside = np.clip(after, self.low, self.high)
         return np.where(inside == after, moved, inside - target), inside
+
+    def allow(self, before: np.ndarray, displacement: np.ndarray, target: np.ndarray, seconds: float) -> bool:
+        """Whether a command keeps to the limits, but for rounding: what a robot checks by itself.
+
+        Args:
+            before: the set-points before, shape [A].
+            displacement: of the command, shape [A].
+            target: of the command, shape [A].
+            seconds: since the command before; infinite where there was none.
+        """
+        return bool(
+            (np.abs(displacement) <= np.add(self.step, ROUNDING)).all()  # also refuses NaN
+            and (target >= np.subtract(self.low, ROUNDING)).all()
+            and (target <= np.add(self.high, ROUNDING)).all()
+            and (np.abs(target - (before + displacement)) <= ROUNDING).all()
+            and np.linalg.norm(displacement) <= self.speed * seconds + ROUNDING
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlLimits:
+    """What actuators may be commanded, each in its own quantity: a torque, an angle, a speed.
+
+    Attributes:
+        names: of the actuators.
+        low: least control of each.
+        high: largest control.
+        rate: largest change per second; infinite where any is allowed.
+
+    Raises:
+        ValueError: for unequal lengths, rates that are not positive, and limits without anything between them.
+
+    Example:
+        >>> limits = ControlLimits(("motor", "servo"), (-2.0, -1.0), (3.0, 1.0), (10.0, math.inf))
+        >>> limits.applied(np.array([0.0, 0.5]), np.array([5.0, 0.75]), 0.1)[1].tolist()
+        [1.0, 1.0]
+    """
+
+    names: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    rate: tuple[float, ...]
+
+    def __post_init__(self):
+        for name in ("low", "high", "rate"):
+            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+        object.__setattr__(self, "names", tuple(self.names))
+        if not len(self.names) == len(self.low) == len(self.high) == len(self.rate):
+            raise ValueError(f"limits: expected one number an actuator in low, high and rate, got {self}")
+        for name, low, high, rate in zip(self.names, self.low, self.high, self.rate, strict=True):
+            if not low < high:
+                raise ValueError(f"limits: {name}: expected LOW below HIGH, got {[low, high]}")
+            if not rate > 0:
+                raise ValueError(f"limits: {name}: expected a rate of more than 0 per second, got {rate:g}")
+
+    def tightened(self, name: str, bounds: Sequence[float] | None = None, rate: float | None = None) -> "ControlLimits":
+        """The same with the limits of an actuator tightened.
+
+        Args:
+            name: of the actuator.
+            bounds: its least and largest control.
+            rate: its largest change per second.
+
+        Raises:
+            ValueError: for another actuator, and what would loosen a limit.
+        """
+        if name not in self.names:
+            raise ValueError(f"limits: expected some of {', '.join(self.names)}, got {name}")
+        place = self.names.index(name)
+        low, high, most = self.low[place], self.high[place], self.rate[place]
+        if bounds is not None and not low <= bounds[0] < bounds[1] <= high:
+            raise ValueError(f"limits: {name}: expected LOW below HIGH within the policy's {[low, high]}, got {bounds}")
+        if rate is not None and not 0 < rate <= most:
+            raise ValueError(
+                f"limits: {name}: expected a rate of more than 0 and at most the policy's {most}, got {rate}"
+            )
+        low, high = (low, high) if bounds is None else bounds
+        put = lambda values, value: (*values[:place], value, *values[place + 1 :])
+        most = most if rate is None else rate
+        return ControlLimits(self.names, put(self.low, low), put(self.high, high), put(self.rate, most))
+
+    def applied(self, before: np.ndarray, change: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """A change of the controls that keeps to all limits: to the rates, and then to the bounds.
+
+        Args:
+            before: the controls before, within the bounds, shape [A].
+            change: what is asked for, shape [A].
+            seconds: since the command before.
+
+        Returns:
+            The change and the controls after it, each of shape [A].
+        """
+        most = self._most(seconds)
+        after = np.clip(before + np.clip(change, -most, most), self.low, self.high)
+        return after - before, after
+
+    def allow(self, before: np.ndarray, change: np.ndarray, control: np.ndarray, seconds: float) -> bool:
+        """Whether a command keeps to the limits, but for rounding: what a robot checks by itself.
+
+        Args:
+            before: the controls before, shape [A].
+            change: of the command, shape [A].
+            control: of the command, shape [A].
+            seconds: since the command before; infinite where there was none.
+        """
+        size = ROUNDING * np.subtract(self.high, self.low)
+        return bool(
+            (control >= self.low - size).all()  # also refuses NaN
+            and (control <= self.high + size).all()
+            and (np.abs(control - (before + change)) <= size).all()
+            and (np.abs(change) <= self._most(seconds) + size).all()
+        )
+
+    def _most(self, seconds: float) -> np.ndarray:
+        """Largest changes in some time; infinite where any is allowed, in no time too."""
+        return np.array([rate if math.isinf(rate) else rate * seconds for rate in self.rate])
 
 
 @dataclasses.dataclass(frozen=True)

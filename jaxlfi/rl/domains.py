@@ -80,6 +80,13 @@ def point(theta: Float[Array | np.ndarray, " dim"], n: int) -> Domain:
     return Domain(jnp.broadcast_to(jnp.asarray(theta, jnp.float32), (n, len(theta))))
 
 
+def standardised(environment: Environment, theta: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
+    """Theta as a network sees it: in inference space, -1 to 1 from one end of Phi to the other."""
+    box = environment.space.box_to_inference(environment.feasible)
+    half = (box.high - box.low) / 2
+    return (environment.space.to_inference(theta) - box.centre) / jnp.where(half > 0, half, 1.0)
+
+
 def check_belief(environment: Environment, space: Space, feasible: Support, units: Sequence[str] | None = None) -> None:
     """Refuse the posterior of other parameters than an environment's.
 

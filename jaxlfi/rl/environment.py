@@ -82,10 +82,12 @@ class EnvState(struct.PyTreeNode):
 class Environment(Protocol):
     """An environment of unknown parameters: pure, for one episode, batched by `vmap`.
 
-    One whose actions displace the set-points of a robot may have an attribute `deployment` besides
-    (`jaxlfi.rl.deployment.Deployment`), which its policies then carry; one whose observations are bounded, an attribute
-    `bounds`, the least and the largest ones [2, O], for learners that ask for them (`jaxlfi.rl.gym`); one where more
-    happens once an episode is over, a method `concluded(state)`, from its last state to facts that evaluations add.
+    What a robot must know of it, it may have as attributes besides, which its policies then carry: `deployment`, where
+    its actions displace set-points (`jaxlfi.rl.deployment.Deployment`); `preparation`, where its observations and
+    actions are made of signals and controls (`jaxlfi.rl.preparation.Preparation`). One whose observations are bounded
+    may have an attribute `bounds`, the least and the largest ones [2, O], for learners that ask for them
+    (`jaxlfi.rl.gym`). One where more happens once an episode is over may have a method `concluded(state)`, from its
+    last state to facts that evaluations add.
 
     Attributes:
         name: of the environment.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlfi.rl.domains import Domain
+from jaxlfi.rl.domains import Domain, standardised
 from jaxlfi.rl.environment import Environment, EnvState
 
 
@@ -21,10 +21,11 @@ class Episodes(struct.PyTreeNode):
         steps: of each episode so far, shape [N].
         sums: of the rewards of each episode so far, shape [N].
         domain: theta of the environments.
-        obs: as a policy sees them, shape [N, O].
+        obs: as a policy sees them, and theta after that, where the value function sees it; shape [N, O] or [N, O + D].
         reward: of the last step, shape [N].
         done: whether the last step ended an episode, 0 or 1, shape [N].
         info: what Brax's loss asks for (`truncation`), and the episodes that ended (`ended`).
+        theta: of each environment's episode, where the value function sees it, shape [N, D]; else None.
     """
 
     env: EnvState
@@ -36,6 +37,7 @@ class Episodes(struct.PyTreeNode):
     reward: Float[Array, "*batch"]
     done: Float[Array, "*batch"]
     info: dict[str, Any]
+    theta: Any = None
 
 
 class Ended(struct.PyTreeNode):
@@ -65,15 +67,16 @@ class Batch:
     of what is learnt if it were a truncation. What is truncated is a failed simulation, of which nothing can be learnt.
     """
 
-    def __init__(self, environment: Environment, n: int, redrawn: bool = False):
+    def __init__(self, environment: Environment, n: int, redrawn: bool = False, privileged: bool = False):
         """N environments.
 
         Args:
             environment: for one episode.
             n: how many.
             redrawn: whether theta is drawn anew for every episode.
+            privileged: whether theta is added to what is observed, for the value function.
         """
-        self.environment, self.n, self.redrawn = environment, n, redrawn
+        self.environment, self.n, self.redrawn, self.privileged = environment, n, redrawn, privileged
 
     def reset(self, key: jax.Array, domain: Domain) -> Episodes:
         """The first episodes.
@@ -83,11 +86,11 @@ class Batch:
         """
         if not self.redrawn and len(domain.theta) != self.n:
             raise ValueError(f"domain: expected {self.n} points, one an environment, got {len(domain.theta)}")
-        keys, env = self._begin(jax.random.split(key, self.n), domain)
+        keys, env, theta = self._begin(jax.random.split(key, self.n), domain)
         zeros = jnp.zeros(self.n)
         info = {"truncation": zeros, "ended": _ended(env, jnp.zeros(self.n, bool), zeros, jnp.zeros(self.n, int))}
-        observed = self.environment.observations.to_unit(env.observation)
-        return Episodes(env, keys, jnp.zeros(self.n, int), zeros, domain, observed, zeros, zeros, info)
+        observed = self._observed(env.observation, theta)
+        return Episodes(env, keys, jnp.zeros(self.n, int), zeros, domain, observed, zeros, zeros, info, theta)
 
     def step(self, state: Episodes, action: Float[Array, "n act"]) -> Episodes:
         """One step of all, by actions as a policy gives them; they are limited to [-1, 1]."""
@@ -100,28 +103,36 @@ class Batch:
         info = {"truncation": truncated.astype(jnp.float32), "ended": _ended(env, done, sums, steps)}
 
         # Keys move on with every step, so that none is used twice.
-        next_keys, fresh = self._begin(state.key, state.domain)
+        next_keys, fresh, theta = self._begin(state.key, state.domain)
         choose: Callable[[Any, Any], Any] = lambda new, old: jax.vmap(jnp.where)(done, new, old)
+        theta = jax.tree.map(choose, theta, state.theta)
         return Episodes(
             env=jax.tree.map(choose, fresh, env),
             key=next_keys,
             steps=jnp.where(done, 0, steps),
             sums=jnp.where(done, 0.0, sums),
             domain=state.domain,
-            obs=self.environment.observations.to_unit(choose(fresh.observation, env.observation)),
+            obs=self._observed(choose(fresh.observation, env.observation), theta),
             reward=env.reward,
             done=done.astype(jnp.float32),
             info=info,
+            theta=theta,
         )
 
-    def _begin(self, keys: jax.Array, domain: Domain) -> tuple[jax.Array, EnvState]:
-        """The environments' next keys, and an episode of each."""
+    def _observed(self, observation: Float[Array, "n obs"], theta: Any) -> Float[Array, "n seen"]:
+        """What the networks see."""
+        seen = self.environment.observations.to_unit(observation)
+        return jnp.concatenate([seen, standardised(self.environment, theta)], axis=-1) if self.privileged else seen
+
+    def _begin(self, keys: jax.Array, domain: Domain) -> tuple[jax.Array, EnvState, Any]:
+        """The environments' next keys, an episode of each, and its theta, where that is seen."""
 
         def one(key, index):
             following, key_theta, key_reset = jax.random.split(key, 3)
             if self.redrawn:
                 index = jax.random.randint(key_theta, (), 0, len(domain.theta))
-            return following, self.environment.reset(key_reset, domain.theta[index])
+            theta = domain.theta[index]
+            return following, self.environment.reset(key_reset, theta), theta if self.privileged else None
 
         return jax.vmap(one)(keys, jnp.arange(self.n))
 

@@ -42,7 +42,8 @@ class Policy:
         biases: likewise, shapes [out].
         schema: what the numbers are: `environment`, and `observations` and `actions` with their `names`, `units`,
             `centre` and `scale` (`jaxlfi.rl.environment.Signals`); `deployment`, what a robot must keep to
-            (`jaxlfi.rl.deployment`); whatever else was recorded with the policy, as `versions`.
+            (`jaxlfi.rl.deployment`); `preparation`, how observations are made of signals, and controls of actions
+            (`jaxlfi.rl.preparation`); whatever else was recorded with the policy, as `versions`.
 
     Raises:
         ValueError: for layers that do not fit together or to the schema, numbers that are not finite, and a schema
@@ -94,18 +95,18 @@ class Policy:
         action = np.dot(layer, self.weights[-1]) + self.biases[-1]
         return np.minimum(np.maximum(action, -ONE), ONE) * outputs[1] + outputs[0]
 
-    def require(self, environment: str, observations: Named, actions: Named) -> "Policy":
+    def require(self, environment: str | None, observations: Named, actions: Named) -> "Policy":
         """Refuse a policy of another environment.
 
         Args:
-            environment: its name.
+            environment: its name; None where that does not matter.
             observations: names and units of its observations, as `jaxlfi.rl.environment.Signals`.
             actions: likewise, of its actions.
 
         Raises:
             ValueError: which says what differs.
         """
-        pairs = {"environment": (environment, self.schema["environment"])}
+        pairs = {"environment": (environment or self.schema["environment"], self.schema["environment"])}
         for what, signals in (("observations", observations), ("actions", actions)):
             pairs[what] = list(signals.names), list(self.schema[what]["names"])
             pairs[f"units of {what}"] = list(signals.units), list(self.schema[what]["units"])

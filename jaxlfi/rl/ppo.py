@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import functools
 import io
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ import optax
 from flax import linen, struct
 from jaxtyping import Array, Float, Int
 
-from jaxlfi.rl import deployment
+from jaxlfi.rl import deployment, preparation
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.environment import Environment
 from jaxlfi.rl.episodes import Batch, Ended, Episodes
@@ -29,6 +30,7 @@ try:
     with contextlib.redirect_stdout(io.StringIO()):  # MJX says there that Warp is not installed
         from brax.training import acting
         from brax.training.agents.ppo import losses, networks
+        from brax.training.networks import make_value_network
 except ImportError as error:
     raise ImportError("jaxlfi.rl needs Brax: pip install 'jaxlfi[policy]'") from error
 
@@ -72,10 +74,11 @@ class Update(struct.PyTreeNode):
 def policy_networks(environment: Environment, settings: PPO) -> networks.PPONetworks:
     """A Gaussian policy whose deviation does not depend on the state, and a value function: tanh networks.
 
-    Observations come to them scaled by the environment's schema.
+    Observations come to them scaled by the environment's schema; where the value function sees theta, it comes after
+    them, and the policy leaves it out.
     """
     orthogonal = lambda gain: functools.partial(jax.nn.initializers.orthogonal, gain)
-    return networks.make_ppo_networks(
+    made = networks.make_ppo_networks(
         environment.observations.size,
         environment.actions.size,
         policy_hidden_layer_sizes=settings.hidden,
@@ -88,9 +91,22 @@ def policy_networks(environment: Environment, settings: PPO) -> networks.PPONetw
         value_network_kernel_init_fn=orthogonal(2**0.5),
         mean_kernel_init_fn=orthogonal(0.01),
     )
+    if not _privileged(settings):
+        return made
+    size, act = environment.observations.size, made.policy_network
+    value = make_value_network(
+        size + environment.space.dim,
+        hidden_layer_sizes=settings.hidden,
+        activation=linen.tanh,
+        kernel_init=orthogonal(2**0.5)(),
+    )
+    seeing = dataclasses.replace(act, apply=lambda scaling, params, seen: act.apply(scaling, params, seen[..., :size]))
+    return made.replace(policy_network=seeing, value_network=value)
 
 
-def init(key: jax.Array, environment: Environment, settings: PPO, domain: Domain) -> Training:
+def init(
+    key: jax.Array, environment: Environment, settings: PPO, domain: Domain, layers: Sequence[Any] | None = None
+) -> Training:
     """The state before the first update: new networks, and the first episodes.
 
     Args:
@@ -98,12 +114,15 @@ def init(key: jax.Array, environment: Environment, settings: PPO, domain: Domain
         environment: what is trained on.
         settings: of the training.
         domain: theta of the environments; as many points as there are environments, unless they are redrawn.
+        layers: weights and bias of each layer of the first policy; by default they are drawn.
     """
     key_policy, key_value, key_episodes, key_updates = jax.random.split(key, 4)
     networks = policy_networks(environment, settings)
     params = losses.PPONetworkParams(
         policy=networks.policy_network.init(key_policy), value=networks.value_network.init(key_value)
     )
+    if layers is not None:
+        params = params.replace(policy=_with_layers(params.policy, layers))
     return Training(
         params=params,
         optimiser=_optimiser(settings, jnp.asarray(0)).init(params),
@@ -213,7 +232,12 @@ def _optimiser(settings: PPO, made: Int[Array, ""]) -> optax.GradientTransformat
 
 
 def _batch(environment: Environment, settings: PPO) -> Batch:
-    return Batch(environment, settings.environments, settings.redrawn)
+    return Batch(environment, settings.environments, settings.redrawn, _privileged(settings))
+
+
+def _privileged(settings: PPO) -> bool:
+    """Whether the value function sees theta."""
+    return settings.critic == "theta"
 
 
 def _acting(ppo_networks: networks.PPONetworks, params: losses.PPONetworkParams):
@@ -247,20 +271,37 @@ def as_file(environment: Environment, params: losses.PPONetworkParams, **recorde
     """The policy as a file that needs neither JAX nor Brax.
 
     Args:
-        environment: that it was trained on; what it declares as `deployment` is written, too.
+        environment: that it was trained on; what it declares as `deployment`, `preparation` and `robot`, a mapping of
+            what robots are to keep to (`jaxlfi.robots.settings`), is written, too.
         params: of its training.
         recorded: what else its schema is to say.
     """
     layers = params.policy["params"]
-    hidden = [layers["MLP_0"][f"hidden_{index}"] for index in range(len(layers["MLP_0"]))]
-    every = jax.device_get([*hidden, layers["Dense_0"]])
+    every = jax.device_get([functools.reduce(lambda part, name: part[name], path, layers) for path in _paths(layers)])
     schema = {
         "environment": environment.name,
         "observations": dataclasses.asdict(environment.observations),
         "actions": dataclasses.asdict(environment.actions),
         **recorded,
     }
-    declared = getattr(environment, deployment.KEY, None)
-    if declared is not None:
-        schema[deployment.KEY] = dataclasses.asdict(declared)
+    for key in (deployment.KEY, preparation.KEY):
+        if (declared := getattr(environment, key, None)) is not None:
+            schema[key] = dataclasses.asdict(declared)
+    if robot := getattr(environment, "robot", None):
+        schema["robot"] = dict(robot)
     return Policy(tuple(layer["kernel"] for layer in every), tuple(layer["bias"] for layer in every), schema)
+
+
+def _paths(layers: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Where the layers of a policy's network are, from the first to the last."""
+    return [*(("MLP_0", f"hidden_{index}") for index in range(len(layers["MLP_0"]))), ("Dense_0",)]
+
+
+def _with_layers(policy: Mapping[str, Any], layers: Sequence[Any]) -> dict[str, Any]:
+    """The parameters of a policy's network with other layers; how much actions vary stays as it is."""
+    inner = dict(policy["params"])
+    inner["MLP_0"] = dict(inner["MLP_0"])
+    for (*outer, name), (weight, bias) in zip(_paths(inner), layers, strict=True):
+        place = inner[outer[0]] if outer else inner
+        place[name] = {"kernel": jnp.asarray(weight, jnp.float32), "bias": jnp.asarray(bias, jnp.float32)}
+    return {**policy, "params": inner}

@@ -51,6 +51,11 @@ class PPO(Checked):
     epochs: int = option(default=10, help="epochs per update", low=1)
     total_steps: int = option(default=60_000, help="total environment steps, rounded up to whole updates", low=1)
     hidden: tuple[int, ...] = option(default=(64, 64), help="widths of the hidden layers of both networks", low=1)
+    critic: str = option(
+        default="observations",
+        choices=("observations", "theta"),
+        help="what the value function sees: what the policy does, or theta besides; the policy never sees theta",
+    )
     redrawn: bool = option(
         default=False,
         help="draw a new theta for every episode; otherwise each environment keeps its own, as in the paper",

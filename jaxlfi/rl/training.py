@@ -1,6 +1,7 @@
 """Trainings side by side: domains times seeds as one compiled program, in a folder that can be resumed.
 
-config.json domains.npz                what was asked for, and the points that are trained and evaluated on
+config.json domains.npz start.npz      what was asked for, the points that are trained and evaluated on, and an
+                                       earlier policy, where one was to begin with
 checkpoint.npz                         while it runs: all trainings, and their learning curves so far
 curves.npz table.csv                   learning curves; how each policy fares on its own domain
 DOMAIN/seed_000/policy.npz ...         the policies (`jaxlfi.rl.policy`)
@@ -28,10 +29,11 @@ from jaxlfi.io import files, formats, provenance, serialise, trees, workfolder
 from jaxlfi.io.formats import TRAINING
 from jaxlfi.io.processes import ALONE, Partition, Processes
 from jaxlfi.io.workfolder import StoreError
-from jaxlfi.rl import ppo
+from jaxlfi.rl import fine_tuning, ppo
 from jaxlfi.rl.domains import POOL, Domain, Draw
 from jaxlfi.rl.environment import Environment
 from jaxlfi.rl.evaluation import evaluate
+from jaxlfi.rl.policy import Policy, load
 from jaxlfi.rl.ppo import Training, Update
 from jaxlfi.rl.settings import PPO
 from jaxlfi.runs.execute import devices_of
@@ -56,6 +58,7 @@ class Plan:
         domains: how to draw the points of each domain, by its name.
         seeds: of every domain's trainings.
         tensorboard: whether the learning curves are written for TensorBoard, too (`jaxlfi.rl.tensorboard`).
+        start: an earlier policy that all trainings begin with (`jaxlfi.rl.fine_tuning`).
     """
 
     reference: str | None
@@ -65,6 +68,7 @@ class Plan:
     domains: Mapping[str, Draw]
     seeds: tuple[int, ...]
     tensorboard: bool = False
+    start: Policy | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,8 +113,9 @@ def begin(plan: Plan, out: Path, processes: Processes = ALONE) -> None:
 
     Raises:
         StoreError: if something is there already.
-        ValueError: where there are more processes than trainings.
+        ValueError: where there are more processes than trainings, and for a policy to begin with that does not fit.
     """
+    first = None if plan.start is None else fine_tuning.started(plan.start, plan.environment, plan.settings)
     names = [(domain, seed) for domain in plan.domains for seed in plan.seeds]
     points = POOL if plan.settings.redrawn else plan.settings.environments
     drawn = []
@@ -132,11 +137,18 @@ def begin(plan: Plan, out: Path, processes: Processes = ALONE) -> None:
         "settings": serialise.fields_to_json(plan.settings, serialise.class_name),
         "trainings": [{"domain": domain, "seed": seed} for domain, seed in names],
         "tensorboard": plan.tensorboard,
+        "start": first is not None,
         "devices": devices_of(len(names), processes),
         "processes": processes.count,
         **provenance.environment(),
     }
-    workfolder.create(out, config, lambda staging: files.write_sealed(staging / "domains.npz", arrays))
+
+    def fill(staging: Path) -> None:
+        files.write_sealed(staging / "domains.npz", arrays)
+        if first is not None:
+            first.save(staging / "start.npz")
+
+    workfolder.create(out, config, fill)
 
 
 def resumed(
@@ -175,7 +187,8 @@ def resumed(
     partition = Partition(processes, len(names), jax.local_device_count())
     mesh = Mesh(np.asarray(jax.local_devices()[: partition.devices]), ("trainings",))
     chunk = min(MAX_CHUNK, settings.updates)
-    start = functools.partial(_start, environment, settings)
+    first = processes.broadcast_json(_first_layers(out, config) if processes.writes else None)
+    start = functools.partial(_start, environment, settings, first)
     some = side_by_side(functools.partial(_some, environment, settings, chunk), mesh, (None, 0))
     fares = side_by_side(functools.partial(_fares, environment, settings), mesh, (0, 0, 0))
 
@@ -256,8 +269,21 @@ def _keys(key: jax.Array) -> jax.Array:
     return jax.random.split(key, 4)
 
 
-def _start(environment: Environment, settings: PPO, key: jax.Array, theta: jax.Array) -> Training:
-    return ppo.init(key, environment, settings, Domain(theta))
+def _first_layers(out: Path, config: Mapping[str, Any]) -> list[Any] | None:
+    """Weights and biases of the policy that trainings begin with, as lists; None where each has one of its own."""
+    if not config.get("start"):
+        return None
+    try:
+        first = load(out / "start.npz")
+    except ValueError as error:
+        raise StoreError(str(error)) from error
+    return [[weight.tolist(), bias.tolist()] for weight, bias in zip(first.weights, first.biases, strict=True)]
+
+
+def _start(
+    environment: Environment, settings: PPO, layers: list[Any] | None, key: jax.Array, theta: jax.Array
+) -> Training:
+    return ppo.init(key, environment, settings, Domain(theta), layers)
 
 
 def _some(

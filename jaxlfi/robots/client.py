@@ -1,15 +1,22 @@
 """A robot in another process, behind a socket (`jaxlfi.robots.wire`)."""
 
+import dataclasses
 import socket
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from jaxlfi.robots import wire
-from jaxlfi.robots.clock import Clock, Monotonic
+from jaxlfi.robots.clock import Clock, Monotonic, Simulated
 from jaxlfi.robots.robot import Command, Observation, RobotError
 
 TIMEOUT = 0.5
 """Seconds that a reply may take."""
+PATIENCE = 20.0
+"""The same of the first one, as a robot gets ready, and of a robot that lives in the loop's time."""
+SIMULATED = "simulated"
+"""What such a robot says of itself."""
 
 
 class SocketRobot:
@@ -27,6 +34,8 @@ class SocketRobot:
         remote: bool = False,
         timeout: float = TIMEOUT,
         clock: Clock | None = None,
+        token: str | None = None,
+        units: Mapping[str, Sequence[str]] | None = None,
     ):
         """Connect.
 
@@ -35,24 +44,34 @@ class SocketRobot:
             observations: names of the numbers that are expected; the driver refuses others than its own.
             actions: names of the set-points' displacements, likewise.
             remote: let the driver be on another host.
-            timeout: for each reply, in s.
+            timeout: for each reply but the first, in s.
             clock: the loop's, for simulated robots that live in its time.
+            token: that the driver asks for; needed where it is on another host.
+            units: of the observations and of the actions, which drivers need to know (`jaxlfi.robots.driver`).
 
         Raises:
-            ValueError: for what is no address, or one of another host.
+            ValueError: for what is no address, or one of another host that is not let, or without a token.
             RobotError: where no driver answers, or one of another protocol.
         """
         host, port = wire.address(address, remote)
+        if token is None and not wire.is_local(host):
+            raise ValueError(f"token: expected the one that the robot at {host}, another host, shares; got none")
         self._name, self._clock = f"robot {host}:{port}", Monotonic() if clock is None else clock
         try:
             self._lines = wire.Lines(socket.create_connection((host, port), timeout))
         except OSError as error:
             raise RobotError(f"{self._name}: expected a driver that listens, got: {error}") from error
         hello = {"protocol": wire.PROTOCOL, "version": wire.VERSION}
+        hello |= {"observations": list(observations), "actions": list(actions)}
+        self._lines.wait_for(max(timeout, PATIENCE))
+        hello |= {} if units is None else {"units": {what: list(each) for what, each in units.items()}}
         try:
-            reply = self._asked("hello", ("hello",), **hello, observations=list(observations), actions=list(actions))
+            reply = self._asked("hello", ("hello", "challenge"), **hello)
+            if reply["type"] == "challenge":
+                reply = self._asked("hello", ("hello",), **hello, proof=self._checked(lambda: _proof(token, reply)))
             self._checked(lambda: wire.check_hello(reply))
             self.about: dict[str, Any] = self._checked(lambda: wire.mapping(reply, "about"))
+            self._lines.wait_for(timeout)
         except RobotError:
             self._lines.close()
             raise
@@ -80,7 +99,7 @@ class SocketRobot:
     def stop(self) -> None:
         """Have the robot stop, and end the connection, upon which it stops in any case."""
         try:
-            self._lines.send("stop")
+            self._lines.send("stop")  # which needs no other call to have returned
             while self._lines.receive()["type"] not in ("stopped", "error"):
                 pass  # a reply that came too late
         except OSError as error:
@@ -88,14 +107,21 @@ class SocketRobot:
         finally:
             self._lines.close()
 
+    def live_in(self, clock: Clock) -> None:
+        """From now on the robot lives in the time of a loop, which waits for each reply."""
+        self._clock = clock
+        self._lines.wait_for(PATIENCE)
+
     def _asked(self, kind: str, replies: Sequence[str], **contents: Any) -> dict[str, Any]:
         def ask() -> dict[str, Any]:
             self._lines.send(kind, **contents)
             reply = self._lines.receive()
             if reply["type"] == "error":
-                raise RobotError(f"its driver refused {kind}: {str(reply.get('message'))[:200]}")
+                raise RobotError(f"its driver refused {kind}: {wire.short(reply.get('message'), 200)}")
             if reply["type"] not in replies:
-                raise RobotError(f"expected {' or '.join(replies)} as the reply to {kind}, got {reply['type']!r}")
+                raise RobotError(
+                    f"expected {' or '.join(replies)} as the reply to {kind}, got {wire.short(reply['type'])!r}"
+                )
             return reply
 
         return self._checked(ask)
@@ -106,3 +132,77 @@ class SocketRobot:
             return work()
         except (OSError, OverflowError, ValueError) as error:
             raise RobotError(f"{self._name}: {error}") from error
+
+
+class SocketDriver:
+    """A driver in another process (`jaxlfi.robots.driver`), which `jaxlfi.robots.server.serve_driver` serves.
+
+    One that says that it is `simulated` lives in the loop's time: it has a `simulated_clock`.
+    """
+
+    def __init__(self, address: str, remote: bool = False, token: str | None = None, timeout: float = TIMEOUT):
+        """It is not connected yet.
+
+        Args:
+            address: socket://HOST:PORT.
+            remote: let the driver be on another host.
+            token: that the driver asks for; needed where it is on another host.
+            timeout: for each reply, in s.
+        """
+        self._address, self._remote, self._token, self._timeout = address, remote, token, timeout
+        self._robot: SocketRobot | None = None
+        self._names: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+        self._given: np.ndarray | None = None
+        self._slot = 0
+
+    def connect(self, signals: Mapping[str, str], controls: Mapping[str, str]) -> Mapping[str, Any]:
+        """Connect to the driver, which may refuse; its own words about itself are returned.
+
+        Raises:
+            ValueError: for what is no address, or one of another host that is not let, or without a token.
+            RobotError: where no driver answers, or it refuses.
+        """
+        self._names = tuple(signals), tuple(controls)
+        units = {"observations": list(signals.values()), "actions": list(controls.values())}
+        robot = SocketRobot(self._address, *self._names, self._remote, self._timeout, token=self._token, units=units)
+        if robot.about.get(SIMULATED) is True:
+            self.simulated_clock = Simulated()
+            robot.live_in(self.simulated_clock)
+        self._robot = robot
+        return robot.about
+
+    def observe(self) -> Observation | None:
+        """The latest observation, by name."""
+        found = self._connected.observe()
+        if found is None:
+            return None
+        signals, controls = self._names
+        if len(found.values) != len(signals):
+            raise RobotError(f"robot: expected {len(signals)} numbers, got {len(found.values)}")
+        values = dict(zip(signals, found.values.tolist(), strict=True))
+        target = None if found.target is None else dict(zip(controls, found.target.tolist(), strict=False))
+        return dataclasses.replace(found, values=values, target=target)
+
+    def act(self, controls: Mapping[str, float]) -> None:
+        """Send the controls."""
+        given = np.array([controls[name] for name in self._names[1]], float)
+        change = np.zeros(len(given)) if self._given is None else given - self._given
+        self._connected.act(Command(self._slot, change, given))
+        self._given, self._slot = given, self._slot + 1
+
+    def stop(self) -> None:
+        """Have the robot stop, if there is one."""
+        if self._robot is not None:
+            self._robot.stop()
+
+    @property
+    def _connected(self) -> SocketRobot:
+        if self._robot is None:
+            raise RobotError("robot: expected connect before anything else, got none")
+        return self._robot
+
+
+def _proof(token: str | None, challenge: Mapping[str, Any]) -> str:
+    if token is None:
+        raise RobotError("it asks for a shared token, got none")
+    return wire.proof(token, wire.texts({"nonce": [challenge.get("nonce")]}, "nonce")[0])

@@ -6,6 +6,8 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+from jaxlfi.robots.robot import RobotError
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -24,6 +26,7 @@ class Interrupts:
         self._received: list[int] = []
         self._patience: int | None = None  # signals that are not raised at once; None: none is
         self._before: dict[int, Any] = {}
+        self._broken_off = ""  # why a call is interrupted without anybody having asked for it
 
     def __enter__(self) -> "Interrupts":
         """Handle signals."""
@@ -35,6 +38,7 @@ class Interrupts:
         """Leave signals to those who handled them before; raise one that has not been raised yet."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        self._before = {}
         if kind is None:
             self.check()
 
@@ -51,6 +55,12 @@ class Interrupts:
         """Where the second signal interrupts at once, as what is called may never return."""
         return self._let(1)
 
+    def break_off(self, why: str) -> None:
+        """From another thread, interrupt what is being called by a `RobotError`; where signals are handled only."""
+        if self._before:
+            self._broken_off = why
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
     @contextlib.contextmanager
     def _let(self, patience: int) -> Iterator[None]:
         self._patience = patience
@@ -62,6 +72,12 @@ class Interrupts:
             self._patience = None
 
     def _handle(self, number: int, frame) -> None:
+        if self._broken_off:
+            why, self._broken_off = self._broken_off, ""
+            if self._patience is not None:
+                self._patience = None
+                raise RobotError(why)
+            return  # the call has returned, and the loop is about to ask
         self._received.append(number)
         if self._patience is not None and len(self._received) > self._patience:
             self._patience = None  # once only

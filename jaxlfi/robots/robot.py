@@ -1,7 +1,7 @@
 """What a robot must provide to be controlled by a policy."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -16,18 +16,19 @@ class Observation:
     """What a robot has measured last.
 
     Attributes:
-        values: numbers in the order and the units of the policy's schema, NaN where one is unknown, shape [O].
+        values: numbers in the order and the units of the policy's schema, NaN where one is unknown, shape [O]; or by
+            name, of a driver (`jaxlfi.robots.driver`).
         number: of the measurement; larger for a later one.
         age: time since it was made, in s, so that no two clocks need to agree.
-        target: where the set-points are, shape [A], if the robot knows; else they are taken to be at the measured
-            positions before the first command.
+        target: where the set-points are, shape [A], or by name, if the robot knows; else they are taken to be at the
+            measured positions before the first command.
         extras: what else is to be logged, by name; the same names in every observation.
     """
 
-    values: Sequence[float] | np.ndarray
+    values: Any
     number: int
     age: float = 0.0
-    target: Sequence[float] | np.ndarray | None = None
+    target: Any = None
     extras: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 

@@ -1,7 +1,10 @@
 """The other end of the socket: a robot served to a control loop in another process (`jaxlfi.robots.wire`)."""
 
+import abc
 import contextlib
+import dataclasses
 import json
+import secrets
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -9,16 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from jaxlfi.rl.deployment import Limits
+from jaxlfi.rl.deployment import ControlLimits, Limits
 from jaxlfi.robots import wire
 from jaxlfi.robots.clock import Clock, Monotonic, Simulated
+from jaxlfi.robots.driver import Driven, Driver
 from jaxlfi.robots.interrupts import Interrupts
-from jaxlfi.robots.robot import Command, Robot, RobotError
+from jaxlfi.robots.robot import Command, Observation, Robot, RobotError
 
 WATCHDOG = 1.0
 """Seconds without a request after which a robot is stopped."""
-ROUNDING = 1e-6
-"""By which commands may exceed limits."""
+MOST = 10_000
+"""Signals and controls that a client may ask for, at most."""
+LEAP = 3600.0
+"""Seconds by which the time of a loop may go on between two requests, for robots that live in it."""
+FREE = (-np.inf, np.inf, np.inf)
+"""Limits of a control that has none."""
 Journal = Callable[[Mapping[str, Any]], None]
 """Takes note of an event."""
 
@@ -33,13 +41,14 @@ def serve(
     watchdog: float = WATCHDOG,
     journal: Journal = lambda event: None,
     clock: Callable[[], Clock] = Monotonic,
+    token: str | None = None,
 ) -> None:
     """Serve one loop after another, until the process is ended.
 
     A robot is stopped exactly once: when it is asked to, when the connection ends or no request comes for a while, when
-    a request is damaged or a command beyond the limits, after any exception of its own or of the journal, and before
-    SIGINT or SIGTERM ends the process. Commands are checked by the server's own clock, and none is let before there was
-    an observation.
+    a request is damaged or a command beyond the limits, when a second client comes, after any exception of its own or
+    of the journal, and before SIGINT or SIGTERM ends the process. Commands are checked by the server's own clock, and
+    none is let before there was an observation.
 
     Args:
         listener: that connections come to (`listen`).
@@ -51,23 +60,76 @@ def serve(
         watchdog: seconds that may pass without a request.
         journal: takes note of connections ("begun"), commands ("act") and stops ("stopped").
         clock: makes a connection's clock. `Simulated` ones follow the loop's time: for robots that live in it.
+        token: that clients have to know; needed where the listener's address is not this very host's own.
 
     Raises:
+        ValueError: for an address that other hosts reach, without a token.
         Interrupted: after SIGINT or SIGTERM.
     """
     names = {"observations": list(observations), "actions": list(actions)}
+    _serve(listener, _Displaced(make, names, list(moved), limits), watchdog, journal, clock, token)
+
+
+def serve_driver(
+    listener: socket.socket,
+    make: Callable[[Clock], Driver],
+    limits: ControlLimits | None = None,
+    watchdog: float = WATCHDOG,
+    journal: Journal = lambda event: None,
+    clock: Callable[[], Clock] = Monotonic,
+    token: str | None = None,
+) -> None:
+    """Serve a driver to one loop after another, as `serve` does a robot; clients say what they need by name.
+
+    Args:
+        listener: that connections come to (`listen`).
+        make: makes a driver for a connection, by the connection's clock.
+        limits: of actuators, which every command is checked by; of others there are none.
+        watchdog: seconds that may pass without a request.
+        journal: takes note of connections ("begun"), commands ("act") and stops ("stopped").
+        clock: makes a connection's clock.
+        token: that clients have to know; needed where the listener's address is not this very host's own.
+
+    Raises:
+        ValueError: for an address that other hosts reach, without a token.
+        Interrupted: after SIGINT or SIGTERM.
+    """
+    limits = ControlLimits((), (), (), ()) if limits is None else limits
+    _serve(listener, _Named(make, limits), watchdog, journal, clock, token)
+
+
+def _serve(
+    listener: socket.socket,
+    kind: "_Kind",
+    watchdog: float,
+    journal: Journal,
+    clock: Callable[[], Clock],
+    token: str | None,
+) -> None:
+    require_token(listener, token)
     with Interrupts() as interrupts:
         while True:
             with interrupts.waiting():
                 connection, _ = listener.accept()
             with connection:
                 connection.settimeout(watchdog)
-                _Session(make, clock(), names, list(moved), limits, journal, interrupts).run(wire.Lines(connection))
+                _Session(kind, clock(), journal, interrupts, listener, token).run(wire.Lines(connection))
 
 
 def listen(port: int, host: str = "127.0.0.1") -> socket.socket:
     """A socket that connections can come to; by default from this very host only. Port 0 is any that is free."""
     return socket.create_server((host, port))
+
+
+def require_token(listener: socket.socket, token: str | None) -> None:
+    """Refuse to serve where other hosts reach without a token.
+
+    Raises:
+        ValueError: naming the address.
+    """
+    host = listener.getsockname()[0]
+    if token is None and not wire.is_local(host):
+        raise ValueError(f"token: expected one for {host}, an address that other hosts reach, got none")
 
 
 def write_to(path: Path) -> Journal:
@@ -77,25 +139,97 @@ def write_to(path: Path) -> Journal:
         OSError: for a file that cannot be written.
     """
     file = path.open("a", buffering=1)
-    return lambda event: file.write(json.dumps(event) + "\n")
+
+    def write(event: Mapping[str, Any]) -> None:
+        file.write(json.dumps(event) + "\n")
+
+    return write
+
+
+class _Kind(abc.ABC):
+    """What a client may ask a robot for."""
+
+    @abc.abstractmethod
+    def opened(self, hello: Mapping[str, Any], clock: Clock) -> tuple[Robot, "ControlLimits | Limits"]:
+        """The robot that a client asks for, and its limits.
+
+        Raises:
+            RobotError: for a client that asks for another robot.
+        """
+
+    @abc.abstractmethod
+    def begin(self, seen: Observation) -> np.ndarray | None:
+        """Where the set-points are before the first command, if that is known."""
+
+
+class _Displaced(_Kind):
+    """A robot whose set-points are displaced: all of its numbers, in their order."""
+
+    def __init__(
+        self, make: Callable[[Clock], Robot], names: Mapping[str, list[str]], moved: list[int], limits: Limits
+    ):
+        self.make, self.names, self.moved, self.limits = make, names, moved, limits
+
+    def opened(self, hello: Mapping[str, Any], clock: Clock) -> tuple[Robot, Limits]:
+        for what, expected in self.names.items():
+            if hello.get(what) != expected:
+                raise RobotError(f"expected {what} {expected}, got {wire.short(hello.get(what))}")
+        return self.make(clock), self.limits
+
+    def begin(self, seen: Observation) -> np.ndarray | None:
+        return np.asarray(np.asarray(seen.values, float)[self.moved] if seen.target is None else seen.target, float)
+
+
+class _Named(_Kind):
+    """A driver: whatever numbers of it, by name."""
+
+    def __init__(self, make: Callable[[Clock], Driver], limits: ControlLimits):
+        self.make, self.limits = make, limits
+
+    def opened(self, hello: Mapping[str, Any], clock: Clock) -> tuple[Robot, ControlLimits]:
+        signals, controls = (_with_units(hello, what) for what in ("observations", "actions"))
+        limits = {name: row for name, *row in zip(*dataclasses.astuple(self.limits), strict=True)}
+        low, high, rate = zip(*(limits.get(name, FREE) for name in controls), strict=True) if controls else ((), (), ())
+        return Driven(self.make(clock), signals, controls), ControlLimits(tuple(controls), low, high, rate)
+
+    def begin(self, seen: Observation) -> np.ndarray | None:
+        return None if seen.target is None else np.asarray(seen.target, float)
+
+
+def _with_units(hello: Mapping[str, Any], what: str) -> dict[str, str]:
+    """Names that a client asks for, with their units."""
+    names = wire.texts(hello, what)
+    units = wire.texts(wire.mapping(hello, "units"), what, len(names)) if "units" in hello else [""] * len(names)
+    if len(set(names)) < len(names) or len(names) > MOST:
+        raise RobotError(f"expected {what} each once, {MOST} at most, got {len(names)}")
+    return dict(zip(names, units, strict=True))
 
 
 class _Session:
     """A robot while a loop is connected to it."""
 
-    def __init__(self, make, clock: Clock, names, moved, limits: Limits, journal: Journal, interrupts: Interrupts):
-        self.make, self.clock, self.names, self.moved, self.limits = make, clock, names, moved, limits
-        self.journal, self.interrupts = journal, interrupts
+    def __init__(
+        self,
+        kind: _Kind,
+        clock: Clock,
+        journal: Journal,
+        interrupts: Interrupts,
+        listener: socket.socket,
+        token: str | None,
+    ):
+        self.kind, self.clock, self.journal, self.interrupts = kind, clock, journal, interrupts
+        self.listener, self.token = listener, token
         self.robot: Robot | None = None
+        self.seen = False  # whether there was an observation
         self.target: np.ndarray | None = None  # where the set-points are, once it is known
         self.sent: float | None = None
+        self.told: float | None = None  # the loop's time
 
     def run(self, lines: wire.Lines) -> None:
         """From hello to the stop."""
         why = "the server was ended"
         try:
             self.journal({"event": "begun"})
-            self.robot = self.make(self.clock)
             self._greet(lines)
             while (message := self._next(lines))["type"] != "stop":
                 kind, contents = self._answer(message)
@@ -113,9 +247,10 @@ class _Session:
 
     def _stop(self, why: str) -> str:
         """Stop the robot if there is one, and say why it was stopped."""
+        robot, self.robot = self.robot, None
         try:
-            if self.robot is not None:
-                self.robot.stop()
+            if robot is not None:
+                robot.stop()
         except Exception as error:
             why = f"{why}; and stopping the robot failed: {error}"
         with contextlib.suppress(Exception):  # a journal that fails does not end the server
@@ -128,7 +263,7 @@ class _Session:
             if why == "asked to":
                 lines.send("stopped")
                 return
-            lines.send("error", message=why)
+            lines.send("error", message=wire.short(why, 1000))
             while self._next(lines)["type"] != "stop":
                 pass
             lines.send("stopped")
@@ -136,36 +271,42 @@ class _Session:
             return
 
     def _next(self, lines: wire.Lines) -> dict[str, Any]:
+        """The next message; while there is a robot, nobody else may come."""
         with self.interrupts.waiting():
-            return lines.receive()
+            return lines.receive(None if self.robot is None else self.listener)
 
     def _greet(self, lines: wire.Lines) -> None:
         message = self._next(lines)
         wire.check_hello(message)
-        for what, expected in self.names.items():
-            if message.get(what) != expected:
-                raise RobotError(f"expected {what} {expected}, got {message.get(what)}")
+        if self.token is not None:
+            nonce = secrets.token_hex(16)
+            lines.send("challenge", nonce=nonce)
+            message = self._next(lines)
+            wire.check_hello(message)
+            wire.check_proof(message, self.token, nonce)
+        self.robot, self.limits = self.kind.opened(message, self.clock)
         about = getattr(self.robot, "about", {})
         lines.send("hello", protocol=wire.PROTOCOL, version=wire.VERSION, about=about)
 
     def _answer(self, message: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
         if message["type"] not in ("observe", "act"):
-            raise RobotError(f"expected observe, act or stop, got {message['type']!r}")
+            raise RobotError(f"expected observe, act or stop, got {wire.short(message['type'])!r}")
+        if self.robot is None:
+            raise RobotError("expected hello before anything else, got none")
         now = self._now(wire.number(message, "now"))
         if message["type"] == "observe":
             seen = self.robot.observe()
             if seen is None:
                 return "nothing", {}
             if self.sent is None:  # from where the first command has to begin
-                values = np.asarray(seen.values, float)
-                self.target = values[self.moved] if seen.target is None else np.asarray(seen.target, float)
+                self.target, self.seen = self.kind.begin(seen), True
             return "observation", vars(seen)
         slot, displacement, target = (
             int(wire.number(message, "slot")),
             wire.numbers(message, "displacement"),
             wire.numbers(message, "target"),
         )
-        if self.target is None:
+        if not self.seen:
             raise RobotError("expected an observation before the first command, got none")
         self._check(now, displacement, target)
         self.journal({"event": "act", "now": now, "displacement": displacement.tolist(), "target": target.tolist()})
@@ -176,22 +317,18 @@ class _Session:
     def _now(self, of_loop: float) -> float:
         """The time, which for a simulated robot is that of the loop."""
         if isinstance(self.clock, Simulated):
+            if self.told is not None and of_loop > self.told + LEAP:
+                raise RobotError(f"expected a time within {LEAP:g} s of {self.told:g} s, got {of_loop:g} s")
+            self.told = of_loop
             self.clock.sleep_until(of_loop)
         return self.clock.now()
 
     def _check(self, now: float, displacement: np.ndarray, target: np.ndarray) -> None:
         """Refuse commands that a loop should not have sent."""
-        limits, size = self.limits, len(self.limits.step)
+        limits, size = self.limits, len(self.limits.low)
         if displacement.shape != (size,) or target.shape != (size,):
             raise RobotError(f"expected {size} set-points, got {target.tolist()} after {displacement.tolist()}")
-        expected = self.target + displacement
+        before = target - displacement if self.target is None else self.target
         elapsed = np.inf if self.sent is None else now - self.sent
-        safe = (
-            (np.abs(displacement) <= np.add(limits.step, ROUNDING)).all()  # also refuses NaN
-            and (target >= np.subtract(limits.low, ROUNDING)).all()
-            and (target <= np.add(limits.high, ROUNDING)).all()
-            and (np.abs(target - expected) <= ROUNDING).all()
-            and np.linalg.norm(displacement) <= limits.speed * elapsed + ROUNDING
-        )
-        if not safe:
+        if not limits.allow(before, displacement, target, elapsed):
             raise RobotError(f"expected a command within {limits}, got {displacement.tolist()} to {target.tolist()}")

@@ -3,7 +3,8 @@
 | request                                              | reply                                                         |
 |------------------------------------------------------|---------------------------------------------------------------|
 | `hello`: `protocol`, `version`, `observations` and   | `hello`: `protocol`, `version`, `about`, what is to be        |
-| `actions`, their names                               | recorded of the robot                                         |
+| `actions`, their names; `units` of both, for drivers | recorded of the robot; or `challenge`: `nonce`, where there   |
+| (`jaxlfi.robots.driver`)                             | is a token, upon which `hello` is said again with a `proof`   |
 | `observe`: `now`                                     | `observation`: `number`, `age`, `values`, and where there are |
 |                                                      | any `target`, `extras`; or `nothing`                          |
 | `act`: `now`, `slot`, `displacement`, `target`       | `done`, as soon as the motion has begun                       |
@@ -12,15 +13,22 @@
 Every line is an object with a `type`, at most 1 MiB. Numbers are in the units of the policy's schema, `age` and `now`
 in s, and an unknown number is null. `now` is the loop's clock, for simulated robots that live in the loop's time;
 others go by their own. Any request may be answered by `error` with a `message`, after which the robot has stopped; it
-stops, too, when the connection ends.
+stops, too, when the connection ends, and when a second client comes, which is refused by an `error`.
+
+A shared token shows that a client may command the robot: the proof is the HMAC-SHA256, in hexadecimal digits, of the
+nonce by the token. The token itself is never sent. Nothing is encrypted.
 """
 
+import hashlib
+import hmac
 import ipaddress
 import json
 import math
+import select
 import socket
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +38,12 @@ from jaxlfi.robots.robot import RobotError
 PROTOCOL, VERSION = "jaxlfi-robot", 1
 LONGEST = 2**20
 """Bytes in a line, at most."""
+SHORTEST_TOKEN = 16
+"""Characters of a token, at least."""
+LARGEST = 1e300
+"""A number, at most."""
+BUSY = "busy: another client came while one had the robot"
+"""Why both are refused."""
 
 
 class Lines:
@@ -44,12 +58,15 @@ class Lines:
         message = {"type": kind, **{name: _plain(value) for name, value in contents.items()}}
         self._socket.sendall(json.dumps(message, allow_nan=False).encode() + b"\n")
 
-    def receive(self) -> dict[str, Any]:
+    def receive(self, others: socket.socket | None = None) -> dict[str, Any]:
         """The next message.
+
+        Args:
+            others: a listening socket, to which nobody else may come meanwhile.
 
         Raises:
             OSError: for a connection that has ended, and where nothing comes in time.
-            RobotError: for what is no message.
+            RobotError: for what is no message, and where somebody else came, who is refused.
         """
         timeout = self._socket.gettimeout()
         ends = time.monotonic() + (timeout or math.inf)
@@ -59,6 +76,13 @@ class Lines:
                     raise RobotError(f"expected a line of at most {LONGEST} bytes, got more")
                 if (left := ends - time.monotonic()) <= 0:  # whoever sends a byte now and then is late all the same
                     raise TimeoutError("timed out")
+                if others is not None:
+                    ready, _, _ = select.select([self._socket, others], [], [], None if timeout is None else left)
+                    if others in ready:
+                        _refuse_next(others)
+                        raise RobotError(BUSY)
+                    if not ready:
+                        continue
                 self._socket.settimeout(None if timeout is None else left)
                 if not (more := self._socket.recv(65536)):
                     raise ConnectionError("the connection was closed")
@@ -68,11 +92,15 @@ class Lines:
         line, _, self._rest = self._rest.partition(b"\n")
         try:
             message = json.loads(line)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise RobotError(f"expected a line of JSON, got {line[:40]!r}") from error
         if not isinstance(message, dict) or not isinstance(message.get("type"), str):
             raise RobotError(f"expected an object with a type, got {line[:40]!r}")
         return message
+
+    def wait_for(self, seconds: float) -> None:
+        """Let each message take so long from now on."""
+        self._socket.settimeout(seconds)
 
     def close(self) -> None:
         """End the connection."""
@@ -97,7 +125,7 @@ def numbers(message: Mapping[str, Any], name: str) -> np.ndarray:
     """
     values = message.get(name)
     if not isinstance(values, list) or not all(value is None or _is_number(value) for value in values):
-        raise RobotError(f"expected numbers as {name!r} of {message['type']!r}, got {str(values)[:40]}")
+        raise RobotError(f"expected numbers as {name!r} of {message['type']!r}, got {short(values)}")
     return np.array([np.nan if value is None else value for value in values], float)
 
 
@@ -108,8 +136,21 @@ def number(message: Mapping[str, Any], name: str) -> float:
         RobotError: where it has none.
     """
     if not _is_number(message.get(name)):
-        raise RobotError(f"expected a number as {name!r} of {message['type']!r}, got {str(message.get(name))[:40]}")
+        raise RobotError(f"expected a number as {name!r} of {message['type']!r}, got {short(message.get(name))}")
     return message[name]
+
+
+def texts(message: Mapping[str, Any], name: str, size: int | None = None) -> list[str]:
+    """A list of texts in a message.
+
+    Raises:
+        RobotError: where it has none, or another number of them than expected.
+    """
+    found = message.get(name)
+    if not isinstance(found, list) or not all(isinstance(one, str) for one in found) or size not in (None, len(found)):
+        several = "texts" if size is None else f"{size} texts"
+        raise RobotError(f"expected {several} as {name!r}, got {short(found)}")
+    return found
 
 
 def mapping(message: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -120,12 +161,13 @@ def mapping(message: Mapping[str, Any], name: str) -> dict[str, Any]:
     """
     found = message.get(name, {})
     if not isinstance(found, dict):
-        raise RobotError(f"expected an object as {name!r} of {message['type']!r}, got {str(found)[:40]}")
+        raise RobotError(f"expected an object as {name!r} of {message['type']!r}, got {short(found)}")
     return found
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Whether it is a number that a float can hold."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
 def check_hello(message: Mapping[str, Any]) -> None:
@@ -136,7 +178,62 @@ def check_hello(message: Mapping[str, Any]) -> None:
     """
     got = tuple(message.get(name) for name in ("type", "protocol", "version"))
     if got != ("hello", PROTOCOL, VERSION):
-        raise RobotError(f"expected hello of {PROTOCOL} of version {VERSION}, got {' '.join(map(str, got))}")
+        raise RobotError(f"expected hello of {PROTOCOL} of version {VERSION}, got {' '.join(map(short, got))}")
+
+
+def proof(token: str, nonce: str) -> str:
+    """What shows that a client knows the token."""
+    return hmac.new(token.encode(), nonce.encode(), hashlib.sha256).hexdigest()
+
+
+def check_proof(message: Mapping[str, Any], token: str, nonce: str) -> None:
+    """Refuse whoever does not know the token.
+
+    Raises:
+        RobotError: which does not say what was expected.
+    """
+    found = message.get("proof")
+    if not isinstance(found, str) or not hmac.compare_digest(found.encode(), proof(token, nonce).encode()):
+        raise RobotError(f"expected proof of the shared token, got {'another' if found else 'none'}")
+
+
+def token_of(path: str | Path) -> str:
+    """The token that a file holds, without the white space around it.
+
+    Raises:
+        ValueError: for a file that is missing, or a token that is easily guessed.
+    """
+    try:
+        text = Path(path).read_text().strip()
+    except (OSError, ValueError) as error:
+        raise ValueError(f"token: expected a file with a token, got {path}, which cannot be read") from error
+    if len(text) < SHORTEST_TOKEN or "\n" in text:
+        raise ValueError(f"token: expected one line of at least {SHORTEST_TOKEN} characters in {path}, got {len(text)}")
+    return text
+
+
+def is_local(host: str) -> bool:
+    """Whether an address is this very host's own."""
+    return ipaddress.ip_address(host).is_loopback
+
+
+def _refuse_next(listener: socket.socket) -> None:
+    """Tell the next client that it came too late."""
+    connection, _ = listener.accept()
+    with connection:
+        try:
+            connection.settimeout(0.1)
+            Lines(connection).send("error", message=BUSY)
+        except OSError:
+            return  # it has gone already
+
+
+def short(value: Any, length: int = 40) -> str:
+    """The beginning of a value in one line; integers of more digits than Python prints are told by their size."""
+    try:
+        return " ".join(str(value)[:length].split())
+    except ValueError:
+        return "an integer of thousands of digits"
 
 
 def address(text: str, remote: bool = False) -> tuple[str, int]:
@@ -144,8 +241,7 @@ def address(text: str, remote: bool = False) -> tuple[str, int]:
 
     Args:
         text: the address.
-        remote: whether other hosts than this one are let. Nothing is encrypted, nor does anybody have to say who they
-            are.
+        remote: whether other hosts than this one are let. Nothing is encrypted.
 
     Raises:
         ValueError: for other texts, and for other hosts where they are not let.
@@ -157,6 +253,6 @@ def address(text: str, remote: bool = False) -> tuple[str, int]:
         found = socket.gethostbyname(host)
     except OSError as error:
         raise ValueError(f"robot: expected a host, got {host!r}: {error}") from error
-    if not (remote or ipaddress.ip_address(found).is_loopback):
+    if not (remote or is_local(found)):
         raise ValueError(f"robot: expected this very host, as 127.0.0.1, got {host!r}; --remote lets other hosts")
     return found, int(port)

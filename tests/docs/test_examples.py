@@ -112,6 +112,13 @@ def test_a_driver_is_controlled_within_its_limits():
     np.testing.assert_allclose(log.observations[1:, 0], log.targets[:, 0], rtol=1e-6)
 
 
+def test_a_robot_of_four_methods_is_driven_to_where_its_policy_leads():
+    log = ran("any_robot")
+    assert log.stopped == "" and log.missed == 0 and len(log.targets) == 150
+    assert log.observations[0, 0] > 0.79 and abs(log.observations[-1, 0]) < 0.01
+    assert np.abs(log.targets).max() == 0.008 and np.abs(np.diff(log.targets[:, 0])).max() <= 0.5 * 0.02 + 1e-12
+
+
 def test_every_example_has_a_test():
     source = Path(__file__).read_text()
     assert EXAMPLES and all(f'ran("{name}")' in source for name in EXAMPLES)

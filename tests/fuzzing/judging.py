@@ -50,7 +50,7 @@ WORK = (
     "jaxlfi.envs.whip.planner.plan", "jaxlfi.envs.whip.reference_objects.repetitions.repeat",
     "jaxlfi.envs.whip.vision.commands.record", "jaxlfi.envs.whip.vision.making.make",
     "jaxlfi.envs.whip.vision.training.train_segmenter", "jaxlfi.envs.whip.vision.scenes.rollouts",
-    "jaxlfi.robots.loop.Loop.run", "jaxlfi.envs.whip.r2s2r._round_and_round",
+    "jaxlfi.robots.episode.Paced.run", "jaxlfi.envs.whip.r2s2r._round_and_round",
 )  # fmt: skip
 """Where work begins."""
 PASSED = ("works", "accepted", "refused")

@@ -215,7 +215,11 @@ def test_figures_know_no_task(path):
     assert not {name for name in imported(path) for library in ("jax", "flax", ENVS) if within(name, library)}
 
 
-ON_ROBOTS = {"jaxlfi.robots", "jaxlfi.rl.policy", "jaxlfi.rl.deployment", "numpy"}
+ON_ROBOTS = {
+    *("jaxlfi.robots", "jaxlfi.rl.policy", "jaxlfi.rl.deployment", "jaxlfi.rl.preparation", "jaxlfi.registry"),
+    *("jaxlfi.io.files", "jaxlfi.io.lerobot", "jaxlfi.io.mcap", "jaxlfi.io.rollout", "jaxlfi.io.serialise"),
+    *("jaxlfi.io.units", "numpy"),
+}
 """Modules of ours and others that a robot's computer needs, besides Python's own."""
 
 
@@ -223,7 +227,10 @@ ON_ROBOTS = {"jaxlfi.robots", "jaxlfi.rl.policy", "jaxlfi.rl.deployment", "numpy
 def test_robots_need_numpy_and_no_jax(path):
     """What they import imports no more at run time: tests/robots run where there is no JAX."""
     modules = {name for node in at_import(tree_of(path)) for name in imported_by(node, path)}
-    others = {name for name in modules if name.split(".")[0] not in sys.stdlib_module_names} - {"jaxlfi.rl"}
+    others = {name for name in modules if name.split(".")[0] not in sys.stdlib_module_names} - {
+        "jaxlfi.rl",
+        "jaxlfi.io",
+    }
     assert not {name for name in others if not any(within(name, known) for known in ON_ROBOTS)}
 
 

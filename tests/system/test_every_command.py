@@ -181,6 +181,21 @@ def an_arm(place: Path, patch: pytest.MonkeyPatch) -> None:
     assert command(*words.split()) == 0
 
 
+def a_machine(place: Path, patch: pytest.MonkeyPatch) -> None:
+    """The task of a model of two joints; nobody connects to it."""
+    from jaxlfi.robots import server
+
+    an_arm(place, patch)
+    patch.setattr(server, "serve_driver", lambda *words: None)
+
+
+def a_wheel(place: Path, patch: pytest.MonkeyPatch) -> None:
+    """A policy for a wheel."""
+    from robots.machines import a_policy
+
+    a_policy().save(place / "wheel.npz")
+
+
 def a_queue(place: Path, patch: pytest.MonkeyPatch) -> None:
     """A run of a task with a design."""
     if not (place / "queue").exists():
@@ -217,6 +232,13 @@ EXAMPLES = {
         needs=("train",), extra="brax", slow=True,
     ),
     "export": Example("export @train --out @export.npz", needs=("train",), writes=(".npz",), extra="brax", slow=True),
+    "control": Example(
+        "control @wheel.npz --robot robots.machines:Wheel --out @real.csv", writes=(".csv",), before=a_wheel
+    ),
+    "mujoco serve": Example(
+        "mujoco serve @arm.toml --truth joint/shoulder/damping=0.1 --truth actuator/motor/gear[0]=1.5",
+        before=a_machine, **WHIP,
+    ),
     "mujoco fit": Example(
         "mujoco fit @arm --starts 4 --keep 1 --out @fit", writes=(".png", ".json"), before=an_arm, **WHIP
     ),

@@ -8,10 +8,11 @@ import pytest
 pytest.importorskip("mujoco")
 
 from jaxlfi.envs.mujoco.columns import ControlWarning, arranged, control_names, signal_name
-from jaxlfi.envs.mujoco.goal import Goal, Reading
+from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.logs import Log
 from jaxlfi.envs.mujoco.model_task import compile_spec, mujoco_task, specification
 from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.envs.mujoco.reading import Reading
 
 HIPS = """
 <mujoco>

@@ -218,7 +218,7 @@ def test_first_states_are_drawn_and_noise_is_added():
     assert 0.2 <= start.min() < 0.22 and 0.68 < start.max() <= 0.7
     angle = jnp.arctan2(state.observation[:, 1], state.observation[:, 0])
     assert (angle - start).std() == pytest.approx(0.08, rel=0.15)
-    assert env.reading.reward(np.array([0.5, 0.1]), np.array([0.2]), np) == pytest.approx(0.3)
+    assert env.reading.reward(np.array([0.5, 0.1]), np.array([0.2]), np.array([0.0]), (), np) == pytest.approx(0.3)
 
 
 SLIDE = """
@@ -255,7 +255,7 @@ def test_a_policy_is_trained_on_it():
         ({"limits": {"engine": (0, 1), "motor": (0, 1)}}, "policy: limits: expected actuators of the model"),
         ({"limits": {"motor": (1, 0)}}, "policy: limits: motor: expected LOW below HIGH"),
         ({"interval": 0.021}, "policy: interval: expected a multiple of the model's time step, 0.004 s"),
-        ({"observed": ("angel",)}, "measured: expected a sensor such as angle"),
+        ({"observed": ("angel",)}, "policy: observed: expected a sensor such as angle"),
         ({"initial": {"hinge/qpos": (0, 1)}}, "expected a joint"),
         ({"xml": ARM.replace("implicitfast", "implicit")}, "model: MJX cannot simulate it"),
     ],
@@ -298,7 +298,7 @@ def test_a_table_is_a_goal():
         ("duration = 1.0", "", "policy: expected duration, got none"),
         ('["angle"]', '"angle"', "policy: observed: expected names of signals"),
         ("[-1, 1]", "[-1]", "policy: limits: motor: expected [LOW, HIGH]"),
-        ("value = 0.4", "weight = 0.4", "policy: targets: angle: expected value and weight"),
+        ("value = 0.4", "weight = 0.4", "policy: targets: angle: expected value or command"),
         ("value = 0.4", "value = 0.4\nweight = -1", "policy: targets: angle: expected a weight of at least 0"),
         ("0.02", '"20 ms"', "policy: interval: expected a number"),
         ("0.02", "2.0", "policy: interval: expected one of more than 0 s, and at most the duration"),
@@ -327,3 +327,28 @@ def test_the_example_has_the_parameters_of_its_task():
     assert env.space == inferred.space and env.units == tuple(inferred.units) and env.name == inferred.name
     for name in ("initial", "feasible"):
         chex.assert_trees_all_equal(env.supports[name], inferred.supports[name])
+
+
+def test_the_error_of_the_model_is_what_inference_says(tmp_path):
+    """Forces, discrepancies and noise: of a signal without any in the file, what the recording says."""
+    from jaxlfi.envs.mujoco import task
+    from jaxlfi.envs.mujoco.discrepancy import Discrepancy
+    from jaxlfi.envs.mujoco.simulator import simulator_of
+
+    folder = config.Path(__file__).parents[3] / "examples/mujoco"
+    for name in ("furuta.xml", "furuta.csv"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    text = (folder / "furuta.toml").read_text().replace('"pendulum angle" = 0.002\n', "", 1)
+    file = tmp_path / "furuta.toml"
+    file.write_text(text.replace("[policy]", "[policy]\nmodel_error = true\nnoises = { 'joint/arm/qvel' = 0.2 }", 1))
+    env, learnt = environment(file), simulator_of(task(file))
+    np.testing.assert_array_equal(env._lacking, learnt.forces.deviations)
+    assert (env._lacking[[0, 2, 4]] > 0).all() and learnt.signals == ("arm angle", "pendulum angle")
+    assert env._noise.tolist() == [0.002, learnt.noise[1], 0.2, 0.0] and 1e-4 < learnt.noise[1] < 0.01
+    kept = np.exp(-0.1 / np.array([0.78, 0.14]))
+    np.testing.assert_allclose(env._nuisances._keep[:2], kept, rtol=1e-6)
+    assert learnt.discrepancies[0] == Discrepancy(0.019, 0.78)
+    np.testing.assert_allclose(env._nuisances._deviations, [0.019, 0.0175, 0.0, 0.0])
+    file.write_text(text.replace("[policy]", "[policy]\nmodel_error = 1", 1))
+    with pytest.raises(ValueError, match="policy: model_error: expected true or false, got 1"):
+        environment(file)

@@ -1,0 +1,147 @@
+"""The first recording of a loop, what recordings have to measure, and what a policy achieved in one.
+
+A machine is excited by sines, three for each actuator, within the limits of its policies. Their frequencies are from
+one turn an episode of a policy to a quarter of its rate.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxlfi.envs.mujoco import config as tables
+from jaxlfi.envs.mujoco import goal as goals
+from jaxlfi.envs.mujoco import machine
+from jaxlfi.envs.mujoco.goal import Goal
+from jaxlfi.envs.mujoco.measured import add_sensors, unit
+from jaxlfi.envs.mujoco.model_task import compile_spec, specification
+from jaxlfi.envs.mujoco.reading import Reading, add_signals
+from jaxlfi.rl.preparation import Preparation, Signal
+from jaxlfi.robots import driving, recording
+from jaxlfi.robots.driver import Driver
+from jaxlfi.robots.driving import Drive
+from jaxlfi.robots.recording import Recording
+from jaxlfi.robots.settings import Settings, of_table
+
+SINES, PART = 3, 0.8
+"""For each actuator, and of what its limits let."""
+
+
+def record(driver: Driver, config: Path, path: Path, duration: float | None = None, seed: int = 0) -> None:
+    """Excite a machine, and write what it measures.
+
+    Args:
+        driver: of the machine.
+        config: of its task.
+        path: a new recording.
+        duration: in s; by default that of an episode.
+        seed: of frequencies and phases.
+
+    Raises:
+        RobotError: for a robot that failed, or had to be stopped.
+    """
+    table, (goal, reading) = tables.load(config), _goal(config)
+    names = measured_of(table, goal)
+    spec = specification(config.parent / table["model"])
+    add_sensors(spec, names)
+    model = compile_spec(spec)
+    step, duration = model.opt.timestep, goal.duration if duration is None else duration
+    interval = step * max(round(0.2 * goal.interval / step), 1)
+    controls = reading.preparation.controls
+    signals = tuple(Signal(name, unit(model, name).removeprefix("1")) for name in names)
+    plain = tuple(dataclasses.replace(one, displacing=False, begins=None) for one in controls)
+    preparation = Preparation(signals, plain, interval, max(round(duration / interval), 2))
+    settings = of_table(machine.carried(table.get("robot", {}), config.parent / table["model"], preparation))
+    limits = driving.limits_within(preparation, settings)
+    bounds = np.array([limits.low, limits.high])
+    samples = sines(np.random.default_rng(seed), bounds, interval, preparation.steps, goal.duration)
+    loop = Drive(
+        preparation,
+        limits,
+        (*names, *(name for name in settings.further if name not in names)),
+        settings.limits,
+        units=settings.units,
+        rate=1 / interval,
+        steps=preparation.steps,
+        watchdog=settings.watchdog or driving.WATCHDOG,
+    )
+    robot, loop, about = driving.connected(loop, driver, settings)
+    played = iter(samples)
+
+    def ended(log: Any) -> None:
+        sent = np.isfinite(log.lateness)
+        given = np.flatnonzero(sent) * log.period + log.lateness[sent]
+        columns = {one.name: log.targets[sent, place] for place, one in enumerate(controls)}
+        known = {name: loop.asked[name] for name in names} | {one.name: one.unit for one in controls}
+        kept = Recording(log.times, dict(zip(names, log.observations.T, strict=False)), given, columns, known)
+        report = {"mode": "excitation", "stopped": log.stopped, "timing": recording.timing(log), "robot": about}
+        for left in (path, path.with_suffix(".loop.npz")):
+            left.unlink(missing_ok=True)  # of a recording that was not written to its end
+        recording.write(path, kept, log, report, loop.signals)
+
+    loop.run(robot, lambda seen: next(played), on_end=ended)
+
+
+def sines(
+    rng: np.random.Generator, bounds: Float[np.ndarray, "2 act"], interval: float, steps: int, episode: float
+) -> Float[np.ndarray, "steps act"]:
+    """Controls that excite: sums of sines about the middle of the bounds, which begin there and stay within them.
+
+    Args:
+        rng: of frequencies and phases.
+        bounds: least and largest controls.
+        interval: between two controls, in s.
+        steps: how many.
+        episode: in s, whose inverse is the lowest frequency.
+    """
+    middle, half = bounds.mean(axis=0), 0.5 * (bounds[1] - bounds[0])
+    frequencies = np.exp(rng.uniform(np.log(1 / episode), np.log(0.05 / interval), (SINES, bounds.shape[1])))
+    phases = rng.uniform(0, 2 * np.pi, frequencies.shape)
+    times = interval * np.arange(steps)
+    angles = 2 * np.pi * times[:, None, None] * frequencies
+    waves = (np.sin(angles + phases) - np.sin(phases) * np.exp(-times / interval / 10)[:, None, None]).mean(axis=1)
+    return middle + PART * half * np.clip(waves, -1.0, 1.0)
+
+
+def measured_of(table: Mapping[str, Any], goal: Goal) -> list[str]:
+    """Signals that inference is to have: those that the task measures, whose noise it knows, or that policies see."""
+    return list(table.get("measured") or table.get("noise") or goal.observed)
+
+
+def measuring(settings: Settings, config: Path) -> Settings:
+    """Settings by which a policy's recordings have all that inference and the goal need."""
+    table, (goal, _) = tables.load(config), _goal(config)
+    names = dict.fromkeys((*settings.record, *measured_of(table, goal), *goal.signals))
+    return dataclasses.replace(settings, record=tuple(names))
+
+
+def achieved(config: Path, path: Path) -> dict[str, float]:
+    """What a policy achieved in a recorded episode: the return as in training, and how far it was off in the end.
+
+    Args:
+        config: of the task.
+        path: of the recording, with what happened beside it (`jaxlfi.robots.recording`).
+    """
+    goal, reading = _goal(config)
+    _, loop = recording.beside(path)
+    log = np.load(loop)
+    names = [str(name) for name in log["signals"]]
+    rows = log["observations"][:, [names.index(name) for name in goal.signals]]
+    commands = np.array([0.5 * (one.low + one.high) for one in reading.preparation.commands])
+    controls = np.concatenate([log["targets"][:1], log["targets"]])
+    total = 0.0
+    for after, last, control in zip(rows[1:], controls[:-1], controls[1:], strict=False):
+        total += float(reading.reward(after, control, last, commands, np))
+    off = {f"{name} off": abs(float(value)) for name, value in reading.off(rows[-1], commands, np).items()}
+    return {"return": total, "controls": len(log["targets"])} | off
+
+
+def _goal(config: Path) -> tuple[Goal, Reading]:
+    table = tables.load(config)
+    goal = goals.of_table(table["policy"])
+    spec = specification(config.parent / table["model"])
+    add_signals(spec, goal)
+    return goal, Reading(compile_spec(spec), goal)

@@ -1,0 +1,249 @@
+"""What stands for a real machine: a model simulated otherwise than inference and training do, served as a driver.
+
+    jaxlfi mujoco serve examples/mujoco/furuta.toml --port 5005
+
+The integrator is another (Runge-Kutta, a tenth of the step), the parameters are the truths of the task's file, sensors
+have the noise of its table `noise`, and there are effects that no parameter is for:
+
+- friction in the joints that falls with speed, a hundredth of what the actuators can do there,
+- drag that grows with the square of the speed, a tenth of the damping at a speed of 1,
+- actuators that do 2 % less than they are told.
+
+It lives in the time of the loop that controls it, as fast as that goes, or by the system's clock.
+"""
+
+import argparse
+import contextlib
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from jaxlfi.envs.mujoco import config as tables
+from jaxlfi.envs.mujoco import goal as goals
+from jaxlfi.envs.mujoco.effects import STATE, built, effects, initial_state, state_place
+from jaxlfi.envs.mujoco.measured import add_sensors, places
+from jaxlfi.envs.mujoco.model_task import compile_spec, specification
+from jaxlfi.envs.mujoco.quiet import quietly
+from jaxlfi.envs.mujoco.reading import Reading, add_signals
+from jaxlfi.rl.deployment import ControlLimits
+from jaxlfi.robots import driving, server, wire
+from jaxlfi.robots.clock import Clock, Monotonic, Simulated
+from jaxlfi.robots.robot import Observation
+
+FINER = 10
+"""Steps in one of the model's."""
+STICTION, SLOW, DRAG, LOSS = 0.01, 0.3, 0.1, 0.02
+"""Of the unmodelled effects; the speed above which friction falls is in rad/s or m/s."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Machine:
+    """A machine to be simulated.
+
+    Attributes:
+        config: of its task.
+        truth: its parameters by name.
+        unmodelled: how large the effects are that no parameter is for; 1 is as above.
+        seed: of the sensors' noise, and of where episodes begin.
+        scattered: whether episodes begin where those of the training do, and not in the task's initial state.
+
+    Raises:
+        ValueError: for a task without truths, and whatever does not fit together, in one line.
+    """
+
+    config: Path
+    truth: Mapping[str, float]
+    unmodelled: float = 1.0
+    seed: int = 0
+    scattered: bool = False
+
+    @staticmethod
+    def of(config: Path, truth: Mapping[str, float] | None = None, **others: Any) -> "Machine":
+        """The machine of a task, whose parameters are the truths of its file but for some."""
+        own = {one.name: one.truth for one in tables.parameters_of(tables.load(config))} | dict(truth or {})
+        if missing := [name for name, value in own.items() if value is None]:
+            raise ValueError(f"truth: expected one of each parameter, as --truth NAME=VALUE, got none of {missing[0]}")
+        return Machine(config, {name: float(value) for name, value in own.items() if value is not None}, **others)
+
+    def __post_init__(self):
+        if unknown := [name for name in self.truth if name not in self.table["parameters"]]:
+            known = ", ".join(self.table["parameters"])
+            raise ValueError(f"truth: expected parameters of {self.config}: {known}; got {', '.join(unknown)}")
+        if not 0 <= self.unmodelled < math.inf:
+            raise ValueError(f"unmodelled: expected a number of at least 0, got {self.unmodelled:g}")
+        if self.scattered and "policy" not in self.table:
+            raise ValueError(f"{self.config}: expected a table [policy] that says where episodes begin, got none")
+        self.limits()
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """Of its file."""
+        return tables.load(self.config)
+
+    def limits(self) -> ControlLimits:
+        """Of the controls: those of the task's policies, or else of the model's actuators."""
+        if "policy" in self.table:
+            goal = goals.of_table(self.table["policy"])
+            spec = specification(self.config.parent / self.table["model"])
+            add_signals(spec, goal)
+            return driving.limits_of(Reading(compile_spec(spec), goal).preparation)
+        model = compile_spec(specification(self.config.parent / self.table["model"]))
+        names = [model.actuator(i).name or f"actuator/{i}" for i in range(model.nu)]
+        free = [not limited for limited in model.actuator_ctrllimited]
+        ranges = zip((-math.inf, math.inf), model.actuator_ctrlrange.T, strict=True)
+        low, high = (np.where(free, far, column) for far, column in ranges)
+        return ControlLimits(tuple(names), tuple(low), tuple(high), (math.inf,) * model.nu)
+
+    def driver(self, clock: Clock) -> "MachineDriver":
+        """A driver of it, by a clock."""
+        return MachineDriver(self, clock)
+
+
+class MachineDriver:
+    """A machine as a driver (`jaxlfi.robots.driver`)."""
+
+    _episodes = 0
+
+    def __init__(self, machine: Machine, clock: Clock):
+        """Nothing is simulated before `connect`."""
+        self._machine, self._clock, self._number = machine, clock, -1
+        self._rng = np.random.default_rng([machine.seed, MachineDriver._episodes])
+        MachineDriver._episodes += 1
+
+    def connect(self, signals: Mapping[str, str], controls: Mapping[str, str]) -> Mapping[str, Any]:
+        """Compile the model with a sensor for each signal; it begins at rest, or where episodes do.
+
+        Raises:
+            ValueError: for signals and actuators that the model does not have.
+        """
+        machine, table, names = self._machine, self._machine.table, list(signals)
+        spec = specification(machine.config.parent / table["model"])
+        add_sensors(spec, names)
+        nominal = compile_spec(spec)
+        actuators = [nominal.actuator(i).name or f"actuator/{i}" for i in range(nominal.nu)]
+        if unknown := [name for name in controls if name not in actuators]:
+            raise ValueError(f"robot: expected controls among {', '.join(actuators)}, got {', '.join(unknown)}")
+        self._places, self._names = places(nominal, names), names
+        supports = [one.support for one in tables.parameters_of(table)]
+        theta = np.array([machine.truth[name] for name in table["parameters"]])
+        sensed = list(dict.fromkeys([*names, *_of_sensors(machine.truth)]))
+        does = effects(spec, nominal, list(table["parameters"]), supports, sensed)
+        spec.option.timestep, spec.option.integrator = nominal.opt.timestep / FINER, mujoco.mjtIntegrator.mjINT_RK4
+        self._model = built(spec, does, theta)
+        self._data = mujoco.MjData(self._model)
+        start = initial_state(nominal, tables.numbers(table, "initial"))
+        if machine.scattered:
+            for name, (low, high) in goals.of_table(table["policy"]).initial.items():
+                start[state_place(nominal, name, f"initial/{name}")] = self._rng.uniform(low, high)
+        mujoco.mj_setState(self._model, self._data, does.started(start, theta), STATE)
+        self._bias, self._noise = np.zeros(len(sensed)), np.zeros(len(sensed))
+        for place, name in enumerate(sensed):
+            self._noise[place] = table.get("noise", {}).get(name, 0.0)
+        for signal, d in does.biases:
+            self._bias[signal] = theta[d]
+        for signal, d in does.deviations:
+            self._noise[signal] = theta[d]
+        self._delay = 0.0 if does.delay is None else float(theta[does.delay])
+        self._order = [actuators.index(name) for name in controls]
+        self._given: list[tuple[float, np.ndarray]] = [(-math.inf, self._rest())]
+        self._reach = self._forces()
+        self._began: float | None = None
+        simulated = isinstance(self._clock, Simulated)
+        return {"description": "a simulated machine", "simulated": simulated, "truth": dict(machine.truth)}
+
+    def observe(self) -> Observation:
+        """What the sensors read now."""
+        self._advance()
+        with quietly():
+            mujoco.mj_forward(self._model, self._data)
+        size = len(self._names)
+        values = self._data.sensordata[self._places] + self._bias[:size]
+        values = values + self._noise[:size] * self._rng.standard_normal(size)
+        self._number += 1
+        return Observation(dict(zip(self._names, values.tolist(), strict=True)), self._number)
+
+    def act(self, controls: Mapping[str, float]) -> None:
+        """Let the controls act from now on, or as much later as the machine's delay is."""
+        self._advance()
+        control = self._given[-1][1].copy()
+        control[self._order] = list(controls.values())
+        self._given.append((self._now() + self._delay, control))
+
+    def stop(self) -> None:
+        """Nothing is simulated any longer."""
+
+    def _now(self) -> float:
+        """Seconds since it was first asked for anything."""
+        self._began = self._clock.now() if self._began is None else self._began
+        return self._clock.now() - self._began
+
+    def _rest(self) -> np.ndarray:
+        """Controls before there are any."""
+        low, high = self._model.actuator_ctrlrange.T
+        return np.where(self._model.actuator_ctrllimited, np.clip(0.0, low, high), 0.0)
+
+    def _forces(self) -> np.ndarray:
+        """What the actuators can do at each degree of freedom: at their limits, servos at a tenth of that."""
+        data, limits = mujoco.MjData(self._model), self._machine.limits()
+        largest = np.zeros(self._model.nv)
+        for i in range(self._model.nu):
+            servo = self._model.actuator_biastype[i] != mujoco.mjtBias.mjBIAS_NONE
+            for control in np.nan_to_num([limits.low[i], limits.high[i]], posinf=1.0, neginf=-1.0):
+                data.ctrl[:] = self._rest()
+                mujoco.mj_forward(self._model, data)
+                before = data.qfrc_actuator.copy()
+                data.ctrl[i] = (0.1 if servo else 1.0) * control
+                mujoco.mj_forward(self._model, data)
+                largest = np.maximum(largest, np.abs(data.qfrc_actuator - before))
+        return largest
+
+    def _advance(self) -> None:
+        """Simulate up to now."""
+        size, model, data = self._machine.unmodelled, self._model, self._data
+        steps = round((self._now() - data.time) / model.opt.timestep)
+        with quietly():
+            for _ in range(steps):
+                while len(self._given) > 1 and self._given[1][0] <= data.time + 1e-9:
+                    self._given.pop(0)
+                speed = data.qvel
+                friction = STICTION * self._reach * np.tanh(speed / (0.03 * SLOW)) * np.exp(-((speed / SLOW) ** 2))
+                data.qfrc_applied[:] = -size * (friction + DRAG * model.dof_damping * speed * np.abs(speed))
+                data.ctrl[:] = (1 - LOSS * size) * self._given[0][1]
+                mujoco.mj_step(model, data)
+
+
+def _of_sensors(names: Sequence[str] | Mapping[str, float]) -> list[str]:
+    """Signals that parameters are of."""
+    return [name.removeprefix("sensor/").rpartition("/")[0] for name in names if name.startswith("sensor/")]
+
+
+def serve(arguments: argparse.Namespace) -> None:
+    """`jaxlfi mujoco serve`: until the process is ended.
+
+    Raises:
+        ValueError: for bad input.
+    """
+    truth = dict(arguments.truth)
+    machine = Machine.of(
+        arguments.config, truth, unmodelled=arguments.unmodelled, seed=arguments.seed, scattered=arguments.scattered
+    )
+    MachineDriver(machine, Simulated()).connect({}, dict.fromkeys(machine.limits().names, ""))
+    if not 0 <= arguments.port < 65536:
+        raise ValueError(f"port: expected a number from 0 to 65535, got {arguments.port}")
+    token = None if arguments.token is None else wire.token_of(arguments.token)
+    journal = server.write_to(arguments.journal) if arguments.journal else lambda event: None
+    with contextlib.closing(server.listen(arguments.port, arguments.host)) as listener:
+        server.require_token(listener, token)
+        print(f"listening on socket://{arguments.host}:{listener.getsockname()[1]}", flush=True)
+        clock = Monotonic if arguments.real_time else Simulated
+        watchdog = server.WATCHDOG if arguments.real_time else PATIENCE
+        server.serve_driver(listener, machine.driver, machine.limits(), watchdog, journal, clock, token)
+
+
+PATIENCE = 60.0
+"""Seconds that a loop may take between two requests, where the machine lives in its time."""

@@ -1,0 +1,70 @@
+"""When an episode of a policy ends early: a signal, a comparison and a number, as "body/torso/pos[2] < 0.2".
+
+condition  = signal comparison number | "abs(" signal ")" comparison number
+comparison = "<" | "<=" | ">" | ">="
+"""
+
+import dataclasses
+import math
+import operator
+import re
+from typing import Any
+
+_FORM = re.compile(
+    r"\s*(?:abs\((?P<inside>[^<>=]+)\)|(?P<plain>[^<>=]+?))\s*(?P<comparison><=|>=|<|>)\s*(?P<number>[^\s<>=]+)\s*"
+)
+_COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
+
+
+@dataclasses.dataclass(frozen=True)
+class Termination:
+    """An episode ends with a control interval at whose end this holds.
+
+    Attributes:
+        signal: that is compared, as the model has it, without noise.
+        comparison: "<", "<=", ">" or ">=".
+        number: that it is compared with.
+        magnitude: whether it is the signal's absolute value that is.
+        cost: of such an end; negative where it is a good one.
+
+    Raises:
+        ValueError: for numbers that are not finite.
+    """
+
+    signal: str
+    comparison: str
+    number: float
+    magnitude: bool = False
+    cost: float = 0.0
+
+    def __post_init__(self):
+        if not (math.isfinite(self.number) and math.isfinite(self.cost)):
+            raise ValueError(f"expected finite numbers, got {self.number:g} and a cost of {self.cost:g}")
+
+    def holds(self, value: Any) -> Any:
+        """Whether it does, at this value of the signal; never at NaN."""
+        return _COMPARISONS[self.comparison](abs(value) if self.magnitude else value, self.number)
+
+
+def parsed(text: str, cost: float = 0.0) -> Termination:
+    """The condition that a text says.
+
+    Raises:
+        ValueError: for a text that is none.
+
+    Example:
+        >>> parsed("abs(pole angle) >= 1.5")
+        Termination(signal='pole angle', comparison='>=', number=1.5, magnitude=True, cost=0.0)
+    """
+    match = _FORM.fullmatch(text)
+    try:
+        if match is None:
+            raise ValueError
+        number = float(match["number"])
+    except ValueError:
+        raise ValueError(
+            f'expected SIGNAL < NUMBER, or with <=, > or >=, as "body/torso/pos[2] < 0.2", got {text!r}'
+        ) from None
+    inside = match["inside"]
+    signal = (match["plain"] if inside is None else inside).strip()
+    return Termination(signal, match["comparison"], number, inside is not None, cost)

@@ -1,0 +1,132 @@
+"""What loops from a real system to a policy and back have in common: stages that are commands and can be gone on with.
+
+A loop is a folder; every stage of it is a command of its own in a folder of its own, complete with its last file.
+Repeating the command of the loop continues an interrupted one. This module imports neither jax nor numpy before it has
+to, so that `--help` answers at once.
+"""
+
+import json
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxlfi.cli.interrupts import INTERRUPTED
+from jaxlfi.io.formats import CONFIG, FORMATS, LOOP
+from jaxlfi.io.shell import quoted
+
+if TYPE_CHECKING:
+    from jaxlfi.runs.run import Run
+
+Words = list[str]
+
+
+class StageError(Exception):
+    """A stage that ended with an exit status other than 0, and has said why."""
+
+    def __init__(self, status: int):
+        super().__init__(status)
+        self.status = status
+
+
+def begin(out: Path, asked: Mapping[str, str | None]) -> None:
+    """Make the folder of a loop, or recognise it.
+
+    Args:
+        out: the folder.
+        asked: what the command asks for.
+
+    Raises:
+        ValueError: for the folder of another command.
+    """
+    from jaxlfi.io import files, workfolder
+    from jaxlfi.io.provenance import environment
+
+    path = out / CONFIG
+    if workfolder.begun(out, CONFIG, "a new folder, or one of the same command"):
+        found = json.loads(path.read_text()).get("asked")
+        if found != asked:
+            raise ValueError(f"out: expected a new folder, or one of the same command, got {out} of {found}")
+        return
+    files.write_json(path, {"format": LOOP, "version": FORMATS[LOOP].version, "asked": asked, **environment()})
+
+
+def begin_or_resume(
+    run: Callable[[Words], int],
+    resume: Callable[[Words], int],
+    words: Words,
+    out: Path,
+    do: Callable[[Callable[[Words], int], Words], None],
+) -> None:
+    """Do a stage by a command of these words, or what is missing of it.
+
+    Args:
+        run: the command.
+        resume: the command line, by which its folder is gone on with.
+        words: of the command.
+        out: its folder.
+        do: runs one or the other with its words.
+    """
+    if (out / CONFIG).exists():
+        run, words = resume, ["resume", str(out)]
+    else:
+        for left in out.parent.glob(f".{out.name}-*"):  # of one that was killed while its folder was created
+            shutil.rmtree(left)
+    do(run, words)
+
+
+def done(run: Callable[[Words], int], prefix: Sequence[str], words: Words, what: str) -> None:
+    """Run a command, which is said as a user would type it.
+
+    Raises:
+        KeyboardInterrupt: where it was interrupted.
+        StageError: where it failed.
+    """
+    say(f"{what}: {quoted('jaxlfi', *prefix, *words)}")
+    if status := run(words):
+        raise KeyboardInterrupt if status == INTERRUPTED else StageError(status)
+
+
+def say(text: str) -> None:
+    """A line between the outputs of stages."""
+    print(f"\n== {text}", flush=True)
+
+
+def believed(folder: Path, run: "Run") -> list[dict[str, str]]:
+    """Median and 90 % interval of each parameter, and the support that the run ended with, in natural units."""
+    import numpy as np
+
+    quantiles = np.quantile(np.asarray(run.draws()), (0.05, 0.5, 0.95), axis=0)
+    box = run.final_support()
+    return [
+        {
+            "run": str(folder),
+            "parameter": name,
+            "median": f"{middle:.4g}",
+            "90 % interval": f"{low:.4g} to {high:.4g}",
+            "last support": f"{float(box.low[place]):.4g} to {float(box.high[place]):.4g}",
+        }
+        for place, (name, low, middle, high) in enumerate(zip(run.space.names, *quantiles, strict=True))
+    ]
+
+
+def moved(before: "Run", after: "Run") -> float:
+    """How far a posterior has moved: the largest change of a median, in half-widths of the 90 % interval before.
+
+    Of parameters whose logarithm is inferred it is that of the logarithm.
+    """
+    import numpy as np
+
+    quantiles = [
+        np.quantile(np.asarray(one.space.to_inference(np.asarray(one.draws()))), (0.05, 0.5, 0.95), axis=0)
+        for one in (before, after)
+    ]
+    (low, middle, high), (_, later, _) = quantiles
+    return float(np.max(np.abs(later - middle) / np.maximum(0.5 * (high - low), 1e-12)))
+
+
+def asked_of(arguments: Any, leaving: Sequence[str] = ("out", "debug")) -> dict[str, str | None]:
+    """What a command asks for, as text."""
+    return {
+        name: None if value is None else str(value) for name, value in vars(arguments).items() if name not in leaving
+    }

@@ -1,0 +1,49 @@
+"""The command `jaxlfi r2s2r`: the loop of a task that its first word names, or else of the whip.
+
+This module imports neither jax nor numpy, so that `--help` answers at once.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from jaxlfi.cli.exit_status import refuse
+from jaxlfi.registry import LOOPS
+
+WHIP = "whip"
+
+
+class Loops:
+    """Loops by the name of their task.
+
+    Attributes:
+        help: what they do, in a line of a list.
+    """
+
+    help = "run the full Real2Sim2Real loop on a machine or a reference object"
+
+    def parser(self) -> argparse.ArgumentParser:
+        """The command line of the whip's, which tells of others."""
+        return LOOPS.find(WHIP).parser()
+
+    def __call__(self, words: Sequence[str] | None = None) -> int:
+        """Go round a loop.
+
+        Returns:
+            0; 2 for bad input; 130 where it was interrupted.
+        """
+        words = sys.argv[1:] if words is None else list(words)
+        named = bool(words) and not words[0].startswith("-")
+        try:
+            loop = LOOPS.find(words[0].partition(",")[0] if named else WHIP)
+        except ValueError as error:
+            return refuse("jaxlfi r2s2r", error)
+        return loop(words if named and "," in words[0] else words[named:])
+
+
+main = Loops()
+parser = main.parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

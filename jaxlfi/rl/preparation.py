@@ -1,0 +1,263 @@
+"""Preparation: what lies between a robot's signals and controls and a policy's observations and actions.
+
+An environment declares it as an attribute `preparation`, its episodes use it, and the training writes it into the
+policy's schema, so that a robot does by the same code what the policy was trained with. Its functions take `xp`, NumPy
+or `jax.numpy`; like `jaxlfi.rl.policy`, this module needs NumPy only.
+
+    memory = preparation.start(values)                            # once an episode, before its first observation
+    memory, observation = preparation.observed(memory, values)    # each control interval
+    memory, control = preparation.commanded(memory, policy(observation))
+
+An observation [O] holds, in this order: what is seen of the signals now, then one control interval before and so on,
+`history` times; the last controls, the latest first, `actions` of them; the commands. At the start of an episode all
+that was before is taken to have been as it is then.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+KEY = "preparation"
+"""Where it lies in a policy's schema."""
+
+
+class Memory(NamedTuple):
+    """What an episode keeps of its past; the latest comes first.
+
+    Attributes:
+        frames: what was seen of the signals, F numbers at a time, shape [history, F].
+        controls: that were commanded, shape [max(actions, 1), A].
+    """
+
+    frames: Float[Any, "history frame"]
+    controls: Float[Any, "before act"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Signal:
+    """What a robot measures.
+
+    Attributes:
+        name: of the signal.
+        unit: that it is measured in; "" where there is none, or it is not known.
+        turning: whether it is an angle that is seen as cosine and sine, and not as a number.
+    """
+
+    name: str
+    unit: str = ""
+    turning: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Control:
+    """What an actuator is commanded, in its own quantity: a torque, a target angle, a speed.
+
+    Attributes:
+        name: of the actuator.
+        low: least control.
+        high: largest control.
+        unit: of the control; "" where it is not known.
+        rate: largest change per second; None where any change is allowed.
+        displacing: whether an action is added to the last control; otherwise it is the control.
+        begins: place of the signal whose first value is the control before the first one; otherwise that is 0, or the
+            limit nearest to it.
+
+    Raises:
+        ValueError: for limits and rates that are none, and actions that displace without a rate.
+    """
+
+    name: str
+    low: float
+    high: float
+    unit: str = ""
+    rate: float | None = None
+    displacing: bool = False
+    begins: int | None = None
+
+    def __post_init__(self):
+        if not -math.inf < self.low < self.high < math.inf:
+            raise ValueError(f"{self.name}: expected finite limits, LOW below HIGH, got {[self.low, self.high]}")
+        if self.rate is not None and not 0 < self.rate < math.inf:
+            raise ValueError(f"{self.name}: expected a rate of more than 0 per second, got {self.rate:g}")
+        if self.displacing and self.rate is None:
+            raise ValueError(f"{self.name}: expected a rate, by which actions displace it at most; got none")
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """What an operator asks for, and a policy observes: a target that is drawn anew for each episode of a training.
+
+    Attributes:
+        name: of the command.
+        low: least value that was trained with.
+        high: largest value.
+        unit: of both.
+    """
+
+    name: str
+    low: float
+    high: float
+    unit: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Preparation:
+    """From S signals and C commands to O observations, and from A actions to A controls; see above.
+
+    Attributes:
+        signals: that the robot measures.
+        controls: that it is given.
+        interval: between two controls, in s.
+        steps: of an episode, at most.
+        history: how many times the signals are seen: 1 is now only.
+        actions: how many of the last controls are seen.
+        commands: that are observed besides.
+        observation_delay: least and largest age of a measurement when the policy acts on it that was trained with, in
+            s; what a robot should have, and nothing that is done here.
+        action_delay: likewise, from an action to when the actuator gets it, in s.
+
+    Raises:
+        ValueError: for whatever does not fit together, in one line.
+
+    Example:
+        >>> arm = Preparation((Signal("angle", "rad"),), (Control("motor", -2.0, 3.0, "N m", rate=10.0),), 0.1, 50,
+        ...                   history=2, actions=1)
+        >>> arm.names
+        ('angle', 'angle 1 before', 'control motor 1 before')
+        >>> memory = arm.start([0.5])
+        >>> memory, control = arm.commanded(memory, np.array([2.5]))
+        >>> control.tolist(), arm.observed(memory, [0.75])[1].tolist()
+        ([1.0], [0.75, 0.5, 1.0])
+    """
+
+    signals: tuple[Signal, ...]
+    controls: tuple[Control, ...]
+    interval: float
+    steps: int
+    history: int = 1
+    actions: int = 0
+    commands: tuple[Command, ...] = ()
+    observation_delay: tuple[float, float] = (0.0, 0.0)
+    action_delay: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self):
+        for name, least in (("history", 1), ("actions", 0), ("steps", 1)):
+            if not isinstance(number := getattr(self, name), int) or number < least:
+                raise ValueError(f"{name}: expected a whole number of at least {least}, got {number!r}")
+        if not 0 < self.interval < math.inf:
+            raise ValueError(f"interval: expected more than 0 s, got {self.interval:g}")
+        for what in ("signals", "controls", "commands"):
+            names = [one.name for one in getattr(self, what)]
+            if len(set(names)) < len(names) or (not names and what != "commands"):
+                raise ValueError(f"{what}: expected at least one, each once, got {names}")
+        for what in ("observation_delay", "action_delay"):
+            object.__setattr__(self, what, delay := tuple(getattr(self, what)))
+            if len(delay) != 2 or not 0 <= delay[0] <= delay[1] < math.inf:
+                raise ValueError(f"{what}: expected LOW up to HIGH of at least 0 s, got {list(delay)}")
+        for one in self.controls:
+            if one.begins is not None and not 0 <= one.begins < len(self.signals):
+                raise ValueError(f"{one.name}: expected to begin at one of {len(self.signals)} signals")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the observations."""
+        seen = [name for one in self.signals for name in _seen(one)]
+        frames = [name + _before(k) for k in range(self.history) for name in seen]
+        controls = [f"control {one.name}{_before(k + 1)}" for k in range(self.actions) for one in self.controls]
+        return (*frames, *controls, *(f"command {one.name}" for one in self.commands))
+
+    @property
+    def ranges(self) -> tuple[Float[np.ndarray, " act"], Float[np.ndarray, " act"]]:
+        """Least and largest actions, in their units."""
+        step = lambda one: one.rate * self.interval
+        low = [-step(one) if one.displacing else one.low for one in self.controls]
+        return np.array(low), np.array([step(one) if one.displacing else one.high for one in self.controls])
+
+    def start(self, values: Float[Any, " values"], xp: Any = np) -> Memory:
+        """The memory of an episode that begins.
+
+        Args:
+            values: signals, and commands after them, shape [S + C].
+            xp: NumPy, or `jax.numpy`.
+        """
+        rest = [min(max(0.0, one.low), one.high) for one in self.controls]
+        first = [r if one.begins is None else values[one.begins] for r, one in zip(rest, self.controls, strict=True)]
+        low, high, _ = self._limits
+        control = xp.clip(xp.asarray(first), low, high)
+        return Memory(xp.stack([self._frame(values, xp)] * self.history), xp.stack([control] * max(self.actions, 1)))
+
+    def observed(
+        self, memory: Memory, values: Float[Any, " values"], xp: Any = np
+    ) -> tuple[Memory, Float[Any, " obs"]]:
+        """The memory with these signals, and what the policy observes; of an episode's first ones, too.
+
+        Args:
+            memory: of the episode.
+            values: signals, and commands after them, shape [S + C].
+            xp: NumPy, or `jax.numpy`.
+        """
+        frames = xp.concatenate([self._frame(values, xp)[None], memory.frames[:-1]])
+        commands = xp.asarray(values)[len(self.signals) :]
+        seen = xp.concatenate([frames.ravel(), memory.controls[: self.actions].ravel(), commands])
+        return memory._replace(frames=frames), seen
+
+    def commanded(self, memory: Memory, action: Float[Any, " act"], xp: Any = np) -> tuple[Memory, Float[Any, " act"]]:
+        """The memory with the control of an action, and the control, which keeps to rates and limits.
+
+        Args:
+            memory: of the episode.
+            action: of the policy, in its units, shape [A].
+            xp: NumPy, or `jax.numpy`.
+        """
+        last, (low, high, most) = memory.controls[0], self._limits
+        wanted = xp.where(np.array([one.displacing for one in self.controls]), last + action, action)
+        control = xp.clip(xp.clip(wanted, last - most, last + most), low, high)
+        return memory._replace(controls=xp.concatenate([control[None], memory.controls[:-1]])), control
+
+    @property
+    def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Least and largest controls, and their largest change in an interval."""
+        rates = [math.inf if one.rate is None else one.rate for one in self.controls]
+        low, high = ([getattr(one, what) for one in self.controls] for what in ("low", "high"))
+        return np.array(low), np.array(high), self.interval * np.array(rates)
+
+    def _frame(self, values: Float[Any, " values"], xp: Any) -> Float[Any, " frame"]:
+        """What is seen of signals at a time."""
+        parts = []
+        for place, one in enumerate(self.signals):
+            parts += [xp.cos(values[place]), xp.sin(values[place])] if one.turning else [xp.asarray(values[place])]
+        return xp.stack(parts)
+
+
+def of_schema(schema: Mapping[str, Any]) -> Preparation | None:
+    """What a policy's schema says of its preparation; None for policies that have none.
+
+    Raises:
+        ValueError: for one that is not whole, or of other observations or actions than the policy's.
+    """
+    found = schema.get(KEY)
+    if found is None:
+        return None
+    parts = {"signals": Signal, "controls": Control, "commands": Command}
+    try:
+        made = {what: tuple(kind(**one) for one in found.get(what, ())) for what, kind in parts.items()}
+        preparation = Preparation(**{**found, **made})
+    except (TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"policy: expected a preparation in its schema, got one that is not whole: {error}") from error
+    names = {"observations": preparation.names, "actions": tuple(one.name for one in preparation.controls)}
+    for what, own in names.items():
+        if own != (got := tuple(schema[what]["names"])):
+            raise ValueError(f"policy: expected a preparation of its {what} {list(got)}, got one of {list(own)}")
+    return preparation
+
+
+def _seen(signal: Signal) -> list[str]:
+    return [f"cos {signal.name}", f"sin {signal.name}"] if signal.turning else [signal.name]
+
+
+def _before(intervals: int) -> str:
+    return f" {intervals} before" if intervals else ""

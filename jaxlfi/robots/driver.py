@@ -1,0 +1,213 @@
+"""A driver: what a robot of your own needs to be controlled by any policy, in one class of four methods.
+
+    class Driver:
+        def connect(self, signals, controls): ...     # names and units that a policy needs; refuse what there is not
+        def observe(self): ...                        # what was measured last, by name, at once
+        def act(self, controls): ...                  # controls by actuator; return at once
+        def stop(self): ...                           # come to rest; called exactly once, last
+
+`jaxlfi control POLICY --robot module:Driver` drives it; `jaxlfi.robots.server.serve_driver` serves it to a loop in
+another process, `SocketDriver` is the other end of that.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from jaxlfi.io import units
+from jaxlfi.io.serialise import json_safe
+from jaxlfi.robots.clock import Clock
+from jaxlfi.robots.robot import Command, Observation, RobotError
+
+DONE = "controls"
+"""What the extras of an observation call the controls that somebody else commands."""
+
+
+@runtime_checkable
+class Driver(Protocol):
+    """A robot by the names of its signals and actuators. Methods may raise whatever they like: the robot is stopped.
+
+    None but `connect` may block for long. A robot should stop by itself when no command comes. One that is simulated
+    may have a `simulated_clock`, on which the loop then waits; none that moves may.
+    """
+
+    def connect(self, signals: Mapping[str, str], controls: Mapping[str, str]) -> Mapping[str, Any] | None:
+        """Get ready, or refuse.
+
+        Args:
+            signals: names of what is to be measured, with the units that it is to be given in.
+            controls: names of the actuators, with the units of what they will be given. None where the robot is only
+                to be watched, and neither moved nor held.
+
+        Returns:
+            What is to be recorded of the robot, which JSON can hold; None for nothing.
+        """
+
+    def observe(self) -> Observation | Mapping[str, float] | None:
+        """What was measured last, by name, and None where there is nothing.
+
+        An `Observation` whose `values` are numbers by name says when it was measured, too; numbers alone are taken to
+        be measured now. A number that is not known is NaN. Further numbers are not used.
+        """
+
+    def act(self, controls: Mapping[str, float]) -> None:
+        """Have the actuators do this from now on."""
+
+    def stop(self) -> None:
+        """Come to rest, whatever went before. It may be called from another thread while another method hangs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Called:
+    """What a driver calls a signal or an actuator, and how its numbers relate to the task's.
+
+    The task's number is `scale` times the driver's, in the task's unit, plus `offset`.
+
+    Attributes:
+        name: the driver's.
+        unit: of the driver's numbers; "" for the task's.
+        scale: such as -1 for an axis that points the other way.
+        offset: in the task's unit, such as the angle at which an encoder's zero is.
+
+    Raises:
+        ValueError: for a unit that is not known, and a scale of zero.
+    """
+
+    name: str
+    unit: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def __post_init__(self):
+        units.parse(self.unit)
+        if not self.scale:
+            raise ValueError(f"{self.name}: expected a scale other than 0, got 0")
+
+    def factors(self, unit: str) -> tuple[float, float]:
+        """Factor and offset from the driver's numbers to the task's.
+
+        Args:
+            unit: the task's; "" where it is not known.
+
+        Raises:
+            ValueError: for units of different quantities.
+
+        Example:
+            >>> Called("pan", "deg", scale=-1.0, offset=0.5).factors("rad")[0].__round__(5)
+            -0.01745
+        """
+        if not self.unit:
+            return self.scale, self.offset
+        own, other = units.parse(self.unit), units.parse(unit)
+        if unit and own.name != other.name:
+            raise ValueError(f"{self.name}: expected a unit of {other.name}, got {self.unit}")
+        factor = self.scale / other.factor
+        return factor * own.factor, factor * (own.offset - other.offset) + self.offset
+
+
+class Driven:
+    """A driver as a robot whose numbers are in an order (`jaxlfi.robots.robot.Robot`).
+
+    Attributes:
+        about: what the driver says of itself.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        signals: Mapping[str, str],
+        controls: Mapping[str, str],
+        called: Mapping[str, Called] | None = None,
+        watching: bool = False,
+    ):
+        """Connect.
+
+        Args:
+            driver: of the robot, which is stopped if it cannot be connected.
+            signals: names and units of the numbers of an observation, in their order.
+            controls: names and units of the controls, likewise.
+            called: what the driver calls signals and actuators, where it is something else.
+            watching: the robot is commanded by somebody else. It is asked what the controls are, besides.
+
+        Raises:
+            ValueError: for units that do not fit.
+        """
+        self._driver, self._watching, self._number = driver, watching, -1
+        try:
+            self.about = self._connect(signals, controls, called or {})
+        except BaseException:
+            driver.stop()
+            raise
+        clock = getattr(driver, "simulated_clock", None)
+        if clock is not None:
+            self.simulated_clock: Clock = clock
+
+    def _connect(
+        self, signals: Mapping[str, str], controls: Mapping[str, str], called: Mapping[str, Called]
+    ) -> dict[str, Any]:
+        known = {name: called.get(name, Called(name)) for name in {**signals, **controls}}
+
+        def rows(several: Mapping[str, str]) -> dict[str, tuple[str, float, float]]:
+            return {name: (known[name].name, *known[name].factors(unit)) for name, unit in several.items()}
+
+        self._signals, self._controls = rows(signals), rows(controls)
+        asked, given = (
+            {known[name].name: known[name].unit or unit for name, unit in several.items()}
+            for several in (signals, controls)
+        )
+        if self._watching:  # a name that is a signal's, too, does not tell what is commanded
+            for name, (own, factor, offset) in self._controls.items():
+                self._controls[name] = ("" if own in asked else own), factor, offset
+            asked, given = {**asked, **given, **asked}, {}
+        about = self._driver.connect(asked, given) or {}
+        try:
+            json.dumps(json_safe(about), allow_nan=False)
+            return dict(about)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"robot: expected a mapping that JSON can hold as what it says of itself, got {str(about)[:60]}"
+            ) from error
+
+    def observe(self) -> Observation | None:
+        """The latest observation, in the order of the signals."""
+        found = self._driver.observe()
+        if found is None:
+            return None
+        if not isinstance(found, Observation):
+            self._number += 1
+            found = Observation(found, self._number)
+        if not isinstance(found.values, Mapping):
+            raise RobotError(f"robot: expected numbers by name from observe, got {type(found.values).__name__}")
+        values = _numbers(found.values, self._signals)
+        if not self._watching:
+            target = None if found.target is None else _numbers(found.target, self._controls)
+            return dataclasses.replace(found, values=values, target=target)
+        done = _numbers(found.values, self._controls, needed=False)
+        return dataclasses.replace(found, values=values, target=done, extras={**found.extras, DONE: done})
+
+    def act(self, command: Command) -> None:
+        """Have the actuators do this from now on; where the robot is watched, nothing."""
+        if not self._watching:
+            parts = zip(self._controls.values(), command.target, strict=True)
+            self._driver.act({name: float((value - offset) / factor) for (name, factor, offset), value in parts})
+
+    def stop(self) -> None:
+        """Come to rest; where the robot is watched, watch no longer."""
+        self._driver.stop()
+
+
+def _numbers(values: Any, wanted: Mapping[str, tuple[str, float, float]], needed: bool = True) -> np.ndarray:
+    """Numbers in the order that is wanted, in the task's units."""
+    if not isinstance(values, Mapping):
+        raise RobotError(f"robot: expected numbers by name, got {type(values).__name__}")
+    if needed and (missing := [name for name, _, _ in wanted.values() if name not in values]):
+        raise RobotError(f"robot: expected a number of each signal, got none of {', '.join(missing)}")
+    try:
+        own = np.array([float(values.get(name, np.nan)) for name, _, _ in wanted.values()])
+    except (TypeError, ValueError) as error:
+        raise RobotError(f"robot: expected numbers by name, got others: {error}") from error
+    factors = np.array([[factor, offset] for _, factor, offset in wanted.values()]).reshape(-1, 2)
+    return factors[:, 0] * own + factors[:, 1]

@@ -1,0 +1,334 @@
+"""An episode of control: at a set rate, within limits, and the robot is stopped whatever happens.
+
+Time is divided into control periods ("slots") that begin at multiples of the period after the first command, by a clock
+that never goes back, so that delays do not add up. In each slot the loop observes, asks the policy, and commands. What
+is commanded, of what the policy asks for, is up to the kind of loop: `jaxlfi.robots.loop` displaces set-points,
+`jaxlfi.robots.driving` drives actuators.
+"""
+
+import abc
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxlfi.robots.clock import Clock, Monotonic
+from jaxlfi.robots.interrupts import Interrupts
+from jaxlfi.robots.robot import Command, Observation, Robot, RobotError
+from jaxlfi.robots.watchdog import Stop, Watchdog
+
+Act = Callable[[np.ndarray], np.ndarray]
+"""From an observation [O] to an action [A], both in the units of the schema."""
+TOLERANCE = 0.1
+"""Part of a period by which a command may come late before its deadline counts as missed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Log:
+    """What happened, of S slots and N observations that could be used.
+
+    Attributes:
+        times: when observations were made, in s since the first command, shape [N].
+        observations: shape [N, O].
+        extras: what else robots report, by name, shape [N, ...].
+        asked: what the policy asked for, NaN where it was not asked, shape [S, A].
+        actions: displacements that were commanded, 0 where set-points were held, shape [S, A].
+        targets: set-points that were commanded, shape [S, A].
+        held: slots without an observation that could be used, shape [S].
+        lateness: of each slot's command, in s; infinite where there was none, as the slot had passed, shape [S].
+        faults: how many observations were "missing", "late" and "non-finite".
+        over: slot at whose beginning the episode was over, or None.
+        stopped: why the robot was stopped before its time; "" where it was not.
+        period: between two commands, in s.
+    """
+
+    times: np.ndarray
+    observations: np.ndarray
+    extras: Mapping[str, np.ndarray]
+    asked: np.ndarray
+    actions: np.ndarray
+    targets: np.ndarray
+    held: np.ndarray
+    lateness: np.ndarray
+    faults: Mapping[str, int]
+    over: int | None
+    stopped: str
+    period: float
+
+    @property
+    def missed(self) -> int:
+        """Deadlines by which no command had been sent, a tenth of a period late at most."""
+        return int(np.sum(self.lateness > TOLERANCE * self.period))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Paced(abc.ABC):
+    """How a robot is controlled: its periods, and what is done without an observation. What is commanded is abstract.
+
+    An observation is of no use if there is none that is new ("missing"), it is older than `max_age` ("late"), or has
+    numbers that are not finite. Then the set-points are held. After more than `holds` such slots in a row the robot is
+    stopped.
+
+    Attributes:
+        rate: of commands, in Hz.
+        steps: of an episode, in control periods.
+        holds: slots in a row that set-points may be held for want of an observation.
+        max_age: of an observation when it is asked for, in s; by default a control period.
+        over: whether an observation ends the episode; from then on the set-points are held.
+        clock: by which time passes.
+        watchdog: seconds that a call of the robot or the policy may take before the robot is stopped; any by default.
+
+    Raises:
+        ValueError: for numbers that are not positive.
+    """
+
+    rate: float
+    steps: int
+    holds: int = 3
+    max_age: float | None = None
+    over: Callable[[np.ndarray], bool] = lambda observation: False
+    clock: Clock = dataclasses.field(default_factory=Monotonic)
+    watchdog: float | None = None
+
+    def __post_init__(self):
+        for name in ("rate", "max_age", "watchdog"):
+            if getattr(self, name) is not None:
+                positive(name, getattr(self, name))
+        for name, least in (("steps", 1), ("holds", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+
+    @property
+    @abc.abstractmethod
+    def measured(self) -> int:
+        """Number of the numbers that are measured."""
+
+    @property
+    @abc.abstractmethod
+    def count(self) -> int:
+        """Number of set-points, or of controls."""
+
+    @abc.abstractmethod
+    def begin(self, observation: Observation) -> Any:
+        """The state before the first command: where the set-points are, and whatever else is remembered."""
+
+    @abc.abstractmethod
+    def observed(self, state: Any, observation: Observation) -> tuple[Any, np.ndarray]:
+        """The state with what was measured, and what the policy observes [O]."""
+
+    @abc.abstractmethod
+    def applied(self, state: Any, asked: np.ndarray | None, seconds: float) -> tuple[Any, np.ndarray]:
+        """The state after an action, within all limits, and the displacement of the set-points [A].
+
+        Args:
+            state: before.
+            asked: the policy's action [A]; None where it was not asked, and the set-points are held.
+            seconds: since the command before, a control period at most.
+        """
+
+    @abc.abstractmethod
+    def target(self, state: Any) -> np.ndarray:
+        """Where the set-points are in a state, shape [A]."""
+
+    @abc.abstractmethod
+    def outside(self, values: np.ndarray) -> str:
+        """Why the robot must be stopped where it has been measured; "" if it need not."""
+
+    @property
+    def period(self) -> float:
+        """Between two commands, in s."""
+        return 1 / self.rate
+
+    def run(self, robot: Robot, act: Act, whole: bool = True, on_end: Callable[[Log], None] = lambda log: None) -> Log:
+        """Control a robot for an episode, and stop it.
+
+        Args:
+            robot: whose `stop` is called exactly once, last, whatever happens; by the watchdog's thread while another
+                call of it hangs.
+            act: the policy.
+            whole: go on to the last slot after the episode is over, with the set-points held.
+            on_end: called after the stop with what happened so far, also where an error or a signal ended the episode.
+
+        Raises:
+            ValueError: for an observation or an action of another size, and actions that are not finite.
+            RobotError: where no first observation comes, the robot does not start within the limits, it fails, or a
+                call takes longer than the watchdog lets it.
+            Interrupted: after SIGINT or SIGTERM.
+        """
+        stop = Stop(robot.stop)
+        with Interrupts() as interrupts, Watchdog(self.watchdog, stop, self.clock, interrupts) as watchdog:
+            episode = _Episode(self, robot, act, interrupts, watchdog)
+            try:
+                episode.run(whole)
+            except BaseException as error:
+                episode.stopped = str(error) or type(error).__name__
+                _stop_after(error, stop)
+                raise
+            else:
+                stop()
+            finally:
+                on_end(episode.log())
+            return episode.log()
+
+
+def positive(name: str, value: float, infinite: bool = False) -> None:
+    """Refuse what is no positive number.
+
+    Raises:
+        ValueError: naming it.
+    """
+    if not (value > 0 and (infinite or math.isfinite(value))):
+        raise ValueError(f"{name}: expected a positive number, got {value}")
+
+
+def _stop_after(error: BaseException, stop: Stop) -> None:
+    try:
+        stop()
+    except Exception as failed:
+        raise RobotError(f"{error}; and stopping the robot failed: {failed}") from error
+
+
+class _Episode:
+    """An episode while it goes on."""
+
+    def __init__(self, loop: Paced, robot: Robot, act: Act, interrupts: Interrupts, watchdog: Watchdog):
+        self.loop, self.robot, self.act, self.clock = loop, robot, act, loop.clock
+        self.interrupts, self.watchdog = interrupts, watchdog
+        self.faults = {"missing": 0, "late": 0, "non-finite": 0}
+        self.last: int | None = None  # number of the observation that was used last
+        self.behind: int | None = None  # of one that came after it, and was made before
+        self.began_anew = ""
+        self.seen: list[tuple[float, np.ndarray, Mapping[str, Any]]] = []
+        self.slots: list[tuple[np.ndarray, np.ndarray, np.ndarray, bool, float]] = []
+        self.over: int | None = None
+        self.stopped = ""
+
+    def run(self, whole: bool) -> None:
+        """From the first observation to the end."""
+        loop, clock = self.loop, self.clock
+        first = self._first()
+        observation: Observation | None = first
+        state = loop.begin(first)
+        start = clock.now()
+        sent, slot, unusable, fault = start - loop.period, 0, 0, None
+        while True:
+            if observation is not None:
+                unusable, values = 0, observation.values
+                self.seen.append((clock.now() - start - observation.age, values, observation.extras))
+                if self.over is None and loop.over(values.copy()):
+                    self.over = slot
+                self.stopped = loop.outside(values)
+            else:
+                unusable += 1
+                if unusable > loop.holds:
+                    self.stopped = f"{unusable} observations in a row could not be used, the last one was {fault}"
+            if self.began_anew:
+                self.stopped = self.began_anew
+            if self.stopped or slot == loop.steps or (self.over is not None and not whole):
+                return
+            asked = None
+            if observation is not None and self.over is None:
+                state, asked = self._asked(state, observation)
+            self.interrupts.check()
+            now = clock.now()
+            seconds = min(loop.period, now - sent)
+            state, displacement = loop.applied(state, asked, seconds)
+            target = loop.target(state)
+            with self.interrupts.calling(), self.watchdog.watching("act"):
+                self.robot.act(Command(slot, displacement.copy(), target.copy()))
+            sent = clock.now()  # so that the next command is no closer to this one than its length allows
+            asked = np.full(loop.count, np.nan) if asked is None else asked
+            self.slots.append((asked, displacement, target, observation is None, now - start - slot * loop.period))
+            self._wait_until(start + (slot + 1) * loop.period)
+            slot = self._due(slot + 1, (clock.now() - start) / loop.period, target)
+            observation, fault = self._look()
+
+    def _wait_until(self, moment: float) -> None:
+        with self.interrupts.waiting(), self.watchdog.watching("waiting", max(moment - self.clock.now(), 0.0)):
+            self.clock.sleep_until(moment)
+
+    def _first(self) -> Observation:
+        """The first observation that can be used, for which the loop waits as long as it would hold."""
+        start = self.clock.now()
+        for wait in range(self.loop.holds + 1):
+            self._wait_until(start + wait * self.loop.period)
+            observation, fault = self._look()
+            if observation is not None:
+                return observation
+        raise RobotError(
+            f"robot: expected a usable observation to begin with, got none in {wait + 1} control periods, "
+            f"the last one was {fault}"
+        )
+
+    def _look(self) -> tuple[Observation | None, str]:
+        """The latest observation if it can be used, and else what is wrong with it."""
+        loop = self.loop
+        with self.interrupts.calling(), self.watchdog.watching("observe"):
+            observation = self.robot.observe()
+        if observation is None:
+            return self._unusable("missing")
+        if self.last is not None and observation.number <= self.last:
+            self._count(observation.number, self.last)
+            return self._unusable("missing")
+        values = np.array(observation.values)  # a driver may measure into the same array again
+        if values.shape != ((size := loop.measured),):
+            raise ValueError(f"robot: expected observations of {size} numbers, got shape {list(values.shape)}")
+        if not observation.age <= (loop.period if loop.max_age is None else loop.max_age):  # NaN is late, too
+            return self._unusable("late")
+        if not np.isfinite(values).all():
+            return self._unusable("non-finite")
+        shapes = {name: np.shape(value) for name, value in observation.extras.items()}
+        if self.seen and shapes != (first := {name: np.shape(value) for name, value in self.seen[0][2].items()}):
+            raise ValueError(f"robot: expected extras of shapes {first} as before, got {shapes}")
+        self.last = observation.number
+        extras = {name: np.array(value) for name, value in observation.extras.items()}
+        return dataclasses.replace(observation, values=values, extras=extras), ""
+
+    def _unusable(self, fault: str) -> tuple[None, str]:
+        self.faults[fault] += 1
+        return None, fault
+
+    def _count(self, number: int, last: int) -> None:
+        """Notice a robot that counts its measurements anew: it was restarted, and knows of no command."""
+        if self.behind is not None and self.behind < number < last:
+            self.began_anew = f"it began anew: its measurement {number} came after {last}"
+        self.behind = number if number < last else None
+
+    def _asked(self, state: Any, observation: Observation) -> tuple[Any, np.ndarray]:
+        state, seen = self.loop.observed(state, observation)
+        with self.interrupts.calling(), self.watchdog.watching("the policy"):
+            asked = np.array(self.act(seen), float)
+        if asked.shape != (self.loop.count,) or not np.isfinite(asked).all():
+            raise ValueError(f"policy: expected {self.loop.count} finite actions, got {asked.tolist()}")
+        return state, asked
+
+    def _due(self, following: int, periods: float, target: np.ndarray) -> int:
+        """The slot that it is time for; those that have passed are missed: their commands are not made up for."""
+        due = min(max(following, int(periods)), self.loop.steps)
+        nothing = np.full(len(target), np.nan), np.zeros(len(target)), target, False, np.inf
+        self.slots += [nothing] * (due - following)
+        return due
+
+    def log(self) -> Log:
+        """What happened so far."""
+        times, observations, extras = zip(*self.seen, strict=True) if self.seen else [()] * 3
+        asked, actions, targets, held, lateness = zip(*self.slots, strict=True) if self.slots else [()] * 5
+        table = lambda rows: np.reshape(np.array(rows, float), (len(rows), self.loop.count))
+        return Log(
+            times=np.array(times),
+            observations=np.reshape(np.array(observations), (len(times), self.loop.measured)),
+            extras={
+                name: np.stack([np.asarray(row[name]) for row in extras]) for name in (extras[0] if extras else ())
+            },
+            asked=table(asked),
+            actions=table(actions),
+            targets=table(targets),
+            held=np.array(held, bool),
+            lateness=np.array(lateness, float),
+            faults=self.faults,
+            over=self.over,
+            stopped=self.stopped,
+            period=self.loop.period,
+        )

@@ -1,0 +1,163 @@
+"""A session: a policy, a robot and a loop that fits both, and the files of what happened."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from jaxlfi.rl import deployment
+from jaxlfi.rl.policy import Policy
+from jaxlfi.robots import driving, recording
+from jaxlfi.robots.driver import Driven, Driver
+from jaxlfi.robots.driving import Drive, Idle
+from jaxlfi.robots.episode import Log
+from jaxlfi.robots.loop import Loop
+from jaxlfi.robots.recording import Recording
+from jaxlfi.robots.robot import Robot, RobotError
+from jaxlfi.robots.settings import Settings
+
+Mode = Literal["control", "dry run", "shadow"]
+SET_POINT = "set-point "
+"""What stands before the name of a measured position, for where it is to be."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Session:
+    """How a policy controls a robot.
+
+    Attributes:
+        policy: that is asked.
+        loop: as the policy was trained, within what the robot allows.
+        settings: of the robot.
+        mode: whether it is commanded, or asked only ("dry run"), or commanded by somebody else ("shadow").
+    """
+
+    policy: Policy
+    loop: Drive | Loop
+    settings: Settings
+    mode: Mode
+
+    def run(
+        self, robot: Robot | Driver, out: Path, about: Mapping[str, Any], say: Callable[[str], Any] = lambda line: None
+    ) -> Log:
+        """Control a robot for an episode, stop it, and write what happened (`jaxlfi.robots.recording`).
+
+        Args:
+            robot: which is stopped in any case.
+            out: a new recording.
+            about: what else the report is to say.
+            say: is given what happened, in a line.
+
+        Raises:
+            RobotError: for a robot that failed, or had to be stopped.
+            Interrupted: after SIGINT or SIGTERM.
+        """
+        made, loop, itself = self._connected(robot)
+        if self.mode == "dry run":
+            made = Idle(made)
+
+        def ended(log: Log) -> None:
+            report = {**about, **self.report(log), "robot": itself}
+            recording.write(out, self.recorded(log), log, report, self._signals)
+            say(f"{recording.timing_line(log)}; wrote {out}")
+
+        log = loop.run(made, self.policy, on_end=ended)
+        if log.stopped:
+            raise RobotError(f"robot: stopped after {len(log.actions)} of {loop.steps} controls: {log.stopped}")
+        return log
+
+    def _connected(self, robot: Robot | Driver) -> tuple[Robot, Drive | Loop, dict[str, Any]]:
+        """The robot as the loop needs it, the loop by the robot's clock, and what the robot says of itself."""
+        if isinstance(self.loop, Drive):
+            if not isinstance(robot, Driver):
+                robot.stop()
+                raise ValueError("robot: expected one with connect, observe, act and stop (jaxlfi.robots.driver)")
+            return driving.connected(self.loop, robot, self.settings)
+        if isinstance(robot, Driver):
+            robot = Driven(robot, _measured(self.policy), _set_points(self.policy), self.settings.names)
+        loop = dataclasses.replace(self.loop, clock=getattr(robot, "simulated_clock", self.loop.clock))
+        return robot, loop, dict(getattr(robot, "about", {}))
+
+    @property
+    def _signals(self) -> tuple[str, ...]:
+        """Names of the numbers of an observation."""
+        return self.loop.signals if isinstance(self.loop, Drive) else tuple(self.policy.observed["names"])
+
+    def recorded(self, log: Log) -> Recording:
+        """What was measured, and given by whoever commanded."""
+        if isinstance(self.loop, Drive):
+            own = self.loop.preparation
+            names, units = self.loop.signals, self.loop.asked
+            controls = {one.name: one.unit for one in own.controls}
+        else:
+            names, units, controls = tuple(_measured(self.policy)), _measured(self.policy), _set_points(self.policy)
+        estimated = set(self.settings.velocities)
+        if both := set(names) & set(controls):  # which recordings tell apart by what stands before
+            names = tuple(f"sensor/{name}" if name in both else name for name in names)
+            controls = {f"actuator/{name}" if name in both else name: unit for name, unit in controls.items()}
+            units = dict(zip(names, units.values(), strict=True))
+        signals = {name: log.observations[:, i] for i, name in enumerate(names) if name not in estimated}
+        sent = np.isfinite(log.lateness)
+        given, rows = np.flatnonzero(sent) * log.period + log.lateness[sent], log.targets[sent]
+        if self.mode == "shadow":
+            given, rows = log.times, driving.done(log) if len(log.times) else np.zeros((0, len(controls)))
+        columns = {} if self.mode == "dry run" else dict(zip(controls, rows.T, strict=True))
+        return Recording(log.times, signals, given if columns else np.zeros(0), columns, {**units, **controls})
+
+    def report(self, log: Log) -> dict[str, Any]:
+        """Why the episode ended, how the rate was kept, and within which limits."""
+        return {
+            "environment": self.policy.schema["environment"],
+            "mode": self.mode,
+            "stopped": log.stopped,
+            "over": log.over,
+            "controls": len(log.targets),
+            "timing": recording.timing(log),
+            "faults": dict(log.faults),
+            "limits": dataclasses.asdict(self.loop.limits),
+            "settings": dataclasses.asdict(self.settings),
+        }
+
+
+def of(
+    policy: Policy,
+    settings: Settings,
+    commands: Mapping[str, float] | None = None,
+    mode: Mode = "control",
+    duration: float | None = None,
+    changes: Mapping[str, Any] | None = None,
+) -> Session:
+    """The session of a policy.
+
+    Args:
+        policy: of any kind.
+        settings: of the robot.
+        commands: what is asked for, by name.
+        mode: see `Session`.
+        duration: of the episode, in s; that of the training by default.
+        changes: of the loop's attributes, such as its `rate` and `watchdog`.
+
+    Raises:
+        ValueError: for what would loosen a limit, and settings of other signals and actuators.
+    """
+    given = dict(changes or {})
+    if deployment.KEY in policy.schema:
+        if commands or mode == "shadow":
+            raise ValueError("policy: expected one that drives actuators for commands and shadow mode, got set-points")
+        loop: Drive | Loop = Loop.of(policy, **({"watchdog": settings.watchdog or driving.WATCHDOG} | given))
+    else:
+        loop = Drive.of(policy, settings, commands, **given, follows=mode == "shadow")
+    if duration is not None:
+        loop = dataclasses.replace(loop, steps=max(round(duration * loop.rate), 1))
+    return Session(policy, loop, settings, mode)
+
+
+def _measured(policy: Policy) -> dict[str, str]:
+    return dict(zip(policy.observed["names"], policy.observed["units"], strict=True))
+
+
+def _set_points(policy: Policy) -> dict[str, str]:
+    moved = deployment.of_schema(policy.schema).moved
+    return {SET_POINT + name: _measured(policy)[name] for name in moved}

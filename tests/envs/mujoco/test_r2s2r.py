@@ -1,0 +1,240 @@
+"""The loop of a MuJoCo task: its stages, that it ends once the posterior has settled, and what the page says.
+
+Training and inference are commands with tests of their own; here they leave what they would leave. The machine is the
+one that is served, in this process.
+"""
+
+import contextlib
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("brax")
+
+from robots.machines import a_policy
+
+import jaxlfi
+from jaxlfi.cli import loops
+from jaxlfi.cli.r2s2r import main as any_loop
+from jaxlfi.distributions.space import Space
+from jaxlfi.envs.mujoco import excitation, logs, r2s2r, r2s2r_page
+from jaxlfi.envs.mujoco.served import Machine
+from jaxlfi.rl.preparation import Control, Preparation, Signal
+from jaxlfi.robots.clock import Simulated
+
+MODEL = """
+<mujoco model="cart">
+  <option timestep="0.01" gravity="0 0 0"/>
+  <worldbody>
+    <body name="cart">
+      <joint name="rail" type="slide" axis="1 0 0" damping="5"/>
+      <geom size="0.1" mass="2"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="rail" ctrlrange="-4 6"/></actuator>
+  <sensor><jointpos name="place" joint="rail"/></sensor>
+</mujoco>
+"""
+TASK = """
+model = "cart.xml"
+[parameters."body/cart/mass"]
+support = [1.0, 3.0]
+truth = 2.5
+[noise]
+place = 0.0
+[initial]
+"rail/qpos" = -0.5
+[policy]
+interval = 0.1
+duration = 1.0
+observed = ["joint/rail/qvel"]
+costs = { push = 0.5 }
+[policy.targets.place]
+value = 0.25
+weight = 2.0
+[policy.initial]
+"rail/qpos" = [1.0, 2.0]
+"""
+PREPARATION = Preparation((Signal("joint/rail/qvel", "m/s"),), (Control("push", -4.0, 6.0),), 0.1, 10)
+
+
+class Run:
+    """A posterior of a mass, as narrow as 0.02 kg either way."""
+
+    space = Space(("body/cart/mass",), (False,))
+
+    def __init__(self, mass):
+        self.mass = mass
+
+    def final_support(self):
+        return jaxlfi.Support([1.0], [3.0])
+
+    def draws(self):
+        return np.linspace(self.mass - 0.02, self.mass + 0.02, 101)[:, None]
+
+
+@pytest.fixture
+def task(tmp_path, monkeypatch):
+    """The file of a task, what was run, and the masses that are believed in one iteration after another."""
+    (tmp_path / "cart.xml").write_text(MODEL)
+    (tmp_path / "task.toml").write_text(TASK)
+    ran, masses = [], [2.0, 2.3, 2.301, 2.4]
+
+    def command(kind):
+        def run(words):
+            ran.append([kind, *words])
+            out = Path(words[words.index("--out") + 1] if "--out" in words else words[1])
+            out.mkdir(parents=True, exist_ok=True)
+            (out / "config.json").write_text("{}")
+            if kind == "train":
+                (out / "domain/seed_000").mkdir(parents=True, exist_ok=True)
+                a_policy(PREPARATION, [[-1.5]]).save(out / "domain/seed_000/policy.npz")
+            for name in ("curves.png", "report.html"):
+                (out / name).write_bytes(b"")
+            return 0
+
+        return run
+
+    @contextlib.contextmanager
+    def machine(arguments, config, seed, scattered=False):
+        made = Machine.of(config, seed=seed, scattered=scattered)
+
+        def driver():
+            clock = Simulated()
+            one = made.driver(clock)
+            one.simulated_clock = clock
+            return one
+
+        ran.append(["machine", seed, scattered])
+        yield driver
+
+    def load(folder):
+        return Run(masses[int(folder.parent.name.rpartition("_")[2]) - 1])
+
+    monkeypatch.setattr(r2s2r.train, "main", command("train"))
+    monkeypatch.setattr(r2s2r.command_line, "main", command("infer"))
+    monkeypatch.setattr(r2s2r.command_line, "parse", lambda words: None)
+    monkeypatch.setattr(r2s2r.train.main, "parser", r2s2r.train.parser, raising=False)
+    monkeypatch.setattr(r2s2r, "_machine", machine)
+    monkeypatch.setattr("jaxlfi.runs.load.load", load)
+    monkeypatch.setattr(r2s2r_page, "load", load)
+    return tmp_path / "task.toml", ran
+
+
+def test_the_loop_ends_once_the_posterior_has_stopped_moving(task, tmp_path, capsys):
+    config, ran = task
+    out = tmp_path / "loop"
+    words = [f"mujoco,config={config}", "--out", str(out), "--episodes", "2", "--seed", "3", "--infer", "--rounds 2"]
+    assert r2s2r.main(words) == 0
+    kinds = [one[0] for one in ran]
+    # Its machine is excited; the second iteration moves by far, the third by a twentieth of a half-width.
+    assert kinds == ["machine", *["infer", "train", "machine"] * 2, "infer", "train", "train", *["machine"] * 4]
+    infers = [one for one in ran if one[0] == "infer"]
+    logs_of = lambda one: [Path(path).name for path in one[2].partition("log=")[2].split(";")]
+    assert [logs_of(one) for one in infers] == [["excitation.csv", *["rollout.csv"] * i] for i in range(3)]
+    assert all("--rounds" in one and one[one.index("--first-seed") + 1] == "3" for one in infers)
+    trained = [one[one.index("--domain") + 1] for one in ran if one[0] == "train"]
+    assert trained == [*(str(out / f"iteration_{i}/posterior") for i in (1, 2, 3)), "uniform"]
+    assert [one[2] for one in ran if one[0] == "machine"] == [False] * 3 + [True] * 4
+    assert "the posterior has moved by 17 half-widths" in capsys.readouterr().out
+    page = (out / "page.html").read_text()
+    for part in ("body/cart/mass", "<td>2.3</td>", "<td>2.5</td>", "uniform box", "iteration 3", "excitation.json"):
+        assert part in page
+    ran.clear()
+    (out / "page.html").unlink()
+    (out / "iteration_2/rollout.json").unlink()
+    assert r2s2r.main(words) == 0  # all else is there
+    assert [one[0] for one in ran] == ["machine"] and (out / "page.html").exists()
+
+
+def test_what_was_achieved_is_the_return_of_the_training(task, tmp_path):
+    """Against the reward's own formula, for an episode on the machine."""
+    config, _ = task
+    with r2s2r._machine(None, config, 0) as driver:
+        policy = a_policy(PREPARATION, [[-1.5]]).save(tmp_path / "policy.npz")
+        r2s2r._controlled(driver(), policy, config, tmp_path / "a.csv")
+    log = logs.read(tmp_path / "a.csv")
+    assert set(log.signals) == {"push", "place", "joint/rail/qvel"}
+    place, push = log.samples("place")[1], log.samples("push")[1]
+    rewards = -0.1 * (2.0 * (place[1:] - 0.25) ** 2 + 0.5 * ((push - 1.0) / 5.0) ** 2)
+    found = excitation.achieved(config, tmp_path / "a.csv")
+    assert found["return"] == pytest.approx(rewards.sum(), rel=1e-6) and found["controls"] == 10
+    assert found["place off"] == pytest.approx(abs(place[-1] - 0.25), rel=1e-6)
+
+
+def test_a_machine_is_excited_within_the_limits_of_its_policies(task, tmp_path):
+    config, _ = task
+    with r2s2r._machine(None, config, 0) as driver:
+        excitation.record(driver(), config, tmp_path / "a.csv", 3.0, seed=1)
+    log = logs.read(tmp_path / "a.csv")
+    assert set(log.signals) == {"push", "place"} and log.units == {"time": "s", "place": "m"}
+    times, push = log.samples("push")
+    np.testing.assert_allclose(np.diff(times), 0.02, atol=1e-9)
+    assert push[0] == 1.0 and -3.0 <= push.min() < 0.5 and 1.5 < push.max() <= 5.0
+    place = log.samples("place")[1]
+    assert place[0] == -0.5 and np.ptp(place) > 0.05
+    bounds = np.array([[-4.0, 0.0], [6.0, 1.0]])
+    other = excitation.sines(np.random.default_rng(2), bounds, 0.02, 500, 1.0)
+    assert (other >= [-3.0, 0.1]).all() and (other <= [5.0, 0.9]).all()
+    power = np.abs(np.fft.rfft(other[:, 0] - other[:, 0].mean())) ** 2
+    frequencies = np.fft.rfftfreq(500, 0.02)
+    assert power[(frequencies > 0.8) & (frequencies < 3.0)].sum() > 0.9 * power.sum()
+
+
+def test_how_far_a_posterior_has_moved():
+    assert loops.moved(Run(2.0), Run(2.045)) == pytest.approx(0.045 / (0.9 * 0.02), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["mujoco"], "task: expected mujoco,config=FILE, got 'mujoco'"),
+        (["mujoco,config=none.toml"], "none.toml: expected a TOML file"),
+        (["TASK", "--iterations", "0"], "iterations, episodes: expected at least 1, got 0 and 8"),
+        (["TASK", "--settled", "-1"], "settled: expected a number above 0, got -1"),
+        (["TASK", "--heuristic", "egde"], "heuristic: expected "),
+        (["TASK", "--total-steps", "0"], "total_steps: expected "),
+        (["TASK", "--address", "10.0.0.7:5005"], "expected this very host, as 127.0.0.1, got '10.0.0.7'"),
+        (["TASK", "--address", "10.0.0.7:5005", "--remote"], "token: expected the one that the robot at 10.0.0.7"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(words, expected, task, tmp_path, capsys):
+    config, ran = task
+    words = [f"mujoco,config={config}" if word == "TASK" else word for word in words]
+    assert r2s2r.main([*words, "--out", str(tmp_path / "loop")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("jaxlfi r2s2r: error: ") and expected in error and error.count("\n") == 1
+    assert not (tmp_path / "loop").exists() and not ran
+
+
+def test_the_folder_of_another_loop_is_refused(task, tmp_path, capsys):
+    config, _ = task
+    words = [f"mujoco,config={config}", "--out", str(tmp_path / "loop"), "--episodes", "1", "--iterations", "1"]
+    assert r2s2r.main(words) == 0
+    assert r2s2r.main([*words, "--seed", "4"]) == 2
+    assert "out: expected a new folder, or one of the same command" in capsys.readouterr().err
+    assert json.loads((tmp_path / "loop/config.json").read_text())["asked"]["seed"] == "0"
+
+
+def test_the_first_word_says_whose_loop_it_is(monkeypatch, capsys):
+    from jaxlfi.cli import r2s2r as dispatch
+
+    calls = {}
+    monkeypatch.setattr(
+        dispatch.LOOPS.__class__, "find", lambda family, name: lambda words: calls.update({name: words}) or 0
+    )
+    for words, name, rest in (
+        (["mujoco,config=a.toml", "--out", "b"], "mujoco", ["mujoco,config=a.toml", "--out", "b"]),
+        (["--object", "dlo-0"], "whip", ["--object", "dlo-0"]),
+        (["whip", "--object", "dlo-0"], "whip", ["--object", "dlo-0"]),
+        (["mujoco", "--help"], "mujoco", ["--help"]),
+    ):
+        calls.clear()
+        assert any_loop(words) == 0 and calls == {name: rest}
+    monkeypatch.undo()
+    assert any_loop(["no_such_loop,config=a"]) == 2
+    assert re.search(r"loop: expected one of .* or module:command, got 'no_such_loop'", capsys.readouterr().err)
