@@ -170,7 +170,7 @@ class Goal:
     bias: float = 0.0
 
     def __post_init__(self):
-        object.__setattr__(self, "targets", {name: Target(*one) for name, one in self.targets.items()})
+        object.__setattr__(self, "targets", self.aims)
         if not self.observed or len(set(self.observed)) < len(self.observed):
             raise ValueError(f"observed: expected at least one signal, each once, got {list(self.observed)}")
         if not 0 < self.interval <= self.duration < math.inf:
@@ -201,7 +201,7 @@ class Goal:
                 raise ValueError(f"terminations: expected a name that has no other meaning, got {name!r}")
 
     def _check_rewards(self) -> None:
-        weights = {f"targets: {name}": one.weight for name, one in self.targets.items()}
+        weights = {f"targets: {name}": one.weight for name, one in self.aims.items()}
         weights |= {f"costs: {name}": cost for name, cost in self.costs.items()}
         weights |= {f"change_costs: {name}": cost for name, cost in self.change_costs.items()}
         for name, number in weights.items():
@@ -212,7 +212,7 @@ class Goal:
         for name, (low, high) in self.commands.items():
             if not -math.inf < low < high < math.inf:
                 raise ValueError(f"commands: {name}: expected LOW below HIGH, got {[low, high]}")
-        for name, one in self.targets.items():
+        for name, one in self.aims.items():
             if isinstance(one.value, str) and one.value not in self.commands:
                 known = near(one.value, [*self.commands])
                 raise ValueError(f"targets: {name}: expected a command {known}, got {one.value!r}")
@@ -220,9 +220,14 @@ class Goal:
                 raise ValueError(f"targets: {name}: expected a finite value, got {one.value:g}")
             if one.within is not None and not 0 < one.within < math.inf:
                 raise ValueError(f"targets: {name}: within: expected more than 0, got {one.within:g}")
-        followed = [one.value for one in self.targets.values()]
+        followed = [one.value for one in self.aims.values()]
         if self.reward is None and (idle := [name for name in self.commands if name not in followed]):
             raise ValueError(f"commands: expected each to be a target of a signal, got no target of {', '.join(idle)}")
+
+    @property
+    def aims(self) -> dict[str, Target]:
+        """The targets, in full."""
+        return {name: Target(*one) for name, one in self.targets.items()}
 
     @property
     def steps(self) -> int:

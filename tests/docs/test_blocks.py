@@ -71,6 +71,7 @@ FRAGMENTS = {
     "from dask_jobqueue": "needs Slurm",
     "from mpi4py": "needs MPI",
     "from robot_driver": "serves until it is ended: tests/robots",
+    "preparation.of_schema": "needs a trained policy: tests/rl/test_prepared_policy.py",
     'policy.load("runs/': "needs a trained policy: tests/rl/test_policy.py",
     "gymnasium.make": "needs a table of policies, and compiles: tests/rl/test_gym.py",
     "WhipVector": "minutes of compiling: tests/envs/whip/test_gym.py",

@@ -75,11 +75,6 @@ def carriage():
     return MujocoEnvironment(CARRIAGE, [DAMPING], GOAL, forces=FORCES, discrepancies=errors)
 
 
-def keys():
-    """Of 300 episodes, anew, as keys are used once."""
-    return jax.random.split(jax.random.key(2), 300)
-
-
 @pytest.fixture(scope="module")
 def stepped(carriage):
     return jax.jit(carriage.step)
@@ -88,7 +83,7 @@ def stepped(carriage):
 @pytest.fixture(scope="module")
 def begun(carriage):
     """Starts of 300 episodes."""
-    return jax.jit(jax.vmap(carriage.reset))(keys(), jnp.full((300, 1), 0.8))
+    return jax.jit(jax.vmap(carriage.reset))(jax.random.split(jax.random.key(2), 300), jnp.full((300, 1), 0.8))
 
 
 def lacking(model, coefficients):
@@ -105,7 +100,7 @@ def test_episodes_are_those_of_commanded_controls(episode, carriage, stepped, be
     state = jax.tree.map(lambda leaf: leaf[episode], begun)
     drawn, model = state.inner.drawn, mujoco.MjModel.from_xml_string(CARRIAGE)
     model.dof_damping[0] = 0.8
-    lacking(model, np.asarray(carriage._forces(jax.random.split(keys()[episode], 3)[0]), float))
+    lacking(model, np.asarray(state.inner.lacking, float))
     data = mujoco.MjData(model)
     data.qpos[0] = target = float(state.inner.state.qpos[0])
     speed, pull, waits = float(state.observation[-1]), 0.0, float(drawn.action_delay)
@@ -136,9 +131,11 @@ def test_episodes_are_those_of_commanded_controls(episode, carriage, stepped, be
     assert state.facts["joint/rail/qvel off"] == pytest.approx(abs(data.qvel[0] - speed), rel=1e-2)
 
 
-def test_commands_are_drawn_anew_for_each_episode(begun):
+def test_commands_and_forces_are_drawn_anew_for_each_episode(begun):
     speeds = np.sort(np.asarray(begun.observation[:, -1]))
     assert np.abs(speeds - np.linspace(-0.5, 2.0, 300)).max() < 0.25
+    lacking = np.asarray(begun.inner.lacking)
+    np.testing.assert_allclose(lacking.std(axis=0), FORCES.deviations, rtol=0.15)
     assert abs(np.corrcoef(begun.observation[:, 0], begun.observation[:, -1])[0, 1]) < 0.15
 
 
