@@ -10,12 +10,15 @@ pytest.importorskip("brax")
 import jax
 import jax.numpy as jnp
 
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
+from jaxlfi.envs.mujoco.effects import Effects, built
 from jaxlfi.envs.mujoco.environment import MujocoEnvironment
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.goal import Goal, Target
+from jaxlfi.envs.mujoco.mjx_models import added, with_forces
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
-from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.envs.mujoco.parameters import Parameter, edit
 from jaxlfi.envs.mujoco.reading import Reading, add_signals
 from jaxlfi.envs.mujoco.termination import parsed
 from jaxlfi.rl.preparation import Command, Control, Signal
@@ -66,7 +69,8 @@ GOAL = Goal(
     action_delay=(0.02, 0.07),
     observation_delay=(0.0, 0.03),
 )
-FORCES = UnmodelledForces(np.array([3.0, 0.0]), np.array([0.4, 0.02]), np.array([0.5, 0.0]))
+FORCES = UnmodelledForces(np.array([3.0, 0.0]), np.array([0.4, 0.02]), np.zeros(2))
+"""Without friction, which MJX would compile its solver for."""
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +96,19 @@ def lacking(model, coefficients):
         model.jnt_stiffness[joint] += coefficients[joint]
         model.dof_damping[joint] = max(model.dof_damping[joint] + coefficients[2 + joint], 0.0)
         model.dof_frictionloss[joint] = max(model.dof_frictionloss[joint] + coefficients[4 + joint], 0.0)
+
+
+@pytest.mark.parametrize("coefficients", [[3.0, -0.1, 0.2, -9.0, 0.7, 0.0], [0.0, 0.0, -0.1, 0.3, -2.0, 0.0]])
+def test_forces_that_a_model_lacks_are_in_its_numbers(coefficients):
+    forces = UnmodelledForces(np.ones(2), np.ones(2), np.array([1.0, 0.0]))
+    spec, low, high = specification(CARRIAGE), np.array([0.1], np.float32), np.array([2.0], np.float32)
+    build = lambda theta: built(spec, Effects(((edit(spec, spec.compile(), DAMPING.name), 0),)), theta)
+    models = with_forces(build, forces, [DAMPING.name], np.array([0.5]), Support(low, high))
+    numbers, _ = models.numbers(jnp.array([0.8, *[0.0] * 6]))
+    got, expected = added(models.model(numbers), forces, jnp.array(coefficients)), build(np.array([0.8]))
+    lacking(expected, coefficients)
+    for field in ("jnt_stiffness", "dof_damping", "dof_frictionloss"):
+        np.testing.assert_allclose(getattr(got, field), getattr(expected, field), rtol=1e-6, atol=1e-8, err_msg=field)
 
 
 @pytest.mark.parametrize("episode", [0, 1])
