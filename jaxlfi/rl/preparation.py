@@ -14,6 +14,7 @@ that was before is taken to have been as it is then.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -214,16 +215,20 @@ class Preparation:
             xp: NumPy, or `jax.numpy`.
         """
         last, (low, high, most) = memory.controls[0], self._limits
-        wanted = xp.where(np.array([one.displacing for one in self.controls]), last + action, action)
+        wanted = xp.where(self._displacing, last + action, action)
         control = xp.clip(xp.clip(wanted, last - most, last + most), low, high)
         return memory._replace(controls=xp.concatenate([control[None], memory.controls[:-1]])), control
 
-    @property
+    @functools.cached_property
     def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Least and largest controls, and their largest change in an interval."""
         rates = [math.inf if one.rate is None else one.rate for one in self.controls]
         low, high = ([getattr(one, what) for one in self.controls] for what in ("low", "high"))
         return np.array(low), np.array(high), self.interval * np.array(rates)
+
+    @functools.cached_property
+    def _displacing(self) -> np.ndarray:
+        return np.array([one.displacing for one in self.controls])
 
     def _frame(self, values: Float[Any, " values"], xp: Any) -> Float[Any, " frame"]:
         """What is seen of signals at a time."""
