@@ -230,12 +230,18 @@ class Preparation:
     def _displacing(self) -> np.ndarray:
         return np.array([one.displacing for one in self.controls])
 
+    @functools.cached_property
+    def _parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The signal of each number of a frame, and whether the number is its cosine, or its sine."""
+        parts = [(k, which) for k, one in enumerate(self.signals) for which in (("cos", "sin") if one.turning else "=")]
+        whiches = np.array([which for _, which in parts])
+        return np.array([k for k, _ in parts]), whiches == "cos", whiches == "sin"
+
     def _frame(self, values: Float[Any, " values"], xp: Any) -> Float[Any, " frame"]:
         """What is seen of signals at a time."""
-        parts = []
-        for place, one in enumerate(self.signals):
-            parts += [xp.cos(values[place]), xp.sin(values[place])] if one.turning else [xp.asarray(values[place])]
-        return xp.stack(parts)
+        places, cosine, sine = self._parts
+        numbers = xp.asarray(values)[places]
+        return xp.where(cosine, xp.cos(numbers), xp.where(sine, xp.sin(numbers), numbers))
 
 
 def of_schema(schema: Mapping[str, Any]) -> Preparation | None:
