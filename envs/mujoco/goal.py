@@ -33,8 +33,8 @@ speed = [-1.0, 2.0]
 fallen = { when = "body/torso/pos[2] < 0.2", cost = 10.0 }      # - once, whatever the interval
 away = "abs(arm angle) > 2.5"       # at no cost
 
-Costs alone make it worth while to end an episode early, unless the end costs more than the rest of the episode, or what
-is `within` and `alive` makes up for them.
+Where there are only costs, ending an episode early pays, unless the end costs more than the rest of the episode would;
+`within` and `alive` reward what goes on.
 
 Positions of hinges without a range are angles: a policy sees their cosine and sine, and a difference d from a target
 costs 2 (1 - cos d), which is d squared while it is small. Conditions compare them as numbers, turns and all.
