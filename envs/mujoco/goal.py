@@ -192,6 +192,9 @@ class Goal:
         ).items():
             if not 0 <= deviation < math.inf:
                 raise ValueError(f"{what}: expected a standard deviation of at least 0, got {deviation:g}")
+        for name, scale in self.scales.items():
+            if not 0 < scale < math.inf:
+                raise ValueError(f"scales: {name}: expected more than 0, got {scale:g}")
         for what in DELAYS:
             low, high = getattr(self, what)
             if not 0 <= low <= high <= self.duration:

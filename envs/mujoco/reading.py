@@ -252,8 +252,10 @@ def _limits(model: mujoco.MjModel, i: int, name: str, goal: Goal) -> tuple[float
         low, high = model.actuator_ctrlrange[i]
     else:
         raise ValueError(f"policy: limits: expected those of {name}, whose actuator has no ctrlrange; got none")
-    if not low < high:
-        raise ValueError(f"policy: limits: {name}: expected LOW below HIGH, got {[float(low), float(high)]}")
+    if not -np.inf < low < high < np.inf:
+        raise ValueError(
+            f"policy: limits: {name}: expected LOW below HIGH, both finite, got {[float(low), float(high)]}"
+        )
     least, most = model.actuator_ctrlrange[i]
     clamps = model.actuator_ctrllimited[i] and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
     if clamps and (low < least or high > most):

@@ -186,6 +186,10 @@ def reading(**changes):
         ({"turns": ("turn",)}, "turns: expected positions of hinges without a range (joint/winch/qpos), got turn"),
         ({"rates": {"motor": 1.0}}, "rates: expected actuators of the model (servo, pull), got motor"),
         ({"displacing": ("motor",)}, "displacing: expected actuators of the model (servo, pull), got motor"),
+        (
+            {"limits": {"servo": (-np.inf, 1.0), "pull": (0.0, 1.0)}},
+            "limits: servo: expected LOW below HIGH, both finite",
+        ),
         ({"displacing": ("pull",)}, "displacing: pull: expected a rate"),
         ({"rates": {"servo": -1.0}}, "rates: servo: expected a rate of more than 0 per second, got -1"),
         ({"observed": ("turn",), "turns": (), "scales": {}}, "rates: servo: expected the position of the joint 'rail'"),
