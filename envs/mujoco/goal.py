@@ -69,6 +69,7 @@ from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import termination
 from jaxlfi.envs.mujoco.parameters import near
 from jaxlfi.envs.mujoco.termination import Termination
+from jaxlfi.rl.preparation import MOST_BEFORE
 
 NEEDED = ("interval", "duration", "observed")
 BOUNDS = ("limits", "initial", "commands")
@@ -92,8 +93,6 @@ KEYS = (
     *DELAYS,
     MODEL_ERROR,
 )
-MOST_BEFORE = 100
-"""Control intervals that a policy looks back, at most."""
 RESERVED = ("return", "value", "steps", "theta", "length", "episodes", "seconds", "failed")
 """What is recorded of episodes under these names is something else than that one ended so."""
 Reward = Callable[[Mapping[str, Array], Mapping[str, Array]], Array]
