@@ -342,8 +342,8 @@ def test_the_error_of_the_model_is_what_inference_says(tmp_path):
     file = tmp_path / "furuta.toml"
     file.write_text(text.replace("[policy]", "[policy]\nmodel_error = true\nnoises = { 'joint/arm/qvel' = 0.2 }", 1))
     env, learnt = environment(file), simulator_of(task(file))
-    np.testing.assert_array_equal(env._lacking, learnt.forces.deviations)
-    assert (env._lacking[[0, 2, 4]] > 0).all() and learnt.signals == ("arm angle", "pendulum angle")
+    np.testing.assert_array_equal(env._forces.deviations, learnt.forces.deviations)
+    assert (env._forces.deviations[[0, 2, 4]] > 0).all() and learnt.signals == ("arm angle", "pendulum angle")
     assert env._noise.tolist() == [0.002, learnt.noise[1], 0.2, 0.0] and 1e-4 < learnt.noise[1] < 0.01
     kept = np.exp(-0.1 / np.array([0.78, 0.14]))
     np.testing.assert_allclose(env._nuisances._keep[:2], kept, rtol=1e-6)
