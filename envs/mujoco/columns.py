@@ -5,6 +5,7 @@
 | `motor` | the control of the actuator `motor`; where there is none, what the sensor `motor` measures |
 | `actuator/motor`, `sensor/motor` | that of the actuator and that of the sensor, where both have one name |
 | `actuator/0`, `sensor/0` | of the first actuator and sensor of the model, which need no name |
+| `action/motor`, `observation.state/motor` | the same two of a LeRobot data set, where both have one name |
 """
 
 import dataclasses
@@ -79,7 +80,7 @@ def signal_name(name: str, sensors: Sequence[str]) -> str:
     """
     match = INDEXED.fullmatch(name)
     own, index = (name, "") if match is None or name in sensors else (match["sensor"], f"[{match['index']}]")
-    rest = own.removeprefix("sensor/")
+    rest = own.removeprefix("sensor/").removeprefix("observation.state/")
     if own in sensors or rest == own:
         return name
     if rest in sensors:
@@ -116,7 +117,9 @@ def arranged(log: Log, actuators: Sequence[str], sensors: Sequence[str]) -> Log:
     """
     called: dict[str, str] = {}
     for i, (name, key) in enumerate(zip(actuators, control_names(actuators, sensors), strict=True)):
-        explicit = [column for column in (f"actuator/{name}", f"actuator/{i}") if column in log.signals]
+        explicit = [
+            column for column in (f"actuator/{name}", f"actuator/{i}", f"action/{name}") if column in log.signals
+        ]
         plain = [name] if name in log.signals and (name not in sensors or not explicit) else []
         called |= dict.fromkeys([*explicit, *plain], key)
         if name and name in sensors and plain and f"sensor/{name}" not in log.signals:

@@ -12,6 +12,9 @@ feasible = [0.0001, 0.1]            # Phi; by default Theta_0
 unit = "N m s/rad"
 log = true                          # infer its logarithm
 
+[signals]                           # other names and units of what is recorded (`jaxlfi.envs.mujoco.renaming`)
+"q1" = { name = "angle", unit = "deg" }
+
 [noise]                             # standard deviations; of other signals it is estimated
 angle = 0.002
 
@@ -36,6 +39,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from jaxlfi.envs.mujoco import log_files, logs, renaming
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -48,6 +52,7 @@ KEYS: Mapping[str, type] = {
     "summary": str,
     "unmodelled_force": float,
     "parameters": dict,
+    "signals": dict,
     "noise": dict,
     "initial": dict,
     "discrepancy": dict,
@@ -82,10 +87,12 @@ def read(
     if not given:
         raise ValueError(f"{path}: expected recordings, as log = [FILE], or mujoco,config={path},log=FILE; got none")
     try:
+        called = renaming.table_of(config)
+        recordings = [recording for one in given for recording in log_files.recorded(one)]
         return mujoco_task(
             path.parent / config["model"],
             parameters_of(config),
-            given,
+            [logs.log_of(one) for one in renaming.renamed(recordings, called)],
             config.get("measured"),
             numbers(config, "noise"),
             numbers(config, "initial"),

@@ -30,6 +30,8 @@ TIMES = ("times", "time", "t", "timestamps", "timestamp", "stamp")
 """What times are called; a unit may follow, as in time_ms."""
 TIME = "time"
 """What times are called among the units of a log."""
+WIDEST = 256
+"""Numbers of a topic, at most: point clouds and other pictures are left out."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -213,12 +215,15 @@ def _of_robotics(path: Path) -> Iterator[Recorded]:
 
 
 def _of_rollout(rollout: Rollout, where: str, known: Mapping[str, str]) -> Recorded:
-    named = {topic: [_named(heading) for heading in signal.names] for topic, signal in rollout.signals.items()}
+    narrow = {topic: signal for topic, signal in rollout.signals.items() if len(signal.names) <= WIDEST}
+    if not narrow:
+        raise ValueError(f"{where}: expected topics of at most {WIDEST} numbers, got {', '.join(rollout.signals)}")
+    named = {topic: [_named(heading) for heading in signal.names] for topic, signal in narrow.items()}
     topics = Counter(name for several in named.values() for name in {name for name, _ in several})
-    times = np.unique(np.concatenate([signal.times for signal in rollout.signals.values()]))
+    times = np.unique(np.concatenate([signal.times for signal in narrow.values()]))
     signals: dict[str, np.ndarray] = {}
     units, faults = dict(known), list(rollout.faults)
-    for topic, signal in rollout.signals.items():
+    for topic, signal in narrow.items():
         if fault := clocks.order(signal.times, "sample").fault:
             faults.append(f"{topic}: expected one sample at a time, got {fault}")
         rows, first = np.unique(np.searchsorted(times, signal.times), return_index=True)

@@ -33,6 +33,7 @@ COLUMN, COLUMN_VERSION = "jaxlfi", 1
 CLOCK = "time"
 """Feature of the frames' time stamps, in s."""
 COUNTED = ("frame_index", "episode_index", "index", "task_index")
+_EVERY = {"timestamp": {"dtype": "float32", "shape": [1]}, "frame_index": {"dtype": "int64", "shape": [1]}}
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 INSTALL = "LeRobot data sets need the package pyarrow: pip install 'jaxlfi[robotics]'"
@@ -383,6 +384,7 @@ def _rollout(path: Path, info: Mapping[str, Any], number: int, row: Mapping[str,
     }
     own = _own(row.get(COLUMN))
     file = path / info["data_path"].format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
+    features |= {name: feature for name, feature in _unlisted(file).items() if name not in features}
     names = [name for name in features if name not in COUNTED or name == "frame_index"]
     table = _table(file, names, [("episode_index", "=", number)])
     if table.num_rows != row["length"] or not table.num_rows:
@@ -418,6 +420,16 @@ def _rollout(path: Path, info: Mapping[str, Any], number: int, row: Mapping[str,
         raise ValueError(f"expected features that are numbers, got {', '.join(info['features'])}")
     faults = (f"{clock}: expected times in order, got {fault}",) if fault else ()
     return Rollout(signals, own["metadata"], (row.get("tasks") or [""])[0], faults)
+
+
+def _unlisted(file: Path) -> dict[str, dict[str, Any]]:
+    """Features that every data set has, where a file has them, as not all who write info.json list them."""
+    _, parquet = _libraries()
+    try:
+        there = parquet.read_schema(file).names
+    except Exception:
+        return {}  # which is refused when the rows are read
+    return {name: feature for name, feature in _EVERY.items() if name in there}
 
 
 def _unit(name: str, feature: Mapping[str, Any]) -> str | tuple[str, ...]:
@@ -497,4 +509,4 @@ def _words(name: str, described: Any, count: int) -> tuple[str, ...]:
         described = inner
     if isinstance(described, list) and len(set(map(str, described))) == len(described) == count:
         return tuple(map(str, described))
-    return tuple(f"{name} {index}" for index in range(count))
+    return tuple(f"{name} {index}" for index in range(count)) if count > 1 else (name,)
