@@ -30,6 +30,8 @@ TIMES = ("times", "time", "t", "timestamps", "timestamp", "stamp")
 """What times are called; a unit may follow, as in time_ms."""
 TIME = "time"
 """What times are called among the units of a log."""
+AXES = ("x", "y", "z", "w")
+"""Names of numbers that say nothing without that of their topic."""
 WIDEST = 256
 """Numbers of a topic, at most: point clouds and other pictures are left out."""
 
@@ -230,7 +232,7 @@ def _of_rollout(rollout: Rollout, where: str, known: Mapping[str, str]) -> Recor
         for (name, own), values, unit in zip(named[topic], signal.values[first].T, signal.units, strict=True):
             column = np.full(len(times), np.nan)
             column[rows] = values
-            called = name if topics[name] == 1 else f"{topic}/{name}"
+            called = name if topics[name] == 1 and name not in AXES else f"{topic}/{name}"
             _add(signals, {called: column}, where)
             units[called] = own or unit
     return Recorded(times, signals, where, units, tuple(faults))
