@@ -102,7 +102,7 @@ def _of_all(
                 yield Candidate(
                     f"sensor/{name.removeprefix('sensor/')}/bias", 0.0, bounds, (-5 * reach, 5 * reach), unit
                 )
-    for i in np.flatnonzero(_touching(model)):
+    for i in map(int, np.flatnonzero(_touching(model))):
         if (name := model.geom(i).name) and model.geom_friction[i, 0] > 0:
             yield _around(f"geom/{name}/friction[0]", float(model.geom_friction[i, 0]), "")
 

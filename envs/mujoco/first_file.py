@@ -56,13 +56,16 @@ def _signals(several: Sequence[Inspected]) -> Iterator[str]:
     called = {name: signal.called for name, signal in together(several).items() if signal.called}
     if times := [one.time for one in several if one.time]:
         called[TIME] = times[0]
-    unknown = [signal for signal in together(several).values() if signal.place is None]
+    unknown = [signal for name, signal in together(several).items() if signal.place is None and name not in called]
     if not called and not unknown:
         return
     yield "[signals]                           # what recordings call them, and what they are in the model"
-    for name, (new, unit) in called.items():
-        both = {"name": new, "unit": unit}
-        said = ", ".join(f"{key} = {_quoted(value)}" for key, value in both.items() if value)
+    for name, (new, unit, read) in called.items():
+        if not read:
+            yield f"{_key(name)} = false"
+            continue
+        given = {"name": new, "unit": unit}
+        said = ", ".join(f"{key} = {_quoted(value)}" for key, value in given.items() if value)
         yield f"{_key(name)} = {_quoted(new) if new and not unit else f'{{ {said} }}'}"
     for signal in unknown:
         near = _quoted(signal.nearest[0] if signal.nearest else "NAME")

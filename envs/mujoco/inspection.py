@@ -7,7 +7,7 @@ is what is odd (`recordings`, `plausible`, `columns`). What a task refuses is sa
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 
 import mujoco
@@ -76,7 +76,7 @@ class Inspected:
         signals: by their names in the recording.
         odd: what is odd about all of it, a line each.
         time: what the table `signals` has to say of times; None where nothing.
-        usable: whether a task can read it as it is, with that table.
+        usable: whether a task can read it with that table.
         log: as a task reads it, without what it would refuse; its signals are called as the model's.
         measured: the signals of the log that the model's sensors can be compared with.
     """
@@ -167,11 +167,9 @@ def inspect(
             *(name, unit, place, near, called.get(name), len(values), *_intervals(times)),
             *(float(values.min()), float(values.max()), noises[name], tuple(dict.fromkeys(texts))),
         )
-    usable = not ordered.faults and not refused
     return Inspected(
-        raw.name,
-        *(len(raw.times), float(log.times[-1]), signals, tuple(dict.fromkeys(odd)), called.get(TIME), usable, log),
-        tuple(compared),
+        *(raw.name, len(raw.times), float(log.times[-1]), signals, tuple(dict.fromkeys(odd)), called.get(TIME)),
+        *(not ordered.faults, log, tuple(compared)),
     )
 
 
@@ -188,9 +186,10 @@ def _readable(raw: Recorded) -> tuple[Recorded, dict[str, str]]:
         elif not is_unit(units.get(name, "")):
             refused[name] = f"is in {units[name]!r}, which is no unit that is known: say one in [signals]"
     signals = {name: values for name, values in raw.signals.items() if name not in refused}
+    units = {name: unit for name, unit in units.items() if name not in refused}
     if not signals:
         raise ValueError(f"{raw.name}: expected signals with finite samples, got none")
-    return dataclasses.replace(raw, signals=signals, faults=()), refused
+    return dataclasses.replace(raw, signals=signals, units=units, faults=()), refused
 
 
 def _read(
@@ -304,7 +303,7 @@ def _time_unit(model: mujoco.MjModel, raw: Recorded) -> str | None:
 
 def _unread(name: str, odd: tuple[str, ...]) -> Signal:
     nan = float("nan")
-    return Signal(name, "", None, (), None, 0, nan, 0, nan, nan, nan, None, odd)
+    return Signal(name, "", None, (), Called(read=False), 0, nan, 0, nan, nan, nan, None, odd)
 
 
 def _intervals(times: np.ndarray) -> tuple[float, int, float]:
@@ -402,11 +401,10 @@ def _joined(first: Signal, other: Signal) -> Signal:
     if not (first.samples and other.samples):
         kept = first if first.samples else other
         return dataclasses.replace(kept, odd=(*first.odd, *other.odd))
-    least: Callable = np.nanmin
     return dataclasses.replace(
         first,
         samples=first.samples + other.samples,
-        rate=float(least([first.rate, other.rate])),
+        rate=float(np.nanmin([first.rate, other.rate])),
         gaps=first.gaps + other.gaps,
         longest=max(first.longest, other.longest),
         low=min(first.low, other.low),

@@ -78,12 +78,13 @@ class _Element(NamedTuple):
 
 
 class _Name(NamedTuple):
-    """A signal's name in words: those of its own, what it may be, and its place in a vector."""
+    """A signal's name in words: those that tell it from others, all of them, what it may be, its place in a vector."""
 
     words: frozenset[str]
+    every: frozenset[str]
     quantities: tuple[str, ...]
     base: str
-    index: int | None
+    number: int | None
 
 
 def places(model: mujoco.MjModel, names: Mapping[str, str], where: str = "recording") -> dict[str, Place | None]:
@@ -99,7 +100,7 @@ def places(model: mujoco.MjModel, names: Mapping[str, str], where: str = "record
     """
     actuators, sensors = ([one(i).name for i in range(count)] for one, count in _named(model))
     called = columns.called(list(names), where, actuators, sensors)
-    found: dict[str, Place | None] = {name: _sure(model, own, [*actuators, *sensors]) for name, own in called.items()}
+    found: dict[str, Place | None] = {name: _sure(model, called[name], [*actuators, *sensors]) for name in names}
     taken = {place.name for place in found.values() if place}
     read = {name: _read(name, unit) for name, unit in names.items()}
     elements = list(_elements(model))
@@ -137,7 +138,8 @@ def _joints(model: mujoco.MjModel) -> list[str]:
 
 def _sure(model: mujoco.MjModel, name: str, known: Sequence[str]) -> Place | None:
     base, _, suffix = name.rpartition("_")
-    if base in known and name not in known and len(suffix) > 1 and is_unit(suffix):
+    own_base = base in known or measured.JOINT.fullmatch(base)
+    if own_base and name not in known and len(suffix) > 1 and is_unit(suffix):
         own = _sure(model, base, known)
         return own and own._replace(unit=suffix)
     if name in (controls := columns.controls_of(model)):
@@ -179,7 +181,7 @@ def _words(text: str) -> list[str]:
 
 def _read(name: str, unit: str) -> _Name:
     match = re.fullmatch(r"(?P<base>.+?)(?:\[(?P<index>\d+)\]| (?P<number>\d+))", name)
-    base, index = (name, None) if match is None else (match["base"], int(match["index"] or match["number"]))
+    base, number = (name, None) if match is None else (match["base"], int(match["index"] or match["number"]))
     words = _words(base)
     said = [what for what, several in QUANTITIES.items() if several & set(words)]
     # A topic of actions has the positions that are aimed at, and a unit is as good as a word.
@@ -188,7 +190,7 @@ def _read(name: str, unit: str) -> _Name:
     elif not said and unit in _UNITS:
         said = [_UNITS[unit]]
     quantity = frozenset().union(*QUANTITIES.values())
-    return _Name(frozenset(words) - quantity - _FILLERS, tuple(said), base, index)
+    return _Name(frozenset(words) - quantity - _FILLERS, frozenset(words), tuple(said), base, number)
 
 
 def _elements(model: mujoco.MjModel) -> Iterator[_Element]:
@@ -225,13 +227,13 @@ def _joint_of(model: mujoco.MjModel, actuator: int) -> str:
 
 def _scalar(read: _Name, elements: Sequence[_Element]) -> Place | None:
     """The only element of one number whose words a name has: all of them, or with others beside a quantity."""
-    if read.index is not None:
+    if read.number is not None:
         return None
-    fitting = [one for one in elements if one.size == 1 and one.words and one.words <= read.words]
+    fitting = [one for one in elements if one.size == 1 and _names(read, one.words)]
     if read.quantities:
         fitting = [one for one in fitting if one.quantity in _meant(read.quantities)]
     else:
-        fitting = [one for one in fitting if one.words == read.words]
+        fitting = [one for one in fitting if one.words in (read.words, read.every)]
     most = max((len(one.words) for one in fitting), default=0)
     fitting = [one for one in fitting if len(one.words) == most]
     for quantity in _meant(read.quantities) or ("position", CONTROL, "velocity", "effort"):
@@ -239,6 +241,11 @@ def _scalar(read: _Name, elements: Sequence[_Element]) -> Place | None:
             same = of_it[0].name.startswith(("joint/", "body/")) or len({one.name for one in _plain(of_it)}) == 1
             return Place(of_it[0].name, of_it[0].what, False) if same else None
     return None
+
+
+def _names(read: _Name, words: frozenset[str]) -> bool:
+    """Whether a name has an element's words; those of one that is called "motor" only if it has no others."""
+    return bool(words) and (words <= read.words or (not read.words and words <= read.every))
 
 
 def _meant(quantities: Sequence[str]) -> tuple[str, ...]:
@@ -256,8 +263,8 @@ def _vectors(model: mujoco.MjModel, read: Mapping[str, _Name], elements: Sequenc
     """Numbers of vectors, as "q[0]" and "action 3": all of a model's, or those of a sensor or body."""
     groups: dict[str, dict[int, str]] = {}
     for name, one in read.items():
-        if one.index is not None:
-            groups.setdefault(one.base, {})[one.index] = name
+        if one.number is not None:
+            groups.setdefault(one.base, {})[one.number] = name
     found: dict[str, Place | None] = {}
     for group in groups.values():
         if sorted(group) != list(range(len(group))):
@@ -285,12 +292,12 @@ def _axes(read: Mapping[str, _Name], elements: Sequence[_Element]) -> dict[str, 
 
 def _whole(model: mujoco.MjModel, read: _Name, count: int) -> list[Place | None]:
     """A vector of all controls, positions or velocities, or of positions and velocities, of a model."""
-    controls = [
+    controls: list[Place | None] = [
         Place(name, f"control of actuator {model.actuator(i).name or i}", False)
         for i, name in enumerate(columns.controls_of(model))
     ]
     positions, velocities = list(_coordinates(model, "qpos")), list(_coordinates(model, "qvel"))
-    vectors = {CONTROL: controls, "position": positions, "velocity": velocities}
+    vectors: Mapping[str, list[Place | None]] = {CONTROL: controls, "position": positions, "velocity": velocities}
     for quantity in read.quantities:
         if read.words and quantity != CONTROL:
             continue  # of something else than the whole model
@@ -325,7 +332,7 @@ def _coordinates(model: mujoco.MjModel, attribute: str) -> Iterator[Place | None
 def _numbers_of(read: _Name, count: int, elements: Sequence[_Element]) -> list[Place | None]:
     """The numbers of the only sensor or body that a vector can be."""
     fitting = [one for one in elements if one.size == count > 1 and one.quantity in read.quantities]
-    named = [one for one in fitting if one.words <= read.words]
+    named = [one for one in fitting if _names(read, one.words)]
     # By its name, or because the model has only one such sensor.
     for several in (_plain(named), [one for one in fitting if one.what.startswith("sensor")]):
         if len(several) == 1:

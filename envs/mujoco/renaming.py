@@ -5,6 +5,7 @@
 "tau1" = { name = "actuator/shoulder", unit = "mN m" }    # in place of what the recording says
 "arm angle" = { unit = "deg" }                           # where the recording says none
 time = { unit = "ms" }                                   # of times
+"spare" = false                                          # is not read
 """
 
 import dataclasses
@@ -22,10 +23,12 @@ class Called(NamedTuple):
     Attributes:
         name: in the model; None for its own.
         unit: in place of the recording's, or without a name where the recording says none; None for its own.
+        read: whether it is.
     """
 
     name: str | None = None
     unit: str | None = None
+    read: bool = True
 
 
 def table_of(config: Mapping[str, Any]) -> dict[str, Called]:
@@ -37,9 +40,12 @@ def table_of(config: Mapping[str, Any]) -> dict[str, Called]:
     found = {}
     for name, value in config.get("signals", {}).items():
         where = f"signals: {name!r}"
+        if value is False:
+            found[name] = Called(read=False)
+            continue
         given = {"name": value} if isinstance(value, str) else value
         if not isinstance(given, dict) or not given or not given.keys() <= {"name", "unit"}:
-            raise ValueError(f"{where}: expected a name, or {{ name = NAME, unit = UNIT }}, got {value!r}")
+            raise ValueError(f"{where}: expected a name, {{ name = NAME, unit = UNIT }} or false, got {value!r}")
         if wrong := [one for one in given.values() if not isinstance(one, str) or not one]:
             raise ValueError(f"{where}: expected words in quotes, got {wrong[0]!r}")
         try:
@@ -63,21 +69,22 @@ def renamed(several: Sequence[Recorded], called: Mapping[str, Called]) -> list[R
         ValueError: for names that no recording has, and two signals that get one name, in one line.
     """
     known = {name for one in several for name in one.signals} | {TIME}
-    for name, (new, _) in called.items():
-        if not {name, new, str(new).removeprefix("actuator/").removeprefix("sensor/")} & known:
+    for name, (new, _, read) in called.items():
+        if read and not {name, new, str(new).removeprefix("actuator/").removeprefix("sensor/")} & known:
             raise ValueError(f"signals: expected a signal of the recordings {near(name, sorted(known))}, got {name!r}")
     return [_renamed(one, called) for one in several]
 
 
 def _renamed(one: Recorded, called: Mapping[str, Called]) -> Recorded:
     own = lambda name: called.get(name, Called())
-    names = {name: own(name).name or name for name in one.signals}
+    names = {name: own(name).name or name for name in one.signals if own(name).read}
     for new in names.values():
         if len(both := [name for name, other in names.items() if other == new]) > 1:
             raise ValueError(f"{one.name}: signals: expected one signal called {new}, got {' and '.join(both)}")
-    signals = {names[name]: values for name, values in one.signals.items()}
+    signals = {new: one.signals[name] for name, new in names.items()}
     units = {
         names.get(name, name): own(name).unit or unit if own(name).name or not unit else unit
         for name, unit in one.units.items()
+        if own(name).read
     }
     return dataclasses.replace(one, signals=signals, units=units)

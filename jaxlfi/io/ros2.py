@@ -164,7 +164,7 @@ def _time(one: _Read, offset: int) -> int:
 
 
 def _joint_state(topic: str, message: Any) -> Row:
-    names, row = list(message.name), {}
+    names, row = list(message.name), dict[str, tuple[float, str]]()
     if len(set(names)) < len(names):
         raise ValueError(f"expected each joint once, got {', '.join(names)}")
     for key, field in (("qpos", "position"), ("qvel", "velocity"), ("effort", "effort")):

@@ -26,6 +26,7 @@ tau = "actuator/motor"
 q1 = { name = "angle", unit = "deg" }
 q2 = { name = "joint/elbow/qpos", unit = "mrad" }
 time = { unit = "ms" }
+spare = false
 """
 
 
@@ -35,7 +36,7 @@ def folder(tmp_path):
     (tmp_path / "arm.xml").write_text(ARM)
     log = recorded()
     rows = zip(1000 * log.times, log.signals["motor"], np.rad2deg(log.signals["angle"]), strict=True)
-    lines = [f"{time:.17g},{tau:.17g},{q1:.17g},{250 + 10 * k},7" for k, (time, tau, q1) in enumerate(rows)]
+    lines = [f"{time:.17g},{tau:.17g},{q1:.17g},{250 + 10 * k},inf" for k, (time, tau, q1) in enumerate(rows)]
     (tmp_path / "swing.csv").write_text("\n".join(["time,tau,q1,q2 [rad],spare", *lines]))
     (tmp_path / "arm.toml").write_text(CONFIG)
     return tmp_path
@@ -68,9 +69,9 @@ def test_a_recording_in_the_models_own_names_is_left_as_it_is(folder):
             'tua = "actuator/motor"',
             "signals: expected a signal of the recordings such as tau, got 'tua'",
         ),
-        ('tau = "actuator/motor"', "tau = 3", r"signals: 'tau': expected a name, or { name = NAME, .*, got 3"),
-        ('tau = "actuator/motor"', "tau = { }", r"signals: 'tau': expected a name, or { name = NAME"),
-        ('tau = "actuator/motor"', "tau = { scale = 2 }", r"signals: 'tau': expected a name, or .*got {'scale': 2}"),
+        ('tau = "actuator/motor"', "tau = 3", r"signals: 'tau': expected a name, { name = NAME, .* or false, got 3"),
+        ('tau = "actuator/motor"', "tau = { }", r"signals: 'tau': expected a name, { name = NAME"),
+        ('tau = "actuator/motor"', "tau = { scale = 2 }", r"signals: 'tau': expected a name, .*got {'scale': 2}"),
         ('tau = "actuator/motor"', "tau = { unit = 2 }", "signals: 'tau': expected words in quotes, got 2"),
         ('unit = "deg"', 'unit = "furlong"', "signals: 'q1': unit: expected a unit such as .* got 'furlong'"),
         ('unit = "mrad"', 'unit = "mm"', "joint/elbow/qpos: expected rad as the sensor, got m"),
