@@ -65,14 +65,19 @@ def candidates(
     seen = _seen(model, compared)
     for one in _of_all(model, recorded, compared, acting):
         kind = one.name.partition("/")[0]
+        if one.name.endswith("/mass") and _masses_are_derived(spec):
+            continue
         try:
             if kind not in ("control", "sensor"):
                 parameters.edit(spec, model, one.name)
         except ValueError:
             continue  # as what the model says in another way
         found.append(one)
-    wanted = [one.name for one in found if one.name in {f"joint/{joint}/damping" for joint in seen}]
-    wanted = (wanted or [one.name for one in found])[: MOST if wanted else 1]
+    # What is driven tells most; a base that slides through the world has hardly any friction.
+    driven = {model.joint(int(joint)).name for joint in _driven(model)}
+    by_driven = sorted(seen, key=lambda joint: joint not in driven)
+    names = [one.name for one in found]
+    wanted = [name for joint in by_driven if (name := f"joint/{joint}/damping") in names][:MOST] or names[:1]
     return [dataclasses.replace(one, chosen=one.name in wanted) for one in found]
 
 
@@ -184,12 +189,22 @@ def _acting(model: mujoco.MjModel, recorded: Sequence[Log]) -> np.ndarray:
     return most
 
 
-def _seen(model: mujoco.MjModel, compared: Sequence[str]) -> set[str]:
-    """Names of the joints whose position or velocity is compared."""
+def _seen(model: mujoco.MjModel, compared: Sequence[str]) -> list[str]:
+    """Names of the joints whose position or velocity is compared, in the model's order."""
     kinds = (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL)
-    found = set()
-    for name in compared:
-        kind, item = measured.of_sensor(model, name)
-        if kind in kinds:
-            found.add(model.joint(item).name)
-    return found
+    items = {item for kind, item in (measured.of_sensor(model, name) for name in compared) if kind in kinds}
+    return [model.joint(item).name for item in sorted(items)]
+
+
+def _driven(model: mujoco.MjModel) -> np.ndarray:
+    """Numbers of the joints that actuators act on."""
+    of_joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    return model.actuator_trnid[np.isin(model.actuator_trntype, of_joints), 0]
+
+
+def _masses_are_derived(spec: mujoco.MjSpec) -> bool:
+    """Whether bodies have the masses of their geoms, or a given sum, whatever their own are."""
+    return bool(
+        spec.compiler.settotalmass > 0
+        or spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    )

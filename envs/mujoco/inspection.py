@@ -224,7 +224,7 @@ def _read(
             called[name] = Called(None if place.sure else place.name, unit)
     if (looks := _time_unit(model, raw)) is not None:
         called[TIME] = Called(None, looks)
-        odd.append(f"times have no unit and look like {looks}: read so")
+        odd.append(f"times have no unit and look like {looks}: read so, unless [signals] says another")
     (new,) = renamed([raw], called)
     return logs.log_of(new), places, called
 
@@ -289,7 +289,7 @@ def _in_degrees(sensing: mujoco.MjModel, place: Place, values: np.ndarray) -> bo
 
 def _degrees(values: np.ndarray) -> str:
     low, high = np.nanmin(values), np.nanmax(values)
-    return f"looks like degrees, from {low:.4g} to {high:.4g} without a unit: read so; say [rad] if it is not"
+    return f"looks like degrees, from {low:.4g} to {high:.4g} without a unit: read so, unless [signals] says another"
 
 
 def _time_unit(model: mujoco.MjModel, raw: Recorded) -> str | None:

@@ -193,6 +193,7 @@ LINE = (
     "--total-steps 80 --hidden 8"
 )
 WHIP = {"extra": "mujoco", "slow": True}
+FURUTA = Path(__file__).parents[2] / "examples/mujoco/furuta"
 EXAMPLES = {
     "tasks": Example("tasks"),
     "infer": Example(f"{INFER} --keep-network --out @infer", writes=(".html", ".png")),
@@ -217,6 +218,9 @@ EXAMPLES = {
         needs=("train",), extra="brax", slow=True,
     ),
     "export": Example("export @train --out @export.npz", needs=("train",), writes=(".npz",), extra="brax", slow=True),
+    "mujoco inspect": Example(
+        f"mujoco inspect {FURUTA}.csv --model {FURUTA}.xml --out @furuta.toml", writes=(".toml",), extra="mujoco"
+    ),
     "mujoco fit": Example(
         "mujoco fit @arm --starts 4 --keep 1 --out @fit", writes=(".png", ".json"), before=an_arm, **WHIP
     ),

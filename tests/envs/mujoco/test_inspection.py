@@ -120,7 +120,7 @@ def test_a_joints_limits_tell_degrees_from_radians():
 def test_what_is_odd_about_times(arm, swing):
     milliseconds = looked(arm, swing, 20.0 * np.arange(101))
     assert milliseconds.time == Called(None, "ms") and milliseconds.duration == pytest.approx(2.0)
-    assert milliseconds.odd == ("times have no unit and look like ms: read so",)
+    assert milliseconds.odd == ("times have no unit and look like ms: read so, unless [signals] says another",)
     assert looked(arm, swing, 20.0 * np.arange(101), {"time": "ms"}).time is None
     nanoseconds = looked(arm, swing, 20_000_000 * np.arange(101))
     assert "read as ns" in nanoseconds.odd[0] and nanoseconds.time is None
