@@ -6,8 +6,9 @@ is what is odd (`recordings`, `plausible`, `columns`). What a task refuses is sa
 
 import contextlib
 import dataclasses
+import functools
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 
 import mujoco
@@ -92,6 +93,18 @@ class Inspected:
     measured: tuple[str, ...]
 
 
+def sensing(spec: mujoco.MjSpec) -> Callable[[tuple[str, ...]], mujoco.MjModel]:
+    """The function that makes a model with a sensor for each of some signals, once for the same signals."""
+
+    @functools.cache
+    def made(compared: tuple[str, ...]) -> mujoco.MjModel:
+        own = spec.copy()
+        measured.add_sensors(own, compared)
+        return own.compile()
+
+    return made
+
+
 def inspect_all(spec: mujoco.MjSpec, model: mujoco.MjModel, several: Sequence[Recorded]) -> list[Inspected]:
     """Look at recordings of one machine: a unit that one of them gives away is that of all.
 
@@ -103,12 +116,13 @@ def inspect_all(spec: mujoco.MjSpec, model: mujoco.MjModel, several: Sequence[Re
     Raises:
         ValueError: where nothing of one can be read, in one line.
     """
-    found = [inspect(spec, model, one) for one in several]
+    of_signals = sensing(spec)
+    found = [inspect(of_signals, model, one) for one in several]
     units = {
         name: own.unit for one in found for name, signal in one.signals.items() if (own := signal.called) and own.unit
     }
     return [
-        inspect(spec, model, raw, units)
+        inspect(of_signals, model, raw, units)
         if any(name in units and (own is None or not own.unit) for name, own in _of_signals(one))
         else one
         for raw, one in zip(several, found, strict=True)
@@ -120,12 +134,15 @@ def _of_signals(one: Inspected) -> Iterator[tuple[str, Called | None]]:
 
 
 def inspect(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, raw: Recorded, units: Mapping[str, str] = MappingProxyType({})
+    of_signals: Callable[[tuple[str, ...]], mujoco.MjModel],
+    model: mujoco.MjModel,
+    raw: Recorded,
+    units: Mapping[str, str] = MappingProxyType({}),
 ) -> Inspected:
     """Look at a recording.
 
     Args:
-        spec: of the model.
+        of_signals: makes the model with a sensor for each of some signals (`sensing`).
         model: as compiled.
         raw: the recording as its file has it.
         units: of signals that the recording says none of.
@@ -140,18 +157,18 @@ def inspect(
         own.setdefault(name, []).append(text)
     with _caught() as said:
         places = matching.places(model, {name: _si(kept.units[name]) for name in kept.signals}, raw.name)
-        log, places, called = _read(spec, model, kept, places, units, own, odd)
+        log, places, called = _read(of_signals, model, kept, places, units, own, odd)
         names = {(place.name if (place := places[name]) else name): name for name in kept.signals}
         control = columns.controls_of(model)
-        compared = [one.name for one in places.values() if one and one.name not in control]
-        sensing = _sensing(spec, compared)
-        log = _as_task(sensing, log, compared, odd)
+        compared = tuple(one.name for one in places.values() if one and one.name not in control)
+        sensors = of_signals(compared)
+        log = _as_task(sensors, log, compared, odd)
     _attribute(said, raw.name, names, own, odd)
     noises = {name: _noise(log.signals[new]) for new, name in names.items()}
-    start = plausible.sensed(sensing, initial_state(sensing, {}))
+    start = plausible.sensed(sensors, initial_state(sensors, {}))
     known = {new: value for new, name in names.items() if (value := noises[name]) is not None}
     with _caught() as said:
-        plausible.check_start(sensing, log, [one for one in compared if one in known], known, [start])
+        plausible.check_start(sensors, log, [one for one in compared if one in known], known, [start])
     _attribute(said, raw.name, names, own, odd)
     signals = {}
     for name in raw.signals:
@@ -162,14 +179,14 @@ def inspect(
         times, values = log.samples(new)
         texts = [*own.get(name, []), *_peculiar(raw.signals[name], values)]
         near = () if place else tuple(matching.nearest(model, name))
-        unit = log.units.get(new, "") or (_unit(sensing, place) if place else "")
+        unit = log.units.get(new, "") or (_unit(sensors, place) if place else "")
         signals[name] = Signal(
             *(name, unit, place, near, called.get(name), len(values), *_intervals(times)),
             *(float(values.min()), float(values.max()), noises[name], tuple(dict.fromkeys(texts))),
         )
     return Inspected(
         *(raw.name, len(raw.times), float(log.times[-1]), signals, tuple(dict.fromkeys(odd)), called.get(TIME)),
-        *(not ordered.faults, log, tuple(compared)),
+        *(not ordered.faults, log, compared),
     )
 
 
@@ -193,7 +210,7 @@ def _readable(raw: Recorded) -> tuple[Recorded, dict[str, str]]:
 
 
 def _read(
-    spec: mujoco.MjSpec,
+    of_signals: Callable[[tuple[str, ...]], mujoco.MjModel],
     model: mujoco.MjModel,
     raw: Recorded,
     places: dict[str, Place | None],
@@ -202,13 +219,13 @@ def _read(
     odd: list[str],
 ) -> tuple[Log, dict[str, Place | None], dict[str, Called]]:
     """A recording by the names and units of the model, what its signals are, and what is to be said of them."""
-    compared = [place.name for place in places.values() if place and place.name not in columns.controls_of(model)]
-    sensing = _sensing(spec, compared)
+    control = columns.controls_of(model)
+    sensors = of_signals(tuple(place.name for place in places.values() if place and place.name not in control))
     called: dict[str, Called] = {}
     for name, place in list(places.items()):
         if place is None:
             continue
-        expected = _units(sensing, place)
+        expected = _units(sensors, place)
         given = raw.units.get(name, "") or place.unit
         if expected and given and parse(given).name not in expected:
             own.setdefault(name, []).append(
@@ -217,7 +234,7 @@ def _read(
             places[name] = None
             continue
         unit = units.get(name) if not given else None
-        if not given and not unit and _in_degrees(sensing, place, np.asarray(raw.signals[name], float)):
+        if not given and not unit and _in_degrees(sensors, place, np.asarray(raw.signals[name], float)):
             unit = "deg"
             own.setdefault(name, []).append(_degrees(np.asarray(raw.signals[name], float)))
         if not place.sure or unit:
@@ -229,58 +246,51 @@ def _read(
     return logs.log_of(new), places, called
 
 
-def _as_task(sensing: mujoco.MjModel, log: Log, compared: Sequence[str], odd: list[str]) -> Log:
+def _as_task(sensors: mujoco.MjModel, log: Log, compared: Sequence[str], odd: list[str]) -> Log:
     """A recording as a task reads it; what the task would refuse is odd."""
     named = [
         [one(i).name for i in range(n)]
-        for one, n in ((sensing.actuator, sensing.nu), (sensing.sensor, sensing.nsensor))
+        for one, n in ((sensors.actuator, sensors.nu), (sensors.sensor, sensors.nsensor))
     ]
     log = recordings.renamed(log, [*named[1], *named[0]])
     log = columns.arranged(log, named[0], named[1])
     try:
-        plausible.check(sensing, log, compared)
+        plausible.check(sensors, log, compared)
     except ValueError as error:
         odd.append(str(error).removeprefix(f"{log.name}: "))
-    columns.warn_of_clamped(log, sensing)
-    if missing := [name for name in columns.controls_of(sensing) if name not in log.signals]:
+    columns.warn_of_clamped(log, sensors)
+    if missing := [name for name in columns.controls_of(sensors) if name not in log.signals]:
         odd.append(f"has no control of {', '.join(missing)}")
-    return recordings.prepared(sensing, log, compared, initial_state(sensing, {}))
+    return recordings.prepared(sensors, log, compared, initial_state(sensors, {}))
 
 
-def _sensing(spec: mujoco.MjSpec, compared: Sequence[str]) -> mujoco.MjModel:
-    """The model with a sensor for each signal that is compared."""
-    own = spec.copy()
-    measured.add_sensors(own, compared)
-    return own.compile()
-
-
-def _units(sensing: mujoco.MjModel, place: Place) -> tuple[str, ...]:
+def _units(sensors: mujoco.MjModel, place: Place) -> tuple[str, ...]:
     """The units that a number of the model may be in; none where it does not say."""
-    controls = columns.controls_of(sensing)
+    controls = columns.controls_of(sensors)
     if place.name in controls:
-        return measured.control_units(sensing, controls.index(place.name))
-    unit = measured.unit(sensing, place.name)
+        return measured.control_units(sensors, controls.index(place.name))
+    unit = measured.unit(sensors, place.name)
     return (unit,) if unit else ()
 
 
-def _unit(sensing: mujoco.MjModel, place: Place) -> str:
-    units = _units(sensing, place)
+def _unit(sensors: mujoco.MjModel, place: Place) -> str:
+    units = _units(sensors, place)
     return units[0] if len(units) == 1 else ""
 
 
-def _in_degrees(sensing: mujoco.MjModel, place: Place, values: np.ndarray) -> bool:
+def _in_degrees(sensors: mujoco.MjModel, place: Place, values: np.ndarray) -> bool:
     """Whether an angle that has no unit is far beyond what it could be in rad, and could be in degrees."""
-    if _units(sensing, place) != ("rad",):
+    if _units(sensors, place) != ("rad",):
         return False
     reach = float(np.nanmax(np.abs(values)))
     if reach > TURNS * angles.TURN:
         return True
-    controls = columns.controls_of(sensing)
+    controls = columns.controls_of(sensors)
     if place.name in controls:
         actuator = controls.index(place.name)
-        limits = sensing.actuator_ctrlrange[actuator] if sensing.actuator_ctrllimited[actuator] else None
+        limits = sensors.actuator_ctrlrange[actuator] if sensors.actuator_ctrllimited[actuator] else None
     else:
-        limits = measured.joint_limits(sensing, place.name)
+        limits = measured.joint_limits(sensors, place.name)
     if limits is None:
         return False
     farthest = 1.2 * float(np.max(np.abs(limits)))

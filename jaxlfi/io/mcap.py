@@ -88,16 +88,18 @@ def read(path: str | Path) -> Rollout:
         ValueError: for a file that is missing, truncated, damaged, of another version or without such topics.
         ImportError: without mcap, and for messages of ROS 2 without mcap-ros2-support.
     """
-    path, messages, records = Path(path), [], {}
-    for file in sorted(path.glob("*.mcap")) if path.is_dir() else [path]:
-        found, said = _content(file)
+    path, messages, others, records = Path(path), [], set(), {}
+    several = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    if not several:
+        raise ValueError(f"{path}: expected a bag of MCAP files, got none: `ros2 bag convert` makes them of others")
+    for file in several:
+        found, left, said = _content(file)
         messages += found
+        others |= left
         records |= said
-    if path.is_dir() and not messages:
-        raise ValueError(f"{path}: expected a bag with messages in MCAP files, got none: `ros2 bag convert` makes them")
     messages.sort(key=lambda one: one[2].log_time)
     try:
-        return _rollout(messages, records)
+        return _rollout(messages, others, records)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -107,8 +109,11 @@ def is_bag(path: Path) -> bool:
     return path.is_dir() and ((path / "metadata.yaml").exists() or any(path.glob("*.mcap")))
 
 
-def _content(path: Path) -> tuple[list[tuple[Any, Any, Any]], dict[str, Mapping[str, str]]]:
-    """All messages of a file, with their schemas and channels, and its metadata."""
+def _content(path: Path) -> tuple[list[tuple[Any, Any, Any]], set[str], dict[str, Mapping[str, str]]]:
+    """Messages of a file that can be read, with their schemas and channels; its other topics, and its metadata.
+
+    Pictures and the like are not even loaded.
+    """
     try:
         from mcap.reader import make_reader
     except ImportError as error:
@@ -116,8 +121,21 @@ def _content(path: Path) -> tuple[list[tuple[Any, Any, Any]], dict[str, Mapping[
     try:
         with path.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
-            messages = list(reader.iter_messages())
-            return messages, {record.name: record.metadata for record in reader.iter_metadata()}
+            summary = reader.get_summary()
+            if summary is not None and summary.channels:
+                channels = [(summary.schemas.get(one.schema_id), one) for one in summary.channels.values()]
+            else:  # which writers may leave out
+                channels = [(schema, channel) for schema, channel, _ in reader.iter_messages()]
+            wanted = {
+                channel.topic for schema, channel in channels if _is_ours(schema, channel) or ros2.is_known(schema)
+            }
+            others = {
+                f"{channel.topic} ({schema.name if schema else 'no schema'}, {channel.message_encoding})"
+                for schema, channel in channels
+                if channel.topic not in wanted
+            }
+            messages = list(reader.iter_messages(topics=sorted(wanted))) if wanted else []
+            return messages, others, {record.name: record.metadata for record in reader.iter_metadata()}
     except OSError as error:
         raise ValueError(f"{path}: expected an MCAP file, got {error.strerror}") from error
     except Exception as error:  # mcap and its decompressors each have their own
@@ -140,13 +158,16 @@ def _schema(signal: Signal) -> dict[str, Any]:
     return {"type": "object", "title": SCHEMA, "properties": properties, "required": ["time", "values"]}
 
 
-def _rollout(messages: list[tuple[Any, Any, Any]], records: Mapping[str, Mapping[str, str]]) -> Rollout:
+def _is_ours(schema: Any, channel: Any) -> bool:
+    return schema is not None and schema.name == SCHEMA and channel.message_encoding == "json"
+
+
+def _rollout(
+    messages: list[tuple[Any, Any, Any]], others: set[str], records: Mapping[str, Mapping[str, str]]
+) -> Rollout:
     channels, times, values, said = {}, {}, {}, {}
-    others, of_ros = set(), False
     for schema, channel, message in messages:
-        if schema is None or schema.name != SCHEMA or channel.message_encoding != "json":
-            others.add(f"{channel.topic} ({schema.name if schema else 'no schema'}, {channel.message_encoding})")
-            of_ros |= channel.message_encoding == ros2.ENCODING
+        if not _is_ours(schema, channel):
             continue
         name = ros2.topic_name(channel.topic)
         if name not in channels:
@@ -154,11 +175,12 @@ def _rollout(messages: list[tuple[Any, Any, Any]], records: Mapping[str, Mapping
         time, row = _message(channel.topic, message.data)
         times.setdefault(name, []).append(time)
         values.setdefault(name, []).append(row)
-    if not channels and of_ros:
+    if not channels and messages:
         return ros2.rollout(messages)
     if not channels:
         raise ValueError(
-            f"expected topics of ROS 2, or of JSON messages by the schema {SCHEMA}, got {ros2.some(others)}"
+            f"expected topics of ROS 2 of the types {', '.join(ros2.TYPES)}, or of JSON messages by the schema "
+            f"{SCHEMA}, got {_some(others)}"
         )
     signals, faults = {}, []
     for name, channel in channels.items():
@@ -229,3 +251,9 @@ def _unit(text: str) -> str | tuple[str, ...]:
     except ValueError:
         return text
     return text if several is None else tuple(map(str, several))
+
+
+def _some(names: set[str]) -> str:
+    """Topics in words, the first ones of many."""
+    shown = sorted(names)[:4]
+    return ", ".join(shown) + (f" and {len(names) - 4} more" if len(names) > 4 else "") if shown else "no messages"

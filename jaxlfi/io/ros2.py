@@ -50,14 +50,11 @@ def rollout(messages: Iterable[tuple[Any, Any, Any]]) -> Rollout:
         messages: schema, channel and message of each, as `mcap` reads them.
 
     Raises:
-        ValueError: where there are none, and for messages that cannot be read, in one line.
+        ValueError: where there are none with numbers, and for messages that cannot be read, in one line.
         ImportError: without mcap-ros2-support.
     """
     messages = list(messages)
     types = _types(messages)
-    if not TYPES.keys() & set(types.values()):
-        got = {f"{topic} ({kind or 'no schema'})" for topic, kind in types.items()}
-        raise ValueError(f"expected topics of ROS 2 of the types {', '.join(TYPES)}, got {some(got)}")
     try:
         from mcap_ros2.decoder import DecoderFactory
     except ImportError as error:
@@ -98,10 +95,9 @@ def _kind(schema: Any) -> str:
     return "" if schema is None else schema.name.replace("/msg/", "/")
 
 
-def some(names: set[str]) -> str:
-    """Topics in words, the first ones of many."""
-    shown = sorted(names)[:4]
-    return ", ".join(shown) + (f" and {len(names) - 4} more" if len(names) > 4 else "") if shown else "no messages"
+def is_known(schema: Any) -> bool:
+    """Whether messages of a schema are of one of the types that are read."""
+    return _kind(schema) in TYPES
 
 
 def topic_name(topic: str) -> str:

@@ -165,7 +165,7 @@ SPOILED = {
         [("/j", JOINTS, BEGIN, joints(BEGIN, ["a"], [1.0])), ("/j", JOINTS, BEGIN, joints(BEGIN, ["a"], [1.0])[:30])],
         "/j: expected sensor_msgs/msg/JointState as ros2msg and CDR, got another in message 2",
     ),
-    "no known type": ([("/tf", OTHER, BEGIN, b"")], r"of the types .*, got /tf \(tf2_msgs/TFMessage\)"),
+    "no known type": ([("/tf", OTHER, BEGIN, b"")], r"of the types .*, got /tf \(tf2_msgs/msg/TFMessage, cdr\)"),
     "nothing in them": ([("/j", JOINTS, BEGIN, joints(BEGIN, []))], "expected messages with numbers, got none"),
 }
 
@@ -189,7 +189,7 @@ def test_a_schema_that_is_no_definition(tmp_path, decoder):
 def test_a_folder_without_mcap_files(tmp_path):
     (tmp_path / "metadata.yaml").write_text("")
     (tmp_path / "bag_0.db3").write_text("")
-    with pytest.raises(ValueError, match="expected a bag with messages in MCAP files, got none: `ros2 bag convert`"):
+    with pytest.raises(ValueError, match="expected a bag of MCAP files, got none: `ros2 bag convert`"):
         read(tmp_path)
 
 

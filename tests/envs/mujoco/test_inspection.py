@@ -37,7 +37,7 @@ def swing():
 @pytest.fixture(scope="module")
 def arm():
     spec = specification(ARM.replace('name="motor" joint', 'name="motor" ctrlrange="-1 1" joint'))
-    return spec, compile_spec(spec)
+    return inspection.sensing(spec), compile_spec(spec)
 
 
 def looked(arm, signals, times=None, units=None, faults=()):
@@ -111,7 +111,7 @@ def test_angles_that_wrap_and_angles_in_degrees(arm):
 
 def test_a_joints_limits_tell_degrees_from_radians():
     spec = specification(ARM.replace('<joint name="shoulder"', '<joint name="shoulder" range="-60 60" limited="true"'))
-    limited = spec, compile_spec(spec)
+    limited = inspection.sensing(spec), compile_spec(spec)
     swung = 40 * np.sin(0.1 * np.arange(80))
     assert looked(limited, {"angle": swung}).signals["angle"].called == Called(None, "deg")
     assert looked(limited, {"angle": np.deg2rad(swung)}).signals["angle"].called is None
@@ -151,13 +151,14 @@ def test_a_recording_that_begins_elsewhere(arm, swing):
     assert re.search(r"the recording begins at 0\.\d+ rad, the model at 0 rad", odd(found, "angle"))
 
 
-def test_a_unit_that_one_recording_gives_away_is_that_of_all(arm):
+def test_a_unit_that_one_recording_gives_away_is_that_of_all():
     small, large = (size * np.sin(0.1 * np.arange(100)) + 0.01 * np.cos(np.arange(100) ** 2) for size in (3.0, 2000.0))
     raws = [
         log_files.Recorded(0.02 * np.arange(100), {"angle": values}, name, {"angle": "", "time": ""})
         for name, values in (("a.csv", small), ("b.csv", large))
     ]
-    first, second = inspection.inspect_all(*arm, raws)
+    spec = specification(ARM)
+    first, second = inspection.inspect_all(spec, compile_spec(spec), raws)
     assert first.signals["angle"].called == second.signals["angle"].called == Called(None, "deg")
     joined = inspection.together([first, second])["angle"]
     assert (joined.samples, joined.high) == (200, pytest.approx(np.deg2rad(large.max())))
