@@ -1,4 +1,4 @@
-"""The command line of tasks of MuJoCo models: `jaxlfi mujoco film | fit | serve`.
+"""The command line of tasks of MuJoCo models: `jaxlfi mujoco inspect | film | fit | serve`.
 
 This module imports neither jax nor numpy, so that `--help` answers at once.
 """
@@ -13,6 +13,7 @@ from jaxlfi.envs.mujoco import require_mujoco
 
 EXAMPLES = """\
 examples:
+  jaxlfi mujoco inspect day1.csv --model arm.xml --out arm.toml    what is in a recording, and a task to begin with
   jaxlfi infer mujoco,config=examples/mujoco/arm.toml --heuristic edge --out runs/arm
   jaxlfi mujoco film runs/arm --out runs/arm.gif                   does the posterior move as the machine did?
   jaxlfi mujoco film runs/arm --draws 30 --slower 4 --out runs/arm-slowly.gif
@@ -25,6 +26,23 @@ examples:
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    inspect = commands.add_parser(
+        "inspect",
+        help="say what is in recordings, and write a task to begin with",
+        description="Print the signals of recordings: unit, rate, gaps, range, what of the model each is, and what is "
+        "odd about it. Reads CSV, .npz, MCAP (ROS 2, too) and LeRobot data sets; an episode is FOLDER#episode=3, "
+        "several are FOLDER#episodes=0-9.",
+    )
+    inspect.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="recordings of one machine")
+    inspect.add_argument("--model", type=Path, required=True, metavar="FILE", help="its MJCF file")
+    inspect.add_argument(
+        "--out",
+        type=flags.output,
+        metavar="FILE",
+        help="a new TOML file of a task: signals, noise, and parameters of the model to choose from",
+    )
+    inspect.add_argument("--json", action="store_true", help="print JSON in place of the table")
 
     film = commands.add_parser(
         "film",
@@ -147,6 +165,10 @@ def _size(text: str) -> tuple[int, int]:
 
 def _run(arguments: argparse.Namespace) -> None:
     require_mujoco()
+    if arguments.command == "inspect":
+        from jaxlfi.envs.mujoco.inspecting import inspect
+
+        return inspect(arguments)
     from jaxlfi.io import compile_cache
 
     compile_cache.enable()
@@ -156,15 +178,16 @@ def _run(arguments: argparse.Namespace) -> None:
         from jaxlfi.envs.mujoco.served import serve as command
     else:
         from jaxlfi.envs.mujoco.commands import fit as command
-    command(arguments)
+    return command(arguments)
 
 
 main = Command(
     "mujoco",
-    "film and refine the posterior of a MuJoCo model, or serve it as a machine",
+    "inspect recordings of a MuJoCo model, film and refine its posterior, serve it as a machine",
     _arguments,
     _run,
-    description="Film the posterior of a MuJoCo model, find least-squares estimates from it, or simulate a machine.",
+    description="Say what is in recordings of a machine, film the posterior of its MuJoCo model, find least-squares "
+    "estimates from it, or simulate the machine in another process.",
     epilog=EXAMPLES,
 )
 parser = main.parser

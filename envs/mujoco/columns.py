@@ -5,6 +5,7 @@
 | `motor` | the control of the actuator `motor`; where there is none, what the sensor `motor` measures |
 | `actuator/motor`, `sensor/motor` | that of the actuator and that of the sensor, where both have one name |
 | `actuator/0`, `sensor/0` | of the first actuator and sensor of the model, which need no name |
+| `action/motor`, `observation.state/motor` | the same two of a LeRobot data set, where both have one name |
 """
 
 import dataclasses
@@ -79,7 +80,7 @@ def signal_name(name: str, sensors: Sequence[str]) -> str:
     """
     match = INDEXED.fullmatch(name)
     own, index = (name, "") if match is None or name in sensors else (match["sensor"], f"[{match['index']}]")
-    rest = own.removeprefix("sensor/")
+    rest = own.removeprefix("sensor/").removeprefix("observation.state/")
     if own in sensors or rest == own:
         return name
     if rest in sensors:
@@ -114,29 +115,45 @@ def arranged(log: Log, actuators: Sequence[str], sensors: Sequence[str]) -> Log:
     Raises:
         ValueError: for two columns of one control or signal, in one line.
     """
-    called: dict[str, str] = {}
-    for i, (name, key) in enumerate(zip(actuators, control_names(actuators, sensors), strict=True)):
-        explicit = [column for column in (f"actuator/{name}", f"actuator/{i}") if column in log.signals]
-        plain = [name] if name in log.signals and (name not in sensors or not explicit) else []
-        called |= dict.fromkeys([*explicit, *plain], key)
-        if name and name in sensors and plain and f"sensor/{name}" not in log.signals:
-            warnings.warn(
-                f"{log.name}: {name} is taken as the control of the actuator of that name; call what the sensor of "
-                f"that name measures sensor/{name}",
-                ControlWarning,
-                stacklevel=3,
-            )
-    called |= {column: signal_name(column, sensors) for column in log.signals if column not in called}
-    for key in called.values():
-        if len(several := [column for column, own in called.items() if own == key]) > 1:
-            raise ValueError(f"{log.name}: expected one column of {key}, got {' and '.join(several)}")
-    if all(column == own for column, own in called.items()):
+    called_as = called(list(log.signals), log.name, actuators, sensors)
+    if all(column == own for column, own in called_as.items()):
         return log
     return dataclasses.replace(
         log,
-        signals={called[column]: values for column, values in log.signals.items()},
-        units={called.get(column, column): unit for column, unit in log.units.items()},
+        signals={called_as[column]: values for column, values in log.signals.items()},
+        units={called_as.get(column, column): unit for column, unit in log.units.items()},
     )
+
+
+def called(names: Sequence[str], where: str, actuators: Sequence[str], sensors: Sequence[str]) -> dict[str, str]:
+    """What controls and signals are called (`control_names`, `signal_name`), by the names of columns.
+
+    Args:
+        names: of the columns.
+        where: they are from, for messages.
+        actuators: names of the model's actuators, "" of those without.
+        sensors: names of its sensors.
+
+    Raises:
+        ValueError: for two columns of one control or signal, in one line.
+    """
+    found: dict[str, str] = {}
+    for i, (name, key) in enumerate(zip(actuators, control_names(actuators, sensors), strict=True)):
+        explicit = [column for column in (f"actuator/{name}", f"actuator/{i}", f"action/{name}") if column in names]
+        plain = [name] if name in names and (name not in sensors or not explicit) else []
+        found |= dict.fromkeys([*explicit, *plain], key)
+        if name and name in sensors and plain and f"sensor/{name}" not in names:
+            warnings.warn(
+                f"{where}: {name} is taken as the control of the actuator of that name; call what the sensor of "
+                f"that name measures sensor/{name}",
+                ControlWarning,
+                stacklevel=4,
+            )
+    found |= {column: signal_name(column, sensors) for column in names if column not in found}
+    for key in found.values():
+        if len(several := [column for column, own in found.items() if own == key]) > 1:
+            raise ValueError(f"{where}: expected one column of {key}, got {' and '.join(several)}")
+    return found
 
 
 def require_measured(log: Log, measured: Sequence[str], actuators: Sequence[str]) -> None:
@@ -165,7 +182,11 @@ def warn_of_clamped(log: Log, model: mujoco.MjModel, inferred: Sequence[str] = (
         return
     for i, name in enumerate(controls_of(model)):
         element = f"actuator/{name.removeprefix('actuator/')}/ctrlrange"
-        if not model.actuator_ctrllimited[i] or any(one.startswith(element) for one in inferred):
+        if (
+            name not in log.signals
+            or not model.actuator_ctrllimited[i]
+            or any(one.startswith(element) for one in inferred)
+        ):
             continue
         low, high = model.actuator_ctrlrange[i]
         _, values = log.samples(name)

@@ -21,6 +21,9 @@ tie = "scaled"                      # a factor of each one's own; or "shared", o
 [parameters."body/link/inertial"]   # its whole inertia, ten numbers (`jaxlfi.envs.mujoco.inertia`)
 spread = 0.2                        # about the model's own
 
+[signals]                           # other names and units of what is recorded (`jaxlfi.envs.mujoco.renaming`)
+"q1" = { name = "angle", unit = "deg" }
+
 [noise]                             # standard deviations; of other signals it is estimated
 angle = 0.002
 
@@ -49,7 +52,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from jaxlfi.envs.mujoco import inertia
+from jaxlfi.envs.mujoco import inertia, log_files, logs, renaming
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
 from jaxlfi.envs.mujoco.model_task import mujoco_task
 from jaxlfi.envs.mujoco.parameters import Parameter
@@ -62,6 +65,7 @@ KEYS: Mapping[str, type] = {
     "summary": str,
     "unmodelled_force": float,
     "parameters": dict,
+    "signals": dict,
     "noise": dict,
     "initial": dict,
     "discrepancy": dict,
@@ -104,10 +108,12 @@ def read(
         raise ValueError(f"{path}: expected recordings, as log = [FILE], or mujoco,config={path},log=FILE; got none")
     try:
         begins, given = initial(config)
+        called = renaming.table_of(config)
+        recordings = [recording for one in several for recording in log_files.recorded(one)]
         return mujoco_task(
             path.parent / config["model"],
             parameters_of(config),
-            several,
+            [logs.log_of(one) for one in renaming.renamed(recordings, called)],
             config.get("measured"),
             numbers(config, "noise"),
             given,

@@ -1,34 +1,23 @@
 """Recordings: controls and sensors over time, by name, in SI units and radians.
 
-| file | times | signals |
-|---|---|---|
-| .npz | the array `times`, or `time [ms]` | arrays [T], or [T, n] for NAME[0] to NAME[n - 1]; `NAME [unit]` |
-| .csv | the first column, headed "time [s]" | columns headed "NAME [unit]"; an empty cell is a missing sample |
-| .mcap, folder of a LeRobot data set | of each signal | by the names of their numbers; needs the extra `robotics` |
-
-Units are those of `jaxlfi.io.units`; an episode of a LeRobot data set is FOLDER#episode=3. Signals may have clocks of
-their own: in a table, a row then has empty cells (NaN) where a signal has no sample. Times may begin anywhere; they are
-counted from the first one.
+`log_files` says which files are read. Units are those of `jaxlfi.io.units`. Signals may have clocks of their own: in a
+table, a row then has empty cells (NaN) where a signal has no sample. Times may begin anywhere; they are counted from
+the first one.
 """
 
-import csv
 import dataclasses
-import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxlfi.io import files
-from jaxlfi.io.units import Unit, is_unit, parse
+from jaxlfi.envs.mujoco import log_files
+from jaxlfi.envs.mujoco.log_files import TIME, Recorded
+from jaxlfi.io import clocks
+from jaxlfi.io.units import Unit, parse
 
-HEADING = re.compile(r"\s*(?P<name>[^\[(]*(?:\[\d+\])?)\s*(?:[\[(](?P<unit>.*)[\])])?\s*")
-TIMES = ("times", "time", "t", "timestamps", "timestamp", "stamp")
-"""What times are called; a unit may follow, as in time_ms."""
-TIME = "time"
-"""What times are called among the units of a log."""
 NANOSECONDS = (1e6, 1e9)
 """Integers that are so far apart are taken for nanoseconds, as recorders have them, where nothing says otherwise."""
 
@@ -126,17 +115,34 @@ def read(path: str | Path) -> Log:
     """Read a recording.
 
     Raises:
+        ValueError: for a file that is missing, damaged or no recording, and several episodes, in one line.
+        ImportError: where the extra `robotics` is needed and not installed.
+    """
+    several = read_all(path)
+    if len(several) > 1:
+        raise ValueError(f"log: expected one recording, got {len(several)} episodes of {path}")
+    return several[0]
+
+
+def read_all(path: str | Path) -> list[Log]:
+    """Read a recording, or several episodes of a data set.
+
+    Raises:
         ValueError: for a file that is missing, damaged or no recording, in one line.
         ImportError: where the extra `robotics` is needed and not installed.
     """
-    path = Path(path)
-    if path.suffix == ".npz":
-        return _of_arrays(files.read_arrays(path), str(path))
-    if path.suffix == ".csv":
-        return _of_table(path)
-    if path.suffix == ".mcap" or path.is_dir() or "#" in path.name:
-        return _of_robotics(path)
-    raise ValueError(f"log: expected NAME.npz, NAME.csv, NAME.mcap or the folder of a LeRobot data set, got {path}")
+    return [log_of(one) for one in log_files.recorded(path)]
+
+
+def log_of(one: Recorded) -> Log:
+    """A recording in SI units and radians.
+
+    Raises:
+        ValueError: for times that do not increase, and units that are not known, in one line.
+    """
+    if one.faults:
+        raise ValueError(f"{one.name}: {one.faults[0]}")
+    return Log(one.times, one.signals, one.name, one.units)
 
 
 def _seconds(times: np.ndarray, unit: Unit, where: str) -> tuple[Float[np.ndarray, " time"], str]:
@@ -167,146 +173,11 @@ def _check_increasing(times: np.ndarray, where: str) -> None:
     if len(times) < 2 or times.dtype.kind not in "iuf":
         return  # which is refused for that
     if times.dtype.kind == "f":
-        if len(rows := np.flatnonzero(~np.isfinite(times))):
-            got = f"{times[rows[0]]} in row {rows[0] + 1}{_more(rows)}"
-            raise ValueError(f"{where}: expected at least two increasing times, got {got}")
-        resolution = float(np.spacing(np.abs(times).max()))
-        if resolution > 0.1 * float(np.ptp(times)) / (len(times) - 1):
+        resolution = float(np.spacing(np.abs(times[np.isfinite(times)]).max(initial=0.0)))
+        if np.isfinite(times).all() and resolution > 0.1 * float(np.ptp(times)) / (len(times) - 1):
             raise ValueError(
                 f"{where}: expected times that tell rows apart, got {times.dtype} of about {times[0]:.6g}, which has "
                 f"steps of {resolution:.3g}: save them in double precision, or from the first one on"
             )
-    if len(rows := np.flatnonzero(times[1:] <= times[:-1])):
-        row = rows[0] + 1
-        raise ValueError(
-            f"{where}: expected at least two increasing times, got {times[row]:.12g} in row {row + 1} after "
-            f"{times[row - 1]:.12g}{_more(rows)}"
-        )
-
-
-def _more(rows: np.ndarray) -> str:
-    return f", and in {len(rows) - 1} more rows likewise" if len(rows) > 1 else ""
-
-
-def _of_arrays(arrays: Mapping[str, np.ndarray], where: str) -> Log:
-    clocks = {name: unit for name in arrays if (unit := _time_unit(name)) is not None}
-    if len(clocks) != 1:
-        raise ValueError(f"{where}: expected one array of times, called {TIMES[0]!r}, got {sorted(arrays)}")
-    ((clock, unit),) = clocks.items()
-    signals: dict[str, np.ndarray] = {}
-    known = {TIME: unit}
-    for heading, values in arrays.items():
-        if heading == clock:
-            continue
-        if values.dtype.kind not in "biuf" or values.ndim not in (1, 2):
-            raise ValueError(
-                f"{where}: {heading}: expected numbers [T] or [T, n], got {values.dtype} {list(values.shape)}"
-            )
-        name, own = _named(heading)
-        found = {name: values} if values.ndim == 1 else {f"{name}[{i}]": row for i, row in enumerate(values.T)}
-        _add(signals, found, where)
-        known |= dict.fromkeys(found, own)
-    return Log(arrays[clock], signals, where, known)
-
-
-def _of_table(path: Path) -> Log:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: expected a CSV file, got one that is missing or no text") from error
-    if len(rows) < 3:
-        raise ValueError(f"{path}: expected a line of headings and two of numbers, got {len(rows)} lines")
-    clock = _time_unit(rows[0][0])
-    if clock is None:
-        raise ValueError(f"{path}: expected times in the first column, headed 'time [s]', got {rows[0][0]!r}")
-    names, known = zip(*(_heading(text, path) for text in rows[0][1:]), strict=True) if len(rows[0]) > 1 else ((), ())
-    if len(set(names)) < len(names):
-        raise ValueError(f"{path}: expected each heading once, got {', '.join(names)}")
-    table = np.full((len(rows) - 1, len(rows[0])), np.nan)
-    for number, row in enumerate(rows[1:]):
-        if len(row) != len(rows[0]):
-            raise ValueError(f"{path}: line {number + 2}: expected {len(rows[0])} cells, got {len(row)}")
-        try:
-            table[number] = [float(cell) if cell.strip() else np.nan for cell in row]
-        except ValueError as error:
-            raise ValueError(f"{path}: line {number + 2}: expected numbers, got {','.join(row)[:60]!r}") from error
-    times = _integers([row[0] for row in rows[1:]])
-    return Log(
-        table[:, 0] if times is None else times,
-        dict(zip(names, table[:, 1:].T, strict=True)),
-        str(path),
-        {TIME: clock} | dict(zip(names, known, strict=True)),
-    )
-
-
-def _integers(cells: Sequence[str]) -> np.ndarray | None:
-    """Cells as integers, which keep all digits of a clock in ns; None where some are none."""
-    try:
-        return np.array([int(cell) for cell in cells], np.int64)
-    except (ValueError, OverflowError):
-        return None
-
-
-def _heading(text: str, path: Path) -> tuple[str, str]:
-    """A signal's name, and its unit or ""."""
-    match = HEADING.fullmatch(text)
-    name, unit = (match["name"].strip(), (match["unit"] or "").strip()) if match else ("", "")
-    if not name or not is_unit(unit):
-        raise ValueError(
-            f"{path}: expected a heading as 'NAME [unit]' with a unit of the SI, or one such as deg, rpm, mm, mN m and "
-            f"ms, got {text!r}"
-        )
-    return name, unit
-
-
-def _named(text: str) -> tuple[str, str]:
-    """The same of a name in which brackets need not hold a unit."""
-    match = HEADING.fullmatch(text)
-    if match and match["unit"] and match["name"].strip() and is_unit(match["unit"]):
-        return match["name"].strip(), match["unit"].strip()
-    return text, ""
-
-
-def _time_unit(text: str) -> str | None:
-    """The unit, or "", of a heading of times; None of another heading."""
-    match = HEADING.fullmatch(text)
-    if match is None:
-        return None
-    name, unit = match["name"].strip().casefold(), (match["unit"] or "").strip()
-    base, _, suffix = name.rpartition("_")
-    if base in TIMES and not unit and is_unit(suffix) and parse(suffix).name == "s":
-        return suffix
-    return unit if name in TIMES else None
-
-
-def _add(signals: dict[str, np.ndarray], found: Mapping[str, np.ndarray], where: str) -> None:
-    if twice := [name for name in found if name in signals]:
-        raise ValueError(f"{where}: expected each signal once, got {twice[0]!r} twice")
-    signals |= found
-
-
-def _of_robotics(path: Path) -> Log:
-    from jaxlfi.io import lerobot, mcap
-
-    folder, episode = lerobot.located(path)
-    of_frames = path.suffix != ".mcap"
-    rollout = lerobot.read(folder, episode) if of_frames else mcap.read(path)
-    times = np.unique(np.concatenate([signal.times for signal in rollout.signals.values()]))
-    signals: dict[str, np.ndarray] = {}
-    known = {TIME: "s"} if of_frames else {}  # where the frame rate bears it out
-    for topic, signal in rollout.signals.items():
-        if len(same := np.flatnonzero(np.diff(signal.times) == 0)):
-            row = same[0] + 1
-            raise ValueError(
-                f"{path}: {topic}: expected one sample at a time, got samples {row} and {row + 1} at "
-                f"{signal.times[row]:.12g} s"
-            )
-        rows = np.searchsorted(times, signal.times)
-        for heading, values, unit in zip(signal.names, signal.values.T, signal.units, strict=True):
-            name, own = _named(heading)
-            column = np.full(len(times), np.nan)
-            column[rows] = values
-            _add(signals, {name: column}, str(path))
-            known[name] = own or unit
-    return Log(times, signals, str(path), known)
+    if fault := clocks.order(times).fault:
+        raise ValueError(f"{where}: expected at least two increasing times, got {fault}")

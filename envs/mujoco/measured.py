@@ -8,9 +8,14 @@ import mujoco
 from jaxlfi.envs.mujoco.columns import INDEXED, sensor_names
 from jaxlfi.envs.mujoco.parameters import near
 
-JOINT = re.compile(r"joint/(?P<joint>.+)/(?P<what>qpos|qvel)")
+JOINT = re.compile(r"joint/(?P<joint>.+)/(?P<what>qpos|qvel|effort)")
 BODY = re.compile(r"body/(?P<body>.+)/(?P<what>pos|quat)\[(?P<index>\d)\]")
-_OF_JOINTS = {"qpos": mujoco.mjtSensor.mjSENS_JOINTPOS, "qvel": mujoco.mjtSensor.mjSENS_JOINTVEL}
+_OF_JOINTS = {
+    "qpos": mujoco.mjtSensor.mjSENS_JOINTPOS,
+    "qvel": mujoco.mjtSensor.mjSENS_JOINTVEL,
+    "effort": mujoco.mjtSensor.mjSENS_JOINTACTFRC,
+}
+"""By what is measured; "effort", as ROS calls it, is what all actuators of a joint apply to it."""
 _OF_BODIES = {"pos": mujoco.mjtSensor.mjSENS_FRAMEPOS, "quat": mujoco.mjtSensor.mjSENS_FRAMEQUAT}
 
 _UNITS = {
@@ -84,8 +89,7 @@ def places(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
 
 def unit(model: mujoco.MjModel, name: str) -> str:
     """The unit that a signal is measured in; "1" of orientations, and "" where its sensor does not say."""
-    sensor = _sensor(model, name)
-    kind, item = mujoco.mjtSensor(int(sensor.type[0])), int(sensor.objid[0])
+    kind, item = of_sensor(model, name)
     if kind in _PER_JOINT:
         of_hinge, of_slide = _PER_JOINT[kind]
         return of_hinge if model.jnt_type[item] == mujoco.mjtJoint.mjJNT_HINGE else of_slide
@@ -94,11 +98,16 @@ def unit(model: mujoco.MjModel, name: str) -> str:
     return _UNIT.get(kind, "")
 
 
+def of_sensor(model: mujoco.MjModel, name: str) -> tuple[mujoco.mjtSensor, int]:
+    """The type of a signal's sensor, and the number of the joint, site or other element that it is of."""
+    sensor = _sensor(model, name)
+    return mujoco.mjtSensor(int(sensor.type[0])), int(sensor.objid[0])
+
+
 def joint_limits(model: mujoco.MjModel, name: str) -> tuple[float, float] | None:
     """The limits of the joint whose position a signal is; None where there are none."""
-    sensor = _sensor(model, name)
-    joint = int(sensor.objid[0])
-    if mujoco.mjtSensor(sensor.type[0]) != _OF_JOINTS["qpos"] or not model.jnt_limited[joint]:
+    kind, joint = of_sensor(model, name)
+    if kind != _OF_JOINTS["qpos"] or not model.jnt_limited[joint]:
         return None
     return tuple(model.jnt_range[joint].tolist())
 

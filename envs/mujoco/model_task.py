@@ -94,7 +94,7 @@ def mujoco_task(
     several = [recorded] if isinstance(recorded, Log | str | Path) else list(recorded)
     if not several or not parameters:
         raise ValueError("expected at least one recording and one parameter, got none")
-    episodes = [one if isinstance(one, Log) else logs.read(Path(one)) for one in several]
+    episodes = [log for one in several for log in ([one] if isinstance(one, Log) else logs.read_all(one))]
     actuators, sensors = ([one.name for one in several] for several in (spec.actuators, spec.sensors))
     episodes = [recordings.renamed(one, [*sensors, *actuators, *(measured or ())]) for one in episodes]
     episodes = [columns.arranged(one, actuators, sensors) for one in episodes]

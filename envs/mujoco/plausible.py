@@ -117,11 +117,27 @@ def say(text: str) -> None:
     warnings.warn(text, RecordingWarning, stacklevel=2)
 
 
+def unit_of_times(log: Log, step: float) -> str | None:
+    """The unit that times look like which are too far apart to be in s; None where they are not.
+
+    Args:
+        log: whose times are taken for s.
+        step: of the model, in s.
+    """
+    between = _between(log)
+    if between < max(SLOWEST * step, LONGEST):
+        return None
+    return looks_like(between, min(5 * step, LONGEST), ("ms", "us", "ns"))
+
+
+def _between(log: Log) -> float:
+    return float(log.times[-1]) / (len(log.times) - 1)
+
+
 def _check_times(log: Log, step: float) -> None:
-    between = float(log.times[-1]) / (len(log.times) - 1)
-    if between >= max(SLOWEST * step, LONGEST):
+    between = _between(log)
+    if looks := unit_of_times(log, step):
         text = f"{log.name}: expected times in s, got rows {between:.6g} apart, {between / step:.3g} steps of the model"
-        looks = looks_like(between, min(5 * step, LONGEST), ("ms", "us", "ns"))
         other = f"in {looks} they would be {parse(looks).factor * between:.3g} s apart"
         if TIME not in log.units:
             raise ValueError(f"{text}: {other}; give them in s, or with their unit, as 'time [{looks}]' or 'time [s]'")

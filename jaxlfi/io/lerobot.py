@@ -17,13 +17,13 @@ Needs the extra `robotics` (pyarrow), and not the package lerobot.
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxlfi.io import files, units
+from jaxlfi.io import clocks, files, units
 from jaxlfi.io.formats import require_version
 from jaxlfi.io.rollout import Rollout, Signal, array, numbers
 
@@ -33,11 +33,12 @@ COLUMN, COLUMN_VERSION = "jaxlfi", 1
 CLOCK = "time"
 """Feature of the frames' time stamps, in s."""
 COUNTED = ("frame_index", "episode_index", "index", "task_index")
+_EVERY = {"timestamp": {"dtype": "float32", "shape": [1]}, "frame_index": {"dtype": "int64", "shape": [1]}}
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 INSTALL = "LeRobot data sets need the package pyarrow: pip install 'jaxlfi[robotics]'"
-EPISODE = "#episode="
-"""What stands between the folder of a data set and the number of an episode in a reference to that episode."""
+EPISODE, EPISODES_OF = "#episode=", "#episodes="
+"""What stands between the folder of a data set and the number of an episode, or the first and last of several."""
 FARTHEST = 100.0
 """Intervals at the frame rate that successive time stamps may be apart, in the median."""
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
@@ -127,6 +128,23 @@ def located(reference: str | Path) -> tuple[Path, int | None]:
     return Path(path), int(number)
 
 
+def selected(reference: str | Path) -> tuple[Path, Sequence[int] | None]:
+    """The path and the numbers of the episodes that a reference names: after "#episode=", or "#episodes=" as 0-9.
+
+    Raises:
+        ValueError: for what are no numbers.
+    """
+    path, mark, span = str(reference).rpartition(EPISODES_OF)
+    if not mark or Path(reference).exists():
+        path, episode = located(reference)
+        return path, None if episode is None else [episode]
+    first, dash, last = span.partition("-")
+    numbers = [int(text) if text.isascii() and text.isdigit() else -1 for text in (first, last if dash else first)]
+    if min(numbers) < 0 or numbers[1] < numbers[0]:
+        raise ValueError(f"recording: expected the first and the last number after {EPISODES_OF}, as 0-9, got {span!r}")
+    return Path(path), range(numbers[0], numbers[1] + 1)
+
+
 def read(path: str | Path, episode: int | None = None) -> Rollout:
     """Read an episode of a data set.
 
@@ -140,19 +158,35 @@ def read(path: str | Path, episode: int | None = None) -> Rollout:
         ValueError: for folders that are no data set, damaged or of another version, and episodes that are not there.
         ImportError: without pyarrow.
     """
+    (rollout,) = read_several(path, None if episode is None else [episode])
+    return rollout
+
+
+def read_several(path: str | Path, numbers: Sequence[int] | None) -> Iterator[Rollout]:
+    """Read episodes of a data set, one after another.
+
+    Args:
+        path: the data set's folder.
+        numbers: of the episodes; may be left out where there is only one.
+
+    Raises:
+        ValueError: for folders that are no data set, damaged or of another version, and episodes that are not there.
+        ImportError: without pyarrow.
+    """
     path = Path(path)
     info = _info(path)
     try:
         listed = _episodes(path)
-        if episode is None and len(listed) != 1:
+        if numbers is None and len(listed) != 1:
             raise ValueError(
                 f"expected the number of one of its {len(listed)} episodes, got none: name it as "
-                f"{path.name}{EPISODE}{min(listed)}"
+                f"{path.name}{EPISODE}{min(listed)}, or several as {path.name}{EPISODES_OF}{min(listed)}-{max(listed)}"
             )
-        number = next(iter(listed)) if episode is None else episode
-        if number not in listed:
-            raise ValueError(f"expected an episode from {min(listed)} to {max(listed)}, got {number}")
-        return _rollout(path, info, number, listed[number])
+        chosen = list(listed) if numbers is None else numbers
+        if missing := [number for number in chosen if number not in listed]:
+            raise ValueError(f"expected an episode from {min(listed)} to {max(listed)}, got {missing[0]}")
+        for number in chosen:
+            yield _rollout(path, info, number, listed[number])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -350,7 +384,8 @@ def _rollout(path: Path, info: Mapping[str, Any], number: int, row: Mapping[str,
     }
     own = _own(row.get(COLUMN))
     file = path / info["data_path"].format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
-    names = [name for name in features if name not in COUNTED]
+    features |= {name: feature for name, feature in _unlisted(file).items() if name not in features}
+    names = [name for name in features if name not in COUNTED or name == "frame_index"]
     table = _table(file, names, [("episode_index", "=", number)])
     if table.num_rows != row["length"] or not table.num_rows:
         raise ValueError(f"expected {row['length']} frames of episode {number} in {file.name}, got {table.num_rows}")
@@ -359,10 +394,15 @@ def _rollout(path: Path, info: Mapping[str, Any], number: int, row: Mapping[str,
     if clock not in columns:
         raise ValueError("expected a feature timestamp, got none")
     times = _seconds(clock, columns[clock][:, 0], features[clock], info.get("fps"))
-    signals = {}
-    for name, values in columns.items():
-        if name in (CLOCK, "timestamp"):
+    times = _of_frames(times, columns.get("frame_index"), info.get("fps")) if clock != CLOCK else times
+    frames, fault = clocks.order(times, "frame", repeated=True)
+    if not len(frames):
+        raise ValueError(f"{clock}: expected finite times, got {fault}")
+    times, signals = times[frames], {}
+    for name, recorded in columns.items():
+        if name in (CLOCK, "timestamp", *COUNTED):
             continue
+        values = recorded[frames]
         words = _words(name, features[name].get("names"), values.shape[1])
         unit = _unit(name, features[name])
         signal = Signal(times, values, words, unit)
@@ -376,7 +416,20 @@ def _rollout(path: Path, info: Mapping[str, Any], number: int, row: Mapping[str,
                     "remove the entry from that column if the rows are right"
                 )
         signals[name] = signal
-    return Rollout(signals, own["metadata"], (row.get("tasks") or [""])[0])
+    if not signals:
+        raise ValueError(f"expected features that are numbers, got {', '.join(info['features'])}")
+    faults = (f"{clock}: expected times in order, got {fault}",) if fault else ()
+    return Rollout(signals, own["metadata"], (row.get("tasks") or [""])[0], faults)
+
+
+def _unlisted(file: Path) -> dict[str, dict[str, Any]]:
+    """Features that every data set has, where a file has them, as not all who write info.json list them."""
+    _, parquet = _libraries()
+    try:
+        there = parquet.read_schema(file).names
+    except Exception:
+        return {}  # which is refused when the rows are read
+    return {name: feature for name, feature in _EVERY.items() if name in there}
 
 
 def _unit(name: str, feature: Mapping[str, Any]) -> str | tuple[str, ...]:
@@ -404,6 +457,14 @@ def _seconds(name: str, times: np.ndarray, feature: Mapping[str, Any], fps: Any)
             f'look like {looks}; say so in meta/info.json, as "info": {{"unit": "{looks}"}} of this feature'
         )
     return seconds
+
+
+def _of_frames(times: np.ndarray, numbers: np.ndarray | None, fps: Any) -> np.ndarray:
+    """Times of frames by their numbers, where time stamps are the same but for their single precision."""
+    if numbers is None or not isinstance(fps, int | float) or not fps > 0:
+        return times
+    exact = numbers[:, 0] / fps
+    return exact if np.allclose(times, exact, rtol=2e-7, atol=1e-9) else times
 
 
 def _own(text: str | None) -> dict[str, Any]:
@@ -434,9 +495,18 @@ def _values(name: str, column: Any, feature: Mapping[str, Any]) -> np.ndarray:
 
 
 def _words(name: str, described: Any, count: int) -> tuple[str, ...]:
-    """Names of a feature's numbers: a list, or one within a mapping as in LeRobot's {"motors": [...]}."""
-    if isinstance(described, Mapping) and len(described) == 1:
-        (described,) = described.values()
-    if isinstance(described, Sequence) and not isinstance(described, str) and len(described) == count:
+    """Names of a feature's numbers as LeRobot has them: a list, one within a mapping or a list, or places by name.
+
+    Those are {"motors": [...]}, [[...]] and {"dx": 0, "dy": 1}. Lists of other lengths name axes; they and names that
+    are not unique are no names of numbers.
+    """
+    if isinstance(described, Mapping) and all(isinstance(place, int) for place in described.values()):
+        described = sorted(described, key=described.__getitem__)
+    while isinstance(described, Mapping | list) and len(described) == 1:
+        (inner,) = described.values() if isinstance(described, Mapping) else described
+        if not isinstance(inner, Mapping | list):
+            break
+        described = inner
+    if isinstance(described, list) and len(set(map(str, described))) == len(described) == count:
         return tuple(map(str, described))
-    return tuple(f"{name} {index}" for index in range(count))
+    return tuple(f"{name} {index}" for index in range(count)) if count > 1 else (name,)

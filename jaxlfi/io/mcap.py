@@ -4,7 +4,8 @@ Each signal is a topic, "observation.state" is /observation/state, with messages
 `jaxlfi.Signal`: {"time": 0.16, "values": [0.4, 0.36]}. What the numbers are is in the channel's metadata: `dtype`,
 `names` (a JSON list), `unit` (or a JSON list of them), `duration`. Units may also stand in the JSON schema, as the
 `unit` of its property `values`, or of its property `time` where times are not in s. The rollout's metadata are in the
-record `jaxlfi.rollout`. A file may have topics of other schemas; they are not read.
+record `jaxlfi.rollout`. A file may have topics of other schemas; they are not read. Of a file, or the folder of a bag,
+that has none of these topics those of ROS 2 are read (`ros2`).
 
 Times of the log are ns from the first message on. Those of the rollout, which may begin before zero, are in the
 messages, in full precision.
@@ -20,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxlfi.io import files, units
+from jaxlfi.io import clocks, files, ros2, units
 from jaxlfi.io.formats import require_version
 from jaxlfi.io.rollout import Rollout, Signal, array, numbers
 
@@ -42,7 +43,7 @@ def write(path: str | Path, rollout: Rollout) -> None:
     path = Path(path)
     if path.exists():
         raise ValueError(f"path: expected a new file, got {path}, which exists")
-    if dotted := [name for name in rollout.signals if name != _name(_topic(name))]:
+    if dotted := [name for name in rollout.signals if name != ros2.topic_name(_topic(name))]:
         raise ValueError(f"signals: expected words with dots between them, got {dotted[0]!r}")
     try:
         from mcap.writer import Writer
@@ -80,11 +81,39 @@ def write(path: str | Path, rollout: Rollout) -> None:
 def read(path: str | Path) -> Rollout:
     """Read a rollout.
 
+    Args:
+        path: a file, or the folder of a ROS 2 bag, whose files are read together.
+
     Raises:
         ValueError: for a file that is missing, truncated, damaged, of another version or without such topics.
-        ImportError: without mcap.
+        ImportError: without mcap, and for messages of ROS 2 without mcap-ros2-support.
     """
-    path = Path(path)
+    path, messages, others, records = Path(path), [], set(), {}
+    several = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    if not several:
+        raise ValueError(f"{path}: expected a bag of MCAP files, got none: `ros2 bag convert` makes them of others")
+    for file in several:
+        found, left, said = _content(file)
+        messages += found
+        others |= left
+        records |= said
+    messages.sort(key=lambda one: one[2].log_time)
+    try:
+        return _rollout(messages, others, records)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is the folder of a ROS 2 bag."""
+    return path.is_dir() and ((path / "metadata.yaml").exists() or any(path.glob("*.mcap")))
+
+
+def _content(path: Path) -> tuple[list[tuple[Any, Any, Any]], set[str], dict[str, Mapping[str, str]]]:
+    """Messages of a file that can be read, with their schemas and channels; its other topics, and its metadata.
+
+    Pictures and the like are not even loaded.
+    """
     try:
         from mcap.reader import make_reader
     except ImportError as error:
@@ -92,8 +121,21 @@ def read(path: str | Path) -> Rollout:
     try:
         with path.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
-            messages = [(schema, channel, message.data) for schema, channel, message in reader.iter_messages()]
-            records = {record.name: record.metadata for record in reader.iter_metadata()}
+            summary = reader.get_summary()
+            if summary is not None and summary.channels:
+                channels = [(summary.schemas.get(one.schema_id), one) for one in summary.channels.values()]
+            else:  # which writers may leave out
+                channels = [(schema, channel) for schema, channel, _ in reader.iter_messages()]
+            wanted = {
+                channel.topic for schema, channel in channels if _is_ours(schema, channel) or ros2.is_known(schema)
+            }
+            others = {
+                f"{channel.topic} ({schema.name if schema else 'no schema'}, {channel.message_encoding})"
+                for schema, channel in channels
+                if channel.topic not in wanted
+            }
+            messages = list(reader.iter_messages(topics=sorted(wanted))) if wanted else []
+            return messages, others, {record.name: record.metadata for record in reader.iter_metadata()}
     except OSError as error:
         raise ValueError(f"{path}: expected an MCAP file, got {error.strerror}") from error
     except Exception as error:  # mcap and its decompressors each have their own
@@ -101,18 +143,10 @@ def read(path: str | Path) -> Rollout:
             f"{path}: expected a whole MCAP file, got a truncated or damaged one; `mcap recover` of the MCAP "
             "command line saves what is left of one"
         ) from error
-    try:
-        return _rollout(messages, records)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def _topic(name: str) -> str:
     return "/" + name.replace(".", "/")
-
-
-def _name(topic: str) -> str:
-    return topic.strip("/").replace("/", ".")
 
 
 def _schema(signal: Signal) -> dict[str, Any]:
@@ -124,29 +158,41 @@ def _schema(signal: Signal) -> dict[str, Any]:
     return {"type": "object", "title": SCHEMA, "properties": properties, "required": ["time", "values"]}
 
 
-def _rollout(messages: list[tuple[Any, Any, bytes]], records: Mapping[str, Mapping[str, str]]) -> Rollout:
+def _is_ours(schema: Any, channel: Any) -> bool:
+    return schema is not None and schema.name == SCHEMA and channel.message_encoding == "json"
+
+
+def _rollout(
+    messages: list[tuple[Any, Any, Any]], others: set[str], records: Mapping[str, Mapping[str, str]]
+) -> Rollout:
     channels, times, values, said = {}, {}, {}, {}
-    others = set()
-    for schema, channel, data in messages:
-        if schema is None or schema.name != SCHEMA or channel.message_encoding != "json":
-            others.add(f"{channel.topic} ({schema.name if schema else 'no schema'}, {channel.message_encoding})")
+    for schema, channel, message in messages:
+        if not _is_ours(schema, channel):
             continue
-        name = _name(channel.topic)
+        name = ros2.topic_name(channel.topic)
         if name not in channels:
             channels[name], said[name] = channel, _said(schema.data)
-        time, row = _message(channel.topic, data)
+        time, row = _message(channel.topic, message.data)
         times.setdefault(name, []).append(time)
         values.setdefault(name, []).append(row)
+    if not channels and messages:
+        return ros2.rollout(messages)
     if not channels:
-        raise ValueError(f"expected topics of JSON messages by the schema {SCHEMA}, got {_some(others)}")
-    signals = {}
+        raise ValueError(
+            f"expected topics of ROS 2 of the types {', '.join(ros2.TYPES)}, or of JSON messages by the schema "
+            f"{SCHEMA}, got {_some(others)}"
+        )
+    signals, faults = {}, []
     for name, channel in channels.items():
         try:
             unit = units.parse(said[name].get("time", "s"))
             if unit.name != "s":
                 raise ValueError(f"expected times in a unit of time, got {said[name]['time']!r}")
             when = [unit.factor * time for time in times[name]]
-            signals[name] = _signal({"unit": said[name].get("values", ""), **channel.metadata}, when, values[name])
+            rows, fault = clocks.order(np.array(when), "message", repeated=True)
+            faults += [f"{channel.topic}: expected times in order, got {fault}"] if fault else []
+            described = {"unit": said[name].get("values", ""), **channel.metadata}
+            signals[name] = _signal(described, np.array(when), values[name], rows)
         except ValueError as error:
             raise ValueError(f"{channel.topic}: {error}") from error
     record = records.get(RECORD, {"version": str(VERSION)})
@@ -154,7 +200,7 @@ def _rollout(messages: list[tuple[Any, Any, bytes]], records: Mapping[str, Mappi
     require_version("record", RECORD, VERSION, int(version) if str(version).isdecimal() else version)
     try:
         metadata = json.loads(record.get("metadata", "{}"))
-        return Rollout(signals, dict(metadata), record.get("task", ""))
+        return Rollout(signals, dict(metadata), record.get("task", ""), tuple(faults))
     except (ValueError, TypeError) as error:
         raise ValueError(f"expected a JSON object as metadata in the record {RECORD}, got another text") from error
 
@@ -181,7 +227,7 @@ def _message(topic: str, data: bytes) -> tuple[float, list]:
     return time, row
 
 
-def _signal(metadata: Mapping[str, str], times: list[float], rows: list[list]) -> Signal:
+def _signal(metadata: Mapping[str, str], times: np.ndarray, rows: list[list], order: np.ndarray) -> Signal:
     if len({len(row) for row in rows}) != 1:
         raise ValueError(f"expected messages of one size, got {sorted({len(row) for row in rows})}")
     values = array(rows, metadata.get("dtype", "float64"))
@@ -191,9 +237,7 @@ def _signal(metadata: Mapping[str, str], times: list[float], rows: list[list]) -
         names = tuple(map(str, names))
     except (ValueError, TypeError) as error:
         raise ValueError(f"expected names as a JSON list and a duration in s, got {dict(metadata)}") from error
-    # In the order of time: messages of the same instant may stand in any.
-    order = np.argsort(times, kind="stable")
-    return Signal(np.asarray(times)[order], values[order], names, _unit(metadata.get("unit", "")), duration)
+    return Signal(times[order], values[order], names, _unit(metadata.get("unit", "")), duration)
 
 
 def _unit_text(signal: Signal) -> str:
@@ -210,5 +254,6 @@ def _unit(text: str) -> str | tuple[str, ...]:
 
 
 def _some(names: set[str]) -> str:
+    """Topics in words, the first ones of many."""
     shown = sorted(names)[:4]
     return ", ".join(shown) + (f" and {len(names) - 4} more" if len(names) > 4 else "") if shown else "no messages"

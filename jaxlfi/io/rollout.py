@@ -110,6 +110,8 @@ class Rollout:
         signals: by their names, words with dots between them such as "observation.state" and "action".
         metadata: facts about the rollout that JSON can hold.
         task: what was to be done, in words.
+        faults: of time stamps, in one line each: samples that their source has in another order. Here they are in the
+            order of time.
 
     Raises:
         ValueError: for names that not every format can hold.
@@ -118,6 +120,7 @@ class Rollout:
     signals: Mapping[str, Signal]
     metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     task: str = ""
+    faults: tuple[str, ...] = ()
 
     def __post_init__(self):
         for name in self.signals:

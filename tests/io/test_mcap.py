@@ -116,7 +116,16 @@ def with_state(metadata, *bodies):
 
 
 FOREIGN = {
-    "other topics": ([ROS], {}, r"expected topics of JSON messages by the schema jaxlfi.Signal, got /joint_states "),
+    "other topics": (
+        [("/log", "Log", "json", {}, [b"{}"])],
+        {},
+        r"expected topics of ROS 2 .*, or of JSON messages by the schema jaxlfi.Signal, got /log \(Log, json\)",
+    ),
+    "ROS's other topics": (
+        [("/tf", "tf2_msgs/msg/TFMessage", "cdr", {}, [b""])],
+        {},
+        r"expected topics of ROS 2 of the types sensor_msgs/JointState, .*, got /tf \(tf2_msgs/msg/TFMessage, cdr\)",
+    ),
     "no topics": ([], {}, "by the schema jaxlfi.Signal, got no messages"),
     "no time": ([with_state({}, b'{"values": [1]}')], {}, '/observation/state: expected messages {"time": in s'),
     "no JSON": ([with_state({}, b"\x00\xff")], {}, "/observation/state: expected messages"),

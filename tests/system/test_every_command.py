@@ -208,6 +208,7 @@ LINE = (
     "--total-steps 80 --hidden 8"
 )
 WHIP = {"extra": "mujoco", "slow": True}
+FURUTA = Path(__file__).parents[2] / "examples/mujoco/furuta"
 EXAMPLES = {
     "tasks": Example("tasks"),
     "infer": Example(f"{INFER} --keep-network --out @infer", writes=(".html", ".png")),
@@ -238,6 +239,9 @@ EXAMPLES = {
     "mujoco serve": Example(
         "mujoco serve @arm.toml --truth joint/shoulder/damping=0.1 --truth actuator/motor/gear[0]=1.5",
         before=a_machine, **WHIP,
+    ),
+    "mujoco inspect": Example(
+        f"mujoco inspect {FURUTA}.csv --model {FURUTA}.xml --out @furuta.toml", writes=(".toml",), extra="mujoco"
     ),
     "mujoco fit": Example(
         "mujoco fit @arm --starts 4 --keep 1 --out @fit", writes=(".png", ".json"), before=an_arm, **WHIP

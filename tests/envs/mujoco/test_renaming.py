@@ -1,0 +1,88 @@
+"""Names and units that a task's file gives to a recording's signals."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+from envs_mujoco import ARM, recorded
+
+from jaxlfi.envs.mujoco.config import read
+
+CONFIG = """
+model = "arm.xml"
+log = ["swing.csv"]
+measured = ["angle", "joint/elbow/qpos"]
+
+[parameters."joint/elbow/damping"]
+support = [0.01, 0.2]
+
+[noise]
+"joint/elbow/qpos" = 0.01
+angle = 0.01
+
+[signals]
+tau = "actuator/motor"
+q1 = { name = "angle", unit = "deg" }
+q2 = { name = "joint/elbow/qpos", unit = "mrad" }
+time = { unit = "ms" }
+spare = false
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A laboratory's recording, with names of its own and without units; its times are in ms, one heading is wrong."""
+    (tmp_path / "arm.xml").write_text(ARM)
+    log = recorded()
+    rows = zip(1000 * log.times, log.signals["motor"], np.rad2deg(log.signals["angle"]), strict=True)
+    lines = [f"{time:.17g},{tau:.17g},{q1:.17g},{250 + 10 * k},inf" for k, (time, tau, q1) in enumerate(rows)]
+    (tmp_path / "swing.csv").write_text("\n".join(["time,tau,q1,q2 [rad],spare", *lines]))
+    (tmp_path / "arm.toml").write_text(CONFIG)
+    return tmp_path
+
+
+def test_names_and_units_of_the_file_take_the_place_of_the_recordings(folder):
+    task = read(folder / "arm.toml")
+    simulator = task.simulate.function
+    np.testing.assert_allclose(simulator.times[0], recorded().times, atol=1e-12)
+    np.testing.assert_allclose(task.observation[:, 0], recorded().signals["angle"], atol=1e-6)
+    np.testing.assert_allclose(task.observation[:3, 1], [0.25, 0.26, 0.27], atol=1e-6)
+    np.testing.assert_allclose(simulator.logs[0].signals["motor"], recorded().signals["motor"])
+
+
+def test_a_recording_in_the_models_own_names_is_left_as_it_is(folder):
+    """As the controls that `jaxlfi design` writes, or another laboratory's."""
+    log = recorded()
+    rows = zip(log.times, log.signals["motor"], log.signals["angle"], strict=True)
+    lines = [f"{time:.17g},{tau:.17g},{q1:.17g},0.5" for time, tau, q1 in rows]
+    (folder / "own.csv").write_text("\n".join(["time [s],motor,angle [rad],joint/elbow/qpos [rad]", *lines]))
+    task = read(folder / "arm.toml", [folder / "own.csv"])
+    np.testing.assert_allclose(task.observation[:, 0], log.signals["angle"], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        (
+            'tau = "actuator/motor"',
+            'tua = "actuator/motor"',
+            "signals: expected a signal of the recordings such as tau, got 'tua'",
+        ),
+        ('tau = "actuator/motor"', "tau = 3", r"signals: 'tau': expected a name, { name = NAME, .* or false, got 3"),
+        ('tau = "actuator/motor"', "tau = { }", r"signals: 'tau': expected a name, { name = NAME"),
+        ('tau = "actuator/motor"', "tau = { scale = 2 }", r"signals: 'tau': expected a name, .*got {'scale': 2}"),
+        ('tau = "actuator/motor"', "tau = { unit = 2 }", "signals: 'tau': expected words in quotes, got 2"),
+        ('unit = "deg"', 'unit = "furlong"', "signals: 'q1': unit: expected a unit such as .* got 'furlong'"),
+        ('unit = "mrad"', 'unit = "mm"', "joint/elbow/qpos: expected rad as the sensor, got m"),
+        ('tau = "actuator/motor"', 'tau = "angle"', "expected one signal called angle, got tau and q1"),
+        ('time = { unit = "ms" }', 'time = { unit = "mm" }', "expected times in a unit of time, got m"),
+        ("[signals]", "signals = 3\n[other]", "expected keys among"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(folder, old, new, expected):
+    assert old in CONFIG
+    (folder / "arm.toml").write_text(CONFIG.replace(old, new))
+    with pytest.raises(ValueError, match=expected) as caught:
+        read(folder / "arm.toml")
+    assert "\n" not in str(caught.value)
