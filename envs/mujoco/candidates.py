@@ -90,11 +90,8 @@ def _of_all(
         if name and mass > 0 and model.body_weldid[i]:
             yield _around(f"body/{name}/mass", mass, "kg", OF_MASSES)
     yield from _of_actuators(model)
-    controls = [name for name in columns.controls_of(model) if any(name in log.signals for log in recorded)]
-    if controls:
-        intervals = [
-            np.median(np.diff(log.samples(name)[0])) for log in recorded for name in controls if name in log.signals
-        ]
+    controls = [log.samples(name)[0] for name in columns.controls_of(model) for log in recorded if name in log.signals]
+    if intervals := [float(np.median(np.diff(times))) for times in controls if len(times) > 1]:
         most = _rounded(5 * float(np.median(intervals)))
         yield Candidate("control/delay", 0.0, (0.0, most), (0.0, 5 * most), "s")
     for name in compared:

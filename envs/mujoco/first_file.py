@@ -34,7 +34,7 @@ def text(path: Path, spec: mujoco.MjSpec, model: Path, logs: Sequence[Path], sev
     own = spec.copy()
     measured.add_sensors(own, compared)
     sensing = compile_spec(own)
-    parameters = candidates.candidates(spec, sensing, [one.log for one in several], compared)
+    parameters = candidates.candidates(spec, sensing, [one.log for one in several], list(deviations))
     lines = [
         "# A task to begin with: look through it, uncomment what you doubt, and bound it as you see fit. Lines with",
         '# "#" and no blank are of the file; all others with "#" are remarks.',

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import mujoco
 
 from jaxlfi.envs.mujoco import columns, measured
-from jaxlfi.io.units import is_unit, parse
+from jaxlfi.io.units import is_unit
 
 CONTROL = "control"
 ALIKE = 0.65
@@ -338,8 +338,3 @@ def _numbers_of(read: _Name, count: int, elements: Sequence[_Element]) -> list[P
         if len(several) == 1:
             return [Place(f"{several[0].name}[{k}]", several[0].what, False) for k in range(count)]
     return []
-
-
-def agrees(unit: str, given: str) -> bool:
-    """Whether a recording's unit can be that of a model's number; one of them may say none."""
-    return not unit or not given or parse(given).name == unit

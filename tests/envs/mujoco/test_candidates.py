@@ -36,12 +36,13 @@ LEG = """
 """
 
 
-def offered(compared, controls=("hip",), compiler='angle="radian"'):
+def offered(compared, controls=("hip",), compiler='angle="radian"', once=()):
     spec = mujoco.MjSpec.from_string(LEG.format(compiler=compiler))
     own = spec.copy()
     measured.add_sensors(own, compared)
     times = 0.01 * np.arange(200)
     signals = {name: np.sin(times) for name in (*compared, *controls)}
+    signals |= {name: np.where(times == 0.5, 1.0, np.nan) for name in once}
     found = candidates.candidates(spec, own.compile(), [Log(times, signals)], compared)
     return {one.name: one for one in found}
 
@@ -69,6 +70,7 @@ def test_what_stands_still_or_touches_nothing_is_left_out():
     found = offered(["joint/knee/qpos"])
     assert not {"body/stand/mass", "geom/thigh/friction[0]", "sensor/joint/hip/qpos/bias"} & set(found)
     assert "control/delay" not in offered(["joint/knee/qpos"], controls=())
+    assert "control/delay" not in offered(["joint/knee/qpos"], once=("hip",))
 
 
 @pytest.mark.parametrize("compiler", ['inertiafromgeom="true"', 'settotalmass="5"'])

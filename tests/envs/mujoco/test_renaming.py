@@ -86,3 +86,22 @@ def test_what_does_not_fit_is_one_line(folder, old, new, expected):
     with pytest.raises(ValueError, match=expected) as caught:
         read(folder / "arm.toml")
     assert "\n" not in str(caught.value)
+
+
+def test_efforts_of_joints_are_what_their_actuators_apply(folder):
+    """As ROS has them: the motor's gear of 1.5 times the control that is held."""
+    (folder / "arm.toml").write_text("""
+        model = "arm.xml"
+        log = ["swing.csv"]
+        measured = ["joint/shoulder/effort"]
+        parameters."joint/elbow/damping".support = [0.01, 0.2]
+        noise."joint/shoulder/effort" = 0.1
+        signals.tau = "actuator/motor"
+        signals.q1 = { name = "joint/shoulder/effort", unit = "mN m" }
+        signals.time.unit = "ms"
+        signals.spare = false
+    """)
+    task = read(folder / "arm.toml")
+    assert task.channels == ("joint/shoulder/effort [N m]",)
+    rows, _ = task.simulate.function.clean([[0.03]])
+    np.testing.assert_allclose(rows[0, :, 0], 1.5 * recorded().signals["motor"], atol=1e-12)
