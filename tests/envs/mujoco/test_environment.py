@@ -319,14 +319,15 @@ def test_a_file_without_a_policy_is_refused(tmp_path):
         environment(file)
 
 
-def test_the_example_has_the_parameters_of_its_task():
+@pytest.mark.parametrize("name", ["furuta", "arm"])
+def test_the_example_has_the_parameters_of_its_task(name):
     from jaxlfi.envs.mujoco import task
 
-    file = config.Path(__file__).parents[3] / "examples/mujoco/furuta.toml"
+    file = config.Path(__file__).parents[3] / f"examples/mujoco/{name}.toml"
     env, inferred = environment(file), task(file)
     assert env.space == inferred.space and env.units == tuple(inferred.units) and env.name == inferred.name
-    for name in ("initial", "feasible"):
-        chex.assert_trees_all_equal(env.supports[name], inferred.supports[name])
+    for support in ("initial", "feasible"):
+        chex.assert_trees_all_equal(env.supports[support], inferred.supports[support])
 
 
 def test_the_error_of_the_model_is_what_inference_says(tmp_path):

@@ -179,6 +179,29 @@ def reading(**changes):
     return Reading(compile_spec(spec), goal)
 
 
+def test_rewards_of_ones_own_are_in_place_of_targets_and_costs():
+    """What is there for being alive, and the costs of ends, are besides; commands are among the signals."""
+    own = lambda signals, controls: 2.0 * signals["command speed"] + controls["pull"] - signals["place"]
+    values, control, last = np.array([0.05, 22.0, 3.0, 1.0, 22.0]), np.array([0.4, 0.7]), np.zeros(2)
+    ours = reading(reward=own, targets={})
+    assert ours.goal.signals == ("place", "joint/winch/qpos", "joint/winch/qvel", "turn")
+    ended = {"wound": True, "back": True}
+    assert ours.ended(values[[0, 1, 2, 4]]) == ended
+    assert ours.reward(values[[0, 1, 2, 4]], control, last, np.array([1.5]), np) == pytest.approx(3.65 - 4.0)
+    values[[0, 4]] = 0.3, 2.0
+    assert ours.reward(values[[0, 1, 2, 4]], control, last, np.array([1.5]), np) == pytest.approx(3.4 + 0.05 * 1.5)
+
+
+def test_rewards_near_an_angle_go_the_shorter_way_round():
+    ours = reading(
+        turns=(), targets={"joint/winch/qpos": Target(3.0, 2.0, 0.5)}, costs={}, change_costs={}, commands={}
+    )
+    values = np.array([0.3, -3.0, 0.0, -3.0])
+    expected = 0.05 * (2.0 * np.exp(-2 * (1 - np.cos(6.0)) / 0.25) + 1.5)
+    assert ours.reward(values, np.zeros(2), np.zeros(2), (), np) == pytest.approx(expected)
+    assert ours.off(values, (), np)["joint/winch/qpos"] == pytest.approx(2 * np.pi - 6.0)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
