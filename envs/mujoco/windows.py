@@ -29,6 +29,8 @@ SLOW = 0.01
 """Seconds over which speeds are taken, as noise changes faster."""
 LEAST_STEPS, SHORTEST, LONGEST = 50, 0.2, 5.0
 """Steps and seconds of a window."""
+FEWEST, TRIED = 20, 1000
+"""Rows of a window that nobody asked for, and windows of a part that are compared."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +49,9 @@ class Window:
 
 
 def wanted(model: mujoco.MjModel, logs: Sequence[Log], signals: Sequence[str]) -> bool:
-    """Whether recordings are long enough to be cut."""
+    """Whether recordings are long enough to be cut, and have enough samples in a window."""
+    if any(FEWEST * log.times[-1] / (len(log.times) - 1) > LONGEST for log in logs):
+        return False
     steps = sum(log.times[-1] for log in logs) / model.opt.timestep
     rows = sum(len(_rows(log, signals)) for log in logs)
     return bool(steps > LONG_STEPS or rows > LONG_ROWS)
@@ -127,6 +131,9 @@ def cut(
         signals: that are measured.
         lead: how long before and after a window controls may matter in it, in s.
         late: of signals that are measured late: by how much at most, in s.
+
+    Raises:
+        ValueError: for a window without samples, in one line.
     """
     rows = sum(len(_between(logs[one.recording], _rows(logs[one.recording], signals), one)) for one in windows)
     every = max(int(np.ceil(rows / ROWS)), 1)
@@ -144,6 +151,8 @@ def cut(
             compared = np.zeros(len(times), bool)
             compared[there[::every]] = True
             kept[name][~compared] = np.nan
+        if sum(np.isfinite(kept[name]).sum() for name in signals) < 2:
+            raise ValueError(f"window: expected samples in each of {one.end - one.begin:g} s of {log.name}, got none")
         found.append(_Part(times - times[0], kept, log.name, log.units))
         begins.append(float(one.begin - times[0]))
     return found, begins
@@ -178,7 +187,7 @@ def _liveliest(
     duration: float,
 ) -> Window:
     """The window between two times in which signals vary most, in relation to their noise or to all that they do."""
-    begins = np.linspace(low, max(high - duration, low), max(int(2 * (high - low) / duration), 1))
+    begins = np.linspace(low, max(high - duration, low), int(np.clip(2 * (high - low) / duration, 1, TRIED)))
     scores = np.zeros(len(begins))
     for name in signals:
         times, values = log.samples(name)

@@ -126,6 +126,7 @@ def test_samples_of_sensors_that_are_late_begin_later():
         ({"windows": 0}, "windows: expected a number of at least 1, got 0"),
         ({"windows": 1.5}, "windows: expected a number of at least 1, got 1.5"),
         ({"window": 0.001}, "window: expected at least two steps of the model, 0.004 s, got 0.001"),
+        ({"windows": 1, "window": 0.006}, "window: expected samples in each of 0.006 s of long, got none"),
         ({"window": 10.0}, "windows: expected 1 of 10 s within long, which lasts 5.996 s; got more"),
         ({"windows": 3, "window": 3.0}, "windows: expected 3 of 3 s within long"),
         (
