@@ -87,7 +87,7 @@ def windows_of(
     whole = sum(float(log.times[-1]) for log in logs)
     for number, log in enumerate(logs):
         total = float(log.times[-1])
-        own = period(model, log, signals) * PERIODS if duration is None else duration
+        own = PERIODS * period(model, log, signals, noises) if duration is None else duration
         if duration is None:
             own = float(np.clip(own, max(SHORTEST, LEAST_STEPS * step), LONGEST))
             own = min(own, total / (count or 1))
@@ -104,7 +104,7 @@ def windows_of(
     return found
 
 
-def period(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> float:
+def period(model: mujoco.MjModel, log: Log, signals: Sequence[str], noises: Mapping[str, float]) -> float:
     """About how long the motion of a recording takes to repeat, in s: of a sine its period.
 
     By how much signals change in relation to how fast they do, the median of those that measure no forces.
@@ -115,8 +115,11 @@ def period(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> float:
         if not measured.kinematic(model, name) or len(times) < 4 or not np.ptp(values) > 0:
             continue
         stride = max(round(SLOW / float(np.median(np.diff(times)))), 1)
-        rate = np.diff(values[::stride]) / np.diff(times[::stride])
-        found.append(2 * np.pi * float(np.std(values) / max(np.sqrt(np.mean(rate**2)), 1e-12)))
+        apart, variance = np.diff(times[::stride]), noises.get(name, 0.0) ** 2
+        speed = np.mean((np.diff(values[::stride]) ** 2 - 2 * variance) / apart**2)
+        moved = np.var(values) - variance
+        if speed > 0 and moved > 0:
+            found.append(2 * np.pi * float(np.sqrt(moved / speed)))
     return float(np.median(found)) if found else LONGEST
 
 
