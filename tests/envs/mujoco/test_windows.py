@@ -146,7 +146,7 @@ def test_windows_that_cannot_be_are_one_line(others, expected):
 def test_a_window_without_samples_is_refused():
     log = driven(3.0)
     rare = np.where(np.arange(len(log.times)) % 100 == 0, log.signals["angle"], np.nan)
-    with pytest.raises(ValueError, match="window: expected samples in each of 0.1 s of log, got none"):
+    with pytest.raises(ValueError, match=r"window: expected samples in each of 0\.1 s of log, got none"):
         task(Log(log.times, dict(log.signals) | {"angle": rare}), windows=2, window=0.1)
 
 
