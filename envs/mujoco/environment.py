@@ -133,13 +133,13 @@ class MujocoEnvironment:
             [one.tie for one in parameters],
         )
         self.reading = Reading(compiled, goal)
+        self._check(compiled, goal)
         self.observations, self.actions, self.steps = self.reading.observations, self.reading.actions, goal.steps
         self.preparation = self.reading.preparation
         build, nominal = functools.partial(built, spec, self._does), np.asarray(self.nominal)
         self.models = with_forces(build, forces, self.space.names, nominal, self.feasible)
         self._forces = forces
         self._physics = Physics(self.models, compiled, self.reading.places)
-        self._check(compiled, goal)
 
         first = {key: np.ravel(number)[:1].tolist() for key, number in (initial or {}).items()}
         self._start = starts.state_of(compiled, begins, *starts.given(compiled, first, 1))

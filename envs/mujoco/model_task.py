@@ -136,7 +136,9 @@ def mujoco_task(
     ]
     deviations = _deviations(episodes[0], measured, noises, inferred)
     parts, whole = None, episodes
-    if windows is not None or window is not None or cuts.wanted(compiled, episodes, measured):
+    complete = all(name in log.signals for name in measured for log in episodes)
+    asked = complete and (windows is not None or window is not None)
+    if asked or (complete and cuts.wanted(compiled, episodes, measured)):
         parts = _windows(compiled, parameters, episodes, measured, deviations, does, (modes, given), windows, window)
     if parts is None:
         begun = starts.chosen(compiled, episodes, measured, deviations, own, given, modes, does)

@@ -345,7 +345,7 @@ def recorded(
                 continue
             number = numbers[place + k]
             series = [(*log.samples(signals[number]), _deviation(log, signals[number], noises), 0)]
-            for name in speeds.get(dof + k, ()):
+            for name in (one for one in speeds.get(dof + k, ()) if one in log.signals):
                 series.append((*log.samples(name), _deviation(log, name, noises), 1))
             moments, covariance = polynomial(series, at, f"{log.name}: {signals[number]}")
             state[1 + place + k], state[1 + model.nq + dof + k], acceleration[dof + k] = moments

@@ -29,6 +29,8 @@ SLOW = 0.01
 """Seconds over which speeds are taken, as noise changes faster."""
 LEAST_STEPS, SHORTEST, LONGEST = 50, 0.2, 5.0
 """Steps and seconds of a window."""
+FEWEST, TRIED = 20, 1000
+"""Rows of a window that nobody asked for, and windows of a part that are compared."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +49,9 @@ class Window:
 
 
 def wanted(model: mujoco.MjModel, logs: Sequence[Log], signals: Sequence[str]) -> bool:
-    """Whether recordings are long enough to be cut."""
+    """Whether recordings are long enough to be cut, and have enough samples in a window."""
+    if any(FEWEST * log.times[-1] / (len(log.times) - 1) > LONGEST for log in logs):
+        return False
     steps = sum(log.times[-1] for log in logs) / model.opt.timestep
     rows = sum(len(_rows(log, signals)) for log in logs)
     return bool(steps > LONG_STEPS or rows > LONG_ROWS)
@@ -83,7 +87,7 @@ def windows_of(
     whole = sum(float(log.times[-1]) for log in logs)
     for number, log in enumerate(logs):
         total = float(log.times[-1])
-        own = period(model, log, signals) * PERIODS if duration is None else duration
+        own = PERIODS * period(model, log, signals, noises) if duration is None else duration
         if duration is None:
             own = float(np.clip(own, max(SHORTEST, LEAST_STEPS * step), LONGEST))
             own = min(own, total / (count or 1))
@@ -100,7 +104,7 @@ def windows_of(
     return found
 
 
-def period(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> float:
+def period(model: mujoco.MjModel, log: Log, signals: Sequence[str], noises: Mapping[str, float]) -> float:
     """About how long the motion of a recording takes to repeat, in s: of a sine its period.
 
     By how much signals change in relation to how fast they do, the median of those that measure no forces.
@@ -111,8 +115,11 @@ def period(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> float:
         if not measured.kinematic(model, name) or len(times) < 4 or not np.ptp(values) > 0:
             continue
         stride = max(round(SLOW / float(np.median(np.diff(times)))), 1)
-        rate = np.diff(values[::stride]) / np.diff(times[::stride])
-        found.append(2 * np.pi * float(np.std(values) / max(np.sqrt(np.mean(rate**2)), 1e-12)))
+        apart, variance = np.diff(times[::stride]), noises.get(name, 0.0) ** 2
+        speed = np.mean((np.diff(values[::stride]) ** 2 - 2 * variance) / apart**2)
+        moved = np.var(values) - variance
+        if speed > 0 and moved > 0:
+            found.append(2 * np.pi * float(np.sqrt(moved / speed)))
     return float(np.median(found)) if found else LONGEST
 
 
@@ -127,6 +134,9 @@ def cut(
         signals: that are measured.
         lead: how long before and after a window controls may matter in it, in s.
         late: of signals that are measured late: by how much at most, in s.
+
+    Raises:
+        ValueError: for a window without samples, in one line.
     """
     rows = sum(len(_between(logs[one.recording], _rows(logs[one.recording], signals), one)) for one in windows)
     every = max(int(np.ceil(rows / ROWS)), 1)
@@ -144,6 +154,8 @@ def cut(
             compared = np.zeros(len(times), bool)
             compared[there[::every]] = True
             kept[name][~compared] = np.nan
+        if sum(np.isfinite(kept[name]).sum() for name in signals) < 2:
+            raise ValueError(f"window: expected samples in each of {one.end - one.begin:g} s of {log.name}, got none")
         found.append(_Part(times - times[0], kept, log.name, log.units))
         begins.append(float(one.begin - times[0]))
     return found, begins
@@ -178,7 +190,7 @@ def _liveliest(
     duration: float,
 ) -> Window:
     """The window between two times in which signals vary most, in relation to their noise or to all that they do."""
-    begins = np.linspace(low, max(high - duration, low), max(int(2 * (high - low) / duration), 1))
+    begins = np.linspace(low, max(high - duration, low), int(np.clip(2 * (high - low) / duration, 1, TRIED)))
     scores = np.zeros(len(begins))
     for name in signals:
         times, values = log.samples(name)

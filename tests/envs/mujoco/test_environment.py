@@ -251,6 +251,8 @@ def test_a_policy_is_trained_on_it():
     ("changes", "message"),
     [
         ({"parameters": ["option/timestep"]}, "expected numbers other than the model's time step"),
+        ({"parameters": ["sensor/angle/delay"]}, "policies that keep time, got sensor/angle/delay"),
+        ({"parameters": ["clock/jitter"]}, "policies that keep time, got clock/jitter"),
         ({"limits": {}}, "policy: limits: expected those of motor, whose actuator has no ctrlrange; got none"),
         ({"limits": {"engine": (0, 1), "motor": (0, 1)}}, "policy: limits: expected actuators of the model"),
         ({"limits": {"motor": (1, 0)}}, "policy: limits: motor: expected LOW below HIGH"),
