@@ -67,9 +67,9 @@ class Log:
 class Paced(abc.ABC):
     """How a robot is controlled: its periods, and what is done without an observation. What is commanded is abstract.
 
-    An observation is of no use if there is none that is new ("missing"), it is older than `max_age` ("late"), or has
-    needed numbers that are not finite. Then the set-points are held. After more than `holds` such slots in a row the robot is
-    stopped.
+    An observation is of no use if there is none that is new ("missing"), it is older than `max_age` ("late"), or a
+    number that is needed is not finite. Then the set-points are held. After more than `holds` such slots in a row the
+    robot is stopped.
 
     Attributes:
         rate: of commands, in Hz.
