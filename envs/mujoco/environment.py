@@ -27,7 +27,7 @@ from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.measured import add_sensors
 from jaxlfi.envs.mujoco.mjx_effects import biased, deviations, started
-from jaxlfi.envs.mujoco.mjx_models import with_forces
+from jaxlfi.envs.mujoco.mjx_models import added, mjx, with_forces
 from jaxlfi.envs.mujoco.mjx_physics import Physics, State, stable
 from jaxlfi.envs.mujoco.model_task import box, compile_spec, specification
 from jaxlfi.envs.mujoco.nuisances import Drawn, Nuisances
@@ -50,6 +50,7 @@ class Inner(struct.PyTreeNode):
         memory: of the observations (`jaxlfi.rl.preparation`).
         drawn: for the episode.
         trace: the signals at the end of the last steps of the model, the latest at the end, shape [T, S].
+        lacking: of the forces that the model lacks (`UnmodelledForces.add`).
         numbers: of the model, that depend on its parameters (`Models`).
         theta: in natural units, shape [D].
         refused: whether MuJoCo refuses the model.
@@ -61,6 +62,7 @@ class Inner(struct.PyTreeNode):
     memory: Memory
     drawn: Drawn
     trace: Float[Array, "*batch steps signals"]
+    lacking: Float[Array, "*batch coefficients"]
     numbers: Float[Array, "*batch numbers"]
     theta: Float[Array, "*batch dim"]
     refused: Bool[Array, "*batch"]
@@ -126,7 +128,7 @@ class MujocoEnvironment:
         self.preparation = self.reading.preparation
         build, nominal = functools.partial(built, spec, self._does), np.asarray(self.nominal)
         self.models = with_forces(build, forces, self.space.names, nominal, self.feasible)
-        self._lacking = np.zeros(0) if forces is None else forces.deviations
+        self._forces = forces
         self._physics = Physics(self.models, compiled, self.reading.places)
         self._check(compiled, goal)
 
@@ -150,9 +152,9 @@ class MujocoEnvironment:
             self._drawn, jax.random.split(key_start, max(len(self._drawn), 1)), strict=False
         ):
             start = start.at[place].set(jax.random.uniform(one, minval=low, maxval=high))
-        numbers, refused = self.models.numbers(jnp.append(theta, self._forces(key_start)))
-        state = self._physics.state(start)
-        model = self.models.model(numbers)
+        lacking = self._lacking(key_start)
+        numbers, refused = self.models.numbers(jnp.append(theta, jnp.zeros_like(lacking)))
+        state, model = self._physics.state(start), self._model(numbers, lacking)
         values = self._physics.values(model, self._physics.data(state, jnp.asarray(self._rest)))
         drawn = self._nuisances.draw(
             _folded(key_start, OF_NUISANCES), self._deviations(theta)[: len(self._goal.observed)]
@@ -165,7 +167,7 @@ class MujocoEnvironment:
         memory, seen = self.preparation.observed(self.preparation.start(measured, jnp), measured, jnp)
         controls = jnp.tile(memory.controls[0], (self._before, 1))
         trace = jnp.tile(values, (self._kept, 1))
-        inner = Inner(state, controls, memory, drawn, trace, numbers, theta, refused, key)
+        inner = Inner(state, controls, memory, drawn, trace, lacking, numbers, theta, refused, key)
         no, reward = jnp.asarray(False), jnp.asarray(0.0, jnp.float32)  # not of a weak type
         return EnvState(inner, seen, reward, no, no, self._facts(values, drawn.commands, no))
 
@@ -175,7 +177,7 @@ class MujocoEnvironment:
         key, key_noise = jax.random.split(before.key)
         memory, control = self.preparation.commanded(before.memory, action, jnp)
         controls = jnp.concatenate([before.controls[1:], control[None]])
-        model = self.models.model(before.numbers)
+        model = self._model(before.numbers, before.lacking)
 
         def substep(state, index):
             after, values, _ = self._physics.step(model, state, self._control(controls, before, index))
@@ -220,12 +222,17 @@ class MujocoEnvironment:
         since = (index * self._timestep - inferred - inner.drawn.action_delay) / self._goal.interval
         return controls[jnp.clip(self._before - 1 + jnp.floor(since + 1e-5).astype(int), 0, self._before - 1)]
 
-    def _forces(self, key: jax.Array) -> Float[Array, " numbers"]:
+    def _lacking(self, key: jax.Array) -> Float[Array, " coefficients"]:
         """Coefficients of the forces that the model lacks, of an episode whose first state is drawn with this key."""
-        if not len(self._lacking):
+        if self._forces is None:
             return jnp.zeros(0)
-        deviations = jnp.asarray(self._lacking, jnp.float32)
+        deviations = jnp.asarray(self._forces.deviations, jnp.float32)
         return deviations * jax.random.normal(_folded(key, OF_FORCES), deviations.shape)
+
+    def _model(self, numbers: Float[Array, " numbers"], lacking: Float[Array, " coefficients"]) -> mjx.Model:
+        """The model of an episode."""
+        model = self.models.model(numbers)
+        return model if self._forces is None else added(model, self._forces, lacking)
 
     def _deviations(self, theta: Float[Array, " dim"]) -> Float[Array, " signals"]:
         """Standard deviations of the signals' noise."""

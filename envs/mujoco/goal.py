@@ -33,8 +33,8 @@ speed = [-1.0, 2.0]
 fallen = { when = "body/torso/pos[2] < 0.2", cost = 10.0 }      # - once, whatever the interval
 away = "abs(arm angle) > 2.5"       # at no cost
 
-Costs alone make it worth while to end an episode early, unless the end costs more than the rest of the episode, or what
-is `within` and `alive` makes up for them.
+Where there are only costs, ending an episode early pays, unless the end costs more than the rest of the episode would;
+`within` and `alive` reward what goes on.
 
 Positions of hinges without a range are angles: a policy sees their cosine and sine, and a difference d from a target
 costs 2 (1 - cos d), which is d squared while it is small. Conditions compare them as numbers, turns and all.
@@ -69,6 +69,7 @@ from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import termination
 from jaxlfi.envs.mujoco.parameters import near
 from jaxlfi.envs.mujoco.termination import Termination
+from jaxlfi.rl.preparation import MOST_BEFORE
 
 NEEDED = ("interval", "duration", "observed")
 BOUNDS = ("limits", "initial", "commands")
@@ -92,8 +93,6 @@ KEYS = (
     *DELAYS,
     MODEL_ERROR,
 )
-MOST_BEFORE = 100
-"""Control intervals that a policy looks back, at most."""
 RESERVED = ("return", "value", "steps", "theta", "length", "episodes", "seconds", "failed")
 """What is recorded of episodes under these names is something else than that one ended so."""
 Reward = Callable[[Mapping[str, Array], Mapping[str, Array]], Array]
@@ -170,7 +169,7 @@ class Goal:
     bias: float = 0.0
 
     def __post_init__(self):
-        object.__setattr__(self, "targets", {name: Target(*one) for name, one in self.targets.items()})
+        object.__setattr__(self, "targets", self.aims)
         if not self.observed or len(set(self.observed)) < len(self.observed):
             raise ValueError(f"observed: expected at least one signal, each once, got {list(self.observed)}")
         if not 0 < self.interval <= self.duration < math.inf:
@@ -192,6 +191,9 @@ class Goal:
         ).items():
             if not 0 <= deviation < math.inf:
                 raise ValueError(f"{what}: expected a standard deviation of at least 0, got {deviation:g}")
+        for name, scale in self.scales.items():
+            if not 0 < scale < math.inf:
+                raise ValueError(f"scales: {name}: expected more than 0, got {scale:g}")
         for what in DELAYS:
             low, high = getattr(self, what)
             if not 0 <= low <= high <= self.duration:
@@ -201,7 +203,7 @@ class Goal:
                 raise ValueError(f"terminations: expected a name that has no other meaning, got {name!r}")
 
     def _check_rewards(self) -> None:
-        weights = {f"targets: {name}": one.weight for name, one in self.targets.items()}
+        weights = {f"targets: {name}": one.weight for name, one in self.aims.items()}
         weights |= {f"costs: {name}": cost for name, cost in self.costs.items()}
         weights |= {f"change_costs: {name}": cost for name, cost in self.change_costs.items()}
         for name, number in weights.items():
@@ -212,7 +214,7 @@ class Goal:
         for name, (low, high) in self.commands.items():
             if not -math.inf < low < high < math.inf:
                 raise ValueError(f"commands: {name}: expected LOW below HIGH, got {[low, high]}")
-        for name, one in self.targets.items():
+        for name, one in self.aims.items():
             if isinstance(one.value, str) and one.value not in self.commands:
                 known = near(one.value, [*self.commands])
                 raise ValueError(f"targets: {name}: expected a command {known}, got {one.value!r}")
@@ -220,9 +222,14 @@ class Goal:
                 raise ValueError(f"targets: {name}: expected a finite value, got {one.value:g}")
             if one.within is not None and not 0 < one.within < math.inf:
                 raise ValueError(f"targets: {name}: within: expected more than 0, got {one.within:g}")
-        followed = [one.value for one in self.targets.values()]
+        followed = [one.value for one in self.aims.values()]
         if self.reward is None and (idle := [name for name in self.commands if name not in followed]):
             raise ValueError(f"commands: expected each to be a target of a signal, got no target of {', '.join(idle)}")
+
+    @property
+    def aims(self) -> dict[str, Target]:
+        """The targets, in full."""
+        return {name: Target(*one) for name, one in self.targets.items()}
 
     @property
     def steps(self) -> int:

@@ -9,7 +9,6 @@ more implementation of MuJoCo's compiler: inverse weights alone are rational fun
 """
 
 import contextlib
-import copy
 import dataclasses
 import functools
 import io
@@ -48,8 +47,6 @@ LEAST_FRICTION = 1e-9
 """N, or N m: in place of none."""
 MOST = 4.0
 """Standard deviations within which the forces that a model lacks are probed."""
-KEPT = 256
-"""Compiled models that such forces are added to."""
 PROBES = 4
 """Models at random parameters that are compared besides."""
 
@@ -201,18 +198,30 @@ def with_forces(
     """
     if forces is None:
         return Models(build, names, nominal, feasible)
-    least, most, dim = LEAST_FRICTION * (forces.friction > 0), MOST * forces.deviations, len(names)
-    known = functools.lru_cache(KEPT)(lambda theta: build(np.frombuffer(theta, float)))
+    least, most, dim = _least_friction(forces), MOST * forces.deviations, len(names)
 
     def lacking(numbers: np.ndarray) -> mujoco.MjModel:
-        numbers = np.asarray(numbers, float)
-        model = forces.add(copy.copy(known(numbers[:dim].tobytes())), numbers[dim:])
+        model = forces.add(build(numbers[:dim]), numbers[dim:])
         # MJX lays out its solver for the degrees of freedom that have friction: here always the same ones.
         model.dof_frictionloss[:] = np.maximum(model.dof_frictionloss, least)
         return model
 
     box = Support(np.append(feasible.low, -most), np.append(feasible.high, most))
     return Models(lacking, (*names, *forces.names), np.append(nominal, 0.0 * most), box)
+
+
+def added(model: mjx.Model, forces: UnmodelledForces, numbers: Float[Array, " numbers"]) -> mjx.Model:
+    """A model of `with_forces` made without them, with these: MuJoCo derives nothing of them (`forces.add`)."""
+    stiffness, damping, friction = jnp.split(numbers, np.cumsum([len(forces.stiffness), len(forces.damping)]))
+    return model.replace(
+        jnt_stiffness=model.jnt_stiffness + stiffness,
+        dof_damping=jnp.maximum(model.dof_damping + damping, 0.0),
+        dof_frictionloss=jnp.maximum(model.dof_frictionloss + friction, _least_friction(forces)),
+    )
+
+
+def _least_friction(forces: UnmodelledForces) -> Float[np.ndarray, " dofs"]:
+    return LEAST_FRICTION * (forces.friction > 0)
 
 
 def _probes(names: Sequence[str], nominal: np.ndarray, feasible: Support) -> list[tuple[np.ndarray, str]]:

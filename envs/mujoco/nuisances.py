@@ -54,12 +54,12 @@ class Nuisances:
             action_delay=uniform(keys[1], *self._goal.action_delay),
             observation_delay=uniform(keys[2], *self._goal.observation_delay),
             offsets=self._goal.bias * noise * jax.random.normal(keys[3], noise.shape),
-            errors=self._deviations * jax.random.normal(keys[4], noise.shape),
+            errors=jax.random.normal(keys[4], noise.shape) * self._deviations,
         )
 
     def later(self, key: jax.Array, drawn: Drawn) -> Drawn:
         """The same a control interval later: errors are Ornstein-Uhlenbeck processes, here exactly so."""
         if not self._deviations.any():
             return drawn
-        fresh = self._deviations * jax.random.normal(key, drawn.errors.shape)
-        return drawn.replace(errors=self._keep * drawn.errors + np.sqrt(1 - self._keep**2) * fresh)
+        fresh = jax.random.normal(key, drawn.errors.shape) * self._deviations
+        return drawn.replace(errors=drawn.errors * self._keep + fresh * np.sqrt(1 - self._keep**2))

@@ -102,8 +102,8 @@ class Reading:
                 controls.append(Control(name, low, high, _control_unit(model, i), rate, displacing, begins))
             except ValueError as error:
                 raise ValueError(f"policy: {'displacing' if rate is None else 'rates'}: {error}") from error
-        units = {one.value: measured.unit(model, name) for name, one in goal.targets.items()}
-        commands = tuple(Command(name, *bounds, units.get(name, "")) for name, bounds in goal.commands.items())
+        of_targets = {one.value: measured.unit(model, name) for name, one in goal.aims.items()}
+        commands = tuple(Command(name, *bounds, of_targets.get(name, "")) for name, bounds in goal.commands.items())
         return Preparation(
             signals=signals,
             controls=tuple(controls),
@@ -171,7 +171,7 @@ class Reading:
         """Reward a second by targets and costs of controls."""
         goal, reward = self.goal, 0.0
         for name, off in self.off(values, commands, xp).items():
-            target, turning = goal.targets[name], self._turning[goal.signals.index(name)]
+            target, turning = goal.aims[name], self._turning[goal.signals.index(name)]
             squared = 2 * (1 - xp.cos(off)) if turning else off**2
             reward += target.weight * (-squared if target.within is None else xp.exp(-squared / target.within**2))
         for i, name in enumerate(self._actuators):
@@ -188,7 +188,7 @@ class Reading:
     ) -> dict[str, Any]:
         """Distances of signals from their targets; for angles, the shorter way round."""
         found, known = {}, [*self.goal.commands]
-        for name, target in self.goal.targets.items():
+        for name, target in self.goal.aims.items():
             place = self.goal.signals.index(name)
             aim = commands[known.index(target.value)] if isinstance(target.value, str) else target.value
             difference = values[place] - aim
@@ -252,8 +252,10 @@ def _limits(model: mujoco.MjModel, i: int, name: str, goal: Goal) -> tuple[float
         low, high = model.actuator_ctrlrange[i]
     else:
         raise ValueError(f"policy: limits: expected those of {name}, whose actuator has no ctrlrange; got none")
-    if not low < high:
-        raise ValueError(f"policy: limits: {name}: expected LOW below HIGH, got {[float(low), float(high)]}")
+    if not -np.inf < low < high < np.inf:
+        raise ValueError(
+            f"policy: limits: {name}: expected LOW below HIGH, both finite, got {[float(low), float(high)]}"
+        )
     least, most = model.actuator_ctrlrange[i]
     clamps = model.actuator_ctrllimited[i] and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
     if clamps and (low < least or high > most):

@@ -26,8 +26,13 @@ COLUMNS = ("names", "units", "centre", "scale")
 class Named(Protocol):
     """Signals by their names and units."""
 
-    names: Sequence[str]
-    units: Sequence[str]
+    @property
+    def names(self) -> Sequence[str]:
+        """One a number."""
+
+    @property
+    def units(self) -> Sequence[str]:
+        """One a number."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,15 +14,18 @@ that was before is taken to have been as it is then.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
 
 KEY = "preparation"
 """Where it lies in a policy's schema."""
+MOST_BEFORE = 100
+"""Control intervals that a policy looks back, at most."""
 
 
 class Memory(NamedTuple):
@@ -45,11 +48,17 @@ class Signal:
         name: of the signal.
         unit: that it is measured in; "" where there is none, or it is not known.
         turning: whether it is an angle that is seen as cosine and sine, and not as a number.
+
+    Raises:
+        ValueError: for values of other types.
     """
 
     name: str
     unit: str = ""
     turning: bool = False
+
+    def __post_init__(self):
+        _check_types(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +76,7 @@ class Control:
             limit nearest to it.
 
     Raises:
-        ValueError: for limits and rates that are none, and actions that displace without a rate.
+        ValueError: for limits and rates that are none, and actions that displace without a rate, in one line.
     """
 
     name: str
@@ -79,8 +88,8 @@ class Control:
     begins: int | None = None
 
     def __post_init__(self):
-        if not -math.inf < self.low < self.high < math.inf:
-            raise ValueError(f"{self.name}: expected finite limits, LOW below HIGH, got {[self.low, self.high]}")
+        _check_types(self)
+        _check_limits(self)
         if self.rate is not None and not 0 < self.rate < math.inf:
             raise ValueError(f"{self.name}: expected a rate of more than 0 per second, got {self.rate:g}")
         if self.displacing and self.rate is None:
@@ -96,12 +105,19 @@ class Command:
         low: least value that was trained with.
         high: largest value.
         unit: of both.
+
+    Raises:
+        ValueError: for limits that are none.
     """
 
     name: str
     low: float
     high: float
     unit: str = ""
+
+    def __post_init__(self):
+        _check_types(self)
+        _check_limits(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,9 +161,9 @@ class Preparation:
     action_delay: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self):
-        for name, least in (("history", 1), ("actions", 0), ("steps", 1)):
-            if not isinstance(number := getattr(self, name), int) or number < least:
-                raise ValueError(f"{name}: expected a whole number of at least {least}, got {number!r}")
+        for name, least, most in (("history", 1, MOST_BEFORE), ("actions", 0, MOST_BEFORE), ("steps", 1, math.inf)):
+            if type(number := getattr(self, name)) is not int or not least <= number <= most:
+                raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {number!r}")
         if not 0 < self.interval < math.inf:
             raise ValueError(f"interval: expected more than 0 s, got {self.interval:g}")
         for what in ("signals", "controls", "commands"):
@@ -214,23 +230,33 @@ class Preparation:
             xp: NumPy, or `jax.numpy`.
         """
         last, (low, high, most) = memory.controls[0], self._limits
-        wanted = xp.where(np.array([one.displacing for one in self.controls]), last + action, action)
+        wanted = xp.where(self._displacing, last + action, action)
         control = xp.clip(xp.clip(wanted, last - most, last + most), low, high)
         return memory._replace(controls=xp.concatenate([control[None], memory.controls[:-1]])), control
 
-    @property
+    @functools.cached_property
     def _limits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Least and largest controls, and their largest change in an interval."""
         rates = [math.inf if one.rate is None else one.rate for one in self.controls]
         low, high = ([getattr(one, what) for one in self.controls] for what in ("low", "high"))
         return np.array(low), np.array(high), self.interval * np.array(rates)
 
+    @functools.cached_property
+    def _displacing(self) -> np.ndarray:
+        return np.array([one.displacing for one in self.controls])
+
+    @functools.cached_property
+    def _parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The signal of each number of a frame, and whether the number is its cosine, or its sine."""
+        parts = [(k, which) for k, one in enumerate(self.signals) for which in (("cos", "sin") if one.turning else "=")]
+        whiches = np.array([which for _, which in parts])
+        return np.array([k for k, _ in parts]), whiches == "cos", whiches == "sin"
+
     def _frame(self, values: Float[Any, " values"], xp: Any) -> Float[Any, " frame"]:
         """What is seen of signals at a time."""
-        parts = []
-        for place, one in enumerate(self.signals):
-            parts += [xp.cos(values[place]), xp.sin(values[place])] if one.turning else [xp.asarray(values[place])]
-        return xp.stack(parts)
+        places, cosine, sine = self._parts
+        numbers = xp.asarray(values)[places]
+        return xp.where(cosine, xp.cos(numbers), xp.where(sine, xp.sin(numbers), numbers))
 
 
 def of_schema(schema: Mapping[str, Any]) -> Preparation | None:
@@ -253,6 +279,20 @@ def of_schema(schema: Mapping[str, Any]) -> Preparation | None:
         if own != (got := tuple(schema[what]["names"])):
             raise ValueError(f"policy: expected a preparation of its {what} {list(got)}, got one of {list(own)}")
     return preparation
+
+
+def _check_types(one: Any) -> None:
+    """Refuse values of other types than a dataclass declares; whole numbers will do for others."""
+    for field in dataclasses.fields(one):
+        value, kinds = getattr(one, field.name), get_args(field.type) or (field.type,)
+        kinds = (*kinds, int) if float in kinds else kinds
+        if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+            raise ValueError(f"{field.name}: expected {kinds[0].__name__}, got {value!r}")
+
+
+def _check_limits(one: Control | Command) -> None:
+    if not -math.inf < one.low < one.high < math.inf:
+        raise ValueError(f"{one.name}: expected finite limits, LOW below HIGH, got {[one.low, one.high]}")
 
 
 def _seen(signal: Signal) -> list[str]:

@@ -74,6 +74,7 @@ FRAGMENTS = {
     "from mpi4py": "needs MPI",
     "from any_robot": "serves until it is ended: tests/robots",
     "from robot_driver": "serves until it is ended: tests/robots",
+    "preparation.of_schema": "needs a trained policy: tests/rl/test_prepared_policy.py",
     'policy.load("runs/': "needs a trained policy: tests/rl/test_policy.py",
     "gymnasium.make": "needs a table of policies, and compiles: tests/rl/test_gym.py",
     "WhipVector": "minutes of compiling: tests/envs/whip/test_gym.py",

@@ -99,6 +99,10 @@ def test_a_schema_says_it_again():
     ("changes", "message"),
     [
         ({"preparation": {"steps": 3}}, "expected a preparation in its schema, got one that is not whole"),
+        (
+            {"preparation": dataclasses.asdict(ARM) | {"history": 2**70}},
+            "history: expected a whole number from 1 to 100",
+        ),
         ({"preparation": 3}, "expected a preparation in its schema, got one that is not whole"),
         ({"preparation": dataclasses.asdict(ARM) | {"signals": [{"title": "x"}]}}, "not whole"),
         ({"observations": {"names": ["angle"]}}, r"expected a preparation of its observations \['angle'\]"),
@@ -113,12 +117,17 @@ def test_a_schema_that_does_not_fit_is_refused(changes, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: Signal("angle", turning=1), "turning: expected bool, got 1"),
+        (lambda: Signal(None), "name: expected str, got None"),
+        (lambda: Control("motor", "0", 1.0), "low: expected float, got '0'"),
+        (lambda: Control("motor", 0.0, 1.0, begins=True), "begins: expected int, got True"),
+        (lambda: Command("speed", 0.0, math.nan), "speed: expected finite limits, LOW below HIGH"),
         (lambda: Control("motor", 1.0, 1.0), "motor: expected finite limits, LOW below HIGH"),
         (lambda: Control("motor", 0.0, math.inf), "motor: expected finite limits"),
         (lambda: Control("motor", 0.0, 1.0, rate=0.0), "motor: expected a rate of more than 0 per second, got 0"),
         (lambda: Control("motor", 0.0, 1.0, displacing=True), "motor: expected a rate, by which actions displace"),
-        (lambda: dataclasses.replace(ARM, history=0), "history: expected a whole number of at least 1, got 0"),
-        (lambda: dataclasses.replace(ARM, actions=1.5), "actions: expected a whole number of at least 0, got 1.5"),
+        (lambda: dataclasses.replace(ARM, history=0), "history: expected a whole number from 1 to 100, got 0"),
+        (lambda: dataclasses.replace(ARM, actions=1.5), "actions: expected a whole number from 0 to 100, got 1.5"),
         (lambda: dataclasses.replace(ARM, interval=0.0), "interval: expected more than 0 s"),
         (lambda: dataclasses.replace(ARM, signals=()), "signals: expected at least one"),
         (lambda: dataclasses.replace(ARM, signals=ARM.signals[:1]), "servo: expected to begin at one of 1 signals"),

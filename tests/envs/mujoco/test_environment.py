@@ -319,14 +319,15 @@ def test_a_file_without_a_policy_is_refused(tmp_path):
         environment(file)
 
 
-def test_the_example_has_the_parameters_of_its_task():
+@pytest.mark.parametrize("name", ["furuta", "arm"])
+def test_the_example_has_the_parameters_of_its_task(name):
     from jaxlfi.envs.mujoco import task
 
-    file = config.Path(__file__).parents[3] / "examples/mujoco/furuta.toml"
+    file = config.Path(__file__).parents[3] / f"examples/mujoco/{name}.toml"
     env, inferred = environment(file), task(file)
     assert env.space == inferred.space and env.units == tuple(inferred.units) and env.name == inferred.name
-    for name in ("initial", "feasible"):
-        chex.assert_trees_all_equal(env.supports[name], inferred.supports[name])
+    for support in ("initial", "feasible"):
+        chex.assert_trees_all_equal(env.supports[support], inferred.supports[support])
 
 
 def test_the_error_of_the_model_is_what_inference_says(tmp_path):
@@ -342,8 +343,8 @@ def test_the_error_of_the_model_is_what_inference_says(tmp_path):
     file = tmp_path / "furuta.toml"
     file.write_text(text.replace("[policy]", "[policy]\nmodel_error = true\nnoises = { 'joint/arm/qvel' = 0.2 }", 1))
     env, learnt = environment(file), simulator_of(task(file))
-    np.testing.assert_array_equal(env._lacking, learnt.forces.deviations)
-    assert (env._lacking[[0, 2, 4]] > 0).all() and learnt.signals == ("arm angle", "pendulum angle")
+    np.testing.assert_array_equal(env._forces.deviations, learnt.forces.deviations)
+    assert (env._forces.deviations[[0, 2, 4]] > 0).all() and learnt.signals == ("arm angle", "pendulum angle")
     assert env._noise.tolist() == [0.002, learnt.noise[1], 0.2, 0.0] and 1e-4 < learnt.noise[1] < 0.01
     kept = np.exp(-0.1 / np.array([0.78, 0.14]))
     np.testing.assert_allclose(env._nuisances._keep[:2], kept, rtol=1e-6)

@@ -115,6 +115,7 @@ def test_what_is_no_condition_is_refused(text):
         ("[0.0, 0.02]", '"late"', "policy: observation_delay: expected a number, got 'late'"),
         ("{ speed = 0.1 }", "{ place = nan }", "policy: noises: place: expected a standard deviation of at least 0"),
         ("{ speed = 0.1 }", "{ sped = 0.1 }", "policy: noises: expected signals that are observed, got sped"),
+        ("turns =", "scales = { speed = 0 }\nturns =", "policy: scales: speed: expected more than 0, got 0"),
         ("bias = 2", "bias = -2", "policy: bias: expected a standard deviation of at least 0, got -2"),
         ("alive = 0.5", "live = 0.5", "policy: expected keys among interval"),
     ],

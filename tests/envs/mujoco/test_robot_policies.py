@@ -10,12 +10,15 @@ pytest.importorskip("brax")
 import jax
 import jax.numpy as jnp
 
+from jaxlfi.distributions.support import Support
 from jaxlfi.envs.mujoco.discrepancy import Discrepancy
+from jaxlfi.envs.mujoco.effects import Effects, built
 from jaxlfi.envs.mujoco.environment import MujocoEnvironment
 from jaxlfi.envs.mujoco.forces import UnmodelledForces
 from jaxlfi.envs.mujoco.goal import Goal, Target
+from jaxlfi.envs.mujoco.mjx_models import added, with_forces
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
-from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.envs.mujoco.parameters import Parameter, edit
 from jaxlfi.envs.mujoco.reading import Reading, add_signals
 from jaxlfi.envs.mujoco.termination import parsed
 from jaxlfi.rl.preparation import Command, Control, Signal
@@ -66,18 +69,14 @@ GOAL = Goal(
     action_delay=(0.02, 0.07),
     observation_delay=(0.0, 0.03),
 )
-FORCES = UnmodelledForces(np.array([3.0, 0.0]), np.array([0.4, 0.02]), np.array([0.5, 0.0]))
+FORCES = UnmodelledForces(np.array([3.0, 0.0]), np.array([0.4, 0.02]), np.zeros(2))
+"""Without friction, which MJX would compile its solver for."""
 
 
 @pytest.fixture(scope="module")
 def carriage():
     errors = {"joint/winch/qvel": Discrepancy(0.3, 0.1)}
     return MujocoEnvironment(CARRIAGE, [DAMPING], GOAL, forces=FORCES, discrepancies=errors)
-
-
-def keys():
-    """Of 300 episodes, anew, as keys are used once."""
-    return jax.random.split(jax.random.key(2), 300)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +87,7 @@ def stepped(carriage):
 @pytest.fixture(scope="module")
 def begun(carriage):
     """Starts of 300 episodes."""
-    return jax.jit(jax.vmap(carriage.reset))(keys(), jnp.full((300, 1), 0.8))
+    return jax.jit(jax.vmap(carriage.reset))(jax.random.split(jax.random.key(2), 300), jnp.full((300, 1), 0.8))
 
 
 def lacking(model, coefficients):
@@ -99,13 +98,26 @@ def lacking(model, coefficients):
         model.dof_frictionloss[joint] = max(model.dof_frictionloss[joint] + coefficients[4 + joint], 0.0)
 
 
+@pytest.mark.parametrize("coefficients", [[3.0, -0.1, 0.2, -9.0, 0.7, 0.0], [0.0, 0.0, -0.1, 0.3, -2.0, 0.0]])
+def test_forces_that_a_model_lacks_are_in_its_numbers(coefficients):
+    forces = UnmodelledForces(np.ones(2), np.ones(2), np.array([1.0, 0.0]))
+    spec, low, high = specification(CARRIAGE), np.array([0.1], np.float32), np.array([2.0], np.float32)
+    build = lambda theta: built(spec, Effects(((edit(spec, spec.compile(), DAMPING.name), 0),)), theta)
+    models = with_forces(build, forces, [DAMPING.name], np.array([0.5]), Support(low, high))
+    numbers, _ = models.numbers(jnp.array([0.8, *[0.0] * 6]))
+    got, expected = added(models.model(numbers), forces, jnp.array(coefficients)), build(np.array([0.8]))
+    lacking(expected, coefficients)
+    for field in ("jnt_stiffness", "dof_damping", "dof_frictionloss"):
+        np.testing.assert_allclose(getattr(got, field), getattr(expected, field), rtol=1e-6, atol=1e-8, err_msg=field)
+
+
 @pytest.mark.parametrize("episode", [0, 1])
 def test_episodes_are_those_of_commanded_controls(episode, carriage, stepped, begun):
     """The servo's target begins where the carriage is, and moves by the actions, 0.1 at most; turns are counted."""
     state = jax.tree.map(lambda leaf: leaf[episode], begun)
     drawn, model = state.inner.drawn, mujoco.MjModel.from_xml_string(CARRIAGE)
     model.dof_damping[0] = 0.8
-    lacking(model, np.asarray(carriage._forces(jax.random.split(keys()[episode], 3)[0]), float))
+    lacking(model, np.asarray(state.inner.lacking, float))
     data = mujoco.MjData(model)
     data.qpos[0] = target = float(state.inner.state.qpos[0])
     speed, pull, waits = float(state.observation[-1]), 0.0, float(drawn.action_delay)
@@ -136,9 +148,11 @@ def test_episodes_are_those_of_commanded_controls(episode, carriage, stepped, be
     assert state.facts["joint/rail/qvel off"] == pytest.approx(abs(data.qvel[0] - speed), rel=1e-2)
 
 
-def test_commands_are_drawn_anew_for_each_episode(begun):
+def test_commands_and_forces_are_drawn_anew_for_each_episode(begun):
     speeds = np.sort(np.asarray(begun.observation[:, -1]))
     assert np.abs(speeds - np.linspace(-0.5, 2.0, 300)).max() < 0.25
+    lacking = np.asarray(begun.inner.lacking)
+    np.testing.assert_allclose(lacking.std(axis=0), FORCES.deviations, rtol=0.15)
     assert abs(np.corrcoef(begun.observation[:, 0], begun.observation[:, -1])[0, 1]) < 0.15
 
 
@@ -165,6 +179,29 @@ def reading(**changes):
     return Reading(compile_spec(spec), goal)
 
 
+def test_rewards_of_ones_own_are_in_place_of_targets_and_costs():
+    """What is there for being alive, and the costs of ends, are besides; commands are among the signals."""
+    own = lambda signals, controls: 2.0 * signals["command speed"] + controls["pull"] - signals["place"]
+    values, control, last = np.array([0.05, 22.0, 3.0, 1.0, 22.0]), np.array([0.4, 0.7]), np.zeros(2)
+    ours = reading(reward=own, targets={})
+    assert ours.goal.signals == ("place", "joint/winch/qpos", "joint/winch/qvel", "turn")
+    ended = {"wound": True, "back": True}
+    assert ours.ended(values[[0, 1, 2, 4]]) == ended
+    assert ours.reward(values[[0, 1, 2, 4]], control, last, np.array([1.5]), np) == pytest.approx(3.65 - 4.0)
+    values[[0, 4]] = 0.3, 2.0
+    assert ours.reward(values[[0, 1, 2, 4]], control, last, np.array([1.5]), np) == pytest.approx(3.4 + 0.05 * 1.5)
+
+
+def test_rewards_near_an_angle_go_the_shorter_way_round():
+    ours = reading(
+        turns=(), targets={"joint/winch/qpos": Target(3.0, 2.0, 0.5)}, costs={}, change_costs={}, commands={}
+    )
+    values = np.array([0.3, -3.0, 0.0, -3.0])
+    expected = 0.05 * (2.0 * np.exp(-2 * (1 - np.cos(6.0)) / 0.25) + 1.5)
+    assert ours.reward(values, np.zeros(2), np.zeros(2), (), np) == pytest.approx(expected)
+    assert ours.off(values, (), np)["joint/winch/qpos"] == pytest.approx(2 * np.pi - 6.0)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -172,6 +209,10 @@ def reading(**changes):
         ({"turns": ("turn",)}, "turns: expected positions of hinges without a range (joint/winch/qpos), got turn"),
         ({"rates": {"motor": 1.0}}, "rates: expected actuators of the model (servo, pull), got motor"),
         ({"displacing": ("motor",)}, "displacing: expected actuators of the model (servo, pull), got motor"),
+        (
+            {"limits": {"servo": (-np.inf, 1.0), "pull": (0.0, 1.0)}},
+            "limits: servo: expected LOW below HIGH, both finite",
+        ),
         ({"displacing": ("pull",)}, "displacing: pull: expected a rate"),
         ({"rates": {"servo": -1.0}}, "rates: servo: expected a rate of more than 0 per second, got -1"),
         ({"observed": ("turn",), "turns": (), "scales": {}}, "rates: servo: expected the position of the joint 'rail'"),
