@@ -7,6 +7,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from jaxlfi.cli.command import Command
 from jaxlfi.cli.exit_status import refuse
 from jaxlfi.registry import LOOPS
 
@@ -26,19 +27,28 @@ class Loops:
         """The command line of the whip's, which tells of others."""
         return LOOPS.find(WHIP).parser()
 
+    def chosen(self, words: Sequence[str]) -> tuple[Command, list[str]]:
+        """The loop that words are for, and its words.
+
+        Raises:
+            ValueError: for a task that has none.
+        """
+        words = list(words)
+        named = bool(words) and not words[0].startswith("-")
+        loop = LOOPS.find(words[0].partition(",")[0] if named else WHIP)
+        return loop, words if named and "," in words[0] else words[named:]
+
     def __call__(self, words: Sequence[str] | None = None) -> int:
         """Go round a loop.
 
         Returns:
             0; 2 for bad input; 130 where it was interrupted.
         """
-        words = sys.argv[1:] if words is None else list(words)
-        named = bool(words) and not words[0].startswith("-")
         try:
-            loop = LOOPS.find(words[0].partition(",")[0] if named else WHIP)
+            loop, own = self.chosen(sys.argv[1:] if words is None else words)
         except ValueError as error:
             return refuse("jaxlfi r2s2r", error)
-        return loop(words if named and "," in words[0] else words[named:])
+        return loop(own)
 
 
 main = Loops()

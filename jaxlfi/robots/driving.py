@@ -120,6 +120,12 @@ class Drive(Paced):
         return len(self.signals)
 
     @property
+    def needed(self) -> list[int]:
+        """Places of what the policy sees, and of what has bounds; what is only recorded may be missing."""
+        seen = len(self.preparation.signals)
+        return [place for place, name in enumerate(self.signals) if place < seen or name in self.bounds]
+
+    @property
     def count(self) -> int:
         """Number of controls."""
         return len(self.preparation.controls)

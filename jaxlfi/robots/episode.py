@@ -67,9 +67,9 @@ class Log:
 class Paced(abc.ABC):
     """How a robot is controlled: its periods, and what is done without an observation. What is commanded is abstract.
 
-    An observation is of no use if there is none that is new ("missing"), it is older than `max_age` ("late"), or has
-    numbers that are not finite. Then the set-points are held. After more than `holds` such slots in a row the robot is
-    stopped.
+    An observation is of no use if there is none that is new ("missing"), it is older than `max_age` ("late"), or a
+    number that is needed is not finite. Then the set-points are held. After more than `holds` such slots in a row the
+    robot is stopped.
 
     Attributes:
         rate: of commands, in Hz.
@@ -104,6 +104,11 @@ class Paced(abc.ABC):
     @abc.abstractmethod
     def measured(self) -> int:
         """Number of the numbers that are measured."""
+
+    @property
+    def needed(self) -> list[int]:
+        """Places of the numbers without which an observation is of no use; by default all."""
+        return list(range(self.measured))
 
     @property
     @abc.abstractmethod
@@ -277,7 +282,7 @@ class _Episode:
             raise ValueError(f"robot: expected observations of {size} numbers, got shape {list(values.shape)}")
         if not observation.age <= (loop.period if loop.max_age is None else loop.max_age):  # NaN is late, too
             return self._unusable("late")
-        if not np.isfinite(values).all():
+        if not np.isfinite(values[loop.needed]).all():
             return self._unusable("non-finite")
         shapes = {name: np.shape(value) for name, value in observation.extras.items()}
         if self.seen and shapes != (first := {name: np.shape(value) for name, value in self.seen[0][2].items()}):

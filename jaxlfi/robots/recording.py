@@ -138,7 +138,7 @@ def timing_line(log: Log) -> str:
     """The same in words."""
     found = timing(log)
     if found["measured_period"] is None:
-        return f"{len(log.targets)} controls"
+        return "one control" if len(log.targets) else "no control"
     late = {name: 1e3 * value for name, value in found["lateness"].items()}
     return (
         f"{len(log.targets)} controls at {1 / log.period:g} Hz: a period of {1e3 * found['measured_period']:.4g} ms "

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from jaxlfi.cli import parser as cli
+from jaxlfi.cli.r2s2r import Loops
 
 ROOT = Path(__file__).parents[2]
 PAGES = {path.name: path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))}
@@ -159,7 +160,8 @@ def test_every_command_is_understood(page):
 def parse(words: list[str]) -> None:
     """By the parser that the command itself uses."""
     if command := cli.foreign_command(words[0]):
-        command.parser().parse_args(words[1:])
+        command, own = command.chosen(words[1:]) if isinstance(command, Loops) else (command, words[1:])
+        command.parser().parse_args(own)
     else:
         cli.parse(words)
 

@@ -332,6 +332,14 @@ def test_a_driver_that_sends_nan_is_held_and_then_stopped(tmp_path):
     assert torques[3] == torques[2] and torques[4] != torques[5] == torques[6] == torques[7] == torques[8]
 
 
+def test_what_is_only_recorded_may_be_missing(tmp_path):
+    lost = lambda plain: dataclasses.replace(plain, values={**plain.values, "battery": math.nan})
+    driver = Wheel(seen=("angle", "joint/wheel/qvel", "battery"), given=dict.fromkeys(range(10, 30), lost))
+    log = run(driver, tmp_path, {"record": ["battery"], "units": {"battery": "V"}})
+    assert log.faults["non-finite"] == 0 and not log.held.any()
+    assert np.isnan(table_of(tmp_path / "log.csv")["battery [V]"][:-1]).sum() == 20
+
+
 def test_a_driver_that_stalls_for_a_tenth_of_a_second_is_stopped_by_the_watchdog(tmp_path):
     def stall(plain):
         driver.simulated_clock.pass_by(0.101)
