@@ -111,6 +111,19 @@ def test_other_methods(problem):
     assert f"| `{problem}` | {found['npe']} | {found['apt']} |" in page("sharpness")
 
 
+def test_the_benchmark_by_the_default_call():
+    with (RESULTS / "sharpness/benchmark/results.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    c2st = lambda setting, simulations: [
+        float(row["c2st"]) for row in rows if (row["setting"], row["simulations"]) == (setting, simulations)
+    ]
+    ten, few, many = c2st("gaussian_linear", "1000"), c2st("gaussian_mixture", "1000"), c2st("gaussian_mixture", "10000")
+    said = " ".join(page("sharpness").split())
+    assert f"C2ST is {min(ten):.2f} to {max(ten):.2f} with 1,000 simulations" in said
+    listed = lambda values: f"{values[0]:.2f}, {values[1]:.2f} and {values[2]:.2f}"
+    assert f"it is {listed(few)} with 1,000 and {listed(many)} with 10,000 on the same three seeds" in said
+
+
 EMBEDDING = RESULTS / "embedding/lotka_volterra/misspecified+edge"
 
 
