@@ -88,7 +88,7 @@ def a_policy():
     return Policy((np.array([[-2.0], [-0.4]], np.float32),), (np.zeros(1, np.float32),), schema)
 
 
-SETTINGS = {
+ROBOT = {
     "limits": {"wheel angle": [-3.0, 3.0]},
     "controls": {"motor": {"limits": [-0.008, 0.008], "rate": 0.5}},
     "velocities": {"joint/wheel/qvel": {"of": "wheel angle", "filter": 0.01}},
@@ -100,7 +100,7 @@ def main():
     """Three seconds on a clock that runs as fast as it can; on a robot, leave the clock out."""
     clock = Simulated()
     driver = Driver(clock)
-    session = sessions.of(a_policy(), of_table(SETTINGS), changes={"clock": clock})
+    session = sessions.of(a_policy(), of_table(ROBOT), changes={"clock": clock})
     with tempfile.TemporaryDirectory() as folder:
         log = session.run(driver, Path(folder) / "log.csv", {}, say=print)
         print((Path(folder) / "log.csv").read_text()[:120])

@@ -82,7 +82,9 @@ def record(driver: Driver, config: Path, path: Path, duration: float | None = No
             left.unlink(missing_ok=True)  # of a recording that was not written to its end
         recording.write(path, kept, log, report, loop.signals)
 
-    loop.run(robot, lambda seen: next(played), on_end=ended)
+    log = loop.run(robot, lambda seen: next(played), on_end=ended)
+    if log.stopped:
+        print(f"the robot was stopped after {len(log.targets)} of {loop.steps} controls: {log.stopped}")
 
 
 def sines(
