@@ -13,7 +13,7 @@ from jaxlfi.envs.mujoco import require_mujoco
 
 EXAMPLES = """\
 examples:
-  jaxlfi mujoco inspect day1.csv --model arm.xml --out arm.toml    what is in a recording, and a task to begin with
+  jaxlfi mujoco inspect day1.csv --model arm.xml --out arm.toml     what is in a recording?
   jaxlfi infer mujoco,config=examples/mujoco/arm.toml --heuristic edge --out runs/arm
   jaxlfi mujoco film runs/arm --out runs/arm.gif                   does the posterior move as the machine did?
   jaxlfi mujoco film runs/arm --draws 30 --slower 4 --out runs/arm-slowly.gif
@@ -183,7 +183,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 main = Command(
     "mujoco",
-    "inspect recordings of a MuJoCo model, film and refine its posterior, serve it as a machine",
+    "inspect recordings of a MuJoCo model, film and refine its posterior",
     _arguments,
     _run,
     description="Say what is in recordings of a machine, film the posterior of its MuJoCo model, find least-squares "

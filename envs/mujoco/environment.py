@@ -87,7 +87,7 @@ class MujocoEnvironment:
         noises: Mapping[str, float] | None = None,
         initial: Mapping[str, float | Sequence[float]] | None = None,
         name: str | None = None,
-        begins: str | None = None,
+        begins: str | Sequence[str] | None = None,
         forces: UnmodelledForces | None = None,
         discrepancies: Mapping[str, Discrepancy] | None = None,
     ):
@@ -141,8 +141,7 @@ class MujocoEnvironment:
         self._forces = forces
         self._physics = Physics(self.models, compiled, self.reading.places)
 
-        first = {key: np.ravel(number)[:1].tolist() for key, number in (initial or {}).items()}
-        self._start = starts.state_of(compiled, begins, *starts.given(compiled, first, 1))
+        self._start = starts.first(compiled, begins, initial or {})
         self._drawn = [(state_place(compiled, key, f"initial/{key}"), bounds) for key, bounds in goal.initial.items()]
         self._goal, self._ends = goal, tuple(goal.terminations)
         self._timestep = compiled.opt.timestep
@@ -301,7 +300,7 @@ def environment(config: Path) -> MujocoEnvironment:
             {name: value for name, value in noises.items() if name in goal.signals},
             numbers,
             table.get("name", config.stem),
-            begins[0] if isinstance(begins, list) else begins,
+            begins,
             **known,
         )
         if "robot" in table:

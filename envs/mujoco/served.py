@@ -25,7 +25,8 @@ import numpy as np
 
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
-from jaxlfi.envs.mujoco.effects import STATE, built, effects, initial_state, state_place
+from jaxlfi.envs.mujoco import starts
+from jaxlfi.envs.mujoco.effects import STATE, built, effects, state_place
 from jaxlfi.envs.mujoco.measured import add_sensors, places
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
 from jaxlfi.envs.mujoco.quiet import quietly
@@ -71,8 +72,9 @@ class Machine:
         return Machine(config, {name: float(value) for name, value in own.items() if value is not None}, **others)
 
     def __post_init__(self):
-        if unknown := [name for name in self.truth if name not in self.table["parameters"]]:
-            known = ", ".join(self.table["parameters"])
+        names = [one.name for one in tables.parameters_of(self.table)]
+        if unknown := [name for name in self.truth if name not in names]:
+            known = ", ".join(names)
             raise ValueError(f"truth: expected parameters of {self.config}: {known}; got {', '.join(unknown)}")
         if not 0 <= self.unmodelled < math.inf:
             raise ValueError(f"unmodelled: expected a number of at least 0, got {self.unmodelled:g}")
@@ -129,21 +131,27 @@ class MachineDriver:
         if unknown := [name for name in controls if name not in actuators]:
             raise ValueError(f"robot: expected controls among {', '.join(actuators)}, got {', '.join(unknown)}")
         self._places, self._names = places(nominal, names), names
-        supports = [one.support for one in tables.parameters_of(table)]
-        theta = np.array([machine.truth[name] for name in table["parameters"]])
+        parameters = tables.parameters_of(table)
+        theta = np.array([machine.truth[one.name] for one in parameters])
         sensed = list(dict.fromkeys([*names, *_of_sensors(machine.truth)]))
-        does = effects(spec, nominal, list(table["parameters"]), supports, sensed)
+        supports, ties = ([getattr(one, what) for one in parameters] for what in ("support", "tie"))
+        does = effects(spec, nominal, [one.name for one in parameters], supports, sensed, ties)
+        if does.lags or does.jitter is not None:
+            late = "clock/jitter" if does.jitter is not None else f"sensor/{sensed[does.lags[0][0]]}/delay"
+            raise ValueError(f"truth: expected parameters of a machine that keeps time, got {late}")
         spec.option.timestep, spec.option.integrator = nominal.opt.timestep / FINER, mujoco.mjtIntegrator.mjINT_RK4
         self._model = built(spec, does, theta)
         self._data = mujoco.MjData(self._model)
-        start = initial_state(nominal, tables.numbers(table, "initial"))
+        start = starts.first(nominal, *tables.initial(table))
         if machine.scattered:
             for name, (low, high) in goals.of_table(table["policy"]).initial.items():
                 start[state_place(nominal, name, f"initial/{name}")] = self._rng.uniform(low, high)
-        mujoco.mj_setState(self._model, self._data, does.started(start, theta), STATE)
-        self._bias, self._noise = np.zeros(len(sensed)), np.zeros(len(sensed))
+        mujoco.mj_setState(self._model, self._data, does.started(start, theta, 0), STATE)
+        self._gain, self._bias, self._noise = np.ones(len(sensed)), np.zeros(len(sensed)), np.zeros(len(sensed))
         for place, name in enumerate(sensed):
             self._noise[place] = table.get("noise", {}).get(name, 0.0)
+        for signal, d in does.gains:
+            self._gain[signal] = theta[d]
         for signal, d in does.biases:
             self._bias[signal] = theta[d]
         for signal, d in does.deviations:
@@ -162,7 +170,7 @@ class MachineDriver:
         with quietly():
             mujoco.mj_forward(self._model, self._data)
         size = len(self._names)
-        values = self._data.sensordata[self._places] + self._bias[:size]
+        values = self._gain[:size] * self._data.sensordata[self._places] + self._bias[:size]
         values = values + self._noise[:size] * self._rng.standard_normal(size)
         self._number += 1
         return Observation(dict(zip(self._names, values.tolist(), strict=True)), self._number)

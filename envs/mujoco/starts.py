@@ -217,6 +217,19 @@ def state_of(model: mujoco.MjModel, mode: str | None, fixed: Mapping[int, float]
     return state
 
 
+def first(
+    model: mujoco.MjModel, begins: str | Sequence[str] | None, initial: Mapping[str, float | Sequence[float]]
+) -> Float[np.ndarray, " state"]:
+    """The state that the first episode begins in, as far as its recording does not say otherwise.
+
+    Raises:
+        ValueError: for joints and keyframes that the model does not have.
+    """
+    numbers = {name: float(np.ravel(several)[0]) for name, several in initial.items()}
+    mode = begins if isinstance(begins, str | None) else begins[0]
+    return state_of(model, mode, given(model, numbers, 1)[0])
+
+
 def chosen(
     model: mujoco.MjModel,
     episodes: Sequence[Log],

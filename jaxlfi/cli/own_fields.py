@@ -190,7 +190,7 @@ HELP = {
     "jaxlfi.cli.design:main": "which experiment to make next",
     "jaxlfi.cli.evaluate:main": "evaluate saved policies on other domains",
     "jaxlfi.cli.export:main": "write a policy as one file for a robot's computer",
-    "jaxlfi.envs.mujoco.cli:main": "film and refine the posterior of a MuJoCo model, or serve it as a machine",
+    "jaxlfi.envs.mujoco.cli:main": "inspect recordings of a MuJoCo model, film and refine its posterior",
     "jaxlfi.cli.r2s2r:main": "run the full Real2Sim2Real loop on a machine or a reference object",
     "jaxlfi.cli.train:main": "train policies by PPO on domains, such as a posterior",
     "jaxlfi.envs.whip.cli:main": "the whipping task: render, plan, deploy, control, record, see",

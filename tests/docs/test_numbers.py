@@ -117,7 +117,8 @@ def test_the_benchmark_by_the_default_call():
     c2st = lambda setting, simulations: [
         float(row["c2st"]) for row in rows if (row["setting"], row["simulations"]) == (setting, simulations)
     ]
-    ten, few, many = c2st("gaussian_linear", "1000"), c2st("gaussian_mixture", "1000"), c2st("gaussian_mixture", "10000")
+    ten = c2st("gaussian_linear", "1000")
+    few, many = (c2st("gaussian_mixture", simulations) for simulations in ("1000", "10000"))
     said = " ".join(page("sharpness").split())
     assert f"C2ST is {min(ten):.2f} to {max(ten):.2f} with 1,000 simulations" in said
     listed = lambda values: f"{values[0]:.2f}, {values[1]:.2f} and {values[2]:.2f}"
