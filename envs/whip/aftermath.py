@@ -50,8 +50,8 @@ class Aftermath(struct.PyTreeNode):
         return self.hit & ~self.displaced[..., : rules.TOP].any(axis=-1)
 
 
-def retreat(target: Float[Array | np.ndarray, "2"], xp: Any = jnp) -> Float[Array | np.ndarray, "intervals 2"]:
-    """Displacements of the set-point, in m: straight back to where episodes begin, and none after that."""
+def retreat(target: Any, xp: Any = jnp) -> Any:
+    """Displacements of the set-point, in m, [T, 2]: straight back to where episodes begin, and none after that."""
     back = (xp.asarray(START) - target) / RETRACTING
     return xp.concatenate([xp.tile(back, (RETRACTING, 1)), xp.zeros((WAITING, 2))])
 

@@ -140,7 +140,7 @@ class WhipEnvironment:
         key, key_step = jax.random.split(state.inner.key)
         return _outlined(stepped(self.whip, key_step, state.inner, action), key)
 
-    def concluded(self, state: EnvState) -> dict[str, Array]:
+    def concluded(self, state: EnvState) -> dict[str, Array | np.ndarray]:
         """What the episode leaves behind once the gripper has retracted and the cubes have come to rest."""
         scene = state.inner
         found = aftermath(self.whip.engine, scene.parameters, scene.episode.state)

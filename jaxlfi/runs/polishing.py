@@ -15,6 +15,7 @@ from jaxlfi.io.progress import RoundProgress
 from jaxlfi.runs.result import PolishNotes
 from jaxlfi.runs.run import Run
 from jaxlfi.tasks.simulation import simulate_batch
+from jaxlfi.tasks.task import Task
 
 STARTS = 64
 """Draws of the posterior that a task begins from."""
@@ -58,16 +59,16 @@ def polished(run: Run, console: Console) -> Run:
         )
     notes = PolishNotes(found.sentences, found.steps, found.simulations)
     run = run.replace(belief=Belief(mixture, support, jnp.asarray(True)), polish=notes, unpolished=run.belief)
-    return run.replace(history=run.history | _predicted(run))
+    return run.replace(history=run.history | _predicted(run, task))
 
 
-def _predicted(run: Run) -> dict[str, np.ndarray]:
+def _predicted(run: Run, task: Task) -> dict[str, np.ndarray]:
     """What the history says of the last round's posterior, of the polished one."""
     count = run.history["sample_theta"].shape[1]
     key_draw, key_simulate = run_keys(run.key).of_predictive(run.settings.rounds + 1)
     theta = run.posterior.sample(key_draw, count, "inference")
-    simulated = simulate_batch(key_simulate, run.task, theta, np.shape(run.observed))
-    seen = compared(run.task, theta, *simulated, np.asarray(run.observed))
+    simulated = simulate_batch(key_simulate, task, theta, np.shape(run.observed))
+    seen = compared(task, theta, *simulated, np.asarray(run.observed))
     changed = {}
     for name in ("theta", "theta_error", "trajectory_error"):
         rows = np.array(run.history[f"sample_{name}"])
