@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from jaxlfi.envs.mujoco import candidates, columns, measured, plausible
+from jaxlfi.envs.mujoco import candidates, columns, measured, plausible, starts
 from jaxlfi.envs.mujoco.candidates import Candidate
 from jaxlfi.envs.mujoco.inspection import Inspected, together
 from jaxlfi.envs.mujoco.log_files import TIME
@@ -104,6 +104,13 @@ def _initial(model: mujoco.MjModel, several: Sequence[Inspected], compared: Sequ
     """Where recordings begin, of joints whose positions are measured, if that is not where the model begins."""
     begun = [_beginning(model, one, compared) for one in several]
     first = begun[0]
+    if not any(begun):
+        return
+    if all(not starts.unmeasured(model, one.measured, []) for one in several):
+        yield "[initial]"
+        yield 'from = "log"                        # episodes begin where their recordings do, and not as the model does'
+        yield ""
+        return
     if not first:
         return
     same = all(

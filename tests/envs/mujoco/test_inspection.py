@@ -19,6 +19,7 @@ from jaxlfi.cli import parser as cli
 from jaxlfi.envs.mujoco import config, inspection, log_files
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
 from jaxlfi.envs.mujoco.renaming import Called
+from jaxlfi.envs.mujoco.simulator import simulator_of
 from jaxlfi.io import lerobot, mcap
 from jaxlfi.io.rollout import Rollout, Signal
 
@@ -212,6 +213,31 @@ def test_every_format_makes_a_task(folder, tmp_path, capsys, swing, log):
     said = tomllib.loads(out.read_text())
     assert said["signals"] == {"q_shoulder": "joint/shoulder/qpos", "tau_motor": "motor"}
     assert said["noise"]["joint/shoulder/qpos"] == pytest.approx(NOISE, rel=0.4)
+
+
+PENDULUM = """<mujoco><worldbody><body><joint name="hip" axis="0 1 0" damping="0.01"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.5"/><body pos="0 0 -0.4">
+<joint name="knee" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.3"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("joints", "expected"), [
+    (("hip", "knee"), {"from": "log"}),
+    (("hip",), {"hip/qpos": pytest.approx(0.8, abs=0.01)}),  # where the knee begins, nobody says
+])  # fmt: skip
+def test_a_task_begins_where_its_recording_does(tmp_path, capsys, joints, expected):
+    (tmp_path / "pendulum.xml").write_text(PENDULUM)
+    times, random = 0.01 * np.arange(200), np.random.default_rng(3)
+    angles = {"hip": 0.8 * np.cos(5 * times), "knee": -0.5 * np.cos(7 * times)}
+    signals = {f"joint/{name}/qpos": angles[name] + 1e-3 * random.standard_normal(200) for name in joints}
+    np.savez(tmp_path / "swing.npz", times=times, **{f"{name} [rad]": values for name, values in signals.items()})
+    out = tmp_path / "pendulum.toml"
+    arguments = ["mujoco", "inspect", tmp_path / "swing.npz", "--model", tmp_path / "pendulum.xml", "--out", out]
+    assert cli.main([str(word) for word in arguments]) == 0, capsys.readouterr().err
+    said = tomllib.loads(out.read_text())["initial"]
+    assert said == expected
+    begun = simulator_of(config.read(out)).starts[0].state
+    np.testing.assert_allclose(begun[1], 0.8, atol=0.01)  # the time comes first
 
 
 def test_json_has_the_same(folder, capsys):
