@@ -108,7 +108,7 @@ def _initial(model: mujoco.MjModel, several: Sequence[Inspected], compared: Sequ
         return
     if all(not starts.unmeasured(model, one.measured, []) for one in several):
         yield "[initial]"
-        yield 'from = "log"                        # episodes begin where their recordings do, and not as the model does'
+        yield 'from = "log"                        # where recordings begin, as the model begins elsewhere'
         yield ""
         return
     if not first:
