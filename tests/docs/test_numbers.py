@@ -69,7 +69,7 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     "line",
     [
         line
-        for study in ("widths", "normaliser", "threshold", "quotient")
+        for study in ("widths", "normaliser", "threshold", "quotient", "regression")
         for folder in sorted((RESULTS / study).glob("*/*"))
         for line in widths.table(folder).splitlines()[2:]
     ],
