@@ -6,7 +6,6 @@ judged here, beside the paper's return.
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -14,10 +13,6 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlfi.envs.whip import rules
 from jaxlfi.envs.whip.frames import COLOURS
-from jaxlfi.envs.whip.parameters import WhipParameters
-from jaxlfi.envs.whip.physics import engine as physics
-from jaxlfi.envs.whip.physics.engine import Engine, State
-from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.rig import START
 
 RETRACTING = 5
@@ -69,22 +64,6 @@ def displaced(
         side: of the cubes, in m.
     """
     return ((after - before) ** 2).sum(axis=-1) ** 0.5 > FALLEN * side
-
-
-def aftermath(engine: Engine, parameters: WhipParameters, state: State) -> Aftermath:
-    """What an episode that ended in this state leaves behind.
-
-    Args:
-        engine: the physics.
-        parameters: of the scene.
-        state: as the episode ended.
-    """
-    cubes = lambda state: frames(engine.scene, parameters, state.qpos).cubes
-    first = physics.reset(engine.scene, parameters)
-    last, _ = jax.lax.scan(
-        lambda state, action: (physics.act(engine, parameters, state, action), None), state, retreat(state.target)
-    )
-    return Aftermath(displaced(cubes(first), cubes(last), parameters.cube_side), last.failed)
 
 
 def sentence(found: Aftermath) -> str:

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.envs.whip import rules
-from jaxlfi.envs.whip.aftermath import aftermath
 from jaxlfi.envs.whip.episode import Episode, Whip
 from jaxlfi.envs.whip.frames import COLOURS
 from jaxlfi.envs.whip.observer import FLAGS
@@ -27,6 +26,7 @@ from jaxlfi.envs.whip.parameters import (
 )
 from jaxlfi.envs.whip.physics.engines import pick
 from jaxlfi.envs.whip.rig import CONTROL_INTERVAL, KEYPOINTS, ON_DLO
+from jaxlfi.envs.whip.settling import aftermath
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS
 from jaxlfi.rl.deployment import Deployment, Limits
 from jaxlfi.rl.environment import EnvState, Signals

@@ -10,12 +10,13 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlfi.envs.whip import rules
-from jaxlfi.envs.whip.aftermath import Aftermath, aftermath
+from jaxlfi.envs.whip.aftermath import Aftermath
 from jaxlfi.envs.whip.parameters import HIGHEST, WhipParameters
 from jaxlfi.envs.whip.physics import engine as physics
 from jaxlfi.envs.whip.physics.engine import Engine, State
 from jaxlfi.envs.whip.physics.kinematics import frames
 from jaxlfi.envs.whip.rig import START
+from jaxlfi.envs.whip.settling import aftermath
 from jaxlfi.envs.whip.vision.camera import project, side_camera
 
 MARGIN = 0.005

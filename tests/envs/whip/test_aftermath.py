@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("mujoco")
 
 from jaxlfi.envs.whip import planner, rules
-from jaxlfi.envs.whip.aftermath import RETRACTING, WAITING, Aftermath, aftermath, displaced, retreat, sentence
+from jaxlfi.envs.whip.aftermath import RETRACTING, WAITING, Aftermath, displaced, retreat, sentence
 from jaxlfi.envs.whip.environment import make
 from jaxlfi.envs.whip.parameters import median
 from jaxlfi.envs.whip.physics import engine as physics
@@ -16,6 +16,7 @@ from jaxlfi.envs.whip.physics.engine import settled
 from jaxlfi.envs.whip.physics.kinematics import initial_positions
 from jaxlfi.envs.whip.physics.scene import Scene
 from jaxlfi.envs.whip.rig import START
+from jaxlfi.envs.whip.settling import aftermath
 from jaxlfi.rl.domains import Domain
 from jaxlfi.rl.evaluation import evaluate
 

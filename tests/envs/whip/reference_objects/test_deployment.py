@@ -13,6 +13,7 @@ pytest.importorskip("mujoco")
 from envs_whip import Rig, a_policy, found
 
 from jaxlfi.envs.whip import cli, rules
+from jaxlfi.envs.whip.aftermath import Aftermath
 from jaxlfi.envs.whip.parameters import HIGHEST, LOWEST
 from jaxlfi.envs.whip.recording import trajectory
 from jaxlfi.envs.whip.reference_objects import deployment, objects, repetitions, robot
@@ -158,7 +159,8 @@ def test_the_command_writes_every_episode_and_their_means(tmp_path, monkeypatch,
         met.append((dlo.name, tuple(place.stack), jax.random.key_data(key).tolist()))
         value = next(values)
         hit = np.arange(6) >= (5 if value == 2 else 4 if value == 1 else 6)
-        return deployment.Deployed(value, hit, value == -1, False, 7, np.zeros((8, 28)), np.zeros((7, 2)))
+        left = Aftermath(hit | (np.arange(6) == 3) * hit[5], np.array(False))  # what is hit falls, and the orange cube
+        return deployment.Deployed(value, hit, value == -1, False, 7, np.zeros((8, 28)), np.zeros((7, 2)), left)
 
     monkeypatch.setattr(repetitions, "deploy", episode)
     monkeypatch.setattr(repetitions, "processors", lambda: 1)
@@ -173,12 +175,16 @@ def test_the_command_writes_every_episode_and_their_means(tmp_path, monkeypatch,
         (policy, dlo, str(place)) for policy in policies for dlo in ("dlo-0", "dlo-2") for place in range(3)
     ]
     assert [row["clean_hit"] for row in rows[:3]] == ["True", "False", "False"]
+    assert [(row["settled_hit"], row["settled_clean"], row["displaced"]) for row in rows[:3]] == [
+        ("True", "False", "2"), ("True", "False", "3"), ("False", "False", "0"),
+    ]  # fmt: skip
     assert met[:3] == [("dlo-0", *rest) for _, *rest in met[3:6]]  # the same places and noise
     with (out / "table.csv").open() as file:
         table = list(csv.DictReader(file))
     for line in table:
-        numbers = [float(line[name]) for name in ("return", "worst", "hit", "clean_hit", "outside")]
-        np.testing.assert_allclose(numbers, [2 / 3, -1, 2 / 3, 1 / 3, 1 / 3])
+        names = ("return", "worst", "hit", "clean_hit", "outside", "settled_hit", "settled_clean")
+        numbers = [float(line[name]) for name in names]
+        np.testing.assert_allclose(numbers, [2 / 3, -1, 2 / 3, 1 / 3, 1 / 3, 2 / 3, 0])
         assert float(line["error"]) == pytest.approx(np.std([2, 1, -1], ddof=1) / 3**0.5)
     assert cli.main(words) == 2
     assert "out: expected a new or empty folder" in capsys.readouterr().err

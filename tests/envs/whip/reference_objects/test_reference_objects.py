@@ -159,8 +159,8 @@ def test_the_physics_is_not_that_of_inference():
     shared = {"frames", "parameters", "recording", "reference_objects", "rig", "rules", "vision"}
     # Policies act on the objects by the task's observations, and films are drawn by its figures.
     acting = {
-        "robot": {"observer"},
-        "deployment": {"control", "observer"},
+        "robot": {"aftermath", "observer"},
+        "deployment": {"aftermath", "control", "observer"},
         "repetitions": {"environment"},
         "film": {"figures", "render"},
     }
