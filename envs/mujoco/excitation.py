@@ -125,7 +125,7 @@ def achieved(config: Path, path: Path) -> dict[str, float]:
 
     Args:
         config: of the task.
-        path: of the recording, with what happened beside it (`jaxlfi.robots.recording`).
+        path: of the recording, with the report of the episode in files beside it (`jaxlfi.robots.recording`).
     """
     goal, reading = _goal(config)
     _, loop = recording.beside(path)

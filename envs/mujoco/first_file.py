@@ -14,7 +14,7 @@ from jaxlfi.envs.mujoco.log_files import TIME
 from jaxlfi.envs.mujoco.model_task import compile_spec
 
 FIRST = 8
-"""Samples at the beginning of a recording by which the velocity there is told."""
+"""Samples at the beginning of a recording that the initial velocity is estimated from."""
 
 
 def text(path: Path, spec: mujoco.MjSpec, model: Path, logs: Sequence[Path], several: Sequence[Inspected]) -> str:

@@ -30,7 +30,7 @@ alive = 0.5                         # + for every second that does not end the e
 speed = [-1.0, 2.0]
 
 [policy.terminations]               # besides the duration; `jaxlfi.envs.mujoco.termination`
-fallen = { when = "body/torso/pos[2] < 0.2", cost = 10.0 }      # - once, whatever the interval
+fallen = { when = "body/torso/pos[2] < 0.2", cost = 10.0 }      # - at the step that ends the episode
 away = "abs(arm angle) > 2.5"       # at no cost
 
 Where there are only costs, ending an episode early pays, unless the end costs more than the rest of the episode would;

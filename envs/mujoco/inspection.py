@@ -38,7 +38,7 @@ class Signal:
     Attributes:
         name: in the recording.
         unit: of the numbers as a task reads them, "" where nothing says it.
-        place: what of the model it is; None where that cannot be told.
+        place: what of the model it is; None where it is unknown.
         nearest: names of the model that are most like it, where it is nothing.
         called: what the table `signals` of a task's file has to say of it; None where nothing.
         samples: how many there are.
@@ -47,7 +47,7 @@ class Signal:
         longest: of all intervals, in s.
         low: its smallest value.
         high: its largest value.
-        noise: the estimated standard deviation of its noise; None where it cannot be told.
+        noise: the estimated standard deviation of its noise; None where it cannot be estimated.
         odd: what is odd about it, a line each.
     """
 
@@ -326,7 +326,7 @@ def _intervals(times: np.ndarray) -> tuple[float, int, float]:
 
 
 def _noise(values: np.ndarray) -> float | None:
-    """The standard deviation of a signal's noise, at least that of its resolution; None where it cannot be told."""
+    """The standard deviation of a signal's noise, at least its resolution's; None where it cannot be estimated."""
     values = values[np.isfinite(values)]
     steps = np.abs(np.diff(values))
     if len(values) < noise.LEAST or not steps.any():

@@ -49,7 +49,8 @@ def polish(
     parts = [_gaussian(task, one, places, low, width) for one in good]
     factors = np.stack([np.linalg.cholesky(covariance) for _, covariance in parts])
     mixture = GaussianMixture(
-        jnp.asarray(_log_weights(good, factors), jnp.float32),
+        # Of points that explain the recording as well: by how much of Phi does so around each (Laplace's method).
+        jnp.asarray(np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1), jnp.float32),
         jnp.asarray(low + width * np.stack([mean for mean, _ in parts]), jnp.float32),
         jnp.asarray(width[:, None] * factors, jnp.float32),
     )
@@ -69,23 +70,16 @@ def _gaussian(
     return known @ mean + unknown @ places.mean(axis=0), covariance + LEAST**2 * np.eye(len(mean))
 
 
-def _log_weights(fits: Sequence[Fit], factors: np.ndarray) -> np.ndarray:
-    """Of points that explain the recording as well: by how much of Phi does so around each (Laplace's method)."""
-    return np.array([np.sum(np.log(np.diagonal(factor))) for factor, _ in zip(factors, fits, strict=True)])
-
-
 def _sentences(good: Sequence[Fit]) -> tuple[str, ...]:
-    best = good[0]
     where = (
         "to one point"
         if len(good) == 1
         else f"to {len(good)} points that explain the recording as well, with a mode of the posterior at each"
     )
-    lines = [
-        f"The posterior was polished: Gauss-Newton steps from its draws led {where}. Residuals are {best.misfit:.2f} "
-        "times the noise, and intervals allow for what the model gets wrong."
-    ]
-    return tuple(lines)
+    return (
+        f"The posterior was polished: Gauss-Newton steps from its draws led {where}. Residuals are "
+        f"{good[0].misfit:.2f} times the noise, and intervals allow for what the model gets wrong.",
+    )
 
 
 def _steps(good: Sequence[Fit]) -> tuple[str, ...]:

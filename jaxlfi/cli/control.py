@@ -77,7 +77,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     mode.add_argument(
         "--shadow",
         action="store_true",
-        help="watch while somebody else commands the robot, and record what the policy would have done beside it",
+        help="let another controller command the robot, and record what the policy would have commanded as well",
     )
     parser.add_argument("--remote", action="store_true", help="allow a driver on another host; needs --token")
     parser.add_argument("--token", type=Path, metavar="FILE", help="a file with the token that the driver asks for")

@@ -23,7 +23,7 @@ from jaxlfi.robots.clock import Clock
 from jaxlfi.robots.robot import Command, Observation, RobotError
 
 DONE = "controls"
-"""What the extras of an observation call the controls that somebody else commands."""
+"""What the extras of an observation call the controls that another controller commands."""
 
 
 @runtime_checkable

@@ -51,7 +51,7 @@ class Drive(Paced):
         signals: names of the numbers of an observation: those that the policy sees, and further ones.
         bounds: least and largest value by signal.
         commands: what the operator asks for, as the policy was trained with, in the order of the preparation.
-        follows: somebody else commands, and observations say what.
+        follows: another controller commands, and observations say what.
         units: of signals that the policy does not see, where they are known.
 
     Raises:

@@ -103,7 +103,7 @@ class Ros2Driver:
         return {"source": "ROS 2", "states": states, "commands": commands, "quantity": self._quantity}
 
     def observe(self) -> Observation:
-        """The latest states, and where somebody else commands the latest commands."""
+        """The latest states, and the latest commands where another controller commands."""
         with self._heard:
             number, received, values = self._latest()
             commanded = dict(self._commanded)

@@ -100,6 +100,10 @@ def prepare(
         ValueError: for anything that does not fit.
     """
     plan.settings.check()
+    if plan.polish and plan.task.polish is None:
+        raise ValueError(f"polish: expected a task that can be polished, such as a MuJoCo model, got {plan.task.name}")
+    if plan.polish and not plan.settings.estimator.closed_form:
+        raise ValueError("polish: expected an estimator that is a mixture of Gaussians (mdn), got another density")
     prior = plan.task.inference.prior
     for name, box in {spec.support_name: spec.support for spec in plan.specs}.items():
         priors.require_mass(prior, box, name)

@@ -34,7 +34,7 @@ def polished(run: Run, console: Console) -> Run:
         console: for a progress bar.
     """
     task = run.task
-    if task is None or task.polish is None or not run.settings.estimator.closed_form:
+    if task is None or task.polish is None:
         return run
 
     def counted(places: Sequence[int]) -> Iterator[int]:

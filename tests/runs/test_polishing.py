@@ -9,6 +9,7 @@ import pytest
 
 import jaxlfi
 from jaxlfi.distributions.mixture import GaussianMixture
+from jaxlfi.estimators.flow_estimators import SplineFlow
 from jaxlfi.runs.account import POLISH
 from jaxlfi.tasks.polish import Polished
 from tests.small import SETTINGS, gaussian, whole_runs  # noqa: F401 - a fixture
@@ -63,9 +64,18 @@ def test_what_was_not_asked_for_is_named_as_a_step(polished):
     _, _, own = polished
     run = jaxlfi.infer(3, own, support="misspecified", heuristic="edge", settings=SETTINGS)
     assert run.polish is None and POLISH in run.summary().next_steps
-    plain = jaxlfi.infer(3, gaussian(), support="misspecified", heuristic="edge", settings=SETTINGS, polish=True)
+    plain = jaxlfi.infer(3, gaussian(), support="misspecified", heuristic="edge", settings=SETTINGS)
     assert plain.polish is None and POLISH not in plain.summary().next_steps
     np.testing.assert_allclose(plain.draws(), run.draws(), atol=1e-4)
+
+
+def test_what_cannot_be_polished_is_refused(polished):
+    _, _, own = polished
+    with pytest.raises(ValueError, match="polish: expected a task that can be polished, such as a MuJoCo model, got g"):
+        jaxlfi.infer(3, gaussian(), settings=SETTINGS, polish=True)
+    flow = SETTINGS.replace(estimator=SplineFlow(hidden=(8,), transforms=1), correction="none")
+    with pytest.raises(ValueError, match="polish: expected an estimator that is a mixture of Gaussians"):
+        jaxlfi.infer(3, own, settings=flow, polish=True)
 
 
 def test_a_support_that_cannot_grow_cuts_it(polished):

@@ -242,7 +242,7 @@ ASKED = {
         "jaxlfi.bayessim.presets": "leaves such a correction out of a preset whose estimator is replaced",
         "jaxlfi.runs.folder": "a folder keeps the networks that its posterior cannot do without",
         "jaxlfi.runs.load": "and reads them",
-        "jaxlfi.runs.polishing": "replaces a mixture of Gaussians by another one, and no other density",
+        "jaxlfi.runs.execute": "a mixture of Gaussians can be polished, and no other density",
     },
     "of_summaries": {
         "jaxlfi.estimators.base": "declares it: the density is that of the summary, and its network has the prior",
