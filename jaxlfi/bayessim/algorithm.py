@@ -145,7 +145,14 @@ def proposal(settings: Settings, belief: Belief) -> Belief:
     return belief.replace(mixture=belief.mixture.inflated(settings.inflation))
 
 
-def propose(key: jax.Array, prior: Any, settings: Settings, belief: Belief) -> Float[Array, "attempts dim"]:
+def support_before(state: State, round: Int[Array, ""] | int) -> Support:
+    """The support that the round before proposed in; in the first round the one that it is going to."""
+    return jax.tree.map(lambda leaf: leaf[jnp.maximum(round - 1, 0)], state.proposals.support)
+
+
+def propose(
+    key: jax.Array, prior: Any, settings: Settings, belief: Belief, before: Support | None = None
+) -> Float[Array, "attempts dim"]:
     """Draw theta ~ p_i (line 8): the prior over Theta_0 in the first round, then the restricted posterior.
 
     A belief that is not informed is the prior over its support: so it is in the first round, and always by `Truncate`.
@@ -153,12 +160,22 @@ def propose(key: jax.Array, prior: Any, settings: Settings, belief: Belief) -> F
     would forget it after the first round. Nothing is proposed where it is zero. A defensive fraction of the draws stays
     with the prior over the *current* support: it covers the ground that the support has gained, also where the
     posterior has locked itself onto a place where it learns nothing more.
+
+    Args:
+        key: consumed.
+        prior: of the task (`Task.inference.prior`), None for a uniform one.
+        settings: the numbers of the run.
+        belief: what the round before left.
+        before: the support that it proposed in, by which restrictions tell bounds that move; None where nothing is
+            known of it.
     """
     key_prior, key_posterior, key_choice = jax.random.split(key, 3)
     attempts = settings.simulation_budget
     factor = None if prior is None or settings.accounts_for_prior else prior.log_prob
     inside = None if prior is None else Region(belief.support, prior)
-    informed = RESTRICTIONS[settings.restriction](key_posterior, belief, attempts, settings.inflation, factor, inside)
+    informed = RESTRICTIONS[settings.restriction](
+        key_posterior, belief, attempts, settings.inflation, factor, inside, before
+    )
     from_prior = jax.random.bernoulli(key_choice, settings.defensive, (attempts, 1)) | ~belief.informed
     return jnp.where(from_prior, prior_draws(key_prior, prior, belief.support, attempts), informed)
 
@@ -335,7 +352,7 @@ def step(
     Returns:
         The next state, and what the round did.
     """
-    theta = propose(keys.propose, task.inference.prior, settings, state.belief)
+    theta = propose(keys.propose, task.inference.prior, settings, state.belief, support_before(state, round))
     x, failure = simulate(keys.simulate, task, theta)
     simulations = within_budget(theta, x, failure, settings.simulations_per_round)
     return update(keys.update, task, settings, heuristic, observed, state, round, simulations)

@@ -33,7 +33,8 @@ def propose_one(
 ) -> tuple[Float[Array, "attempts dim"], jax.Array]:
     """Proposals of a round, and the key of their simulations."""
     keys = round_keys(run_keys(run.key).run, index)
-    return algorithm.propose(keys.propose, prior, settings, state.belief), keys.simulate
+    before = algorithm.support_before(state, index)
+    return algorithm.propose(keys.propose, prior, settings, state.belief, before), keys.simulate
 
 
 def simulate_one(task: Task, settings: Settings, theta: Float[Array, "attempts dim"], key: jax.Array) -> Simulations:

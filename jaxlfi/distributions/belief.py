@@ -58,6 +58,7 @@ def clipped(
     inflation: Factor = 1.0,
     log_weight: LogWeight | None = None,
     region: Region | None = None,
+    before: Support | None = None,
 ) -> Array:
     """`n` draws of the mixture, those outside the support moved to its nearest point (the paper's choice).
 
@@ -71,6 +72,7 @@ def clipped(
         log_weight: logarithm of a factor of the density, such as a prior, by which draws are chosen from many more.
         region: the part of the support that draws are kept in; all of it by default. What is moved to where it is not
             is drawn again, and, where that does not help, drawn from the prior in there.
+        before: the support of the round before, for `mixed`.
     """
     sample = lambda key, n: belief.support.clip(belief.mixture.inflated(inflation).sample(key, n))
     if log_weight is not None:
@@ -89,6 +91,7 @@ def rejected(
     inflation: Factor = 1.0,
     log_weight: LogWeight | None = None,
     region: Region | None = None,
+    before: Support | None = None,
 ) -> Array:
     """`n` draws of the mixture truncated to the support (`jaxlfi.distributions.truncation.rejection_sample`)."""
     sample, inside = belief.mixture.inflated(inflation).sample, region or belief.support
@@ -104,18 +107,25 @@ def mixed(
     inflation: Factor = 1.0,
     log_weight: LogWeight | None = None,
     region: Region | None = None,
+    before: Support | None = None,
 ) -> Array:
-    """`n` draws: as by `clipped` for the mass that the mixture has outside the support, as by `rejected` for the rest.
+    """`n` draws: as by `clipped` for the mass that the mixture has beyond bounds that move, as by `rejected` for the rest.
 
-    While much of the posterior lies beyond a bound, clipped draws on that bound show the network where it wants to go.
+    While the support follows a posterior that lies beyond a bound, clipped draws on that bound show the network where
+    it wants to go. On a bound that stays, as that of Phi does, they would draw the posterior onto it, round by round.
     Once all of it is inside, wide proposals are wanted, and would pile up on the bounds if they were clipped. The mass
     outside is that of the mixture itself, as wide as it is and whatever the weight.
     """
     key_posterior, key_wide = jax.random.split(key)
     draws = belief.mixture.sample(key_posterior, n)
     moved = belief.support.clip(draws)
+    # Of a support that nothing is known of before, all bounds count as moving.
+    low, high = (-jnp.inf, jnp.inf) if before is None else (before.low, before.high)
+    stays = ((moved > draws) & (belief.support.low >= low)) | ((moved < draws) & (belief.support.high <= high))
     inside = belief.support.contains(draws)
-    wide = inside if region is None else inside | ~region.contains(moved)
+    wide = inside | jnp.any(stays, axis=-1)
+    if region is not None:
+        wide = wide | ~region.contains(moved)
     return jnp.where(wide[:, None], rejected(key_wide, belief, n, inflation, log_weight, region), moved)
 
 
