@@ -170,7 +170,7 @@ def believed(
     @jax.jit
     @jax.vmap
     def drawn(key, x, state):
-        return posterior_after(state.reported, state.network, x).sample(key, DRAWS, "inference")
+        return posterior_after(settings.correction, state.reported, state.network, x).sample(key, DRAWS, "inference")
 
     draws = drawn(jax.vmap(jax.random.key)(jnp.asarray(cases.seeds)), jnp.asarray(x), states)
     support = states.belief.support

@@ -99,7 +99,7 @@ def inferred(task: Task, settings: Settings, own: Cases, console: Console) -> di
     @jax.jit
     @jax.vmap
     def one(key, truth, x, state):
-        return described(key, truth, posterior_after(state.reported, state.network, x), DRAWS)
+        return described(key, truth, posterior_after(settings.correction, state.reported, state.network, x), DRAWS)
 
     state, seconds = final_states(
         task, settings, task.support("initial"), HEURISTICS["edge"], own, len(own.seeds), console

@@ -69,7 +69,8 @@ def cases_of(task: Task, first: int, observed: np.ndarray) -> Cases:
 def beliefs(task: Task, settings: Settings, cases: Cases, batch: int, console: Console) -> Posterior:
     """The posteriors of all cases, stacked."""
     states, _ = final_states(task, settings, task.support(SUPPORT), Fixed(), cases, batch, console)
-    return jax.vmap(lambda state, x: posterior_after(state.reported, state.network, x))(states, cases.x)
+    after = lambda state, x: posterior_after(settings.correction, state.reported, state.network, x)
+    return jax.vmap(after)(states, cases.x)
 
 
 def multiplied(each: GaussianMixture) -> GaussianMixture:

@@ -187,7 +187,7 @@ def infer_all(
     @jax.jit
     @jax.vmap
     def one(key, truth, x, state):
-        posterior = posterior_after(state.reported, state.network, x)
+        posterior = posterior_after(settings.correction, state.reported, state.network, x)
         found = both(key, truth, posterior if on is None else posterior.on(on), task.support(box))
         return found | {"rounds": state.progress.rounds, "moved": state.progress.moved}
 

@@ -75,7 +75,7 @@ def posterior_draws(task_name: str, settings: Settings, seed: int) -> dict[str, 
     def one(key, x):
         key_run, key_draw = jax.random.split(key)
         state, _ = algorithm.run(key_run, task, settings, Fixed(), x, box)
-        posterior = posterior_after(state.reported, state.network, x)
+        posterior = posterior_after(settings.correction, state.reported, state.network, x)
         return posterior.sample(key_draw, DRAWS, space="inference"), posterior.mass_inside
 
     keys = jax.random.split(jax.random.key(seed), len(OBSERVATIONS))

@@ -41,7 +41,8 @@ TRUTHS_KEPT = 12
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--problems", nargs="+", default=["tuning"], help="tuning, held-out, all, or names")
+    sets = "tuning, held-out, all, leaning, mujoco, or names"
+    parser.add_argument("--problems", nargs="+", default=["tuning"], help=sets)
     parser.add_argument("--boxes", nargs="+", choices=runner.BOXES, default=list(runner.BOXES))
     parser.add_argument("--heuristics", nargs="+", choices=list(runner.RULES), default=["fixed", "edge"])
     parser.add_argument("--simulations", nargs="+", type=int, default=[1000], help="in ten rounds, failures included")

@@ -8,21 +8,23 @@ PROBLEMS: dict[str, Problem] = {
     for name in held_out.NAMES
     for problem in (*curves.PROBLEMS, *counts.PROBLEMS, *series.PROBLEMS)
     if problem.name == name
-}
+} | {problem.name: problem for problem in curves.LEANING}
 MODELS = ("mujoco_puck", "mujoco_arm", "mujoco_furuta")
 """Examples of MuJoCo models."""
 
 
 def chosen(words: list[str]) -> list[Problem]:
-    """The problems that words name: "tuning", "held-out", "all", "mujoco", or names.
+    """The problems that words name: "tuning", "held-out", "all", "leaning", "mujoco", or names.
 
-    Those of MuJoCo are not among "all": they need an extra, and are neither held out nor tuned on.
+    Those that lean on bounds and those of MuJoCo are not among "all": they are neither held out nor tuned on, and the
+    latter need an extra.
 
     Raises:
         ValueError: for a word that is none of these.
         ImportError: for problems of MuJoCo where that is not installed.
     """
     sets = {"tuning": held_out.TUNING, "held-out": held_out.HELD_OUT, "all": held_out.NAMES}
+    sets["leaning"] = tuple(problem.name for problem in curves.LEANING)
     names = [name for word in words for name in sets.get(word, (word,))]
     models = [name for name in MODELS if name in names or "mujoco" in names]
     if unknown := [name for name in names if name not in (*PROBLEMS, *MODELS, "mujoco")]:

@@ -119,7 +119,7 @@ def _design(rows: int, columns: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(rows, columns)) / np.sqrt(rows)
 
 
-_NAMES = {dim: tuple(f"p{d + 1}" for d in range(dim)) for dim in (2, 5, 8, 20)}
+_NAMES = {dim: tuple(f"p{d + 1}" for d in range(dim)) for dim in (2, 3, 4, 5, 8, 20)}
 _ONES = {dim: ("",) * dim for dim in _NAMES}
 _TIMES5 = jnp.linspace(-1, 1, 6)
 
@@ -187,3 +187,20 @@ PROBLEMS = (
         low=(-3.0, -3.0), high=(3.0, 3.0), open=("east", "north"), shaped=True,
     ),
 )  # fmt: skip
+
+LEANING = (
+    linear(
+        _design(6, 2, 22), 1.0, name="leaning_2", names=_NAMES[2], units=_ONES[2], truth=(0.05, 1.9),
+        low=(0.0, -3.0), high=(2.0, 2.0), shaped=True,
+    ),
+    linear(
+        _design(8, 4, 24), 1.0, name="leaning_4", names=_NAMES[4], units=_ONES[4], truth=(0.05, 1.9, 0.3, -0.5),
+        low=(0.0, -3.0, -3.0, -3.0), high=(2.0, 2.0, 3.0, 3.0), shaped=True,
+    ),
+    # Of the first two parameters little is known beyond their bounds.
+    linear(
+        _design(6, 3, 23), 3.0, name="leaning_3", names=_NAMES[3], units=_ONES[3], truth=(0.5, 0.5, 0.5),
+        low=(0.0, 0.0, -3.0), high=(1.0, 1.0, 3.0), shaped=True,
+    ),
+)  # fmt: skip
+"""Linear models whose posteriors lean on bounds of their boxes; written down after the held-out problems were."""

@@ -58,7 +58,7 @@ def _run(method: str, task: Task, simulations: int, key: jax.Array, x: jax.Array
     rule = PAPER_EDGE if method.endswith("+edge") else Fixed()
     look = lambda index, state, info: (info.simulations.attempted, jnp.sum(info.failed))
     state, (attempted, failed) = algorithm.run(keys.run, task, settings, rule, x, box, look)
-    posterior = posterior_after(state.reported, state.network, x)
+    posterior = posterior_after(settings.correction, state.reported, state.network, x)
     draws = posterior.sample(keys.check, DRAWS, space="inference")
     # A likelihood's posterior has no density that is normalised.
     log_prob = jnp.zeros(()) if settings.estimator.of_summaries else posterior.log_prob(theta, space="inference")

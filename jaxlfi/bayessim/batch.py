@@ -21,15 +21,17 @@ from jaxtyping import Array, Float, Int
 
 from jaxlfi.bayessim import algorithm
 from jaxlfi.bayessim.algorithm import State
+from jaxlfi.bayessim.correction import CORRECTIONS
 from jaxlfi.bayessim.keys import init_key, key_of, round_keys, run_keys
 from jaxlfi.bayessim.programs import program
 from jaxlfi.bayessim.record import record
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.diagnostics.discrepancy import POSTERIOR_SAMPLES, Discrepancy, discrepancy, not_simulated
 from jaxlfi.distributions.belief import Belief
+from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network
-from jaxlfi.estimators.posterior import Posterior
+from jaxlfi.estimators.posterior import Posterior, truncated
 from jaxlfi.heuristics import Choice, Heuristic
 from jaxlfi.io.executables import call, compiled
 from jaxlfi.tasks import summaries
@@ -114,12 +116,27 @@ def stack_inputs(
     return RunInputs(keys, support, heuristic, np.asarray(observed), np.asarray(x)), places
 
 
-def posterior_after(belief: Belief, network: Network, x: Float[Array, " obs"]) -> Posterior:
+def posterior_after(correction: str, belief: Belief, network: Network, x: Float[Array, " obs"]) -> Posterior:
     """The posterior of a run after a round, truncated to the adapted support.
 
     Where the density is a mixture of Gaussians it is the belief's own, after correction and heuristic.
+
+    Args:
+        correction: the run's, by name.
+        belief: on the adapted support, as the run reports it.
+        network: as trained.
+        x: the observed summary, shape [S].
     """
-    return network.estimator.posterior(network, x, belief.mixture, belief.support)
+    if CORRECTIONS[correction].beyond is None:
+        return network.estimator.posterior(network, x, belief.mixture, belief.support)
+    return posterior_of(correction, belief, network.space, network.prior)
+
+
+def posterior_of(correction: str, belief: Belief, space: Space, prior: Any = None) -> Posterior:
+    """The posterior whose density is a belief's mixture of Gaussians, as the correction has it beyond the bounds."""
+    beyond = CORRECTIONS[correction].beyond
+    density = belief.mixture if beyond is None else beyond(belief.mixture, belief.support)
+    return truncated(density, belief.mixture, belief.support, space, prior)
 
 
 def start_one(task: Task, first: int | None, settings: Settings, run: RunInputs) -> State:
@@ -134,16 +151,16 @@ def _reading(task: Task, settings: Settings, run: RunInputs) -> Settings:
     return settings.replace(estimator=settings.estimator.reading(layout))
 
 
-def check_draws(run: RunInputs, state: State) -> tuple[Float[Array, "samples dim"], Array]:
+def check_draws(settings: Settings, run: RunInputs, state: State) -> tuple[Float[Array, "samples dim"], Array]:
     """Draws of the posterior after a run's last round, in inference space, and the key of their simulations."""
     key_draw, key_simulate = run_keys(run.key).of_predictive(state.progress.rounds - 1)
-    posterior = posterior_after(state.reported, state.network, run.x)
+    posterior = posterior_after(settings.correction, state.reported, state.network, run.x)
     return posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference"), key_simulate
 
 
 def check_one(task: Task, settings: Settings, run: RunInputs, state: State) -> Discrepancy:
     """How far the posterior after a run's last round is from truth and observation, for a simulator in JAX."""
-    theta, key_simulate = check_draws(run, state)
+    theta, key_simulate = check_draws(settings, run, state)
     if not settings.predictive:
         return not_simulated(task, theta, run.observed, run.x.shape[-1])
     return discrepancy(key_simulate, task, theta, run.observed)

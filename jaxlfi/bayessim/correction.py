@@ -13,6 +13,8 @@ from jaxlfi.bayessim.pooled import log_pool, without_pool
 from jaxlfi.distributions.belief import Belief
 from jaxlfi.distributions.mixture import GaussianMixture
 from jaxlfi.distributions.mixture_algebra import product, quotient, reduce
+from jaxlfi.distributions.support import Support
+from jaxlfi.distributions.untruncated import untruncated
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.tasks.priors import InferencePrior
 
@@ -43,12 +45,15 @@ class Correction:
         change: (prior, q, the round's proposal p_i) -> (posterior, pairs not positive definite).
         report: (prior, q, all rounds' proposals, round, defensive fraction, support) -> the mixture that a run reports
             and the effective share of q's draws, where it is not what proposals and heuristics go on with; else None.
+        beyond: (mixture that a run reports, support) -> the mixture that, truncated there, is the posterior; None where
+            it is the one reported.
         accounts_for_prior: whether it does all that is done for a task's own prior; else proposals do.
     """
 
     row_weights: Callable[[Any, Dataset, Belief, Array | int, Array | float], Array]
     change: Callable[[Any, GaussianMixture, Belief], tuple[GaussianMixture, Array]]
     report: Callable[..., tuple[GaussianMixture, Array]] | None = None
+    beyond: Callable[[GaussianMixture, Support], GaussianMixture] | None = None
     accounts_for_prior: bool = False
 
 
@@ -146,7 +151,7 @@ CORRECTIONS: dict[str, Correction] = {
     # To the letter, which draws from the posterior itself (line 8) and divides by the prior (line 11).
     "paper": Correction(equal_weights, times_reference, accounts_for_prior=True),
     "quotient": Correction(equal_weights, divided_by_proposal),
-    "pooled": Correction(equal_weights, unchanged, report=without_pool),
+    "pooled": Correction(equal_weights, unchanged, report=without_pool, beyond=untruncated),
     "importance": Correction(importance_weights, unchanged, accounts_for_prior=True),
 }
 """Corrections by name."""

@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
 from jaxlfi.distributions.belief import Belief
@@ -19,7 +18,6 @@ from jaxlfi.distributions.decomposition import svd
 from jaxlfi.distributions.mixture import GaussianMixture, lower_factor
 from jaxlfi.distributions.region import region
 from jaxlfi.distributions.support import Support
-from jaxlfi.distributions.untruncated import untruncated
 from jaxlfi.tasks.priors import prior_mass
 
 COMPONENT_POINTS = 64
@@ -93,8 +91,7 @@ def without_pool(
 ) -> tuple[GaussianMixture, Float[Array, ""]]:
     """The mixture q / p_pool: each component of q divided by the Gaussian that the pool is to it.
 
-    Nothing was proposed outside all rounds' supports: components are first what they are without those bounds, and the
-    pool is what it would be without them.
+    Outside the support, where nothing was proposed, the pool is what it would be without the bounds.
 
     Args:
         prior: of the task (`Task.inference.prior`), None for a uniform one.
@@ -118,15 +115,11 @@ def without_pool(
     mean = jnp.sum(log_p, axis=1, where=known) / jnp.maximum(jnp.sum(known, axis=1), 1)
     log_p, slope = jnp.where(known, log_p, mean[:, None]), jnp.where(known[..., None], slope, 0.0)
 
-    whole = untruncated(q, _hull(proposals, round))
-    log_mass, means, scale_tril = jax.vmap(_quotient)(
-        q.means, q.scale_tril, whole.means, whole.scale_tril, log_p, slope
-    )
+    log_mass, means, scale_tril = jax.vmap(_quotient)(q.means, q.scale_tril, log_p, slope)
     weights = jnp.where(sound, q.weights, 0.0)
     typical = jnp.sum(weights * log_mass) / jnp.maximum(jnp.sum(weights), 1e-30)
     log_mass = jnp.minimum(log_mass - typical, jnp.log(HIGHEST))
-    logits = jnp.where(sound, whole.logits + log_mass, -jnp.inf)
-    found = GaussianMixture(logits, means, scale_tril)
+    found = GaussianMixture(jnp.where(sound, jnp.log(q.weights) + log_mass, -jnp.inf), means, scale_tril)
     mixture = jax.tree.map(lambda new, old: jnp.where(jnp.any(sound), new, old), found, q)
     share = jnp.where(sound[:, None], share, 0.0)
     weight = share * jnp.exp(jnp.min(log_p, where=sound[:, None], initial=jnp.inf) - log_p)
@@ -134,57 +127,35 @@ def without_pool(
     return mixture, jnp.where(jnp.any(sound), effective, 0.0)
 
 
-def _hull(proposals: Belief, round: Int[Array, ""] | int) -> Support:
-    """The smallest box that holds the supports of all rounds."""
-    used = (jnp.arange(proposals.informed.shape[0]) <= round)[:, None]
-    low, high = proposals.support.low, proposals.support.high
-    return Support(jnp.min(jnp.where(used, low, jnp.inf), axis=0), jnp.max(jnp.where(used, high, -jnp.inf), axis=0))
-
-
 def _quotient(
-    mean: Float[Array, " dim"],
-    factor: Float[Array, "dim dim"],
-    whole_mean: Float[Array, " dim"],
-    whole_factor: Float[Array, "dim dim"],
-    log_p: Float[Array, " n"],
-    slope: Float[Array, "n dim"],
+    mean: Float[Array, " dim"], factor: Float[Array, "dim dim"], log_p: Float[Array, " n"], slope: Float[Array, "n dim"]
 ) -> tuple[Float[Array, ""], Float[Array, " dim"], Float[Array, "dim dim"]]:
-    """N(m, M M') / p, as mass times Gaussian: its log-mass, mean and factor.
+    """N(mean, L L') / p, as mass times Gaussian: its log-mass, mean and factor.
 
-    log p is the parabola that it is to the component as it was fitted, N(mean, L L'). With theta = mean + L z it is
-    a + g'z + z'Hz / 2: g and H are the means of its gradient and Hessian under the Gaussian, and the latter is that of
-    z times the gradient (Stein's lemma). With theta = m + M z, the quotient has precision I + M'HM in z.
+    With theta = mean + L z, log p is a + g'z + z'Hz / 2: g and H are the means of its gradient and Hessian under the
+    Gaussian, and the latter is that of z times the gradient (Stein's lemma). The quotient has precision I + H in z.
     Weights of points, as in importance sampling, would not do: what wide proposals have cut off is in the tails, where
     there are no points, the more so the more parameters there are.
 
     Args:
-        mean: of the component as it was fitted.
+        mean: of the component.
         factor: L.
-        whole_mean: m, of the component without the bounds.
-        whole_factor: M.
-        log_p: at the fitted component's points.
+        log_p: at the component's points.
         slope: its gradient there.
     """
     normal = _normal_points(len(mean))
     along = slope @ factor
     g, hessian = jnp.mean(along, axis=0), normal.T @ along / len(normal)
-    constant = jnp.mean(log_p) - 0.5 * jnp.trace(hessian)
-    z, turned = (solve_triangular(factor, other, lower=True) for other in (whole_mean - mean, whole_factor))
     hessian = 0.5 * (hessian + hessian.T)
-    constant = constant + g @ z + 0.5 * z @ hessian @ z
-    g, hessian = turned.T @ (g + hessian @ z), turned.T @ hessian @ turned
     # Eigenvalues of either sign, as singular values of what is moved to be positive.
     shift = 1.0 + jnp.linalg.norm(hessian)
     axes, values, _ = svd(hessian + shift * jnp.eye(len(mean)))
     precision = jnp.clip(1.0 + values - shift, 1 / WIDEST**2, WIDEST**2)
     moved = -(axes.T @ g) / precision
     moved = moved * jnp.minimum(1.0, FARTHEST / jnp.maximum(jnp.linalg.norm(moved), 1e-30))
-    log_mass = -0.5 * (axes.T @ g) @ moved - 0.5 * jnp.sum(jnp.log(precision)) - constant
-    return (
-        log_mass,
-        whole_mean + whole_factor @ (axes @ moved),
-        lower_factor(whole_factor @ (axes / jnp.sqrt(precision))),
-    )
+    log_mass = -0.5 * (axes.T @ g) @ moved - 0.5 * jnp.sum(jnp.log(precision)) - jnp.mean(log_p)
+    log_mass = log_mass + 0.5 * jnp.trace(hessian)
+    return log_mass, mean + factor @ (axes @ moved), lower_factor(factor @ (axes / jnp.sqrt(precision)))
 
 
 def _points(mixture: GaussianMixture) -> tuple[Float[Array, "n dim"], Float[Array, " n"]]:

@@ -73,7 +73,7 @@ def conclude_one(
     state, info = algorithm.conclude(
         key, prior, reasons, settings, run.heuristic, run.x, state, index, gathered, learnt
     )
-    return state, info, *check_draws(run, state)
+    return state, info, *check_draws(settings, run, state)
 
 
 def _update_keys(settings: Settings, run: RunInputs, index: Int[Array, ""] | int) -> tuple[jax.Array, jax.Array | None]:

@@ -109,7 +109,7 @@ def mixed(
     region: Region | None = None,
     before: Support | None = None,
 ) -> Array:
-    """`n` draws: as by `clipped` for the mass that the mixture has beyond bounds that move, as by `rejected` for the rest.
+    """`n` draws: as by `clipped` for the mass beyond bounds that move, as by `rejected` for the rest.
 
     While the support follows a posterior that lies beyond a bound, clipped draws on that bound show the network where
     it wants to go. On a bound that stays, as that of Phi does, they would draw the posterior onto it, round by round.

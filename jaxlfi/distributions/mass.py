@@ -79,7 +79,7 @@ def rare_draws(density: Any, mixture: GaussianMixture, region: Support | Region)
         region: a box, or the part of one where a prior is not zero.
     """
     if isinstance(density, GaussianMixture) and isinstance(region, Support):
-        return lambda key, n: truncated_mixture_draws(key, mixture, region, n)
+        return lambda key, n: truncated_mixture_draws(key, density, region, n)
     box = region if isinstance(region, Support) else region.box
     mixture = mixture.inflated(WIDER)
 

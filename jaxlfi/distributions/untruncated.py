@@ -22,7 +22,7 @@ WIDEST = 2.25
 FARTHEST = 2.5
 """How far its mean may move, in its deviations."""
 NEAREST = 1.2
-"""Distance of a mean from a bound, in deviations, below which no truncated normal has such moments: 1 is exponential."""
+"""Distance of a mean from a bound, in deviations, below which hardly any truncated normal has such moments."""
 
 
 def untruncated(mixture: GaussianMixture, support: Support) -> GaussianMixture:

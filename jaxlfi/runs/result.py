@@ -9,7 +9,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from jaxlfi.bayessim.batch import RunSpec, posterior_after
+from jaxlfi.bayessim.batch import RunSpec, posterior_after, posterior_of
 from jaxlfi.bayessim.correction import CORRECTIONS
 from jaxlfi.bayessim.keys import run_keys, seed_of
 from jaxlfi.bayessim.settings import Settings
@@ -21,7 +21,7 @@ from jaxlfi.distributions.space import Space, SpaceName, is_natural
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators.base import Network
 from jaxlfi.estimators.dataset import Dataset
-from jaxlfi.estimators.posterior import Posterior, truncated
+from jaxlfi.estimators.posterior import Posterior
 from jaxlfi.heuristics import Heuristic
 from jaxlfi.io.executables import quickly
 from jaxlfi.tasks import failures
@@ -111,10 +111,12 @@ class Result(struct.PyTreeNode):
     @property
     def posterior(self) -> Posterior:
         """The posterior of the observation, truncated to the support the run ended with."""
+        # What a polished run reports was not fitted to draws inside the box.
+        correction = self.settings.correction if self.polish is None else "none"
         if self.network is None:
             prior = None if self.task is None else self.task.inference.prior
-            return _truncated(self.belief.mixture, self.belief.mixture, self.belief.support, self.space, prior)
-        return quickly(_posterior_after, self.belief, self.network, self.counted(self.x))
+            return _posterior_of(correction, self.belief, self.space, prior)
+        return quickly(_posterior_after(correction), self.belief, self.network, self.counted(self.x))
 
     @property
     def amortised(self) -> bool:
@@ -187,8 +189,12 @@ def _conditioned(task, settings, heuristic, network, support, feasible, x, key):
     else:
         mixture = network.estimator.weighted(network, x)
     belief, _ = heuristic(prior, mixture, feasible)
-    return posterior_after(belief, network, x)
+    return posterior_after(settings.correction, belief, network, x)
 
 
-_posterior_after = jax.jit(single(posterior_after))
-_truncated = jax.jit(single(truncated), static_argnums=(3, 4))
+@functools.cache
+def _posterior_after(correction: str) -> Any:
+    return jax.jit(single(functools.partial(posterior_after, correction)))
+
+
+_posterior_of = jax.jit(single(posterior_of), static_argnums=(0, 2, 3))

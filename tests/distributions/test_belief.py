@@ -82,6 +82,29 @@ def test_mixed_draws_of_a_posterior_inside_leave_the_bounds_free(key):
     assert draws[:, 1].std() > 2 * SCALE[1]
 
 
+def test_mixed_draws_lie_on_bounds_that_have_just_moved_alone(key):
+    """The lower bound of the first parameter was moved down, the upper one of the second up; the others stay."""
+    box = GAUSSIAN.support
+    before = Support([0.5, 3.0], [2.0, 5.0])
+    draws = np.asarray(MIXED(key, GAUSSIAN, n=N, inflation=2.0, before=before))
+    low, high = draws == np.asarray(box.low), draws == np.asarray(box.high)
+    assert not low[:, 1].any() and not high[:, 0].any()
+    first, second = (stats.norm(MEAN[d], SCALE[d]) for d in range(2))
+    # A draw is moved where no bound that stays is in its way.
+    inside = [first.cdf(2.0) - first.cdf(0.0), second.cdf(5.5) - second.cdf(3.0)]
+    for found, mass in (
+        (low[:, 0], first.cdf(0.0) * (inside[1] + second.sf(5.5))),
+        (high[:, 1], second.sf(5.5) * (inside[0] + first.cdf(0.0))),
+    ):
+        assert abs(found.mean() - mass) < 5 * np.sqrt(mass * (1 - mass) / N)
+
+
+def test_mixed_draws_of_a_support_that_stays_are_those_of_rejection(key):
+    draws = np.asarray(MIXED(key, GAUSSIAN, n=N, before=GAUSSIAN.support))
+    for d in range(2):
+        assert stats.kstest(draws[:, d], truncated(d).cdf).pvalue > 1e-3
+
+
 def test_rejection_far_outside_falls_back_to_uniform_draws(key):
     far = Belief(
         GaussianMixture(jnp.zeros(2), jnp.full((2, 2), 1e3), jnp.tile(jnp.eye(2), (2, 1, 1))),

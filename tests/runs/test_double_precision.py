@@ -120,7 +120,7 @@ def test_other_methods_are_traced_in_single_precision(method):
     assert all(jax.tree.leaves(same))  # so that it can be carried by a scan, and its memory be used again
 
     def draws(state, one):
-        posterior = posterior_after(state.reported, state.network, one.x)
+        posterior = posterior_after(numbers.correction, state.reported, state.network, one.x)
         return posterior.inner_draws(jax.random.key(0), 10)
 
     assert not wide(jax.eval_shape(single(draws), after, one))

@@ -83,7 +83,7 @@ def alone(key, rule, observed, x):
     support = TASK.support("misspecified")
     state, info = algorithm.run(run_keys(key).run, TASK, SETTINGS, rule, x, support)
     key_draw, key_simulate = jax.random.split(run_keys(key).of_check(SETTINGS.rounds - 1))
-    posterior = posterior_after(state.reported, state.network, x)
+    posterior = posterior_after(SETTINGS.correction, state.reported, state.network, x)
     theta = posterior.sample(key_draw, POSTERIOR_SAMPLES, space="inference")
     return info, discrepancy(key_simulate, TASK, theta, observed)
 

@@ -107,7 +107,8 @@ def repeated_chunks(run: Run, plan: CalibrationPlan, progress: RoundProgress) ->
         if made < run.settings.rounds:  # all had settled, and the next chunk's are going to
             progress.advance(run.settings.rounds - made)
         keys, x = _keys(plan, DRAWS, first, len(truths["x"])), np.asarray(engine.inputs.x)[: len(truths["x"])]
-        found = jax.device_get(_by_states(keys, truths["theta"], x, engine.fetch(state), plan.draws))
+        correction, states = run.settings.correction, engine.fetch(state)
+        found = jax.device_get(_by_states(correction, keys, truths["theta"], x, states, plan.draws))
         return found, time.perf_counter() - began
 
     return chunk
@@ -124,11 +125,11 @@ def _by_network(run: Run, key: jax.Array, truth: jax.Array, x: jax.Array, draws:
     return described(key_draw, truth, run.conditioned(x, key_condition), draws)
 
 
-@functools.partial(jax.jit, static_argnums=4)
+@functools.partial(jax.jit, static_argnums=(0, 5))
 @single
-@functools.partial(jax.vmap, in_axes=(0, 0, 0, 0, None))
-def _by_states(key: jax.Array, truth: jax.Array, x: jax.Array, state: Any, draws: int):
-    return described(key, truth, posterior_after(state.reported, state.network, x), draws)
+@functools.partial(jax.vmap, in_axes=(None, 0, 0, 0, 0, None))
+def _by_states(correction: str, key: jax.Array, truth: jax.Array, x: jax.Array, state: Any, draws: int):
+    return described(key, truth, posterior_after(correction, state.reported, state.network, x), draws)
 
 
 def _keys(plan: CalibrationPlan, purpose: int, first: int, count: int) -> jax.Array:
