@@ -120,7 +120,7 @@ def mixed(
     draws = belief.mixture.sample(key_posterior, n)
     moved = belief.support.clip(draws)
     # Of a support that nothing is known of before, all bounds count as moving.
-    low, high = (-jnp.inf, jnp.inf) if before is None else (before.low, before.high)
+    low, high = (jnp.inf, -jnp.inf) if before is None else (before.low, before.high)
     stays = ((moved > draws) & (belief.support.low >= low)) | ((moved < draws) & (belief.support.high <= high))
     inside = belief.support.contains(draws)
     wide = inside | jnp.any(stays, axis=-1)
