@@ -13,6 +13,8 @@ from jaxlfi.estimators.shuffling import LARGEST_PLACE, shuffled
 
 BEYOND = 2**LARGEST_PLACE + 1
 """Rows that are too many for the fast way."""
+_shuffled = jax.jit(shuffled)
+"""One program for each capacity: by themselves, its operations would be twenty."""
 
 
 CAPACITIES = (1, 2, 5, 64, 127, 128, 129, 300)
@@ -23,14 +25,14 @@ CAPACITIES = (1, 2, 5, 64, 127, 128, 129, 300)
 def test_the_filled_rows_stay_in_front_and_each_is_there_once(seed, capacity, data):
     count = data.draw(st.integers(0, capacity))
     rows = np.random.default_rng(seed).permutation(capacity)
-    order = np.asarray(shuffled(jax.random.key(seed), jnp.asarray(rows), count))
+    order = np.asarray(_shuffled(jax.random.key(seed), jnp.asarray(rows), count))
     np.testing.assert_array_equal(np.sort(order[:count]), np.sort(rows[:count]))
     np.testing.assert_array_equal(order[count:], rows[count:])
 
 
 @pytest.mark.parametrize("capacity", [2**LARGEST_PLACE, BEYOND])
 def test_many_rows(capacity):
-    order = np.asarray(shuffled(jax.random.key(0), jnp.arange(capacity), capacity - 5))
+    order = np.asarray(_shuffled(jax.random.key(0), jnp.arange(capacity), capacity - 5))
     np.testing.assert_array_equal(np.sort(order), np.arange(capacity))
     np.testing.assert_array_equal(order[-5:], np.arange(capacity - 5, capacity))
     assert abs(scipy.stats.spearmanr(order[:-5], np.arange(capacity - 5)).statistic) < 4 / np.sqrt(capacity)
@@ -39,7 +41,7 @@ def test_many_rows(capacity):
 @pytest.mark.parametrize("capacity", [7, 8, 9])
 def test_every_order_of_four_rows_is_as_likely(capacity):
     keys = jax.random.split(jax.random.key(3), 24_000)
-    orders = jax.vmap(lambda key: shuffled(key, jnp.arange(capacity), 4)[:4])(keys)
+    orders = jax.jit(jax.vmap(lambda key: shuffled(key, jnp.arange(capacity), 4)[:4]))(keys)
     _, counts = np.unique(np.asarray(orders), axis=0, return_counts=True)
     assert len(counts) == 24
     assert scipy.stats.chisquare(counts).pvalue > 1e-4
