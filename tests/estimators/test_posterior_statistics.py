@@ -1,5 +1,7 @@
 """Moments, quantiles, marginals and conditionals of a posterior: closed forms, quadrature and plain rejection."""
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +29,6 @@ MIXTURE = GaussianMixture(
 )
 BOX = Support([-0.9, -1.0, -0.2], [0.9, 0.6, 1.1])
 """It cuts off half of the mixture, more in one dimension than in others."""
-OPTIMISED = True
 _truncated = jax.jit(truncated, static_argnums=3)
 
 
@@ -148,8 +149,8 @@ def test_a_marginals_draws_and_statistics_are_those_of_the_whole(key):
     logs = posterior(space=LOGS)
     marginal = logs.marginal(["c", "a"])
     np.testing.assert_array_equal(marginal.sample(key, 50), logs.sample(jax.random.clone(key), 50)[:, [2, 0]])
-    np.testing.assert_allclose(marginal.mean(), logs.mean()[jnp.array([2, 0])])
-    np.testing.assert_allclose(marginal.std(), logs.std()[jnp.array([2, 0])])
+    np.testing.assert_allclose(marginal.mean(), np.asarray(logs.mean())[[2, 0]])
+    np.testing.assert_allclose(marginal.std(), np.asarray(logs.std())[[2, 0]])
     np.testing.assert_allclose(marginal.quantile([0.2, 0.9]), logs.quantile([0.2, 0.9])[:, [2, 0]])
     assert marginal.space == Space(("c", "a"), (True, True))
     again = marginal.marginal("a")
@@ -157,7 +158,7 @@ def test_a_marginals_draws_and_statistics_are_those_of_the_whole(key):
     np.testing.assert_allclose(logs.marginal(0).log_prob([1.1]), again.log_prob([1.1]))
     moved = marginal.on(Support([0.0, -0.5], [0.5, 0.5]))
     whole = logs.on(Support([-0.5, -1.0, 0.0], [0.5, 0.6, 0.5]))
-    np.testing.assert_allclose(moved.mean(), whole.mean()[jnp.array([2, 0])], rtol=1e-5)
+    np.testing.assert_allclose(moved.mean(), np.asarray(whole.mean())[[2, 0]], rtol=1e-5)
     np.testing.assert_allclose(CUT.marginal(NAMES).log_prob([0.1, 0.2, 0.3]), CUT.log_prob([0.1, 0.2, 0.3]), rtol=1e-5)
 
 
@@ -195,6 +196,16 @@ def test_conditional_and_marginal_commute():
     np.testing.assert_allclose(one.quantile([0.1, 0.6]), other.quantile([0.1, 0.6]), atol=1e-5)
 
 
+@contextlib.contextmanager
+def optimised():
+    """Programs that are compiled within run for longer than they are compiled."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", True)
+
+
 @settings(max_examples=15)
 @given(
     strategies.mixtures(*strategies.SHAPES[1], spread=2.0),
@@ -204,11 +215,12 @@ def test_quantiles_are_monotone_and_invert_the_distribution_function(mixture, le
     """Where nothing is cut off, that of the mixture is a closed form."""
     levels = np.sort(levels)
     wide = posterior(mixture, Support([-40.0] * 3, [40.0] * 3))
-    found = wide.quantile(levels)
+    narrow = posterior(mixture, Support([-1.0] * 3, [1.5] * 3))
+    with optimised():
+        found, narrow = wide.quantile(levels), narrow.quantile(levels)
     assert (np.diff(found, axis=0) >= 0).all()
     held = np.stack([mixture.marginal_cdf(row) for row in found])
     np.testing.assert_allclose(held, np.tile(levels[:, None], 3), atol=0.004)
-    narrow = posterior(mixture, Support([-1.0] * 3, [1.5] * 3)).quantile(levels)
     assert (np.diff(narrow, axis=0) >= 0).all() and (narrow >= -1).all() and (narrow <= 1.5).all()
 
 
