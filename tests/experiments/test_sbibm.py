@@ -34,7 +34,9 @@ def test_gaussian_linear_is_the_benchmarks(number):
     np.testing.assert_allclose(theta.mean(0), x / 2, atol=5 * np.sqrt(0.05 / len(theta)))
     np.testing.assert_allclose(np.cov(theta.T), 0.05 * np.eye(10), atol=5 * 0.05 * np.sqrt(2 / len(theta)))
     task = TASKS["gaussian_linear"]()
-    draws = np.asarray(jax.vmap(task.simulate)(jax.random.split(jax.random.key(0), 10000), jnp.ones((10000, 10))))
+    draws = np.asarray(
+        jax.jit(jax.vmap(task.simulate))(jax.random.split(jax.random.key(0), 10000), jnp.ones((10000, 10)))
+    )
     np.testing.assert_allclose(draws.mean(0), 1.0, atol=5 * np.sqrt(0.1 / 10000))
     np.testing.assert_allclose(draws.var(0), 0.1, rtol=0.08)
     np.testing.assert_allclose(task.prior.variance(), 0.1, rtol=1e-5)
@@ -62,7 +64,7 @@ def test_the_needle_is_there():
     """Half of the mixture's posterior is ten times as narrow as the other half."""
     draws, x = reference("gaussian_mixture", 1), observation("gaussian_mixture", 1)
     assert np.mean(np.linalg.norm(draws - x, axis=1) < 0.3) == pytest.approx(0.5 + 0.5 * 0.044, abs=0.03)
-    simulated = jax.vmap(TASKS["gaussian_mixture"]().simulate)(
+    simulated = jax.jit(jax.vmap(TASKS["gaussian_mixture"]().simulate))(
         jax.random.split(jax.random.key(0), 4000), jnp.zeros((4000, 2))
     )
     expected = lambda z: 0.5 * stats.norm.cdf(z) + 0.5 * stats.norm.cdf(z, scale=0.1)

@@ -145,7 +145,7 @@ def test_a_particle_filter_estimates_what_a_kalman_filter_knows():
         return particles, jax.scipy.stats.norm.logpdf(observation, particles, error)
 
     estimate = lambda key: series.particle_filter(key, jnp.zeros(200), move, jnp.asarray(x), 200)
-    estimates = np.asarray(jax.vmap(estimate)(jax.random.split(jax.random.key(0), 200)), float)
+    estimates = np.asarray(jax.jit(jax.vmap(estimate))(jax.random.split(jax.random.key(0), 200)), float)
     mean, variance, exact = 0.0, 0.0, 0.0
     for value in x:
         mean, variance = memory * mean, memory**2 * variance + deviation**2
@@ -165,7 +165,8 @@ def test_the_queue_s_likelihood_is_a_density_of_departures(monkeypatch):
     density = jax.jit(jax.vmap(lambda x: series._mg1_likelihood(jax.random.key(3), theta, x)))(jnp.asarray(pairs))
     mass = np.exp(np.asarray(density, float)) * (grid[1] - grid[0]) ** 2
     assert mass.sum() == pytest.approx(1, abs=0.05)
-    simulated = jax.vmap(lambda key: series._mg1(key, theta)[:2])(jax.random.split(jax.random.key(0), 4000))
+    departures = jax.jit(jax.vmap(lambda key: series._mg1(key, theta)[:2]))
+    simulated = departures(jax.random.split(jax.random.key(0), 4000))
     np.testing.assert_allclose(mass @ pairs / mass.sum(), np.mean(simulated, axis=0), rtol=0.05)
 
 
