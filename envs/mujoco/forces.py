@@ -12,7 +12,7 @@ import dataclasses
 
 import mujoco
 import numpy as np
-import scipy.stats
+import scipy.special
 from jaxtyping import Float
 
 MOST_STATES = 200
@@ -113,7 +113,7 @@ def estimated(
     if excess <= 0 or not visible.any():
         return 0.0, 1.0
     degrees = np.sum(visible) ** 2 / np.sum(visible**2)
-    widened = scipy.stats.t.ppf(0.95, degrees) / scipy.stats.norm.ppf(0.95)
+    widened = scipy.special.stdtrit(degrees, 0.95) / scipy.special.ndtri(0.95)
     return float(np.sqrt(excess / np.sum(visible))), float(widened)
 
 

@@ -7,7 +7,6 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import qmc
 
 from jaxlfi.design import evolution
 from jaxlfi.design.regions import Region
@@ -196,6 +195,8 @@ def steps(count: int, rated: int) -> int:
 
 def spread(task: Task, count: int, rng: np.random.Generator) -> Float[np.ndarray, "designs k"]:
     """Designs that fill the bounds evenly (a scrambled Sobol sequence), the nominal one first."""
+    from scipy.stats import qmc  # a quarter of what importing jaxlfi would take
+
     size = len(task.design.variables)
     power = int(np.ceil(np.log2(max(count - 1, 1))))
     points = qmc.Sobol(size, rng=rng).random_base2(power)[: max(count - 1, 1)]

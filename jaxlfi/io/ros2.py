@@ -23,7 +23,6 @@ import numpy as np
 from jaxlfi.io import clocks
 from jaxlfi.io.rollout import Rollout, Signal
 
-ENCODING = "cdr"
 INSTALL = "MCAP files of ROS 2 need the package mcap-ros2-support: pip install 'jaxlfi[robotics]'"
 APART = 1.0
 """Seconds between the clock of stamps and that of the recorder from which on they are taken for different clocks."""
