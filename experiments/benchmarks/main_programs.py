@@ -13,17 +13,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from jaxlfi.bayessim.algorithm import State
-from jaxlfi.bayessim.batch import BatchEngine, RunSpec, round_one, stack_inputs, start_one
+from jaxlfi.bayessim.batch import AXIS, BatchEngine, RunSpec, round_one, stack_inputs, start_one
 from jaxlfi.bayessim.presets import QUICK
 from jaxlfi.bayessim.programs import program
 from jaxlfi.bayessim.settings import Settings
-from jaxlfi.bayessim.staged import StagedEngine
+from jaxlfi.bayessim.staged import StagedEngine, gather_one, train_one
 from jaxlfi.envs import lotka_volterra, mg1
 from jaxlfi.envs.mujoco import task as mujoco_task
 from jaxlfi.heuristics import Edge
-from jaxlfi.tasks.simulation import trajectory_and_outcome
+from jaxlfi.tasks.simulation import Simulations, trajectory_and_outcome
 from jaxlfi.tasks.task import Task
 
 ARM = Path(__file__).parents[2] / "examples/mujoco/arm.toml"
@@ -97,6 +98,19 @@ def on_device(models: Any) -> None:
     vars(models)["numbers"] = lambda theta: (jnp.asarray(nominal) + 0.0 * theta[0], theta[0] != theta[0])
 
 
+def training(name: str, task: Task, support: str, runs: int, settings: Settings = QUICK) -> Program:
+    """The training of so many runs side by side, by far the most of their round."""
+    inputs = inputs_of(task, support, runs)
+    mesh = Mesh(np.asarray(jax.local_devices()[:1]), (AXIS,))
+    given = (settings, inputs, started(task, settings, inputs), jnp.asarray(0))
+    stage = lambda one, *bound: program(functools.partial(one, *bound), mesh, (None, 0, 0, None, 0))
+    flags = jax.ShapeDtypeStruct((runs, settings.simulation_budget), bool)
+    numbers = lambda *shape, dtype="float32": jax.ShapeDtypeStruct((runs, settings.simulation_budget, *shape), dtype)
+    made = Simulations(numbers(task.dim), numbers(inputs.x.shape[-1]), numbers(dtype="int32"), flags, flags, numbers())
+    gathered = jax.eval_shape(stage(gather_one, task.inference.prior), *given, made)
+    return Program(name, stage(train_one), (*given, gathered.lesson))
+
+
 def rollouts(name: str, batch: int) -> Program:
     """Rollouts of an arm by MJX under its recorded controls, each with a model of its own, which is there already."""
     task = mujoco_task(ARM, engine="mjx")
@@ -130,7 +144,8 @@ BATCH = 1024
 MAKERS: dict[str, Callable[[], list[Program]]] = {
     "lotka-volterra": lambda: list(stages("Lotka-Volterra", lotka_volterra.task(), "misspecified")),
     "mg1": lambda: [one for one in stages("M/G/1", mg1.task(), "misspecified") if one.holds_simulator],
-    "grid": lambda: [fused(f"Lotka-Volterra: {GRID_RUNS} runs", lotka_volterra.task(), "misspecified", GRID_RUNS)],
+    "training": lambda: [training(f"{GRID_RUNS} runs: train", lotka_volterra.task(), "misspecified", GRID_RUNS)],
+    "grid": lambda: [fused(f"{GRID_RUNS} runs: a round", lotka_volterra.task(), "misspecified", GRID_RUNS)],
     "mjx": lambda: [rollouts(f"MJX: {BATCH} rollouts of an arm", BATCH)],
     "ppo": lambda: [policy_update("PPO: an update on an arm by MJX")],
 }
