@@ -91,8 +91,9 @@ def fit(
             normalisers are replaced where the network starts anew.
         dataset: simulations; only the filled rows are used.
         weights: weight of each row in the loss, shape [C]; all ones without importance correction.
-        expected_size: filled rows if no simulation had failed. It sets the number of minibatches of an epoch and,
-            unlike the size itself, is the same for all runs of a batch, which then step together.
+        expected_size: rows that an epoch goes through: filled ones if no simulation had failed, or fewer. It sets the
+            number of minibatches of an epoch and, unlike the size itself, is the same for all runs of a batch, which
+            then step together.
         log_prior: log-density of the prior at each row, up to a constant, shape [C]; None for a uniform one. Only
             the atomic losses ask for it.
 

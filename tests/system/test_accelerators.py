@@ -32,7 +32,7 @@ def keys_of_brax():
         yield
 
 
-@pytest.mark.parametrize("group", main_programs.MAKERS)
+@pytest.mark.parametrize("group", [name for name in main_programs.MAKERS if name != "training"])  # a part of the grid's
 def test_programs_are_lowered_for_accelerators(group):
     for one in main_programs.MAKERS[group]():
         module = export.export(one.function, platforms=PLATFORMS)(*one.arguments).mlir_module()
