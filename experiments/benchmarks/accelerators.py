@@ -12,6 +12,7 @@ import argparse
 import dataclasses
 import functools
 import json
+import unittest.mock
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -60,11 +61,8 @@ def gillespie_steps() -> tuple[float, float]:
 
     task = lotka_volterra.task()
     theta = task.support("misspecified").sample(jax.random.key(1), QUICK.simulation_budget)
-    jax.lax.while_loop = counting
-    try:
+    with unittest.mock.patch.object(jax.lax, "while_loop", counting):
         jax.block_until_ready(jax.jit(lambda key: simulate(key, task, theta))(jax.random.key(0)))
-    finally:
-        jax.lax.while_loop = loop
     jax.effects_barrier()
     return made[0], made[1] / made[0]
 
@@ -76,10 +74,9 @@ def _tick(made: list[int], place: int) -> None:
 def counted(group: str) -> dict[str, list[dict[str, float]]]:
     """The parts of a group's programs, by their names."""
     epochs, size = QUICK.estimator.epochs, ROUND * QUICK.simulations_per_round
-    training, phases = (epochs, -(-size // QUICK.estimator.batch_size)), ()
-    if group == "lotka-volterra":
-        phases = gillespie_steps()
-    unknown = {"train": training, "simulate": phases, "compare": phases, "arm": (SOLVER,), "MJX": (SOLVER,)}
+    training = epochs, -(-size // QUICK.estimator.batch_size)
+    phases = gillespie_steps() if group == "lotka-volterra" else ()
+    unknown: dict[str, tuple[float, ...]] = {"train": training, "simulate": phases, "compare": phases, "arm": (SOLVER,), "MJX": (SOLVER,)}
     return {
         one.name: [
             dataclasses.asdict(part)

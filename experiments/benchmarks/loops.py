@@ -56,7 +56,7 @@ def parts(function: Any, arguments: tuple, steps: Sequence[float] = ()) -> list[
 
 
 def _parts(program: ClosedJaxpr, steps: float, left: list[float]) -> Iterator[Part]:
-    whole, inner = _cost(program), []
+    whole: tuple[float, ...] = _cost(program)
     for equation in _loops(program.jaxpr):
         fixed = equation.primitive.name == "scan"
         if not fixed and not left:
@@ -64,8 +64,7 @@ def _parts(program: ClosedJaxpr, steps: float, left: list[float]) -> Iterator[Pa
         body = equation.params["jaxpr" if fixed else "body_jaxpr"]
         once = _cost(body)
         whole = tuple(max(all_ - own, 0.0) for all_, own in zip(whole, once, strict=True))
-        inner.append((body, steps * (equation.params["length"] if fixed else left.pop(0))))
-        yield from _parts(*inner[-1], left)
+        yield from _parts(body, steps * (equation.params["length"] if fixed else left.pop(0)), left)
     yield Part(steps, *whole)
 
 
