@@ -76,7 +76,13 @@ def counted(group: str) -> dict[str, list[dict[str, float]]]:
     epochs, size = QUICK.estimator.epochs, ROUND * QUICK.simulations_per_round
     training = epochs, -(-size // QUICK.estimator.batch_size)
     phases = gillespie_steps() if group == "lotka-volterra" else ()
-    unknown: dict[str, tuple[float, ...]] = {"train": training, "simulate": phases, "compare": phases, "arm": (SOLVER,), "MJX": (SOLVER,)}
+    unknown: dict[str, tuple[float, ...]] = {
+        "train": training,
+        "simulate": phases,
+        "compare": phases,
+        "arm": (SOLVER,),
+        "MJX": (SOLVER,),
+    }
     return {
         one.name: [
             dataclasses.asdict(part)
