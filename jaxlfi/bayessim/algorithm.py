@@ -26,6 +26,12 @@ from jaxlfi.tasks.priors import prior_draws
 from jaxlfi.tasks.simulation import Simulations, simulate, within_budget
 from jaxlfi.tasks.task import Task
 
+WHOLE = 20
+"""Rounds whose epochs go through all simulations so far: those of a run by default.
+
+If all did, the time of a run would grow with the square of its rounds.
+"""
+
 
 class State(struct.PyTreeNode):
     """What the next round needs.
@@ -232,11 +238,23 @@ def gather(
         # Success is a part of the prior of the simulations that the atomic losses compare.
         log_prior = (0.0 if log_prior is None else log_prior) + learnt.log_prob(dataset.theta)
     key_prepare, _ = fit_keys(key)
-    lesson = prepare(key_prepare, network, dataset, weights, log_prior)
+    lesson = prepare(key_prepare, network, dataset, weights, log_prior, _rows_after(settings, state, WHOLE - 1))
     return Gathered(simulations, dataset, attempts, proposals, lesson, effective_size(weights))
 
 
 def expected_size(settings: Settings, state: State, round: Int[Array, ""] | int) -> Int[Array, ""] | int:
+    """Simulations that an epoch of a round without failures goes through: all so far, in the first `WHOLE` rounds.
+
+    Thereafter as many as the epochs of those rounds did on average, other ones each time until all had their turn: the
+    time of a run is in proportion to its rounds.
+    """
+    size = _rows_after(settings, state, round)
+    if settings.rounds <= WHOLE:
+        return size
+    return jnp.where(round < WHOLE, size, _rows_after(settings, state, (WHOLE - 1) // 2))
+
+
+def _rows_after(settings: Settings, state: State, round: Any) -> Any:
     """Rows of the dataset after a round without failures: those that later rounds have room for are not there yet."""
     return state.dataset.capacity - (settings.rounds - 1 - round) * settings.simulations_per_round
 

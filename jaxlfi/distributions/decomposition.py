@@ -1,5 +1,7 @@
 """Singular values that are found whatever else runs beside."""
 
+import functools
+
 import jax
 from jaxtyping import Array, Float
 
@@ -7,8 +9,11 @@ from jaxtyping import Array, Float
 def svd(x: Float[Array, "rows columns"]) -> tuple[Float[Array, "rows rank"], Array, Float[Array, "rank columns"]]:
     """Left vectors, singular values and right vectors, x = U diag(s) V', of rank min(rows, columns).
 
-    By QR iteration. Divide and conquer, `jnp.linalg.svd`'s way on CPUs, hands the matrices of a batch to the threads it
-    runs on itself, and waits for them: where two such batches run at once on two cores, both can wait for ever.
+    By QR iteration on CPUs. Divide and conquer, `jnp.linalg.svd`'s way there, hands the matrices of a batch to the
+    threads it runs on itself, and waits for them: where two such batches run at once on two cores, both can wait for
+    ever. Other platforms have ways of their own; TPUs have no QR iteration.
     """
-    left, values, right = jax.lax.linalg.svd(x, full_matrices=False, algorithm=jax.lax.linalg.SvdAlgorithm.QR)
+    by = lambda algorithm: functools.partial(jax.lax.linalg.svd, full_matrices=False, algorithm=algorithm)
+    ways = jax.lax.linalg.SvdAlgorithm
+    left, values, right = jax.lax.platform_dependent(x, cpu=by(ways.QR), default=by(ways.DEFAULT))
     return left, values, right

@@ -57,7 +57,8 @@ class Estimator(Checked, abc.ABC):
         clip_norm: global norm the gradients are clipped to.
         components: Gaussians K of each network's mixture, its own or the one fitted to it.
         ensemble_size: networks E; the posterior is their equally weighted mixture, of E K Gaussians.
-        epochs: full passes over the dataset each round (docs/paper.md, reading B); 0 where `steps` counts instead.
+        epochs: full passes over the dataset each round (docs/paper.md, reading B), after twenty rounds over a part of
+            it, in turn; 0 where `steps` counts instead.
         steps: gradient steps each round, rounded up to epochs of equal length; 0 where `epochs` counts.
         batch_size: simulations in a minibatch, drawn from the filled rows only.
         schedule: "constant", or "cosine" to zero within the round.

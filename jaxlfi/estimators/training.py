@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
@@ -57,6 +58,7 @@ class Lesson(struct.PyTreeNode):
             can compare them; the places of the others follow, shape [C].
         size: number of filled rows, shape [].
         late: which rows are of the later rounds, shape [C].
+        longest: rows that an epoch goes through, at most; of more, epochs take turns.
     """
 
     network: Network
@@ -64,6 +66,13 @@ class Lesson(struct.PyTreeNode):
     order: Int[Array, "*batch cap"]
     size: Int[Array, "*batch"]
     late: Bool[Array, "*batch cap"]
+    longest: int = struct.field(pytree_node=False)
+
+    def held_out(self) -> tuple[Int[Array, "*batch"], np.ndarray]:
+        """The number of rows that are held out, the last ones in order, and the places of as many as there can be."""
+        share = self.network.estimator.validation
+        places = np.arange(max(2, int(share * self.longest)))
+        return jnp.minimum(jnp.floor(share * self.size).astype(jnp.int32), len(places)), places
 
 
 def fit(
@@ -82,8 +91,9 @@ def fit(
             normalisers are replaced where the network starts anew.
         dataset: simulations; only the filled rows are used.
         weights: weight of each row in the loss, shape [C]; all ones without importance correction.
-        expected_size: filled rows if no simulation had failed. It sets the number of minibatches of an epoch and,
-            unlike the size itself, is the same for all runs of a batch, which then step together.
+        expected_size: rows that an epoch goes through: filled ones if no simulation had failed, or fewer. It sets the
+            number of minibatches of an epoch and, unlike the size itself, is the same for all runs of a batch, which
+            then step together.
         log_prior: log-density of the prior at each row, up to a constant, shape [C]; None for a uniform one. Only
             the atomic losses ask for it.
 
@@ -108,8 +118,12 @@ def prepare(
     dataset: Dataset,
     weights: Float[Array, " cap"],
     log_prior: Float[Array, " cap"] | None = None,
+    longest: int | None = None,
 ) -> Lesson:
-    """What comes before training; the arguments are those of `fit`."""
+    """What comes before training; the arguments are those of `fit`, and how many rows an epoch goes through, at most.
+
+    That is all rows by default.
+    """
     estimator = network.estimator
     if estimator.warm_start:
         x = network.given(dataset.x)
@@ -121,7 +135,8 @@ def prepare(
     from_prior = (dataset.round == 0).astype(weights.dtype)
     rows = estimator.rows(key_rows, theta, x, weights, log_prior, from_prior)
     order = shuffled(jax.random.fold_in(jax.random.clone(key), 2), jnp.arange(dataset.capacity), dataset.size)
-    return Lesson(network, rows, order, dataset.size, dataset.late)
+    longest = dataset.capacity if longest is None else min(longest, dataset.capacity)
+    return Lesson(network, rows, order, dataset.size, dataset.late, longest)
 
 
 def train(key: jax.Array, lesson: Lesson, expected_size: Int[Array, ""] | int) -> tuple[dict, FitInfo]:
@@ -137,7 +152,7 @@ def train(key: jax.Array, lesson: Lesson, expected_size: Int[Array, ""] | int) -
 
     def one(key, params, view):
         own = lesson.rows.replace(given=viewed(lesson.rows.given, view))
-        return _fit_one(key, estimator, params, own, lesson.order, lesson.size, expected_size)
+        return _fit_one(key, params, lesson.replace(rows=own), expected_size)
 
     keys = jax.random.split(key, estimator.ensemble_size)
     return jax.vmap(one)(keys, network.params, network.views)
@@ -156,11 +171,10 @@ def _weights(network: Network, lesson: Lesson) -> Float[Array, " member"]:
 
     By the held-out rows of the later rounds, which are nearer to the observation than those before.
     """
-    estimator, capacity = network.estimator, len(lesson.order)
+    estimator = network.estimator
     if not estimator.validation or estimator.loss != "likelihood":
         return estimator.equal_weights
-    count = jnp.floor(estimator.validation * lesson.size).astype(jnp.int32)
-    places = jnp.arange(max(2, int(estimator.validation * capacity)))
+    count, places = lesson.held_out()
     held_out = jnp.take(lesson.order, jnp.maximum(lesson.size - count, 1) + places, mode="clip")
     own = lesson.rows.take(held_out)
     module: Any = estimator.embedded(network.scale.dim)
@@ -168,8 +182,9 @@ def _weights(network: Network, lesson: Lesson) -> Float[Array, " member"]:
     return stacked(jax.vmap(score)(network.params, network.views), (places < count) * lesson.late[held_out] * 1.0)
 
 
-def _fit_one(key_epochs, estimator, params, data, rows, size, expected_size):
+def _fit_one(key_epochs, params, lesson, expected_size):
     """Training of one network: epochs over the data, each a loop over minibatches."""
+    estimator, data, rows, size = lesson.network.estimator, lesson.rows, lesson.order, lesson.size
     capacity, dim = data.value.shape
     module = estimator.embedded(dim)
     objective = LOSSES[estimator.loss]
@@ -181,14 +196,20 @@ def _fit_one(key_epochs, estimator, params, data, rows, size, expected_size):
 
     adam = optax.adamw(rate, weight_decay=estimator.weight_decay)
 
-    held_out = jnp.floor(estimator.validation * size).astype(jnp.int32)
+    held_out, held_out_places = lesson.held_out()
     training = jnp.maximum(size - held_out, 1)
-    held_out_places = jnp.arange(max(2, int(estimator.validation * capacity)))
     held_out_rows = jnp.take(rows, training + held_out_places, mode="clip")
     mean_weight = jnp.sum(jnp.where(jnp.arange(capacity) < size, data.weights, 0.0)) / jnp.maximum(size, 1)
     data = data.replace(weights=data.weights / jnp.maximum(mean_weight, 1e-30))
     held_out_data = data.take(held_out_rows)
     held_out_data = held_out_data.replace(weights=jnp.where(held_out_places < held_out, held_out_data.weights, 0.0))
+
+    # What is more than an epoch goes through is not shuffled as a whole: the time would grow with it.
+    shared = lesson.longest < capacity
+    turn = jnp.minimum(training, batches * estimator.batch_size) if shared else training
+
+    def in_turn(index):
+        return rows[(index * turn + jnp.arange(lesson.longest)) % training] if shared else rows
 
     key_loss, key_held_out = jax.random.fold_in(key_epochs, epochs), jax.random.fold_in(key_epochs, epochs + 1)
 
@@ -213,7 +234,7 @@ def _fit_one(key_epochs, estimator, params, data, rows, size, expected_size):
 
         def minibatch(b, loop):
             state, total, count = loop
-            batch = data.take(order[(b * estimator.batch_size + jnp.arange(estimator.batch_size)) % training])
+            batch = data.take(order[(b * estimator.batch_size + jnp.arange(estimator.batch_size)) % turn])
             key = jax.random.fold_in(key_loss, index * batches + b)
             state, loss, finite = gradient_step(key, state, batch)
             return state, total + loss, count + finite
@@ -240,7 +261,7 @@ def _fit_one(key_epochs, estimator, params, data, rows, size, expected_size):
 
     def body(carry):
         index, training_state, curves = carry
-        order = shuffled(jax.random.fold_in(key_epochs, index), rows, training)
+        order = shuffled(jax.random.fold_in(key_epochs, index), in_turn(index), turn)
         training_state, seen = one_epoch(training_state, index, order)
         return index + 1, training_state, jax.tree.map(lambda curve, now: curve.at[index].set(now), curves, seen)
 

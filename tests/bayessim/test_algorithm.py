@@ -406,3 +406,18 @@ def test_the_defaults_are_the_papers():
     paper = Settings().check()
     assert (paper.rounds, paper.simulations_per_round, paper.simulation_budget) == (10, 100, 125)
     assert (paper.correction, paper.restriction, paper.defensive) == ("none", "clip", 0.0)
+
+
+# ------------------------------------------------------------------------------------------- the time of a run
+
+
+@pytest.mark.parametrize("first", [None, 35])
+def test_the_time_of_long_runs_is_in_proportion_to_their_rounds(first):
+    """Twenty rounds train on all simulations so far, and any twenty later ones take as long as the first."""
+    settings, box = Settings(rounds=60, simulations_per_round=10), TASK.support("ok")
+    state = jax.eval_shape(lambda key: algorithm.init(key, TASK, box, settings, X, first), jax.random.key(0))
+    sizes = np.array([int(algorithm.expected_size(settings, state, index)) for index in range(60)])
+    np.testing.assert_array_equal(sizes[:20], (first or 10) + 10 * np.arange(20))
+    np.testing.assert_allclose(sizes.reshape(3, 20).sum(axis=1), sizes[:20].sum(), rtol=0.05)
+    short = algorithm.expected_size(settings.replace(rounds=20), state, 19)
+    assert isinstance(short, int)  # nothing is chosen where nothing is long

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from experiments import design, embedding, misspecification, mujoco_sysid, widths
+from experiments.benchmarks import accelerators
 from experiments.policies import report
 from experiments.policies import results as policies
 from experiments.sharpness.held_out import HELD_OUT
@@ -472,6 +473,12 @@ def test_engines_of_the_whip():
     ):
         cells = " | ".join(f"{measured[name][batch]['steps/s']:,.0f}" for batch in ("1", "12", "100", "1024"))
         assert_printed("benchmarks", [f"| {printed} | {cells} |"])
+
+
+def test_predictions_for_an_accelerator():
+    body = (ROOT.parent / "docs/accelerators.md").read_text()
+    for line in accelerators.table(json.loads(accelerators.SAVED.read_text())).splitlines():
+        assert f"{line}\n" in body
 
 
 def test_front_page():

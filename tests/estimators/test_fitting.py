@@ -17,7 +17,7 @@ from jaxlfi.estimators.base import Estimator, Network, untrained
 from jaxlfi.estimators.dataset import Dataset
 from jaxlfi.estimators.flow_estimators import FlowEstimator, MaskedFlow, SplineFlow
 from jaxlfi.estimators.mixture_network import MixtureNetwork
-from jaxlfi.estimators.training import fit
+from jaxlfi.estimators.training import fit, prepare, train
 
 SCALE = Support([-4.0, -6.0], [4.0, 2.0])
 SPACE = Space(("a", "b"), (False, False))
@@ -224,6 +224,29 @@ def test_an_epoch_sees_every_row_once():
     network = start(SMALL)
     _, info = fitted(change(SMALL, learning_rate=STILL), network=network)
     np.testing.assert_allclose(info.loss, mean_loss(network), rtol=1e-4)
+
+
+@pytest.mark.parametrize("row", [0, 17, SIZE - 1])
+def test_short_epochs_take_turns_through_all_rows(row):
+    """Five epochs of sixteen rows, twice through all forty: a row that is NaN spoils two steps, whichever it is."""
+    nan = dataclasses.replace(DATA, x=DATA.x.at[row].set(jnp.nan))
+    network, weights = by(change(SMALL, epochs=5, normaliser="none"), start(SMALL)), jnp.ones(CAPACITY)
+
+    @jax.jit
+    def taught(key):
+        lesson = prepare(key, network, nan, weights, longest=16)
+        return train(jax.random.fold_in(jax.random.clone(key), 1), lesson, 16)[1]
+
+    assert int(taught(jax.random.key(2)).nonfinite[0]) == 2
+
+
+def test_a_share_of_an_epoch_is_held_out_at_most():
+    """What is held out is not trained on, and the others take turns: 28 rows of 40, or 36 of them."""
+    network, weights = by(VALIDATED, start(VALIDATED)), jnp.ones(CAPACITY)
+    held_out = lambda longest: prepare(jax.random.key(2), network, DATA, weights, longest=longest).held_out()
+    for longest, count, room in ((None, 12, 14), (CAPACITY, 12, 14), (16, 4, 4)):
+        found, places = held_out(longest)
+        assert (int(found), len(places)) == (count, room)
 
 
 def test_the_cosine_schedule_slows_down():

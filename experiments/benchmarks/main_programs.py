@@ -1,0 +1,152 @@
+"""The programs that a user waits for, with what they are called with: nothing is run or compiled.
+
+Each is lowered for accelerators in tests/system/test_accelerators.py, and its operations are counted by
+`experiments.benchmarks.accelerators`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from jaxlfi.bayessim.algorithm import State
+from jaxlfi.bayessim.batch import AXIS, BatchEngine, RunSpec, round_one, stack_inputs, start_one
+from jaxlfi.bayessim.presets import QUICK
+from jaxlfi.bayessim.programs import program
+from jaxlfi.bayessim.settings import Settings
+from jaxlfi.bayessim.staged import StagedEngine, gather_one, train_one
+from jaxlfi.envs import lotka_volterra, mg1
+from jaxlfi.envs.mujoco import task as mujoco_task
+from jaxlfi.heuristics import Edge
+from jaxlfi.tasks.simulation import Simulations, trajectory_and_outcome
+from jaxlfi.tasks.task import Task
+
+ARM = Path(__file__).parents[2] / "examples/mujoco/arm.toml"
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """A jitted function and what it is called with: arrays, or their shapes."""
+
+    name: str
+    function: Any
+    arguments: tuple
+
+    @property
+    def holds_simulator(self) -> bool:
+        """Whether it is one of the stages that depend on the task; the others depend on shapes."""
+        return self.name.endswith(("simulate", "compare"))
+
+
+def shapes(tree: Any) -> Any:
+    """The shapes of a pytree's arrays."""
+    return jax.eval_shape(lambda: tree)
+
+
+def inputs_of(task: Task, support: str, runs: int) -> Any:
+    """What so many runs are given; EDGE's thresholds differ."""
+    trajectory, _ = jax.eval_shape(
+        functools.partial(trajectory_and_outcome, task), jax.random.key(0), task.support(support).centre
+    )
+    size = jax.eval_shape(task.summary, trajectory).shape[-1]
+    specs = [
+        RunSpec("edge", support, task.support(support), Edge(mass_threshold=0.05 + 0.1 * run / runs), run)
+        for run in range(runs)
+    ]
+    observed = np.ones((runs, *trajectory.shape), np.float32)
+    return stack_inputs(specs, observed, np.ones((runs, size), np.float32))[0]
+
+
+def started(task: Task, settings: Settings, inputs: Any) -> State:
+    """Shapes of the state before the first round."""
+    return jax.eval_shape(jax.vmap(functools.partial(start_one, task, None), (None, 0)), settings, inputs)
+
+
+def stages(name: str, task: Task, support: str, settings: Settings = QUICK) -> Iterator[Program]:
+    """The stages of a round of a single run."""
+    engine = StagedEngine(task, settings, inputs_of(task, support, 1))
+    inputs = (settings, engine.inputs, started(task, settings, engine.inputs), jnp.asarray(0))
+    proposed = jax.eval_shape(engine._propose, *inputs)
+    made = engine.simulations_like(*proposed)
+    gathered = jax.eval_shape(engine._gather, *inputs, made)
+    learnt = jax.eval_shape(engine._train, *inputs, gathered.lesson)
+    _, _, *drawn = jax.eval_shape(engine._conclude, *inputs, gathered, learnt)
+    yield Program(f"{name}: propose", engine._propose, inputs)
+    yield Program(f"{name}: simulate", engine._simulate, (settings, *proposed))
+    yield Program(f"{name}: gather", engine._gather, (*inputs, made))
+    yield Program(f"{name}: train", engine._train, (*inputs, gathered.lesson))
+    yield Program(f"{name}: conclude", engine._conclude, (*inputs, gathered, learnt))
+    yield Program(f"{name}: compare", engine._compare, (settings, engine.inputs, *drawn))
+
+
+def fused(name: str, task: Task, support: str, runs: int, settings: Settings = QUICK) -> Program:
+    """A round of so many runs as one program, on one device."""
+    engine = BatchEngine(task, settings, inputs_of(task, support, runs), devices=jax.local_devices()[:1])
+    many = program(functools.partial(round_one, task), engine.mesh, (None, 0, 0, None))
+    return Program(name, many, (settings, engine.inputs, started(task, settings, engine.inputs), jnp.asarray(0)))
+
+
+def on_device(models: Any) -> None:
+    """Take nominal numbers of models (`jaxlfi.envs.mujoco.mjx_models`), which MuJoCo compiles on the host otherwise."""
+    nominal = models._nominal
+    vars(models)["numbers"] = lambda theta: (jnp.asarray(nominal) + 0.0 * theta[0], theta[0] != theta[0])
+
+
+def training(name: str, task: Task, support: str, runs: int, settings: Settings = QUICK) -> Program:
+    """The training of so many runs side by side, by far the most of their round."""
+    inputs = inputs_of(task, support, runs)
+    mesh = Mesh(np.asarray(jax.local_devices()[:1]), (AXIS,))
+    given = (settings, inputs, started(task, settings, inputs), jnp.asarray(0))
+    stage = lambda one, *bound: program(functools.partial(one, *bound), mesh, (None, 0, 0, None, 0))
+    flags = jax.ShapeDtypeStruct((runs, settings.simulation_budget), bool)
+    numbers = lambda *shape, dtype="float32": jax.ShapeDtypeStruct((runs, settings.simulation_budget, *shape), dtype)
+    made = Simulations(numbers(task.dim), numbers(inputs.x.shape[-1]), numbers(dtype="int32"), flags, flags, numbers())
+    gathered = jax.eval_shape(stage(gather_one, task.inference.prior), *given, made)
+    return Program(name, stage(train_one), (*given, gathered.lesson))
+
+
+def rollouts(name: str, batch: int) -> Program:
+    """Rollouts of an arm by MJX under its recorded controls, each with a model of its own, which is there already."""
+    task = mujoco_task(ARM, engine="mjx")
+    on_device(task.simulate._physics.models)
+    keys = jax.eval_shape(lambda key: jax.random.split(key, batch), jax.random.key(0))
+    theta = jax.ShapeDtypeStruct((batch, task.dim), jnp.float32)
+    return Program(name, jax.jit(jax.vmap(task.simulate)), (keys, theta))
+
+
+def policy_update(name: str, settings: Any = None) -> Program:
+    """An update of PPO: episodes of the arm by MJX, and the gradient steps on them."""
+    from jaxlfi.envs.mujoco.environment import environment  # needs Brax
+    from jaxlfi.rl import ppo
+    from jaxlfi.rl.domains import Domain
+    from jaxlfi.rl.settings import QUICK as QUICK_PPO
+
+    settings, arm = settings or QUICK_PPO, environment(ARM)
+    on_device(arm.models)
+    theta = jax.ShapeDtypeStruct((settings.environments, arm.space.dim), jnp.float32)
+    begun = jax.eval_shape(
+        lambda key, theta: ppo.init(key, arm, settings, Domain(theta)), jax.eval_shape(jax.random.key, 0), theta
+    )
+    return Program(name, jax.jit(functools.partial(ppo.update, arm, settings)), (begun,))
+
+
+GRID_RUNS = 64
+"""Runs of the grid, side by side."""
+BATCH = 1024
+"""Rollouts side by side."""
+
+MAKERS: dict[str, Callable[[], list[Program]]] = {
+    "lotka-volterra": lambda: list(stages("Lotka-Volterra", lotka_volterra.task(), "misspecified")),
+    "mg1": lambda: [one for one in stages("M/G/1", mg1.task(), "misspecified") if one.holds_simulator],
+    "training": lambda: [training(f"{GRID_RUNS} runs: train", lotka_volterra.task(), "misspecified", GRID_RUNS)],
+    "grid": lambda: [fused(f"{GRID_RUNS} runs: a round", lotka_volterra.task(), "misspecified", GRID_RUNS)],
+    "mjx": lambda: [rollouts(f"MJX: {BATCH} rollouts of an arm", BATCH)],
+    "ppo": lambda: [policy_update("PPO: an update on an arm by MJX")],
+}
+"""Groups of programs, by their names. A grid's is the round as one program, for several runs side by side."""
