@@ -23,7 +23,7 @@ OBJECTS: dict[str, tuple[float, float]] = {
 """Mass (kg) and friction: the first is inside of the guess, the others leave it in friction, in mass, and in both."""
 POOL = 512
 """Points of a domain."""
-STEPS, DRAWS = 10, 100
+STEPS, DRAWS = 15, 100
 """Steps of SimOpt, and simulations of each."""
 DROPO = dropo.Dropo(lookahead=4, epsilon=2.0)
 """States are in standard deviations of their noise, which the first and the last one of a transition both have."""

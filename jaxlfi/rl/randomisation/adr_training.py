@@ -40,7 +40,9 @@ def train(
     updates: int,
     probes: int,
 ) -> tuple[ppo.Training, Ranges, Round]:
-    """Train from new networks on, with ranges that begin as a point; a policy's performance is its return, without noise.
+    """Train from new networks on, with ranges that begin as a point.
+
+    A policy's performance is its return, without noise in its actions.
 
     Args:
         key: consumed.
