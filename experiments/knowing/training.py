@@ -28,10 +28,11 @@ SETTINGS = PPO(
     segments=8,
     minibatches=4,
     epochs=8,
-    total_steps=204_800,
+    total_steps=163_840,
+    hidden=(32, 32),
     redrawn=True,
 )
-"""320 updates on an episode or more of each of 32 environments; the same for all arms."""
+"""256 updates on an episode or more of each of 32 environments; the same for all arms."""
 CHUNK = 32
 """Updates between two reports."""
 RANDOMISING = Adr(low_threshold=-0.25, high_threshold=-0.1, buffer=16, step=0.05)
