@@ -15,6 +15,7 @@ All arms have the same learner, networks, steps and episodes. What they are trai
     constant, random             floors: the constant force that is best in the middle of the guess; chance
 
     domains.npz      what each arm is trained on
+    parts/           what is done of the study: a command that was stopped goes on with the next part
     episodes.npz     returns [seeds, episodes] by arm and object: minus the distance from the mark, in m
     config.json      settings, versions, command
     table.md, contrasts.md, returns.png, from these arrays
@@ -22,6 +23,7 @@ All arms have the same learner, networks, steps and episodes. What they are trai
 
 import argparse
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from jaxlfi.io import compile_cache
@@ -55,29 +57,63 @@ def drawn(out: Path) -> dict[str, np.ndarray]:
     return files.read_arrays(path)
 
 
-def played(out: Path, seeds: int) -> dict[str, np.ndarray]:
-    """Returns of all policies, by arm and object."""
-    pools, now, past = drawn(out), Slide(), Slide(HISTORY)
+def memoryless(out: Path, seeds: int) -> dict[str, np.ndarray]:
+    """Returns of policies that see the last state only, by arm and object, each on its own or on all."""
+    pools, env = drawn(out), Slide()
     runs = [(name, seed) for name in pools for seed in range(seeds)]
-    params = training.train(now, np.stack([pools[name] for name, _ in runs]), np.array([seed for _, seed in runs]))
-    fared = training.returns(now, training.learnt(now), params)
-    found: dict[str, np.ndarray] = {}
+    params = training.train(env, np.stack([pools[name] for name, _ in runs]), np.array([seed for _, seed in runs]))
+    fared = training.returns(env, training.learnt(env), params)
+    found = {}
     for place, name in enumerate(pools):
         arm, _, own = name.partition("/")
         for dlo in [own] if own else domains.OBJECTS:
             found[f"{arm}/{dlo}"] = fared[dlo][place * seeds : (place + 1) * seeds]
-    each = np.arange(seeds)
-    params = training.train(past, np.stack([pools["wide box"]] * seeds), each)
-    found |= {f"history/{name}": own for name, own in training.returns(past, training.learnt(past), params).items()}
-    params, ranges = training.train_with_adr(now, each)
-    found |= {f"ADR/{name}": own for name, own in training.returns(now, training.learnt(now), params).items()}
-    forces = jnp.linspace(0.0, STRONGEST, FORCES)
-    nominal = jax.vmap(lambda force: training._fares(now, training.constant, force, jnp.asarray(now.nominal)).mean())
+    return found
+
+
+def with_history(out: Path, seeds: int) -> dict[str, np.ndarray]:
+    """Returns of policies that see more, on the wide box."""
+    env = Slide(HISTORY)
+    params = training.train(env, np.stack([drawn(out)["wide box"]] * seeds), np.arange(seeds))
+    return named("history", training.returns(env, training.learnt(env), params))
+
+
+def with_adr(out: Path, seeds: int) -> dict[str, np.ndarray]:
+    """Returns of policies under automatic domain randomisation, and the ranges that they came to."""
+    env = Slide()
+    params, ranges = training.train_with_adr(env, np.arange(seeds))
+    return named("ADR", training.returns(env, training.learnt(env), params)) | {"ADR ranges": np.asarray(ranges)}
+
+
+def floors(out: Path, seeds: int) -> dict[str, np.ndarray]:
+    """Returns of the constant force that is best in the middle of the guess, and of chance."""
+    env, forces = Slide(), jnp.linspace(0.0, STRONGEST, FORCES)
+    nominal = jax.vmap(lambda force: training.fares(env, training.constant, force, jnp.asarray(env.nominal)).mean())
     best = forces[jnp.argmax(nominal(forces))][None]
-    found |= {f"constant/{name}": own for name, own in training.returns(now, training.constant, best).items()}
     keys = jax.vmap(jax.random.key_data)(jax.random.split(jax.random.key(8), seeds))
-    found |= {f"random/{name}": own for name, own in training.returns(now, training.random, keys).items()}
-    return found | {"ADR ranges": np.asarray(ranges)}
+    constant = named("constant", training.returns(env, training.constant, best))
+    return constant | named("random", training.returns(env, training.random, keys))
+
+
+def named(arm: str, returns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Returns by arm and object."""
+    return {f"{arm}/{dlo}": own for dlo, own in returns.items()}
+
+
+PARTS = {"memoryless": memoryless, "history": with_history, "adr": with_adr, "floors": floors}
+"""What the study consists of; each is kept once it is done."""
+
+
+def played(out: Path, seeds: int) -> dict[str, np.ndarray]:
+    """Returns of all policies; of parts that are there, nothing is trained again."""
+    found: dict[str, np.ndarray] = {}
+    for name, make in PARTS.items():
+        path = out / "parts" / f"{name}-{seeds}.npz"
+        if not path.exists():
+            path.parent.mkdir(exist_ok=True)
+            files.write_arrays(path, make(out, seeds))
+        found |= files.read_arrays(path)
+    return found
 
 
 def main() -> None:

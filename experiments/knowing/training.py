@@ -71,14 +71,15 @@ def train_with_adr(env: Slide, seeds: Float[np.ndarray, " runs"]):
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _fares(env: Slide, act_of: Callable, params, theta: Float[Array, "2"]) -> Float[Array, " episodes"]:
+def fares(env: Slide, act_of: Callable, params, theta: Float[Array, "2"]) -> Float[Array, " episodes"]:
+    """Returns of a policy on an object."""
     domain = Domain(jnp.broadcast_to(theta, (EPISODES, 2)))
     return evaluate(jax.random.key(7), env, act_of(params), domain).value
 
 
 def returns(env: Slide, act_of: Callable, params) -> dict[str, Float[np.ndarray, "runs episodes"]]:
     """Returns of R policies on each object."""
-    every = jax.vmap(lambda own, theta: _fares(env, act_of, own, theta), in_axes=(0, None))
+    every = jax.vmap(lambda own, theta: fares(env, act_of, own, theta), in_axes=(0, None))
     return {name: np.asarray(every(params, jnp.asarray(theta))) for name, theta in OBJECTS.items()}
 
 

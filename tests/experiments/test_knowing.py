@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("brax")
 
+from experiments.knowing import __main__ as study
 from experiments.knowing import report
 from experiments.knowing.domains import OBJECTS
 from experiments.knowing.slide import GRAVITY, INTERVAL, LINE, STEPS, Slide, trajectory
@@ -95,3 +96,24 @@ def test_tables_say_which_arm_is_nearer():
     assert contrasts["wide box"]["A"] == "1.00" and contrasts["wide box"]["p, Holm"] == "0.005"  # 10 times 2 / 4001
     assert float(contrasts["oracle"]["nearer to the mark by, cm"].split()[0]) == pytest.approx(0.0, abs=0.11)
     assert found["history"].shared and not found["SimOpt"].shared and isinstance(found["ADR"], Arm)
+
+
+def test_a_study_that_was_stopped_goes_on_with_the_next_part(tmp_path, monkeypatch):
+    made = []
+
+    def part(name, fails=False):
+        def make(out, seeds):
+            made.append(name)
+            if fails:
+                raise KeyboardInterrupt
+            return {f"{name}/inside": np.full((seeds, 2), float(len(made)))}
+
+        return make
+
+    monkeypatch.setattr(study, "PARTS", {"first": part("first"), "second": part("second", fails=True)})
+    with pytest.raises(KeyboardInterrupt):
+        study.played(tmp_path, 3)
+    monkeypatch.setattr(study, "PARTS", {"first": part("first"), "second": part("second")})
+    found = study.played(tmp_path, 3)
+    assert made == ["first", "second", "second"]
+    assert found["first/inside"].shape == (3, 2) and (found["first/inside"] == 1.0).all()
