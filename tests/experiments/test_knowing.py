@@ -8,10 +8,11 @@ import pytest
 pytest.importorskip("brax")
 
 from experiments.knowing import __main__ as study
-from experiments.knowing import report
+from experiments.knowing import domains, report, training
 from experiments.knowing.domains import OBJECTS
 from experiments.knowing.slide import GRAVITY, INTERVAL, LINE, STEPS, Slide, trajectory
 from jaxlfi.diagnostics.contrasts import Arm
+from jaxlfi.io import files
 from jaxlfi.rl.environment import Environment
 
 SMALL = 1e-5
@@ -117,3 +118,24 @@ def test_a_study_that_was_stopped_goes_on_with_the_next_part(tmp_path, monkeypat
     found = study.played(tmp_path, 3)
     assert made == ["first", "second", "second"]
     assert found["first/inside"].shape == (3, 2) and (found["first/inside"] == 1.0).all()
+
+
+@pytest.mark.slow
+def test_the_whole_study_in_small(tmp_path, monkeypatch):
+    """All parts with hardly any training, on made-up domains: every arm has returns on every object, and tables."""
+    small = training.SETTINGS.replace(
+        total_steps=160, environments=4, unroll=20, segments=2, minibatches=2, epochs=1, hidden=(4,)
+    )
+    for name, value in {"SETTINGS": small, "CHUNK": 2, "EVERY": 1, "PROBES": 4, "EPISODES": 3}.items():
+        monkeypatch.setattr(training, name, value)
+    pool = np.random.default_rng(0).uniform([0.5, 0.2], [1.5, 0.5], (domains.POOL, 2)).astype(np.float32)
+    own = {f"{arm}/{dlo}": pool for arm in domains.OWN for dlo in OBJECTS}
+    files.write_arrays(tmp_path / "domains.npz", {"guess": pool, "wide box": pool} | own)
+    with jax.debug_key_reuse(False):  # Brax uses keys in its own way
+        found = study.played(tmp_path, 2)
+    assert {name.partition("/")[0] for name in found} == {*report.ARMS, "ADR ranges"}
+    shapes = {name: values.shape for name, values in found.items() if name.startswith(("random", "history", "oracle"))}
+    assert set(shapes.values()) == {(2, 3)}
+    files.write_arrays(tmp_path / "episodes.npz", found)
+    report.write(tmp_path)
+    assert "| random |" in (tmp_path / "table.md").read_text() and (tmp_path / "returns.png").stat().st_size > 10_000
