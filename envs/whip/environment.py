@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
-from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip import rewards, rules
 from jaxlfi.envs.whip.episode import Episode, Whip
 from jaxlfi.envs.whip.frames import COLOURS
 from jaxlfi.envs.whip.observer import FLAGS
@@ -108,6 +108,11 @@ class WhipEnvironment:
     bounds = BOUNDS
 
     @property
+    def reward(self) -> str:
+        """The name of what episodes are rewarded for, which trainings and their policies record."""
+        return self.whip.reward
+
+    @property
     def supports(self) -> Mapping[str, Support]:
         """Theta_0 of section VI-B, and Phi."""
         return {"initial": in_task_units(INITIAL), "feasible": self.feasible}
@@ -147,19 +152,20 @@ class WhipEnvironment:
         return {"settled_hit": found.hit, "settled_clean": found.clean, "displaced": jnp.sum(found.displaced, axis=-1)}
 
 
-def make(detector: str = "mask", engine: str = "auto") -> WhipEnvironment:
+def make(detector: str = "mask", engine: str = "auto", reward: str = "paper") -> WhipEnvironment:
     """The whipping task.
 
     Args:
         detector: of keypoints: "clean", "mask", "noisy", "transporter", "learnt" or "learnt-transporter".
         engine: the physics: "auto", "native", "mjx" or "warp".
+        reward: "paper", "ordered" or "settled" (`jaxlfi.envs.whip.rewards`).
 
     Raises:
         ValueError: for unknown names.
     """
     if detector not in DETECTORS:
         raise ValueError(f"detector: expected one of {', '.join(DETECTORS)}, got {detector!r}")
-    return WhipEnvironment(Whip(pick(engine), DETECTORS[detector]))
+    return WhipEnvironment(Whip(pick(engine), DETECTORS[detector], rewards.check(reward)))
 
 
 def _outlined(state: EnvState, key: jax.Array) -> EnvState:

@@ -7,13 +7,14 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlfi.envs.whip import rules
+from jaxlfi.envs.whip import rewards, rules
 from jaxlfi.envs.whip.frames import Frames
 from jaxlfi.envs.whip.observer import observation
 from jaxlfi.envs.whip.parameters import WhipParameters
 from jaxlfi.envs.whip.physics import engine as physics
 from jaxlfi.envs.whip.physics.engine import Engine, State
 from jaxlfi.envs.whip.physics.kinematics import frames
+from jaxlfi.envs.whip.settling import aftermath
 from jaxlfi.envs.whip.vision.camera import side_camera
 from jaxlfi.envs.whip.vision.keypoints import DETECTORS, ON_DLO, Detector, Tracking, begin, measured, track
 
@@ -42,7 +43,7 @@ class Step(struct.PyTreeNode):
     Attributes:
         observation: the gripper's x and z in m, four DLO and six cube keypoints in normalised pixels, six flags of
             cubes that have been hit, shape [28].
-        reward: see `rules.reward`.
+        reward: by the task's rule (`rewards`).
         terminated: whether the top cube has been hit or the gripper has left its workspace.
         truncated: whether the episode's time is up, or the simulation has become unstable.
         hit: cubes hit so far, bottom-up, shape [6].
@@ -68,6 +69,7 @@ class Whip:
     Attributes:
         engine: the physics.
         detector: the error model of the keypoints.
+        reward: what episodes are rewarded for, one of `rewards.REWARDS`.
 
     Example:
         >>> import jax
@@ -81,6 +83,7 @@ class Whip:
 
     engine: Engine
     detector: Detector = DETECTORS["clean"]
+    reward: str = rewards.REWARDS[0]
 
     def reset(self, key: jax.Array, parameters: WhipParameters) -> tuple[Episode, Float[Array, "28"]]:
         """The start of an episode in a scene, and the first observation."""
@@ -103,7 +106,7 @@ class Whip:
         steps = episode.steps + 1
         step = Step(
             observation=observation(measured(key_gripper, self.detector, gripper), keypoints, verdict.hit),
-            reward=verdict.reward,
+            reward=self._reward(parameters, state, verdict, steps),
             terminated=verdict.over & ~state.failed,
             truncated=(steps >= rules.STEPS) | state.failed,
             hit=verdict.hit,
@@ -116,6 +119,15 @@ class Whip:
     def frames(self, parameters: WhipParameters, episode: Episode) -> Frames:
         """The current frame."""
         return frames(self.engine.scene, parameters, episode.state.qpos)
+
+    def _reward(self, parameters, state, verdict, steps):
+        if self.reward == "ordered":
+            return jnp.where(state.failed, 0.0, rewards.ordered(verdict.hit, verdict.outside))
+        if self.reward == "settled":
+            over = verdict.over | (steps >= rules.STEPS)
+            left = aftermath(self.engine, parameters, state.stopped(~over))  # of other episodes nothing is simulated
+            return jnp.where(over, rewards.settled(left, verdict.outside), 0.0)
+        return verdict.reward
 
     def _look(self, key, parameters, tracking, state):
         seen = frames(self.engine.scene, parameters, state.qpos)

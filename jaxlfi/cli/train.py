@@ -46,6 +46,7 @@ examples:
   jaxlfi train whip --domain runs/dlo-0 --start runs/uniform/uniform/seed_000/policy.npz \\
     --initial-deviation 0.2 --out runs/tuned     fine-tune an earlier policy
   jaxlfi train whip --domain uniform --critic theta --out runs/privileged    the value function sees theta
+  jaxlfi train whip --domain uniform --reward settled --out runs/settled      judged by what has fallen in the end
   jaxlfi train whip --domain uniform --seeds 2 --tensorboard --out runs/watched
   jaxlfi train whip --domain uniform --seeds 16 --out runs/many --coordinator 10.0.0.5:1234 --processes 2 \\
     --process-id 0                               on 10.0.0.5; and on another host with --process-id 1
@@ -82,6 +83,12 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="a policy.npz of the same signals and actions that all trainings begin with",
     )
     parser.add_argument(
+        "--reward",
+        metavar="NAME",
+        help="what episodes are rewarded for, as NAME of the environment's option reward; of whip: paper (default), "
+        "ordered or settled",
+    )
+    parser.add_argument(
         "--tensorboard", action="store_true", help="write learning curves while training: tensorboard --logdir DIR"
     )
     parser.add_argument("--no-figures", action="store_true", help="draw no pictures at the end")
@@ -98,6 +105,8 @@ def _train(arguments: argparse.Namespace) -> None:
     from jaxlfi.io.locks import locked
 
     compile_cache.enable()
+    if arguments.reward is not None:
+        arguments.environment += f",reward={arguments.reward}"
     processes = multi_process.join(arguments)
     from jaxlfi.rl import training
 

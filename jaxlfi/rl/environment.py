@@ -86,8 +86,9 @@ class Environment(Protocol):
     its actions displace set-points (`jaxlfi.rl.deployment.Deployment`); `preparation`, where its observations and
     actions are made of signals and controls (`jaxlfi.rl.preparation.Preparation`). One whose observations are bounded
     may have an attribute `bounds`, the least and the largest ones [2, O], for learners that ask for them
-    (`jaxlfi.rl.gym`). One where more happens once an episode is over may have a method `concluded(state)`, from its
-    last state to facts that evaluations add.
+    (`jaxlfi.rl.gym`). One that knows several rewards may have an attribute `reward`, the name of its own, which
+    trainings and policies record. One where more happens once an episode is over may have a method `concluded(state)`,
+    from its last state to facts that evaluations add.
 
     Attributes:
         name: of the environment.

@@ -133,6 +133,7 @@ def begin(plan: Plan, out: Path, processes: Processes = ALONE) -> None:
         "version": formats.FORMATS[TRAINING].version,
         "environment": plan.reference,
         "environment_name": plan.environment.name,
+        "reward": getattr(plan.environment, "reward", None),
         "preset": plan.preset,
         "settings": serialise.fields_to_json(plan.settings, serialise.class_name),
         "trainings": [{"domain": domain, "seed": seed} for domain, seed in names],
@@ -177,6 +178,8 @@ def resumed(
     names = tuple((one["domain"], one["seed"]) for one in config["trainings"])
     if config["environment_name"] != environment.name:
         raise StoreError(f"{out}: expected a training of {environment.name}, got one of {config['environment_name']}")
+    if (known := config.get("reward")) != (own := getattr(environment, "reward", None)) and known is not None:
+        raise StoreError(f"{out}: expected a training by the reward {own}, got one by {known}")
     points = _read(out / "domains.npz") if processes.writes else dict.fromkeys(("trained", "held_out"), 0)
     trained, held_out = processes.broadcast((points["trained"], points["held_out"]))
     # Stacked as raw data: jax's key-reuse checker counts the stacking of keys as their use.
@@ -342,6 +345,7 @@ def _write_result(out: Path, environment: Environment, config: Mapping[str, Any]
         folder.mkdir(parents=True, exist_ok=True)
         params = jax.tree.map(lambda leaf, place=place: leaf[place], result.params)
         recorded = {"reference": config["environment"], "domain": domain, "seed": seed, "versions": config["versions"]}
+        recorded |= {"reward": config["reward"]} if config.get("reward") else {}
         ppo.as_file(environment, params, **recorded).save(folder / "policy.npz")
         means = [float(np.mean(result.outcomes[name][place])) for name in ("value", *facts)]
         writer.writerow([domain, seed, *(f"{mean:.4f}" for mean in means)])

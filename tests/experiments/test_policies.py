@@ -10,7 +10,18 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("brax")
 
-from experiments.policies import collection, evaluation, findings, intervals, making, report, results, sysid, tables
+from experiments.policies import (
+    collection,
+    contrasts,
+    evaluation,
+    findings,
+    intervals,
+    making,
+    report,
+    results,
+    sysid,
+    tables,
+)
 from experiments.policies.barycentres import barycentre, soft_dtw
 from experiments.policies.evaluation import domains_of, objects_of
 from experiments.policies.simulation import KNOWN, Performed, lowest, perform
@@ -305,6 +316,20 @@ def test_the_question_is_answered_with_its_sign():
         "simulated objects of known truth (sim-stiff) 1.25 [1.25, 1.25], better on sim-stiff." in answer
     )
     assert "posterior mean" not in answer
+
+
+def test_contrasts_over_objects():
+    """EDGE is 0.25 to 1.51 ahead of U by object, 0.1 of the truth but on the last, 1.02; the mean has no dlo-3."""
+    own, truths = (1.5, 1.75, 0.5, 1.76), (1.4, 1.65, 0.4, 0.74)
+    returns = {(f"{dlo}-edge", dlo): value for dlo, value in zip(FEM, own, strict=True)}
+    returns |= {(f"{dlo}-true", dlo): value for dlo, value in zip(FEM, truths, strict=True)}
+    returns |= {("uniform", dlo): 0.25 for dlo in FEM} | {(f"{dlo}-mean", dlo): 0.0 for dlo in FEM[:3]}
+    rows = {row["EDGE −"]: row for row in contrasts.table(made_up(returns))}
+    assert list(rows) == ["U", "truth"]  # the others were not evaluated on all objects
+    assert rows["U"]["difference"].startswith("1.13 [") and rows["truth"]["difference"].startswith("0.33 [0.10, ")
+    assert rows["U"]["p"] == "< 0.001" and rows["U"]["A"] == rows["truth"]["A"] == "1.00"
+    low, high = (float(end) for end in rows["U"]["difference"].split("[")[1].strip("]").split(", "))
+    assert 0.25 <= low < 0.75 and 1.25 < high <= 1.51
 
 
 def test_findings_hold_or_not():

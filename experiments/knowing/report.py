@@ -1,0 +1,93 @@
+"""Tables and the figure, from saved arrays: distances from the mark in cm, and contrasts against the posterior."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from experiments.knowing.domains import OBJECTS, OWN
+from jaxlfi.diagnostics.contrasts import Arm, contrast, holm
+from jaxlfi.figures import style
+from jaxlfi.io import files
+
+ARMS = (*OWN, "history", "ADR", "wide box", "guess", "constant", "random")
+"""In the order of the tables."""
+CENTIMETRES = 100.0
+
+
+def arms(episodes: Mapping[str, np.ndarray]) -> dict[str, Arm]:
+    """Distances from the mark in cm, negative, by arm: [objects, seeds, episodes]."""
+    return {
+        name: Arm(CENTIMETRES * np.stack([episodes[f"{name}/{dlo}"] for dlo in OBJECTS]), shared=name not in OWN)
+        for name in ARMS
+    }
+
+
+def table(found: Mapping[str, Arm]) -> list[dict[str, str]]:
+    """How far from the mark the puck stops: over all objects with its interval, and on each."""
+    rows = []
+    for name, arm in found.items():
+        all_objects = contrast(Arm(np.zeros((len(OBJECTS), 1, arm.values.shape[2]))), arm)
+        row = {
+            "trained on": name,
+            "all": f"{all_objects.difference:.1f} [{all_objects.low:.1f}, {all_objects.high:.1f}]",
+        }
+        off = -arm.values.mean(axis=2)
+        each = lambda seeds: f"{seeds.mean():.1f} ({seeds.min():.1f} to {seeds.max():.1f})"
+        rows.append(row | {dlo: each(own) for dlo, own in zip(OBJECTS, off, strict=True)})
+    return rows
+
+
+def contrasts(found: Mapping[str, Arm]) -> list[dict[str, str]]:
+    """By how much less the posterior's policies miss than each other arm's; all rows are a family of Holm's."""
+    others = {name: contrast(found["posterior"], arm) for name, arm in found.items() if name != "posterior"}
+    corrected = holm([one.p for one in others.values()])
+    p_text = lambda p: "< 0.001" if p < 0.001 else f"{p:.3f}"
+    return [
+        {
+            "against": name,
+            "nearer to the mark by, cm": f"{one.difference:.1f} [{one.low:.1f}, {one.high:.1f}]",
+            "p": p_text(one.p),
+            "p, Holm": p_text(p),
+            "g": f"{one.standardised:.1f}",
+            "A": f"{one.superiority:.2f}",
+        }
+        for (name, one), p in zip(others.items(), corrected, strict=True)
+    ]
+
+
+def markdown(rows: list[dict[str, str]]) -> str:
+    """Rows as a Markdown table."""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def draw(axes: Axes, found: Mapping[str, Arm]) -> None:
+    """A mark for each policy on each object, by arm; a bar is the mean of all."""
+    for row, arm in enumerate(found.values()):
+        off = -arm.values.mean(axis=2)
+        for place, (own, marker) in enumerate(zip(off, "osD^", strict=True)):
+            heights = row + 0.16 * (place - 1.5) + np.zeros(len(own))
+            axes.plot(own, heights, marker, color=f"C{place}", markersize=3, alpha=0.8)
+        axes.plot([off.mean()] * 2, [row - 0.4, row + 0.4], "-", color="black", linewidth=1.2)
+    for place, (name, marker) in enumerate(zip(OBJECTS, "osD^", strict=True)):
+        axes.plot([], [], marker, color=f"C{place}", label=name)
+    axes.set_yticks(range(len(found)), list(found))
+    axes.invert_yaxis()
+    axes.set_xscale("log")
+    axes.set_xlabel("distance from the mark in cm, mean of a policy's episodes")
+    axes.grid(axis="x")
+    axes.legend(loc="lower left", title="object")
+
+
+def write(out: Path) -> None:
+    """Tables and figure of a folder that has the arrays."""
+    found = arms(files.read_arrays(out / "episodes.npz"))
+    for name, make in (("table", table), ("contrasts", contrasts)):
+        files.write_bytes(out / f"{name}.md", f"{markdown(make(found))}\n".encode())
+        print(markdown(make(found)))
+    with style.context():
+        figure = style.new_figure(style.TEXT_WIDTH, 3.6)
+        draw(figure.subplots(), found)
+        style.save(figure, out / "returns.png", dpi=200)

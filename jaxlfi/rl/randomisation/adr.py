@@ -1,0 +1,132 @@
+"""Automatic domain randomisation: ranges that widen where the policy copes with their bounds, and narrow where not.
+
+OpenAI et al., "Solving Rubik's Cube with a Robot Hand" (2019), section 5 and Algorithm 1. Training starts at one point.
+Now and then an episode is played with one parameter at a bound of its range and the others drawn from theirs: a probe.
+Once `buffer` probes of a bound are known, their mean performance decides whether the bound moves out, in, or stays.
+
+    ranges = adr.init(start, feasible)
+    domain = adr.domain(key, ranges, space, n)              # what the policy is trained on
+    probes = adr.probes(key, ranges, n)                     # where it is to be evaluated
+    ranges = adr.recorded(settings, ranges, probes, performances)
+
+Bounds move inside the box Phi, and never past the point that training started at (both ours; the paper's ranges have no
+limits but those that physics sets).
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from jaxlfi.distributions.space import Space
+from jaxlfi.distributions.support import Support
+from jaxlfi.fields import Checked, hyperparameter
+from jaxlfi.rl.domains import Domain
+
+Number = Float[Array, "*batch"] | float
+
+
+class Adr(Checked):
+    """Hyperparameters of automatic domain randomisation; thresholds are in units of the performance."""
+
+    low_threshold: Number = hyperparameter(
+        default=0.0, help="mean performance at a bound at or below which it moves in", symbol="t_L"
+    )
+    high_threshold: Number = hyperparameter(
+        default=1.0, help="mean performance at a bound at or above which it moves out", symbol="t_H"
+    )
+    step: Number = hyperparameter(
+        default=0.05, help="how far a bound moves, as a fraction of the width of Phi", symbol="Delta", above=0, high=1
+    )
+    buffer: Number = hyperparameter(default=16, help="probes of a bound by which it is judged", symbol="m", low=1)
+
+
+class Ranges(struct.PyTreeNode):
+    """Where the parameters are drawn from, and what is known of the policy at the bounds.
+
+    Attributes:
+        support: the ranges phi_L and phi_H, in inference space, bounds [D].
+        start: the point that training started at, shape [D].
+        feasible: Phi, in inference space, bounds [D].
+        sums: of performances at the lower and the upper bounds since they were last judged, shape [2, D].
+        counts: of these performances, shape [2, D].
+    """
+
+    support: Support
+    start: Float[Array, " dim"]
+    feasible: Support
+    sums: Float[Array, "2 dim"]
+    counts: Int[Array, "2 dim"]
+
+
+class Probe(struct.PyTreeNode):
+    """An episode at a bound.
+
+    Attributes:
+        theta: its parameters lambda, in inference space, shape [D].
+        parameter: the index i of the one at a bound.
+        upper: 1 where that is its upper bound, and 0 where it is the lower.
+    """
+
+    theta: Float[Array, "*n dim"]
+    parameter: Int[Array, "*n"]
+    upper: Int[Array, "*n"]
+
+
+def init(start: Float[Array, " dim"], feasible: Support) -> Ranges:
+    """Ranges of no width around a point.
+
+    Args:
+        start: a calibrated point, in inference space, shape [D].
+        feasible: Phi, in inference space.
+    """
+    start = jnp.asarray(start, jnp.float32)
+    none = jnp.zeros((2, len(start)))
+    return Ranges(Support(start, start), start, feasible, none, none.astype(int))
+
+
+def domain(key: jax.Array, ranges: Ranges, space: Space, n: int) -> Domain:
+    """`n` points to train on: uniform over the ranges, in natural units."""
+    return Domain(space.to_natural(ranges.support.sample(key, n)))
+
+
+def probes(key: jax.Array, ranges: Ranges, n: int) -> Probe:
+    """`n` episodes to play: each of a parameter and a bound drawn uniformly, the others drawn from their ranges."""
+    key_theta, key_parameter, key_upper = jax.random.split(key, 3)
+    dim = ranges.support.dim
+    parameter = jax.random.randint(key_parameter, (n,), 0, dim)
+    upper = jax.random.bernoulli(key_upper, shape=(n,)).astype(int)
+    bound = jnp.where(upper == 1, ranges.support.high[parameter], ranges.support.low[parameter])
+    at = jnp.arange(dim) == parameter[:, None]
+    return Probe(jnp.where(at, bound[:, None], ranges.support.sample(key_theta, n)), parameter, upper)
+
+
+def recorded(settings: Adr, ranges: Ranges, probes: Probe, performances: Float[Array, " n"]) -> Ranges:
+    """The ranges after probes, one after another.
+
+    Args:
+        settings: hyperparameters.
+        ranges: before them.
+        probes: [N] of them, drawn from these ranges.
+        performances: of the policy in each, such as its return, shape [N].
+    """
+    far, start, width = ranges.feasible, ranges.start, ranges.feasible.width
+
+    def one(ranges: Ranges, given: tuple[Probe, Array]) -> tuple[Ranges, None]:
+        probe, performance = given
+        place = (probe.upper, probe.parameter)
+        sums, counts = ranges.sums.at[place].add(performance), ranges.counts.at[place].add(1)
+        full, mean = counts >= settings.buffer, sums / jnp.maximum(counts, 1)
+        outwards = jnp.where(mean >= settings.high_threshold, 1.0, jnp.where(mean <= settings.low_threshold, -1.0, 0.0))
+        lower, upper = jnp.where(full, outwards, 0.0) * settings.step * width
+        support = Support(
+            jnp.clip(ranges.support.low - lower, far.low, start), jnp.clip(ranges.support.high + upper, start, far.high)
+        )
+        return ranges.replace(support=support, sums=jnp.where(full, 0.0, sums), counts=jnp.where(full, 0, counts)), None
+
+    return jax.lax.scan(one, ranges, (probes, performances))[0]
+
+
+def entropy(ranges: Ranges) -> Float[Array, ""]:
+    """The entropy of the ranges in nats per parameter, (1/D) sum log(phi_H - phi_L): -inf at the start."""
+    return jnp.mean(jnp.log(ranges.support.width))
