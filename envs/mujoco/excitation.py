@@ -53,7 +53,8 @@ def record(driver: Driver, config: Path, path: Path, duration: float | None = No
     controls = reading.preparation.controls
     signals = tuple(Signal(name, unit(model, name).removeprefix("1")) for name in names)
     plain = tuple(dataclasses.replace(one, displacing=False, begins=None) for one in controls)
-    preparation = Preparation(signals, plain, interval, max(round(duration / interval), 2))
+    steps, ends = max(round(duration / interval), 2), reading.preparation.terminations
+    preparation = Preparation(signals, plain, interval, steps, terminations=ends)
     settings = of_table(machine.carried(table.get("robot", {}), config.parent / table["model"], preparation))
     limits = driving.limits_within(preparation, settings)
     bounds = np.array([limits.low, limits.high])

@@ -42,6 +42,8 @@ class Log:
         over: slot at whose beginning the episode was over, or None.
         stopped: why the robot was stopped before its time; "" where it was not.
         period: between two commands, in s.
+        ended: which termination of the policy's training ended the episode; "" where none did.
+        failed: whether it is an error or a signal that stopped the robot, and not the loop.
     """
 
     times: np.ndarray
@@ -56,6 +58,8 @@ class Log:
     over: int | None
     stopped: str
     period: float
+    ended: str = ""
+    failed: bool = False
 
     @property
     def missed(self) -> int:
@@ -141,6 +145,10 @@ class Paced(abc.ABC):
     def outside(self, values: np.ndarray) -> str:
         """Why the robot must be stopped where it has been measured; "" if it need not."""
 
+    def ended(self, values: np.ndarray) -> str:
+        """Which termination ends the episode where the robot has been measured; "" if none does."""
+        return ""
+
     @property
     def period(self) -> float:
         """Between two commands, in s."""
@@ -168,7 +176,7 @@ class Paced(abc.ABC):
             try:
                 episode.run(whole)
             except BaseException as error:
-                episode.stopped = str(error) or type(error).__name__
+                episode.stopped, episode.failed = str(error) or type(error).__name__, True
                 _stop_after(error, stop)
                 raise
             else:
@@ -208,7 +216,8 @@ class _Episode:
         self.seen: list[tuple[float, np.ndarray, Mapping[str, Any]]] = []
         self.slots: list[tuple[np.ndarray, np.ndarray, np.ndarray, bool, float]] = []
         self.over: int | None = None
-        self.stopped = ""
+        self.stopped = self.ended = ""
+        self.failed = False
 
     def run(self, whole: bool) -> None:
         """From the first observation to the end."""
@@ -224,14 +233,14 @@ class _Episode:
                 self.seen.append((clock.now() - start - observation.age, values, observation.extras))
                 if self.over is None and loop.over(values.copy()):
                     self.over = slot
-                self.stopped = loop.outside(values)
+                self.stopped, self.ended = loop.outside(values), loop.ended(values)
             else:
                 unusable += 1
                 if unusable > loop.holds:
                     self.stopped = f"{unusable} observations in a row could not be used, the last one was {fault}"
             if self.began_anew:
                 self.stopped = self.began_anew
-            if self.stopped or slot == loop.steps or (self.over is not None and not whole):
+            if self.stopped or self.ended or slot == loop.steps or (self.over is not None and not whole):
                 return
             asked = None
             if observation is not None and self.over is None:
@@ -336,4 +345,6 @@ class _Episode:
             over=self.over,
             stopped=self.stopped,
             period=self.loop.period,
+            ended=self.ended,
+            failed=self.failed,
         )

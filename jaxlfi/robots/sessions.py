@@ -62,6 +62,8 @@ class Session:
             report = {**about, **self.report(log), "robot": itself}
             recording.write(out, self.recorded(log), log, report, self._signals)
             say(f"{recording.timing_line(log)}; wrote {out}")
+            if log.ended:
+                say(f"the episode ended after {len(log.actions)} of {loop.steps} controls, as in training: {log.ended}")
 
         log = loop.run(made, self.policy, on_end=ended)
         if log.stopped:
@@ -112,6 +114,8 @@ class Session:
             "environment": self.policy.schema["environment"],
             "mode": self.mode,
             "stopped": log.stopped,
+            "failed": log.failed,
+            "ended": log.ended,
             "over": log.over,
             "controls": len(log.targets),
             "timing": recording.timing(log),

@@ -14,6 +14,7 @@ from robots.machines import INTERVAL, MOTOR, SIGNALS, Wheel, a_policy, expected,
 from jaxlfi.rl.deployment import ControlLimits
 from jaxlfi.rl.policy import Policy
 from jaxlfi.rl.preparation import Command, Control, Signal
+from jaxlfi.rl.termination import parsed
 from jaxlfi.robots import driving, recording, sessions
 from jaxlfi.robots.clock import Monotonic, Simulated
 from jaxlfi.robots.driver import Called, Driven, Driver
@@ -92,6 +93,53 @@ def test_a_robot_is_stopped_outside_of_the_bounds_of_its_signals(tmp_path):
     assert report_of(tmp_path)["stopped"].endswith("outside of its limits [-0.2, 0.6]")
     table = table_of(tmp_path / "log.csv")
     assert len(table["battery"]) == first + 1 and set(table["battery"]) == {11.0}
+
+
+ENDS = {"turned": parsed("angle < -0.2", cost=3.0), "flat": parsed("abs(battery) < 10")}
+
+
+def test_terminations_of_the_training_end_an_episode_which_is_no_fault(tmp_path):
+    """At the measurement at which the condition first holds; the robot is stopped, and the recording goes up to it."""
+    driver, said = Wheel(seen=("angle", "joint/wheel/qvel", "battery"), angle=0.5), []
+    session = sessions.of(a_policy(prepared(terminations=ENDS)), Settings())
+    log = session.run(driver, tmp_path / "log.csv", {}, said.append)
+    _, seen = expected(100)
+    first = int(np.flatnonzero(seen[:, 0] < -0.2)[0])
+    assert len(driver.torques) == first and driver.stops == 1 and log.stopped == "" and not log.failed
+    where = f"turned (angle < -0.2: angle was measured at {log.observations[-1, 0]:.6g})"
+    assert said[-1] == f"the episode ended after {first} of 100 controls, as in training: {where}"
+    report = report_of(tmp_path)
+    assert report["ended"] == where and report["stopped"] == "" and report["failed"] is False
+    assert set(table_of(tmp_path / "log.csv")["battery"]) == {11.0}  # which the policy does not see
+
+
+def test_a_termination_needs_its_signal_or_is_ignored_by_name(tmp_path):
+    """A number that is not finite does not pass for one at which the episode goes on."""
+    policy, plain = a_policy(prepared(terminations=ENDS)), ("angle", "joint/wheel/qvel")
+    with pytest.raises(ValueError, match="robot: expected signals among angle, joint/wheel/qvel, got battery"):
+        run(Wheel(seen=plain), tmp_path, policy=policy, name="none.csv")
+    lost = lambda seen: dataclasses.replace(seen, values={**seen.values, "battery": math.nan})
+    driver = Wheel(seen=(*plain, "battery"), given=dict.fromkeys(range(3, 9), lost))
+    with pytest.raises(RobotError, match="4 observations in a row could not be used, the last one was non-finite"):
+        run(driver, tmp_path, policy=policy, name="lost.csv")
+    log = run(Wheel(seen=plain), tmp_path, {"ignored_terminations": ["turned", "flat"]}, policy, name="whole.csv")
+    assert len(log.targets) == 100 and log.ended == ""
+    with pytest.raises(ValueError, match="ignored_terminations: expected some of turned, flat, got turnt"):
+        run(Wheel(), tmp_path, {"ignored_terminations": ["turnt"]}, policy)
+
+
+def test_what_an_error_cut_short_is_marked_so(tmp_path):
+    """And what a limit ended is not: the loop itself stopped the robot there."""
+    with pytest.raises(RobotError, match="bus"):
+        run(Wheel(given={5: lambda seen: failing("bus")}), tmp_path)
+    assert report_of(tmp_path)["failed"] is True and len(table_of(tmp_path / "log.csv")["angle [rad]"]) == 5
+    with pytest.raises(RobotError, match="outside of its limits"):
+        run(Wheel(angle=0.5), tmp_path, {"limits": {"angle": [-0.2, 0.6]}}, name="limit.csv")
+    assert report_of(tmp_path, "limit")["failed"] is False
+
+
+def failing(why):
+    raise RobotError(why)
 
 
 def test_targets_of_the_operator_are_within_what_was_trained_with(tmp_path):
@@ -254,7 +302,7 @@ def test_settings_that_a_policy_carries_are_used():
 @pytest.mark.parametrize(
     ("table", "expected"),
     [
-        ({"limit": {}}, "robot: expected keys among controls, holds, limits, max_age, names, record, units"),
+        ({"limit": {}}, "robot: expected keys among controls, holds, ignored_terminations, limits, max_age, names, record, units"),
         ({"limits": {"angle": [1, -1]}}, r"robot: limits: angle: expected LOW below HIGH, got \[1, -1\]"),
         ({"limits": {"angle": [0, "x"]}}, "robot: limits: angle: expected a number, got 'x'"),
         ({"limits": 3}, "robot: limits: expected a table, got 3"),

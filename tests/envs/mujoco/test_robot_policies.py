@@ -20,8 +20,8 @@ from jaxlfi.envs.mujoco.mjx_models import added, with_forces
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
 from jaxlfi.envs.mujoco.parameters import Parameter, edit
 from jaxlfi.envs.mujoco.reading import Reading, add_signals
-from jaxlfi.envs.mujoco.termination import parsed
 from jaxlfi.rl.preparation import Command, Control, Signal
+from jaxlfi.rl.termination import parsed
 
 CARRIAGE = """
 <mujoco model="carriage">
