@@ -5,6 +5,7 @@ one turn an episode of a policy to a quarter of its rate.
 """
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -78,10 +79,12 @@ def record(driver: Driver, config: Path, path: Path, duration: float | None = No
         columns = {one.name: log.targets[sent, place] for place, one in enumerate(controls)}
         known = {name: loop.asked[name] for name in names} | {one.name: one.unit for one in controls}
         kept = Recording(log.times, dict(zip(names, log.observations.T, strict=False)), given, columns, known)
-        report = {"mode": "excitation", "stopped": log.stopped, "timing": recording.timing(log), "robot": about}
+        report = {"mode": "excitation", "stopped": log.stopped, "failed": log.failed, "controls": len(log.targets)}
+        report |= {"timing": recording.timing(log), "robot": about}
         for left in (path, path.with_suffix(".loop.npz")):
             left.unlink(missing_ok=True)  # of a recording that was not written to its end
         recording.write(path, kept, log, report, loop.signals)
+        print(f"{recording.timing_line(log)}; wrote {path}")
 
     log = loop.run(robot, lambda seen: next(played), on_end=ended)
     if log.stopped:
@@ -121,25 +124,34 @@ def measuring(settings: Settings, config: Path) -> Settings:
     return dataclasses.replace(settings, record=tuple(names))
 
 
-def achieved(config: Path, path: Path) -> dict[str, float]:
+def achieved(config: Path, path: Path) -> dict[str, Any]:
     """What a policy achieved in a recorded episode: the return as in training, and how far it was off in the end.
+
+    A control interval's reward is that of the last measurement by its end, where there was none at its end.
 
     Args:
         config: of the task.
         path: of the recording, with the report of the episode in files beside it (`jaxlfi.robots.recording`).
+
+    Returns:
+        Also which termination ended it, and why the robot was stopped before its time, "" where it was not: its return
+        lacks what was still to come then.
     """
     goal, reading = _goal(config)
-    _, loop = recording.beside(path)
-    log = np.load(loop)
+    report, loop = recording.beside(path)
+    log, told = np.load(loop), json.loads(report.read_text())
     names = [str(name) for name in log["signals"]]
-    rows = log["observations"][:, [names.index(name) for name in goal.signals]]
+    ends = told["timing"]["period"] * (np.arange(len(log["targets"])) + 1.5)
+    last = np.maximum(np.searchsorted(log["times"], ends) - 1, 0)
+    rows = log["observations"][np.append(0, last)][:, [names.index(name) for name in goal.signals]]
     commands = np.array([0.5 * (one.low + one.high) for one in reading.preparation.commands])
     controls = np.concatenate([log["targets"][:1], log["targets"]])
     total = 0.0
-    for after, last, control in zip(rows[1:], controls[:-1], controls[1:], strict=False):
-        total += float(reading.reward(after, control, last, commands, np))
+    for after, before, control in zip(rows[1:], controls[:-1], controls[1:], strict=True):
+        total += float(reading.reward(after, control, before, commands, np))
     off = {f"{name} off": abs(float(value)) for name, value in reading.off(rows[-1], commands, np).items()}
-    return {"return": total, "controls": len(log["targets"])} | off
+    ended = str(told.get("ended", "")).partition(" (")[0]
+    return {"return": total, "controls": len(log["targets"]), "ended": ended, "stopped": told["stopped"]} | off
 
 
 def _goal(config: Path) -> tuple[Goal, Reading]:

@@ -105,8 +105,9 @@ def of_table(table: Mapping[str, Any]) -> Settings:
         if isinstance(table["holds"], bool) or not isinstance(table["holds"], int) or table["holds"] < 0:
             raise ValueError(f"robot: holds: expected a whole number of at least 0, got {table['holds']!r}")
         found["holds"] = table["holds"]
-    several = {"record": "signals", "ignored_terminations": "terminations"}
-    return Settings(**found, **{key: _names(table.get(key, []), key, what) for key, what in several.items()})
+    for key, what in {"record": "signals", "ignored_terminations": "terminations"}.items():
+        found[key] = _names(table.get(key, []), key, what)
+    return Settings(**found)
 
 
 def _names(value: Any, key: str, what: str) -> tuple[str, ...]:

