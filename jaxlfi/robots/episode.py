@@ -42,6 +42,8 @@ class Log:
         over: slot at whose beginning the episode was over, or None.
         stopped: why the robot was stopped before its time; "" where it was not.
         period: between two commands, in s.
+        ages: of the measurement that each slot's command was made from, as it was sent, in s; NaN where there was none,
+            shape [S].
         ended: which termination of the policy's training ended the episode; "" where none did.
         failed: whether it is an error or a signal that stopped the robot, and not the loop.
     """
@@ -58,6 +60,7 @@ class Log:
     over: int | None
     stopped: str
     period: float
+    ages: np.ndarray
     ended: str = ""
     failed: bool = False
 
@@ -214,7 +217,7 @@ class _Episode:
         self.behind: int | None = None  # of one that came after it, and was made before
         self.began_anew = ""
         self.seen: list[tuple[float, np.ndarray, Mapping[str, Any]]] = []
-        self.slots: list[tuple[np.ndarray, np.ndarray, np.ndarray, bool, float]] = []
+        self.slots: list[tuple[np.ndarray, np.ndarray, np.ndarray, bool, float, float]] = []
         self.over: int | None = None
         self.stopped = self.ended = ""
         self.failed = False
@@ -254,7 +257,8 @@ class _Episode:
                 self.robot.act(Command(slot, displacement.copy(), target.copy()))
             sent = clock.now()  # so that the next command is no closer to this one than its length allows
             asked = np.full(loop.count, np.nan) if asked is None else asked
-            self.slots.append((asked, displacement, target, observation is None, now - start - slot * loop.period))
+            age = np.nan if observation is None else now - start - self.seen[-1][0]
+            self.slots.append((asked, displacement, target, observation is None, now - start - slot * loop.period, age))
             self._wait_until(start + (slot + 1) * loop.period)
             slot = self._due(slot + 1, (clock.now() - start) / loop.period, target)
             observation, fault = self._look()
@@ -321,14 +325,14 @@ class _Episode:
     def _due(self, following: int, periods: float, target: np.ndarray) -> int:
         """The slot that it is time for; those that have passed are missed: their commands are not made up for."""
         due = min(max(following, int(periods)), self.loop.steps)
-        nothing = np.full(len(target), np.nan), np.zeros(len(target)), target, False, np.inf
+        nothing = np.full(len(target), np.nan), np.zeros(len(target)), target, False, np.inf, np.nan
         self.slots += [nothing] * (due - following)
         return due
 
     def log(self) -> Log:
         """What happened so far."""
         times, observations, extras = zip(*self.seen, strict=True) if self.seen else [()] * 3
-        asked, actions, targets, held, lateness = zip(*self.slots, strict=True) if self.slots else [()] * 5
+        asked, actions, targets, held, lateness, ages = zip(*self.slots, strict=True) if self.slots else [()] * 6
         table = lambda rows: np.reshape(np.array(rows, float), (len(rows), self.loop.count))
         return Log(
             times=np.array(times),
@@ -345,6 +349,7 @@ class _Episode:
             over=self.over,
             stopped=self.stopped,
             period=self.loop.period,
+            ages=np.array(ages, float),
             ended=self.ended,
             failed=self.failed,
         )

@@ -128,6 +128,21 @@ def test_a_termination_needs_its_signal_or_is_ignored_by_name(tmp_path):
         run(Wheel(), tmp_path, {"ignored_terminations": ["turnt"]}, policy)
 
 
+@pytest.mark.parametrize(("age", "trained", "said"), [(0.011, (0.0, 0.0), True), (0.011, (0.005, 0.015), False)])
+def test_ages_of_measurements_that_a_policy_was_not_trained_with_are_said(age, trained, said, tmp_path):
+    """As long as they are let: a tenth of a period more or less is not worth a word."""
+    older = dict.fromkeys(range(101), lambda seen: dataclasses.replace(seen, age=age))
+    session, lines = sessions.of(a_policy(prepared(observation_delay=trained)), Settings()), []
+    log = session.run(Wheel(given=older), tmp_path / "log.csv", {}, lines.append)
+    np.testing.assert_allclose(log.ages, age, atol=1e-9)
+    assert report_of(tmp_path)["timing"]["age"] == pytest.approx(age)
+    expected = (
+        "measurements were 11 ms old when the controls made from them were sent (median); the policy was trained with "
+        "0 to 0 ms: give [policy] an observation_delay that holds it"
+    )
+    assert lines[1:] == ([expected] if said else [])
+
+
 def test_what_an_error_cut_short_is_marked_so(tmp_path):
     """And what a limit ended is not: the loop itself stopped the robot there."""
     with pytest.raises(RobotError, match="bus"):
