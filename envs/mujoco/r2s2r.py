@@ -44,13 +44,6 @@ SETTLED = 0.5
 """Half-widths of 90 % intervals by which medians move at most once a posterior has stopped moving."""
 EPISODES = 8
 """On the machine, by which policies are compared."""
-TRAINING = {
-    "quick": "--learning-rate 1e-3 --entropy 0.001 --initial-deviation 0.5 --environments 32 --unroll 10 --segments 8 "
-    "--minibatches 8 --epochs 6",
-    "paper": "",
-}
-"""Words of `jaxlfi train` by preset. The preset `quick` alone is one of the whip's 16 steps and one hit: of a Furuta
-pendulum with rewards in each of 30 steps its policies are worse than none."""
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -114,7 +107,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--train",
         default="",
         metavar="WORDS",
-        help=f"further words of jaxlfi train, as '--environments 64'; those of quick are {TRAINING['quick']}",
+        help="further words of jaxlfi train, as '--environments 64'",
     )
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
 
@@ -216,7 +209,7 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
 
 def _train_words(arguments: argparse.Namespace, domain: str, out: Path) -> list[str]:
     words = [arguments.task, "--domain", domain, "--out", str(out), "--preset", arguments.preset]
-    words += shlex.split(f"--first-seed {arguments.seed} {TRAINING[arguments.preset]} {arguments.train}")
+    words += shlex.split(f"--first-seed {arguments.seed} {arguments.train}")
     return words + ([] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)])
 
 
