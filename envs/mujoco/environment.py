@@ -54,8 +54,8 @@ TRAINING: Mapping[str, Mapping[str, Any]] = {
 }
 """Settings of PPO for rewards in every step, by preset.
 
-The preset's own are for the whip's one hit in 16 steps: a policy of the Furuta pendulum in `examples` was worse with them
-than none (docs/mujoco.md).
+The preset's own are for the whip's one hit in 16 steps: with them a policy of the Furuta pendulum in `examples` was
+worse than none (docs/mujoco.md).
 """
 
 
