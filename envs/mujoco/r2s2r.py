@@ -101,13 +101,16 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--total-steps", type=int, metavar="N", help="environment steps of each training (default: the preset's)"
     )
     parser.add_argument(
-        "--infer", default="", metavar="WORDS", help="further words of jaxlfi infer, as '--rounds 3 --epochs 50'"
+        "--infer",
+        default="",
+        metavar="WORDS",
+        help="further words of jaxlfi infer, as '--rounds 3 --epochs 50'; a single one as --infer=--polish",
     )
     parser.add_argument(
         "--train",
         default="",
         metavar="WORDS",
-        help="further words of jaxlfi train, as '--environments 64'",
+        help="further words of jaxlfi train, likewise, as '--environments 64'",
     )
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
 
@@ -167,6 +170,8 @@ def _begin(arguments: argparse.Namespace, config: Path) -> None:
     command_line.parse(_infer_words(arguments, [Path("recording.csv")], arguments.out))
     train.main.parser().parse_args(_train_words(arguments, "uniform", arguments.out))
     if arguments.address is None:
+        if arguments.remote or arguments.token or arguments.confirm:
+            raise ValueError("remote, token, confirm: expected with --address only, got a simulated machine")
         Machine.of(config)
     else:
         token = None if arguments.token is None else wire.token_of(arguments.token)

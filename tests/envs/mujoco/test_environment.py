@@ -321,7 +321,7 @@ def test_a_file_without_a_policy_is_refused(tmp_path):
         environment(file)
 
 
-@pytest.mark.parametrize("name", ["furuta", "arm"])
+@pytest.mark.parametrize("name", ["furuta", "arm", "shuffle"])
 def test_the_example_has_the_parameters_of_its_task(name):
     from jaxlfi.envs.mujoco import task
 

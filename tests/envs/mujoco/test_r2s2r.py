@@ -186,6 +186,8 @@ def test_how_far_a_posterior_has_moved():
         (["TASK", "--settled", "-1"], "settled: expected a number above 0, got -1"),
         (["TASK", "--heuristic", "egde"], "heuristic: expected "),
         (["TASK", "--total-steps", "0"], "total_steps: expected "),
+        (["TASK", "--beside", "point", "point"], "beside: expected each once, got point point"),
+        (["TASK", "--confirm"], "remote, token, confirm: expected with --address only, got a simulated machine"),
         (["TASK", "--address", "10.0.0.7:5005"], "expected this very host, as 127.0.0.1, got '10.0.0.7'"),
         (["TASK", "--address", "10.0.0.7:5005", "--remote"], "token: expected the one that the robot at 10.0.0.7"),
     ],
@@ -197,6 +199,28 @@ def test_bad_input_is_one_line_and_leaves_nothing(words, expected, task, tmp_pat
     error = capsys.readouterr().err
     assert error.startswith("jaxlfi r2s2r: error: ") and expected in error and error.count("\n") == 1
     assert not (tmp_path / "loop").exists() and not ran
+
+
+def test_a_machine_that_moves_can_wait_for_an_operator(monkeypatch):
+    """Who is told where to bring it, each time; where nobody can answer, nothing moves."""
+    words = ["mujoco", "--out", "runs/loop", "--address", "127.0.0.1:5005", "--confirm"]
+    arguments, told = r2s2r.parser().parse_args(words), []
+    monkeypatch.setattr("builtins.input", lambda text: told.append(text) or "")
+    for scattered in (False, True):
+        with r2s2r_machine.connected(arguments, Path("task.toml"), 0, scattered) as driver:
+            assert driver()._address == "127.0.0.1:5005"
+    assert [text.partition(",")[0] for text in told] == [
+        "bring the machine to where recordings begin",
+        "bring the machine to where policies' episodes begin",
+    ]
+
+    def ended(text):
+        raise EOFError
+
+    monkeypatch.setattr("builtins.input", ended)
+    with r2s2r_machine.connected(arguments, Path("task.toml"), 0) as driver:
+        with pytest.raises(ValueError, match="confirm: expected Enter on a terminal before each recording"):
+            driver()
 
 
 def test_the_folder_of_another_loop_is_refused(task, tmp_path, capsys):
