@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
-from jaxlfi.envs.mujoco import machine
+from jaxlfi.envs.mujoco import machine, starts
 from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.measured import add_sensors, unit
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
@@ -115,6 +115,19 @@ def sines(
 def measured_of(table: Mapping[str, Any], goal: Goal) -> list[str]:
     """Signals that inference is to have: those that the task measures, whose noise it knows, or that policies see."""
     return list(table.get("measured") or table.get("noise") or goal.observed)
+
+
+def says_its_start(config: Path) -> bool:
+    """Whether inference reads off a recording where its episode began (`jaxlfi.envs.mujoco.starts`)."""
+    table = tables.load(config)
+    begins, numbers = tables.initial(table)
+    inferred = any(one.name.startswith(("initial/", "episode/")) for one in tables.parameters_of(table))
+    if begins not in (None, "log") or numbers or inferred:
+        return False
+    names = measured_of(table, goals.of_table(table["policy"]))
+    spec = specification(config.parent / table["model"])
+    add_sensors(spec, names)
+    return not starts.unmeasured(compile_spec(spec), names, [])
 
 
 def measuring(settings: Settings, config: Path) -> Settings:

@@ -89,10 +89,17 @@ def excited(arguments: argparse.Namespace, config: Path, path: Path) -> Path:
 
 
 def rolled_out(arguments: argparse.Namespace, config: Path, policy: Path, path: Path, iteration: int) -> Path:
-    """What a policy does on the machine; a recording that a limit or a termination ended is one, too."""
+    """What a policy does on the machine; a recording that a limit or a termination ended is one, too.
+
+    It begins where the training's episodes do, if recordings say how they begin: at a start of the task's own there may
+    be nothing to do, and nothing to learn.
+    """
+    from jaxlfi.envs.mujoco import excitation
+
     if not whole(path):
         loops.say(f"{policy} on the machine")
-        with connected(arguments, config, arguments.seed + iteration) as driver:
+        scattered = excitation.says_its_start(config)
+        with connected(arguments, config, arguments.seed + iteration, scattered) as driver:
             controlled(driver(), policy, config, path)
     return _informative(path)
 

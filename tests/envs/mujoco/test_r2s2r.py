@@ -114,7 +114,7 @@ def test_the_loop_ends_once_the_posterior_has_stopped_moving(task, tmp_path, cap
     assert trained == [*(str(out / f"iteration_{i}/posterior") for i in (1, 2, 3)), "uniform", "point:2.25"]
     fitted = next(one for one in ran if one[0] == "fit")
     assert fitted[2] == infers[-1][2]  # given the same recordings
-    assert [one[2] for one in ran if one[0] == "machine"] == [False] * 3 + [True] * 5
+    assert [one[2] for one in ran if one[0] == "machine"] == [False] * 3 + [True] * 5  # [initial] has a number
     assert "the posterior has moved by 17 half-widths" in capsys.readouterr().out
     page = (out / "page.html").read_text()
     for part in ("body/cart/mass", "<td>2.3</td>", "<td>2.5</td>", "uniform box", "iteration 3", "excitation.json"):
@@ -152,6 +152,41 @@ def test_what_was_achieved_is_the_return_of_the_training(task, tmp_path):
     found = excitation.achieved(config, tmp_path / "a.csv")
     assert found["return"] == pytest.approx(rewards.sum(), rel=1e-6) and found["controls"] == 10
     assert found["place off"] == pytest.approx(abs(place[-1] - 0.25), rel=1e-6)
+
+
+def test_an_interval_without_a_measurement_is_rewarded_by_the_one_before(task, tmp_path):
+    """So that an episode of lost measurements does not come off better than one of all."""
+    config, _ = task
+    with r2s2r_machine.connected(None, config, 0) as driver:
+        policy = a_policy(PREPARATION, [[-1.5]]).save(tmp_path / "policy.npz")
+        one = driver()
+        plain, count = one.observe, itertools.count()
+        one.observe = lambda: None if next(count) in (4, 5, 10) else plain()
+        r2s2r_machine.controlled(one, policy, config, tmp_path / "a.csv")
+    seen = logs.read(tmp_path / "a.csv").samples("place")
+    assert len(seen[0]) == 8
+    ends = 0.1 * np.arange(1, 11)
+    place = seen[1][np.searchsorted(seen[0], ends + 0.05) - 1]
+    assert place[3] == place[4] == place[2] and place[9] == place[8]
+    push = np.load(tmp_path / "a.loop.npz")["targets"][:, 0]
+    rewards = -0.1 * (2.0 * (place - 0.25) ** 2 + 0.5 * ((push - 1.0) / 5.0) ** 2)
+    assert excitation.achieved(config, tmp_path / "a.csv")["return"] == pytest.approx(rewards.sum(), rel=1e-6)
+
+
+def test_episodes_that_were_stopped_before_their_time_are_counted_and_not_averaged(tmp_path):
+    """Where rewards are costs, a robot that stops at once would seem to be the best."""
+    (tmp_path / "table.csv").write_text(
+        "policy,episode,return,controls,ended,stopped,place off\n"
+        "point,0,-3.0,10,,,0.5\n"
+        "point,1,-0.1,1,,place was measured at 9,9.0\n"
+        "point,2,-5.0,8,fallen,,0.7\n"
+        "uniform,0,-1.0,10,,,0.1\n"
+    )
+    found = r2s2r_page.achieved(tmp_path / "table.csv", "point")
+    assert (found["episodes"], found["stopped"], found["ended"]) == (3, 1, {"fallen": 1})
+    assert found["return"] == {"mean": -4.0, "error": 1.0}
+    assert found["place off"]["mean"] == pytest.approx(0.6) and "episode" not in found
+    assert r2s2r_page.achieved(tmp_path / "table.csv", "uniform")["return"] == {"mean": -1.0, "error": None}
 
 
 def test_a_machine_is_excited_within_the_limits_of_its_policies(task, tmp_path):
@@ -199,6 +234,26 @@ def test_bad_input_is_one_line_and_leaves_nothing(words, expected, task, tmp_pat
     error = capsys.readouterr().err
     assert error.startswith("jaxlfi r2s2r: error: ") and expected in error and error.count("\n") == 1
     assert not (tmp_path / "loop").exists() and not ran
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (('[initial]\n"rail/qpos" = -0.5\n', ""), True),
+        (('"rail/qpos" = -0.5', 'from = "log"'), True),
+        (('"rail/qpos" = -0.5', 'from = "model"'), False),
+        (("", ""), False),
+        (('[initial]\n"rail/qpos" = -0.5\n', 'measured = ["joint/rail/qvel"]\n'), False),
+        (('[initial]\n"rail/qpos" = -0.5\n', '[parameters."initial/rail/qpos"]\nsupport = [-1.0, 1.0]\n'), False),
+    ],
+)
+def test_policies_are_recorded_from_anywhere_if_recordings_say_where_they_began(change, says, task, tmp_path):
+    config, _ = task
+    text = TASK.replace(*change)
+    config.write_text(
+        text if "measured" not in text else 'measured = ["joint/rail/qvel"]\n' + TASK.replace(change[0], "")
+    )
+    assert excitation.says_its_start(config) is says
 
 
 def test_a_machine_that_moves_can_wait_for_an_operator(monkeypatch):
