@@ -45,7 +45,9 @@ def write(arguments: argparse.Namespace, config: Path, policies: Mapping[str, Pa
     out = arguments.out
     found = results(arguments, config, policies)
     files.write_json(out / "results.json", {**found, **environment()})
-    pictures = [*sorted(out.glob("**/curves.png")), *sorted(out.glob("iteration_*/posterior/figures/*.png"))]
+    figures = sorted(out.glob("iteration_*/posterior/figures/*.png"))
+    pictures = [*(path.parents[2] / "curves.png" for path in policies.values())]
+    pictures += [path for path in figures if path.stem in SHOWN and path.stem != "curves"]  # its curves are of errors
     machine = f"the driver at {arguments.address}" if arguments.address else "a simulated machine in another process"
     steps = ", ".join(f"{far:.2g}" for far in found["moved"])
     settled = f" The medians moved by {steps} half-widths of the 90 % intervals before." if steps else ""
@@ -61,7 +63,7 @@ def write(arguments: argparse.Namespace, config: Path, policies: Mapping[str, Pa
         web_page.table([_fared(row) for row in found["policies"]]),
         "<h2>Recordings</h2>",
         web_page.table(recorded(out)),
-        *(_figure(path.relative_to(out)) for path in pictures if path.stem in SHOWN),
+        *(_figure(path.relative_to(out)) for path in pictures),
     )
     page = web_page.document(f"{config.stem}: from the machine to a policy, and back", parts)
     files.write_bytes(out / "page.html", page.encode())
@@ -183,7 +185,8 @@ def _in_simulation(path: Path) -> float:
 
 def _belief(row: Mapping[str, Any]) -> dict[str, str]:
     truth = "" if row["truth"] is None else f"{row['truth']:.4g}"
-    return {**row, "policy": beside.TITLES.get(row["policy"], row["policy"]), "truth": truth}
+    shown = {key: row[key] for key in ("parameter", "median", "90 % interval", "last support")}
+    return {"after": beside.TITLES.get(row["policy"], row["policy"]), **shown, "truth": truth}
 
 
 def _fared(row: Mapping[str, Any]) -> dict[str, str]:

@@ -65,6 +65,9 @@ def task(tmp_path, monkeypatch):
                 (out / "fit.json").write_text(json.dumps({"points": [point, {**point, "theta": [9.0]}]}))
             for name in ("curves.png", "report.html", "pairs.png"):
                 (out / name).write_bytes(b"")
+            if kind == "infer":
+                (out / "figures").mkdir(exist_ok=True)
+                (out / "figures/curves.png").write_bytes(b"")  # of errors, and not shown
             return 0
 
         return run
@@ -119,6 +122,9 @@ def test_the_loop_ends_once_the_posterior_has_stopped_moving(task, tmp_path, cap
     page = (out / "page.html").read_text()
     for part in ("body/cart/mass", "<td>2.3</td>", "<td>2.5</td>", "uniform box", "iteration 3", "excitation.json"):
         assert part in page
+    pictures = re.findall(r'src="([^"]*)"', page)
+    iterations = [f"iteration_{i}/policy/curves.png" for i in (1, 2, 3)]
+    assert pictures == [*iterations, "uniform/policy/curves.png", "point/policy/curves.png"]
     found = json.loads((out / "results.json").read_text())
     assert [one["policy"] for one in found["policies"]] == [*(f"iteration {i}" for i in (1, 2, 3)), "uniform", "point"]
     assert all(one["trained"] == -0.75 and one["episodes"] == 2 and not one["stopped"] for one in found["policies"])
