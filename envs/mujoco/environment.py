@@ -55,7 +55,7 @@ TRAINING: Mapping[str, Mapping[str, Any]] = {
 """Settings of PPO for rewards in every step, by preset.
 
 The preset's own are for the whip's one hit in 16 steps: with them a policy of the Furuta pendulum in `examples` was
-worse than none (docs/mujoco.md).
+no better than none (docs/mujoco.md).
 """
 
 
