@@ -523,10 +523,12 @@ def test_only_recordings_that_are_known_are_written(tmp_path):
 def test_how_the_rate_was_kept_is_told():
     """Against the definitions, for a period of 20 ms, where one slot was passed over."""
     late = np.array([0.0, 0.001, np.inf, 0.003, 0.0])
-    log = type("Log", (), {"period": 0.02, "lateness": late, "missed": 2, "held": np.zeros(5, bool)})()
+    ages = np.array([0.004, 0.006, np.nan, 0.01, 0.002])
+    log = type("Log", (), {"period": 0.02, "lateness": late, "missed": 2, "held": np.zeros(5, bool), "ages": ages})()
     found = recording.timing(log)
     periods = [0.02 + 0.001, 0.02 - 0.003]
     assert found["measured_period"] == pytest.approx(np.mean(periods)) and found["skipped"] == 1
+    assert found["age"] == pytest.approx(0.005)
     assert found["jitter"] == pytest.approx(np.std(periods)) and found["lateness"]["100"] == 0.003
     assert found["lateness"]["50"] == pytest.approx(np.median([0.0, 0.001, 0.003, 0.0]))
 

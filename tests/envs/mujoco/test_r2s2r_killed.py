@@ -117,8 +117,15 @@ def whole(out):
     return {name: path.stat().st_mtime_ns for name, path in kept.items()}
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-@pytest.mark.parametrize(("connection", "observation"), [(0, 20), (3, 4)])
+@pytest.mark.parametrize(
+    ("number", "connection", "observation"),
+    [
+        pytest.param(signal.SIGKILL, 3, 4),
+        pytest.param(signal.SIGINT, 0, 20),
+        pytest.param(signal.SIGKILL, 0, 20, marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, 3, 4, marks=pytest.mark.slow),
+    ],
+)
 def test_a_loop_goes_on_from_where_it_was_ended(number, connection, observation, loop, monkeypatch, tmp_path):
     """In the excitation, and in the third episode of the policy."""
     words, out = loop
