@@ -130,6 +130,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     serve.add_argument("--seed", type=int, default=0, metavar="N", help="seed of noise and starts (default: 0)")
     serve.add_argument(
+        "--first-episode",
+        type=int,
+        default=0,
+        metavar="N",
+        help="number of the first connection's episode; noise and start depend on seed and number (default: 0)",
+    )
+    serve.add_argument(
         "--scattered", action="store_true", help="begin episodes where [policy.initial] does, and not in [initial]"
     )
     serve.add_argument(
@@ -139,6 +146,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: this host only)"
     )
     serve.add_argument("--token", type=Path, metavar="FILE", help="a file with the token that clients have to know")
+    serve.add_argument(
+        "--until-closed", action="store_true", help="end when standard input does, as when the starting process ends"
+    )
     serve.add_argument("--journal", type=Path, metavar="FILE", help="a file for what was asked of it: lines of JSON")
 
 

@@ -40,6 +40,24 @@ from jaxlfi.rl.preparation import Memory
 OF_NUISANCES, OF_FORCES, OF_ERRORS = 1, 2, 3
 """Folded into keys of episodes."""
 
+TRAINING: Mapping[str, Mapping[str, Any]] = {
+    "quick": {
+        "learning_rate": 1e-3,
+        "entropy": 0.001,
+        "initial_deviation": 0.5,
+        "environments": 32,
+        "unroll": 10,
+        "segments": 8,
+        "minibatches": 8,
+        "epochs": 6,
+    }
+}
+"""Settings of PPO for rewards in every step, by preset.
+
+The preset's own are for the whip's one hit in 16 steps: with them a policy of the Furuta pendulum in `examples` was
+no better than none (docs/mujoco.md).
+"""
+
 
 class Inner(struct.PyTreeNode):
     """A model's state, and what lasts for an episode.
@@ -73,6 +91,7 @@ class MujocoEnvironment:
     """Episodes of a model whose parameters are those of an inference task; see `mujoco_environment`.
 
     Attributes:
+        training: settings of PPO, in place of those of a preset.
         models: MJX models of parameters.
         reading: what the policy sees, may do and is rewarded for.
         preparation: of what it sees and does, as a robot needs it.
@@ -108,6 +127,7 @@ class MujocoEnvironment:
             ValueError: for whatever does not fit together, or MJX cannot simulate, in one line.
         """
         self.robot: Mapping[str, Any] = {}
+        self.training = TRAINING
         if not parameters:
             raise ValueError("parameters: expected at least one, got none")
         spec = specification(model)

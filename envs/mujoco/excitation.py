@@ -5,6 +5,7 @@ one turn an episode of a policy to a quarter of its rate.
 """
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from jaxtyping import Float
 
 from jaxlfi.envs.mujoco import config as tables
 from jaxlfi.envs.mujoco import goal as goals
-from jaxlfi.envs.mujoco import machine
+from jaxlfi.envs.mujoco import machine, starts
 from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.measured import add_sensors, unit
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
@@ -53,7 +54,8 @@ def record(driver: Driver, config: Path, path: Path, duration: float | None = No
     controls = reading.preparation.controls
     signals = tuple(Signal(name, unit(model, name).removeprefix("1")) for name in names)
     plain = tuple(dataclasses.replace(one, displacing=False, begins=None) for one in controls)
-    preparation = Preparation(signals, plain, interval, max(round(duration / interval), 2))
+    steps, ends = max(round(duration / interval), 2), reading.preparation.terminations
+    preparation = Preparation(signals, plain, interval, steps, terminations=ends)
     settings = of_table(machine.carried(table.get("robot", {}), config.parent / table["model"], preparation))
     limits = driving.limits_within(preparation, settings)
     bounds = np.array([limits.low, limits.high])
@@ -77,10 +79,12 @@ def record(driver: Driver, config: Path, path: Path, duration: float | None = No
         columns = {one.name: log.targets[sent, place] for place, one in enumerate(controls)}
         known = {name: loop.asked[name] for name in names} | {one.name: one.unit for one in controls}
         kept = Recording(log.times, dict(zip(names, log.observations.T, strict=False)), given, columns, known)
-        report = {"mode": "excitation", "stopped": log.stopped, "timing": recording.timing(log), "robot": about}
+        report = {"mode": "excitation", "stopped": log.stopped, "failed": log.failed, "controls": len(log.targets)}
+        report |= {"timing": recording.timing(log), "robot": about}
         for left in (path, path.with_suffix(".loop.npz")):
             left.unlink(missing_ok=True)  # of a recording that was not written to its end
         recording.write(path, kept, log, report, loop.signals)
+        print(f"{recording.timing_line(log)}; wrote {path}")
 
     log = loop.run(robot, lambda seen: next(played), on_end=ended)
     if log.stopped:
@@ -113,6 +117,19 @@ def measured_of(table: Mapping[str, Any], goal: Goal) -> list[str]:
     return list(table.get("measured") or table.get("noise") or goal.observed)
 
 
+def says_its_start(config: Path) -> bool:
+    """Whether inference reads off a recording where its episode began (`jaxlfi.envs.mujoco.starts`)."""
+    table = tables.load(config)
+    begins, numbers = tables.initial(table)
+    inferred = any(one.name.startswith(("initial/", "episode/")) for one in tables.parameters_of(table))
+    if begins not in (None, "log") or numbers or inferred:
+        return False
+    names = measured_of(table, goals.of_table(table["policy"]))
+    spec = specification(config.parent / table["model"])
+    add_sensors(spec, names)
+    return not starts.unmeasured(compile_spec(spec), names, [])
+
+
 def measuring(settings: Settings, config: Path) -> Settings:
     """Settings by which a policy's recordings have all that inference and the goal need."""
     table, (goal, _) = tables.load(config), _goal(config)
@@ -120,25 +137,34 @@ def measuring(settings: Settings, config: Path) -> Settings:
     return dataclasses.replace(settings, record=tuple(names))
 
 
-def achieved(config: Path, path: Path) -> dict[str, float]:
+def achieved(config: Path, path: Path) -> dict[str, Any]:
     """What a policy achieved in a recorded episode: the return as in training, and how far it was off in the end.
+
+    A control interval's reward is that of the last measurement by its end, where there was none at its end.
 
     Args:
         config: of the task.
         path: of the recording, with the report of the episode in files beside it (`jaxlfi.robots.recording`).
+
+    Returns:
+        Also which termination ended it, and why the robot was stopped before its time, "" where it was not: its return
+        lacks what was still to come then.
     """
     goal, reading = _goal(config)
-    _, loop = recording.beside(path)
-    log = np.load(loop)
+    report, loop = recording.beside(path)
+    log, told = np.load(loop), json.loads(report.read_text())
     names = [str(name) for name in log["signals"]]
-    rows = log["observations"][:, [names.index(name) for name in goal.signals]]
+    ends = told["timing"]["period"] * (np.arange(len(log["targets"])) + 1.5)
+    last = np.maximum(np.searchsorted(log["times"], ends) - 1, 0)
+    rows = log["observations"][np.append(0, last)][:, [names.index(name) for name in goal.signals]]
     commands = np.array([0.5 * (one.low + one.high) for one in reading.preparation.commands])
     controls = np.concatenate([log["targets"][:1], log["targets"]])
     total = 0.0
-    for after, last, control in zip(rows[1:], controls[:-1], controls[1:], strict=False):
-        total += float(reading.reward(after, control, last, commands, np))
+    for after, before, control in zip(rows[1:], controls[:-1], controls[1:], strict=True):
+        total += float(reading.reward(after, control, before, commands, np))
     off = {f"{name} off": abs(float(value)) for name, value in reading.off(rows[-1], commands, np).items()}
-    return {"return": total, "controls": len(log["targets"])} | off
+    ended = str(told.get("ended", "")).partition(" (")[0]
+    return {"return": total, "controls": len(log["targets"]), "ended": ended, "stopped": told["stopped"]} | off
 
 
 def _goal(config: Path) -> tuple[Goal, Reading]:

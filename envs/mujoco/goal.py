@@ -29,7 +29,7 @@ alive = 0.5                         # + for every second that does not end the e
 [policy.commands]                   # drawn anew for each episode, uniformly; a policy sees them
 speed = [-1.0, 2.0]
 
-[policy.terminations]               # besides the duration; `jaxlfi.envs.mujoco.termination`
+[policy.terminations]               # besides the duration; `jaxlfi.rl.termination`
 fallen = { when = "body/torso/pos[2] < 0.2", cost = 10.0 }      # - at the step that ends the episode
 away = "abs(arm angle) > 2.5"       # at no cost
 
@@ -66,10 +66,10 @@ from typing import Any, NamedTuple
 from jaxtyping import Array
 
 from jaxlfi.envs.mujoco import config as tables
-from jaxlfi.envs.mujoco import termination
 from jaxlfi.envs.mujoco.parameters import near
-from jaxlfi.envs.mujoco.termination import Termination
+from jaxlfi.rl import termination
 from jaxlfi.rl.preparation import MOST_BEFORE
+from jaxlfi.rl.termination import Termination
 
 NEEDED = ("interval", "duration", "observed")
 BOUNDS = ("limits", "initial", "commands")

@@ -24,6 +24,7 @@ def carried(table: Mapping[str, Any], model: str | Path, preparation: Preparatio
     found = settings.of_table(table)
     try:
         driving.limits_within(preparation, found)
+        driving.terminations_within(preparation, found)
         spec = specification(model)
         measured.add_sensors(spec, found.further)
         compiled = compile_spec(spec)

@@ -5,9 +5,9 @@ iteration_1/posterior/     what it may be (jaxlfi infer), from all recordings so
 iteration_1/policy/        a policy on that posterior (jaxlfi train)
 iteration_1/rollout.csv    that policy on the machine (jaxlfi control)
 iteration_2/ ...           likewise, with that recording besides
-uniform/                   a policy on the uniform box, to compare with
+uniform/ point/ sysid/     policies on other domains, to compare with (`jaxlfi.envs.mujoco.r2s2r_beside`)
 deployed/                  all policies on the machine, from scattered starts
-page.html
+results.json, page.html
 
 Every stage is a command of its own in a folder of its own. Repeating the command continues an interrupted run. The
 machine is a driver at an address, or by default one that is simulated in another process, with another integrator and
@@ -16,18 +16,20 @@ recordings begin. This module imports neither jax nor numpy before it has to, so
 """
 
 import argparse
-import contextlib
+import csv
+import io
 import math
-import subprocess
+import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from jaxlfi import flags, references
 from jaxlfi.cli import loops, train
 from jaxlfi.cli import parser as command_line
 from jaxlfi.cli.command import Command
+from jaxlfi.envs.mujoco import r2s2r_beside as beside
+from jaxlfi.envs.mujoco import r2s2r_machine as machine
 from jaxlfi.envs.mujoco import require_mujoco
 from jaxlfi.io.formats import CONFIG
 from jaxlfi.registry import HEURISTICS
@@ -54,6 +56,11 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--remote", action="store_true", help="allow a driver on another host; needs --token")
     parser.add_argument("--token", type=Path, metavar="FILE", help="a file with the token that the driver asks for")
+    parser.add_argument(
+        "--confirm",
+        action="store_true",
+        help="with --address: wait for Enter before each recording; the machine moves then",
+    )
     parser.add_argument(
         "--heuristic", default="edge", metavar="NAME", help="how the support is adapted (default: edge)"
     )
@@ -82,13 +89,28 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="episodes that policies are compared by (default: 8)",
     )
     parser.add_argument(
+        "--beside",
+        nargs="*",
+        choices=beside.ARMS,
+        default=["uniform"],
+        metavar="ARM",
+        help="what else policies are trained on and deployed, to compare with: uniform, the first guess; point, the "
+        "least-squares point of jaxlfi mujoco fit; sysid, that of mujoco.sysid; a training each (default: uniform)",
+    )
+    parser.add_argument(
         "--total-steps", type=int, metavar="N", help="environment steps of each training (default: the preset's)"
     )
     parser.add_argument(
-        "--infer", default="", metavar="WORDS", help="further words of jaxlfi infer, as '--rounds 3 --epochs 50'"
+        "--infer",
+        default="",
+        metavar="WORDS",
+        help="further words of jaxlfi infer, as '--rounds 3 --epochs 50'; a single one as --infer=--polish",
     )
     parser.add_argument(
-        "--train", default="", metavar="WORDS", help="further words of jaxlfi train, as '--environments 32'"
+        "--train",
+        default="",
+        metavar="WORDS",
+        help="further words of jaxlfi train, likewise, as '--environments 64'",
     )
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
 
@@ -102,9 +124,11 @@ def _loop(arguments: argparse.Namespace) -> int:
 
     compile_cache.enable()
     try:
-        iterations = _round_and_round(arguments, config)
-        policies = {"uniform box": _train(arguments, "uniform", arguments.out / "uniform")}
-        policies |= {f"iteration {i}": path for i, path in enumerate(iterations, 1)}
+        recordings, iterations = _round_and_round(arguments, config)
+        policies = {f"iteration {i}": path for i, path in enumerate(iterations, 1)}
+        for arm in arguments.beside:
+            domain = beside.domain_of(arm, arguments.task, recordings, arguments.out)
+            policies[arm] = _train(arguments, domain, arguments.out / arm / "policy")
         _deploy(arguments, config, policies)
     except loops.StageError as stage:
         return stage.status
@@ -138,6 +162,7 @@ def _begin(arguments: argparse.Namespace, config: Path) -> None:
     for name in ("settled", "excitation"):
         if (value := getattr(arguments, name)) is not None and not 0 < value < math.inf:
             raise ValueError(f"{name}: expected a number above 0, got {value:g}")
+    beside.check(arguments.beside)
     train.check_seeds(arguments.seed, 1, "seed")
     HEURISTICS.load(arguments.heuristic)
     if arguments.total_steps is not None:
@@ -145,21 +170,25 @@ def _begin(arguments: argparse.Namespace, config: Path) -> None:
     command_line.parse(_infer_words(arguments, [Path("recording.csv")], arguments.out))
     train.main.parser().parse_args(_train_words(arguments, "uniform", arguments.out))
     if arguments.address is None:
+        if arguments.remote or arguments.token or arguments.confirm:
+            raise ValueError("remote, token, confirm: expected with --address only, got a simulated machine")
         Machine.of(config)
     else:
         token = None if arguments.token is None else wire.token_of(arguments.token)
         host, _ = wire.address(arguments.address, arguments.remote)
         if token is None and not wire.is_local(host):
             raise ValueError(f"token: expected the one that the robot at {host}, another host, shares; got none")
-    loops.begin(arguments.out, loops.asked_of(arguments))
+    # A driver may be started anew at another address.
+    asked = loops.asked_of(arguments, ("out", "debug", "address", "remote", "token", "confirm"))
+    loops.begin(arguments.out, asked | {"machine": "simulated" if arguments.address is None else "at an address"})
 
 
-def _round_and_round(arguments: argparse.Namespace, config: Path) -> list[Path]:
-    """The policies of the iterations; the loop ends once the posterior has stopped moving."""
+def _round_and_round(arguments: argparse.Namespace, config: Path) -> tuple[list[Path], list[Path]]:
+    """All recordings, and the policies of the iterations; the loop ends once the posterior has stopped moving."""
     from jaxlfi.runs.load import load
 
     out, policies, posteriors = arguments.out, [], []
-    recordings = [_excite(arguments, config, out / "excitation.csv")]
+    recordings = [machine.excited(arguments, config, out / "excitation.csv")]
     for iteration in range(1, arguments.iterations + 1):
         folder = out / f"iteration_{iteration}"
         folder.mkdir(exist_ok=True)
@@ -171,46 +200,9 @@ def _round_and_round(arguments: argparse.Namespace, config: Path) -> list[Path]:
             if far <= arguments.settled:
                 break
         if iteration < arguments.iterations:
-            recordings.append(_rollout(arguments, config, policies[-1], folder / "rollout.csv", iteration))
-    return policies
-
-
-def _excite(arguments: argparse.Namespace, config: Path, path: Path) -> Path:
-    """What the machine measures under sines of its actuators."""
-    from jaxlfi.envs.mujoco import excitation
-
-    if not path.with_suffix(".json").exists():
-        loops.say("the machine under sines of its actuators")
-        with _machine(arguments, config, arguments.seed) as driver:
-            excitation.record(driver(), config, path, arguments.excitation, arguments.seed)
-    return path
-
-
-def _rollout(arguments: argparse.Namespace, config: Path, policy: Path, path: Path, iteration: int) -> Path:
-    """What a policy does on the machine; a recording that a limit ended is one, too."""
-    if not path.with_suffix(".json").exists():
-        loops.say(f"{policy} on the machine")
-        with _machine(arguments, config, arguments.seed + iteration) as driver:
-            _controlled(driver(), policy, config, path)
-    return path
-
-
-def _controlled(driver: Any, policy: Path, config: Path, path: Path) -> None:
-    from jaxlfi.envs.mujoco import excitation
-    from jaxlfi.rl import policy as policies
-    from jaxlfi.robots import driving, sessions
-    from jaxlfi.robots.robot import RobotError
-
-    trained = policies.load(policy)
-    settings = excitation.measuring(driving.settings_of(trained), config)
-    for left in (path, path.with_suffix(".loop.npz")):
-        left.unlink(missing_ok=True)  # of a rollout that was not written to its end
-    try:
-        sessions.of(trained, settings).run(driver, path, {"policy": str(policy)}, say=print)
-    except RobotError as error:
-        if not path.exists():
-            raise
-        print(f"{error}; the recording ends there")
+            path = folder / "rollout.csv"
+            recordings.append(machine.rolled_out(arguments, config, policies[-1], path, iteration))
+    return recordings, policies
 
 
 def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
@@ -222,7 +214,7 @@ def _train(arguments: argparse.Namespace, domain: str, out: Path) -> Path:
 
 def _train_words(arguments: argparse.Namespace, domain: str, out: Path) -> list[str]:
     words = [arguments.task, "--domain", domain, "--out", str(out), "--preset", arguments.preset]
-    words += ["--first-seed", str(arguments.seed), *arguments.train.split()]
+    words += shlex.split(f"--first-seed {arguments.seed} {arguments.train}")
     return words + ([] if arguments.total_steps is None else ["--total-steps", str(arguments.total_steps)])
 
 
@@ -237,7 +229,7 @@ def _infer(arguments: argparse.Namespace, recordings: Sequence[Path], out: Path)
 def _infer_words(arguments: argparse.Namespace, recordings: Sequence[Path], out: Path) -> list[str]:
     logs = ";".join(map(str, recordings))
     words = ["infer", f"{arguments.task},log={logs}", "--heuristic", arguments.heuristic, "--preset", arguments.preset]
-    return [*words, "--first-seed", str(arguments.seed), *arguments.infer.split(), "--out", str(out)]
+    return [*words, "--first-seed", str(arguments.seed), *shlex.split(arguments.infer), "--out", str(out)]
 
 
 def _begin_or_resume(run: Callable[[list[str]], int], words: list[str], out: Path, what: str) -> None:
@@ -257,45 +249,32 @@ def _deploy(arguments: argparse.Namespace, config: Path, policies: dict[str, Pat
         return
     rows = []
     for name, policy in policies.items():
-        loops.say(f"the policy of {name} on the machine, {arguments.episodes} times")
-        with _machine(arguments, config, arguments.seed, scattered=True) as driver:
-            for episode in range(arguments.episodes):
-                path = out / f"{name.replace(' ', '_')}_{episode}.csv"
-                if not path.with_suffix(".json").exists():
-                    _controlled(driver(), policy, config, path)
-                rows.append({"policy": name, "episode": episode, **excitation.achieved(config, path)})
-    lines = [",".join(map(str, rows[0])), *(",".join(map(str, row.values())) for row in rows)]
-    files.write_bytes(out / "table.csv", ("\n".join(lines) + "\n").encode())
+        paths = [out / f"{name.replace(' ', '_')}_{episode}.csv" for episode in range(arguments.episodes)]
+        for first, some in _missing(paths):
+            loops.say(f"the policy of {beside.TITLES.get(name, name)} on the machine, {len(some)} times")
+            with machine.connected(arguments, config, arguments.seed, scattered=True, first=first) as driver:
+                for path in some:
+                    machine.controlled(driver(), policy, config, path)
+        for episode, path in enumerate(paths):
+            rows.append({"policy": name, "episode": episode, **excitation.achieved(config, path)})
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    files.write_bytes(out / "table.csv", text.getvalue().encode())
 
 
-@contextlib.contextmanager
-def _machine(
-    arguments: argparse.Namespace, config: Path, seed: int, scattered: bool = False
-) -> Iterator[Callable[[], Any]]:
-    """Makes drivers of the machine; a simulated one in a process that ends with the context."""
-    from jaxlfi.robots import wire
-    from jaxlfi.robots.client import SocketDriver
-
-    if arguments.address is not None:
-        token = None if arguments.token is None else wire.token_of(arguments.token)
-        yield lambda: SocketDriver(arguments.address, arguments.remote, token)
-        return
-    words = [sys.executable, "-m", "jaxlfi.envs.mujoco.cli", "serve", str(config), "--seed", str(seed)]
-    words += ["--scattered"] if scattered else []
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    try:
-        line = process.stdout.readline() if process.stdout else ""
-        if not line:
-            raise ValueError(
-                f"robot: expected a simulated machine that listens, got one that ended: jaxlfi mujoco serve {config} "
-                "says why"
-            )
-        yield lambda: SocketDriver(line.split()[-1])
-    finally:
-        process.terminate()
-        process.wait()
-        if process.stdout:
-            process.stdout.close()
+def _missing(paths: Sequence[Path]) -> list[tuple[int, list[Path]]]:
+    """Recordings that are still to be made, those without a gap between them together, and the first one's number."""
+    found: list[tuple[int, list[Path]]] = []
+    for number, path in enumerate(paths):
+        if machine.whole(path):
+            continue
+        if found and found[-1][0] + len(found[-1][1]) == number:
+            found[-1][1].append(path)
+        else:
+            found.append((number, [path]))
+    return found
 
 
 main = Command(

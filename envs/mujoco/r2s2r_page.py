@@ -1,17 +1,25 @@
-"""The page that `jaxlfi r2s2r mujoco,config=FILE` ends with: what was believed, trained and achieved, by iteration."""
+"""What `jaxlfi r2s2r mujoco,config=FILE` came to: believed, trained and achieved, by iteration, and beside it.
+
+results.json       numbers
+page.html          the same in words, with pictures
+"""
 
 import argparse
 import csv
 import html
-import json
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxlfi.cli.loops import believed, moved
 from jaxlfi.envs.mujoco import config as tables
+from jaxlfi.envs.mujoco import r2s2r_beside as beside
+from jaxlfi.envs.mujoco.r2s2r_machine import report_of
 from jaxlfi.io import files, web_page
+from jaxlfi.io.provenance import environment
 from jaxlfi.rl import policy
 from jaxlfi.runs.load import load
 
@@ -22,87 +30,175 @@ SHOWN = {
     "predictive": "Simulations of the posterior over time, as bands, and what was recorded",
 }
 """What pictures show, for those who cannot see them, by file name; others are left out."""
+TEXTS = ("policy", "ended", "stopped")
+"""Columns of the table of episodes that are no numbers."""
 
 
 def write(arguments: argparse.Namespace, config: Path, policies: Mapping[str, Path]) -> Path:
-    """Write page.html.
+    """Write results.json and page.html.
 
     Args:
         arguments: of the loop, whose stages are complete.
         config: of the task.
-        policies: by name.
+        policies: by name, "iteration 1" and so on, and what they are compared with.
     """
     out = arguments.out
-    folders = sorted(out.glob("iteration_*/posterior"), key=lambda path: int(path.parent.name.rpartition("_")[2]))
-    runs = {folder: load(folder) for folder in folders}
-    steps = [f"{moved(*pair):.2g}" for pair in zip(list(runs.values())[:-1], list(runs.values())[1:], strict=True)]
-    truths = {name: table.get("truth") for name, table in tables.load(config)["parameters"].items()}
-    rows = [
-        {"iteration": folder.parent.name.rpartition("_")[2], **_beliefs(row, truths)}
-        for folder, run in runs.items()
-        for row in believed(folder, run)
-    ]
-    fared = achieved(out / "deployed" / "table.csv")
-    trained = [
-        {"policy": name, "domain": str(policy.load(path).schema.get("domain", "")), "file": str(path)}
-        for name, path in policies.items()
-    ]
-    pictures = [*sorted(out.glob("**/curves.png")), *sorted(out.glob("iteration_*/posterior/figures/*.png"))]
+    found = results(arguments, config, policies)
+    files.write_json(out / "results.json", {**found, **environment()})
+    figures = sorted(out.glob("iteration_*/posterior/figures/*.png"))
+    pictures = [*(path.parents[2] / "curves.png" for path in policies.values())]
+    pictures += [path for path in figures if path.stem in SHOWN and path.stem != "curves"]  # its curves are of errors
     machine = f"the driver at {arguments.address}" if arguments.address else "a simulated machine in another process"
-    settled = f" The medians moved by {', '.join(steps)} half-widths of the 90 % intervals before." if steps else ""
+    steps = ", ".join(f"{far:.2g}" for far in found["moved"])
+    settled = f" The medians moved by {steps} half-widths of the 90 % intervals before." if steps else ""
     parts = (
         f"<p>The machine: {html.escape(machine)}. Heuristic {html.escape(arguments.heuristic)}, preset "
         f"{arguments.preset}, seed {arguments.seed}.</p>",
         f"<h2>What was believed</h2><p>From the excitation and the policies' recordings so far.{settled}</p>",
-        web_page.table(rows),
-        "<h2>What was trained</h2>",
-        web_page.table(trained),
-        f"<h2>What was achieved on the machine</h2><p>Means of {arguments.episodes} episodes with their standard "
-        "errors; the return is that of the training.</p>",
-        web_page.table(fared),
+        web_page.table([_belief(row) for row in found["believed"]]),
+        "<h2>What was trained and achieved</h2><p>The return in simulation is the mean over 128 other points of what a "
+        f"policy was trained on, that on the machine the mean of up to {arguments.episodes} episodes with its standard "
+        "error, from measurements, and so with their noise. Episodes in which the robot was stopped before its time "
+        "are counted, and not averaged.</p>",
+        web_page.table([_fared(row) for row in found["policies"]]),
         "<h2>Recordings</h2>",
         web_page.table(recorded(out)),
-        *(_figure(path.relative_to(out)) for path in pictures if path.stem in SHOWN),
+        *(_figure(path.relative_to(out)) for path in pictures),
     )
     page = web_page.document(f"{config.stem}: from the machine to a policy, and back", parts)
     files.write_bytes(out / "page.html", page.encode())
     return out / "page.html"
 
 
-def achieved(table: Path) -> list[dict[str, str]]:
-    """Means over the episodes of each policy, with their standard errors."""
+def results(arguments: argparse.Namespace, config: Path, policies: Mapping[str, Path]) -> dict[str, Any]:
+    """The same in numbers.
+
+    Returns:
+        "believed", a row for each parameter of an iteration, and of what it is compared with; "moved", how far each
+        posterior was from the one before (`loops.moved`); "policies", a row for each, with what it was trained on, the
+        return in simulation and on the machine.
+    """
+    out = arguments.out
+    names = [name for name in policies if name.startswith("iteration ")]
+    runs = {name: load(out / name.replace(" ", "_") / "posterior") for name in names}
+    parameters = tables.parameters_of(tables.load(config))
+    rows = [
+        {"policy": name, **{key: row[key] for key in ("parameter", "median", "90 % interval", "last support")}}
+        for name, run in runs.items()
+        for row in believed(out, run)
+    ]
+    for arm in (name for name in policies if name not in runs):
+        rows += _beside(arm, parameters, out)
+    truths = {one.name: one.truth for one in parameters}
+    several = list(runs.values())
+    return {
+        "task": arguments.task,
+        "asked": {key: getattr(arguments, key) for key in ("heuristic", "preset", "seed", "infer", "train")},
+        "believed": [{**row, "truth": truths.get(row["parameter"])} for row in rows],
+        "moved": [moved(*pair) for pair in itertools.pairwise(several)],
+        "policies": [
+            {
+                "policy": name,
+                "domain": str(policy.load(path).schema.get("domain", "")),
+                "trained": _in_simulation(path),
+                **achieved(out / "deployed" / "table.csv", name),
+            }
+            for name, path in policies.items()
+        ],
+    }
+
+
+def achieved(table: Path, name: str) -> dict[str, Any]:
+    """What a policy achieved on the machine, over the episodes that were not stopped before their time.
+
+    Args:
+        table: of all episodes.
+        name: of the policy.
+
+    Returns:
+        How many episodes there are, were "stopped", and "ended" by each termination; of each further column the mean
+        and its standard error, None where there are none.
+    """
     with table.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    found = []
-    for name in dict.fromkeys(row["policy"] for row in rows):
-        own = [row for row in rows if row["policy"] == name]
-        line = {"policy": name, "episodes": str(len(own))}
-        for column in rows[0]:
-            if column in ("policy", "episode", "controls"):
-                continue
-            values = np.array([float(row[column]) for row in own])
-            error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-            line[column] = f"{values.mean():.3g} ± {error:.2g}"
-        found.append(line)
+        own = [row for row in csv.DictReader(file) if row["policy"] == name]
+    ended = [row["ended"] for row in own if row["ended"]]
+    kept = [row for row in own if not row["stopped"]]
+    found: dict[str, Any] = {"episodes": len(own), "stopped": len(own) - len(kept)}
+    found["ended"] = {one: ended.count(one) for one in dict.fromkeys(ended)}
+    for column in own[0]:
+        if column in (*TEXTS, "episode"):
+            continue
+        values = np.array([float(row[column]) for row in kept])
+        error = float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
+        found[column] = {"mean": float(values.mean()) if len(values) else None, "error": error}
     return found
 
 
 def recorded(out: Path) -> list[dict[str, str]]:
-    """How each recording went."""
+    """How each recording went, those that were cut short among them."""
     rows = []
-    for path in [out / "excitation.json", *sorted(out.glob("iteration_*/rollout.json"))]:
+    paths = [*sorted(out.glob("excitation*/*.json")), out / "excitation.json"]
+    for path in (
+        *paths,
+        *sorted(out.glob("iteration_*/rollout*.json")),
+        *sorted(out.glob("iteration_*/*.cut-*/*.json")),
+    ):
         if path.exists():
-            report = json.loads(path.read_text())
-            missed, why = report["timing"]["missed"], report["stopped"]
-            rows.append({"recording": str(path.relative_to(out)), "deadlines missed": str(missed), "stopped": why})
+            report = report_of(path)
+            missed, why = str(report["timing"]["missed"]), report["stopped"] or report.get("ended", "")
+            row = {"recording": str(path.relative_to(out)), "controls": str(report["controls"])}
+            rows.append({**row, "deadlines missed": missed, "ended early": why})
     return rows
 
 
-def _beliefs(row: Mapping[str, str], truths: Mapping[str, float | None]) -> dict[str, str]:
-    truth = truths.get(row["parameter"])
-    return {key: row[key] for key in ("parameter", "median", "90 % interval", "last support")} | {
-        "truth of the simulated machine": "" if truth is None else f"{truth:.4g}"
-    }
+def _beside(arm: str, parameters: Sequence[Any], out: Path) -> list[dict[str, str]]:
+    """What is believed of the parameters where no posterior is."""
+    if arm == "uniform":
+        bounds = [f"{one.support[0]:.4g} to {one.support[1]:.4g}" for one in parameters]
+        return [
+            {"policy": arm, "parameter": one.name, "median": "", "90 % interval": "", "last support": box}
+            for one, box in zip(parameters, bounds, strict=True)
+        ]
+    found = beside.found_point(arm, out)
+    return [
+        {
+            "policy": arm,
+            "parameter": name,
+            "median": f"{value:.4g}",
+            "90 % interval": _interval(*ends),
+            "last support": "",
+        }
+        for name, value, ends in zip(found["names"], found["theta"], found["interval"], strict=True)
+    ]
+
+
+def _interval(low: float | None, high: float | None) -> str:
+    """Of a point; JSON has None for what is not a number."""
+    return "not constrained" if low is None or high is None or low != low else f"{low:.4g} to {high:.4g}"
+
+
+def _in_simulation(path: Path) -> float:
+    """The return of a trained policy on points of its domain that it was not trained on."""
+    with (path.parents[2] / "table.csv").open(newline="") as file:
+        return float(next(csv.DictReader(file))["return"])
+
+
+def _belief(row: Mapping[str, Any]) -> dict[str, str]:
+    truth = "" if row["truth"] is None else f"{row['truth']:.4g}"
+    shown = {key: row[key] for key in ("parameter", "median", "90 % interval", "last support")}
+    return {"after": beside.TITLES.get(row["policy"], row["policy"]), **shown, "truth": truth}
+
+
+def _fared(row: Mapping[str, Any]) -> dict[str, str]:
+    shown = {"policy": beside.TITLES.get(row["policy"], row["policy"]), "trained on": row["domain"]}
+    shown |= {"return in simulation": f"{row['trained']:.3g}"}
+    for column, one in row.items():
+        if isinstance(one, Mapping) and "mean" in one and column != "controls":
+            error = "" if one["error"] is None else f" ± {one['error']:.2g}"
+            mean = "none" if one["mean"] is None else f"{one['mean']:.3g}{error}"
+            shown["return on the machine" if column == "return" else column] = mean
+    ended = ", ".join(f"{count} {name}" for name, count in row["ended"].items())
+    return {**shown, "episodes": str(row["episodes"]), "ended": ended, "stopped": str(row["stopped"])}
 
 
 def _figure(path: Path) -> str:

@@ -1,5 +1,6 @@
 """A goal in terms of a model: where its signals are, what a policy observes and does, and what it is rewarded with."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -104,6 +105,10 @@ class Reading:
                 raise ValueError(f"policy: {'displacing' if rate is None else 'rates'}: {error}") from error
         of_targets = {one.value: measured.unit(model, name) for name, one in goal.aims.items()}
         commands = tuple(Command(name, *bounds, of_targets.get(name, "")) for name, bounds in goal.commands.items())
+        ends = {
+            name: dataclasses.replace(one, unit=measured.unit(model, one.signal).removeprefix("1"))
+            for name, one in goal.terminations.items()
+        }
         return Preparation(
             signals=signals,
             controls=tuple(controls),
@@ -114,6 +119,7 @@ class Reading:
             commands=commands,
             observation_delay=goal.observation_delay,
             action_delay=goal.action_delay,
+            terminations=ends,
         )
 
     def _signals(self, owners: Sequence["_Owner"]) -> tuple[Signals, Signals]:

@@ -15,7 +15,11 @@ It lives in the time of the loop that controls it, as fast as that goes, or by t
 import argparse
 import contextlib
 import dataclasses
+import itertools
 import math
+import os
+import sys
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -101,21 +105,18 @@ class Machine:
         low, high = (np.where(free, far, column) for far, column in ranges)
         return ControlLimits(tuple(names), tuple(low), tuple(high), (math.inf,) * model.nu)
 
-    def driver(self, clock: Clock) -> "MachineDriver":
-        """A driver of it, by a clock."""
-        return MachineDriver(self, clock)
+    def driver(self, clock: Clock, episode: int = 0) -> "MachineDriver":
+        """A driver of it, by a clock, for one of its episodes."""
+        return MachineDriver(self, clock, episode)
 
 
 class MachineDriver:
     """A machine as a driver (`jaxlfi.robots.driver`)."""
 
-    _episodes = 0
-
-    def __init__(self, machine: Machine, clock: Clock):
-        """Nothing is simulated before `connect`."""
+    def __init__(self, machine: Machine, clock: Clock, episode: int = 0):
+        """Nothing is simulated before `connect`. Noise and start are those of the episode's number."""
         self._machine, self._clock, self._number = machine, clock, -1
-        self._rng = np.random.default_rng([machine.seed, MachineDriver._episodes])
-        MachineDriver._episodes += 1
+        self._rng = np.random.default_rng([machine.seed, episode])
 
     def connect(self, signals: Mapping[str, str], controls: Mapping[str, str]) -> Mapping[str, Any]:
         """Compile the model with a sensor for each signal; it begins at rest, or where episodes do.
@@ -241,16 +242,29 @@ def serve(arguments: argparse.Namespace) -> None:
         arguments.config, truth, unmodelled=arguments.unmodelled, seed=arguments.seed, scattered=arguments.scattered
     )
     MachineDriver(machine, Simulated()).connect({}, dict.fromkeys(machine.limits().names, ""))
+    if arguments.first_episode < 0:
+        raise ValueError(f"first_episode: expected a number of at least 0, got {arguments.first_episode}")
     if not 0 <= arguments.port < 65536:
         raise ValueError(f"port: expected a number from 0 to 65535, got {arguments.port}")
     token = None if arguments.token is None else wire.token_of(arguments.token)
     journal = server.write_to(arguments.journal) if arguments.journal else lambda event: None
     with contextlib.closing(server.listen(arguments.port, arguments.host)) as listener:
         server.require_token(listener, token)
+        if arguments.until_closed:
+            threading.Thread(target=_end_with_input, daemon=True).start()
         print(f"listening on socket://{arguments.host}:{listener.getsockname()[1]}", flush=True)
         clock = Monotonic if arguments.real_time else Simulated
         watchdog = server.WATCHDOG if arguments.real_time else PATIENCE
-        server.serve_driver(listener, machine.driver, machine.limits(), watchdog, journal, clock, token)
+        episodes = itertools.count(arguments.first_episode)
+        made = lambda clock: machine.driver(clock, next(episodes))
+        server.serve_driver(listener, made, machine.limits(), watchdog, journal, clock, token)
+
+
+def _end_with_input() -> None:
+    """End the process as its standard input ends: whoever started it has ended, killed or not."""
+    while sys.stdin.buffer.read(4096):
+        pass
+    os._exit(0)
 
 
 PATIENCE = 60.0

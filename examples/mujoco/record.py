@@ -94,7 +94,26 @@ def finger() -> Reality:
     return Reality(times, {"pull": pull}, act, {"pull": "N", "bend": "rad"})
 
 
-EXAMPLES: Mapping[str, Callable[[], Reality]] = {"furuta": furuta, "arm": arm, "puck": puck, "finger": finger}
+def shuffle() -> Reality:
+    """A push, and one that finds the puck again; the pusher's rail sticks a little, the air brakes the puck."""
+    times = 0.01 * np.arange(250)
+    push = np.select([times < 0.15, times < 1.2, times < 1.6], [2.5, 0.0, 3.0])
+
+    def act(model, data, controls):
+        data.ctrl[:] = controls
+        data.qfrc_applied[0] = -0.02 * np.tanh(data.qvel[0] / 0.01) * np.exp(-((data.qvel[0] / 0.3) ** 2))
+        data.qfrc_applied[1] = -0.001 * data.qvel[1] * np.abs(data.qvel[1])
+
+    return Reality(times, {"motor": push}, act, {"motor": "N", "pusher place": "m", "puck place": "m"})
+
+
+EXAMPLES: Mapping[str, Callable[[], Reality]] = {
+    "furuta": furuta,
+    "arm": arm,
+    "puck": puck,
+    "finger": finger,
+    "shuffle": shuffle,
+}
 
 
 def recorded(name: str, truth: Mapping[str, float] | None = None, seed: int | None = 0, backwards: bool = False) -> Log:

@@ -242,10 +242,11 @@ def _plan(arguments: argparse.Namespace) -> Any:
     from jaxlfi.rl.training import Plan
 
     environment = ENVIRONMENTS.load(arguments.environment)
+    own = getattr(environment, "training", {}).get(arguments.preset, {})
     return Plan(
         reference=arguments.environment,
         environment=environment,
-        settings=SETTINGS_OF[arguments.preset].replace(**arguments.settings),
+        settings=SETTINGS_OF[arguments.preset].replace(**{**own, **arguments.settings}),
         preset=arguments.preset,
         domains=domains_of(environment, arguments.domain),
         seeds=tuple(range(arguments.first_seed, arguments.first_seed + arguments.seeds)),

@@ -87,8 +87,9 @@ class Environment(Protocol):
     actions are made of signals and controls (`jaxlfi.rl.preparation.Preparation`). One whose observations are bounded
     may have an attribute `bounds`, the least and the largest ones [2, O], for learners that ask for them
     (`jaxlfi.rl.gym`). One that knows several rewards may have an attribute `reward`, the name of its own, which
-    trainings and policies record. One where more happens once an episode is over may have a method `concluded(state)`,
-    from its last state to facts that evaluations add.
+    trainings and policies record; one that learns by other numbers than the whip, an attribute `training`: by the name
+    of a preset, settings of PPO in place of the preset's own (`jaxlfi.rl.settings`). One where more happens once an
+    episode is over may have a method `concluded(state)`, from its last state to facts that evaluations add.
 
     Attributes:
         name: of the environment.

@@ -22,6 +22,8 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float
 
+from jaxlfi.rl.termination import Termination
+
 KEY = "preparation"
 """Where it lies in a policy's schema."""
 MOST_BEFORE = 100
@@ -135,6 +137,7 @@ class Preparation:
         observation_delay: least and largest age of a measurement when the policy acts on it that was trained with, in
             s; what a robot should have, and nothing that is done here.
         action_delay: likewise, from an action to when the actuator gets it, in s.
+        terminations: when an episode ends early, by name.
 
     Raises:
         ValueError: for whatever does not fit together, in one line.
@@ -159,6 +162,7 @@ class Preparation:
     commands: tuple[Command, ...] = ()
     observation_delay: tuple[float, float] = (0.0, 0.0)
     action_delay: tuple[float, float] = (0.0, 0.0)
+    terminations: Mapping[str, Termination] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         for name, least, most in (("history", 1, MOST_BEFORE), ("actions", 0, MOST_BEFORE), ("steps", 1, math.inf)):
@@ -271,7 +275,8 @@ def of_schema(schema: Mapping[str, Any]) -> Preparation | None:
     parts = {"signals": Signal, "controls": Control, "commands": Command}
     try:
         made = {what: tuple(kind(**one) for one in found.get(what, ())) for what, kind in parts.items()}
-        preparation = Preparation(**{**found, **made})
+        ends = {name: Termination(**one) for name, one in found.get("terminations", {}).items()}
+        preparation = Preparation(**{**found, **made, "terminations": ends})
     except (TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"policy: expected a preparation in its schema, got one that is not whole: {error}") from error
     names = {"observations": preparation.names, "actions": tuple(one.name for one in preparation.controls)}

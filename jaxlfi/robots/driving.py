@@ -15,6 +15,7 @@ from jaxlfi.rl import preparation as preparations
 from jaxlfi.rl.deployment import ControlLimits
 from jaxlfi.rl.policy import Policy
 from jaxlfi.rl.preparation import Control, Memory, Preparation, Signal
+from jaxlfi.rl.termination import Termination
 from jaxlfi.robots.driver import DONE, Driven, Driver
 from jaxlfi.robots.episode import Log, Paced
 from jaxlfi.robots.robot import Command, Observation, Robot, RobotError
@@ -53,9 +54,10 @@ class Drive(Paced):
         commands: what the operator asks for, as the policy was trained with, in the order of the preparation.
         follows: another controller commands, and observations say what.
         units: of signals that the policy does not see, where they are known.
+        terminations: when an episode ends early, by name.
 
     Raises:
-        ValueError: for bounds and commands of others.
+        ValueError: for bounds, commands and terminations of others.
     """
 
     preparation: Preparation
@@ -65,11 +67,14 @@ class Drive(Paced):
     commands: tuple[float, ...] = ()
     follows: bool = False
     units: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    terminations: Mapping[str, Termination] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         super().__post_init__()
         if unknown := [name for name in self.bounds if name not in self.signals]:
             raise ValueError(f"limits: expected signals among {', '.join(self.signals)}, got {', '.join(unknown)}")
+        if unknown := [name for name, one in self.terminations.items() if one.signal not in self.signals]:
+            raise ValueError(f"terminations: expected some of {', '.join(self.signals)}, got {', '.join(unknown)}")
         if len(self.commands) != len(self.preparation.commands):
             names = ", ".join(one.name for one in self.preparation.commands)
             raise ValueError(f"commands: expected a number for each of {names or 'none'}, got {list(self.commands)}")
@@ -98,6 +103,8 @@ class Drive(Paced):
         own = preparation_of(policy, rate)
         settings = settings_of(policy) if settings is None else settings
         names = tuple(one.name for one in own.signals)
+        ends = terminations_within(own, settings)
+        further = (*(one.signal for one in ends.values()), *settings.further)
         given = {
             "rate": 1 / own.interval if rate is None else rate,
             "watchdog": settings.watchdog or WATCHDOG,
@@ -107,10 +114,11 @@ class Drive(Paced):
         return Drive(
             own,
             limits_within(own, settings),
-            (*names, *(name for name in settings.further if name not in names)),
+            tuple(dict.fromkeys((*names, *further))),
             settings.limits,
             _commands(own, commands or {}),
-            units=settings.units,
+            units={one.signal: one.unit for one in ends.values()} | dict(settings.units),
+            terminations=ends,
             **({"steps": own.steps} | {name: value for name, value in given.items() if value is not None} | changes),
         )
 
@@ -121,9 +129,10 @@ class Drive(Paced):
 
     @property
     def needed(self) -> list[int]:
-        """Places of what the policy sees, and of what has bounds; what is only recorded may be missing."""
+        """Places of what the policy sees, has bounds or ends episodes; what is only recorded may be missing."""
         seen = len(self.preparation.signals)
-        return [place for place, name in enumerate(self.signals) if place < seen or name in self.bounds]
+        watched = {*self.bounds, *(one.signal for one in self.terminations.values())}
+        return [place for place, name in enumerate(self.signals) if place < seen or name in watched]
 
     @property
     def count(self) -> int:
@@ -182,6 +191,13 @@ class Drive(Paced):
             value = values[self.signals.index(name)]
             if not low <= value <= high:
                 return f"{name} was measured at {value:.6g}, outside of its limits {[low, high]}"
+        return ""
+
+    def ended(self, values: np.ndarray) -> str:
+        """Which termination ends the episode where the robot has been measured; "" if none does."""
+        for name, one in self.terminations.items():
+            if one.holds(value := values[self.signals.index(one.signal)]):
+                return f"{name} ({one}: {one.signal} was measured at {value:.6g})"
         return ""
 
     def _values(self, observation: Observation) -> np.ndarray:
@@ -286,6 +302,20 @@ def limits_within(preparation: Preparation, settings: Settings) -> ControlLimits
         if one.of in settings.velocities:
             raise ValueError(f"velocities: {name}: expected a signal that is measured, got {one.of}")
     return limits
+
+
+def terminations_within(preparation: Preparation, settings: Settings) -> dict[str, Termination]:
+    """Terminations of a training that end episodes on a robot, too: all but those that its settings ignore.
+
+    Raises:
+        ValueError: where they ignore others.
+    """
+    known = preparation.terminations
+    if unknown := [name for name in settings.ignored_terminations if name not in known]:
+        raise ValueError(
+            f"ignored_terminations: expected some of {', '.join(known) or 'none'}, got {', '.join(unknown)}"
+        )
+    return {name: one for name, one in known.items() if name not in settings.ignored_terminations}
 
 
 def settings_of(policy: Policy) -> Settings:

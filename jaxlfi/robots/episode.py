@@ -42,6 +42,10 @@ class Log:
         over: slot at whose beginning the episode was over, or None.
         stopped: why the robot was stopped before its time; "" where it was not.
         period: between two commands, in s.
+        ages: of the measurement that each slot's command was made from, as it was sent, in s; NaN where there was none,
+            shape [S].
+        ended: which termination of the policy's training ended the episode; "" where none did.
+        failed: whether it is an error or a signal that stopped the robot, and not the loop.
     """
 
     times: np.ndarray
@@ -56,6 +60,9 @@ class Log:
     over: int | None
     stopped: str
     period: float
+    ages: np.ndarray
+    ended: str = ""
+    failed: bool = False
 
     @property
     def missed(self) -> int:
@@ -141,6 +148,10 @@ class Paced(abc.ABC):
     def outside(self, values: np.ndarray) -> str:
         """Why the robot must be stopped where it has been measured; "" if it need not."""
 
+    def ended(self, values: np.ndarray) -> str:
+        """Which termination ends the episode where the robot has been measured; "" if none does."""
+        return ""
+
     @property
     def period(self) -> float:
         """Between two commands, in s."""
@@ -168,7 +179,7 @@ class Paced(abc.ABC):
             try:
                 episode.run(whole)
             except BaseException as error:
-                episode.stopped = str(error) or type(error).__name__
+                episode.stopped, episode.failed = str(error) or type(error).__name__, True
                 _stop_after(error, stop)
                 raise
             else:
@@ -206,9 +217,10 @@ class _Episode:
         self.behind: int | None = None  # of one that came after it, and was made before
         self.began_anew = ""
         self.seen: list[tuple[float, np.ndarray, Mapping[str, Any]]] = []
-        self.slots: list[tuple[np.ndarray, np.ndarray, np.ndarray, bool, float]] = []
+        self.slots: list[tuple[np.ndarray, np.ndarray, np.ndarray, bool, float, float]] = []
         self.over: int | None = None
-        self.stopped = ""
+        self.stopped = self.ended = ""
+        self.failed = False
 
     def run(self, whole: bool) -> None:
         """From the first observation to the end."""
@@ -224,14 +236,14 @@ class _Episode:
                 self.seen.append((clock.now() - start - observation.age, values, observation.extras))
                 if self.over is None and loop.over(values.copy()):
                     self.over = slot
-                self.stopped = loop.outside(values)
+                self.stopped, self.ended = loop.outside(values), loop.ended(values)
             else:
                 unusable += 1
                 if unusable > loop.holds:
                     self.stopped = f"{unusable} observations in a row could not be used, the last one was {fault}"
             if self.began_anew:
                 self.stopped = self.began_anew
-            if self.stopped or slot == loop.steps or (self.over is not None and not whole):
+            if self.stopped or self.ended or slot == loop.steps or (self.over is not None and not whole):
                 return
             asked = None
             if observation is not None and self.over is None:
@@ -245,7 +257,8 @@ class _Episode:
                 self.robot.act(Command(slot, displacement.copy(), target.copy()))
             sent = clock.now()  # so that the next command is no closer to this one than its length allows
             asked = np.full(loop.count, np.nan) if asked is None else asked
-            self.slots.append((asked, displacement, target, observation is None, now - start - slot * loop.period))
+            age = np.nan if observation is None else now - start - self.seen[-1][0]
+            self.slots.append((asked, displacement, target, observation is None, now - start - slot * loop.period, age))
             self._wait_until(start + (slot + 1) * loop.period)
             slot = self._due(slot + 1, (clock.now() - start) / loop.period, target)
             observation, fault = self._look()
@@ -312,14 +325,14 @@ class _Episode:
     def _due(self, following: int, periods: float, target: np.ndarray) -> int:
         """The slot that it is time for; those that have passed are missed: their commands are not made up for."""
         due = min(max(following, int(periods)), self.loop.steps)
-        nothing = np.full(len(target), np.nan), np.zeros(len(target)), target, False, np.inf
+        nothing = np.full(len(target), np.nan), np.zeros(len(target)), target, False, np.inf, np.nan
         self.slots += [nothing] * (due - following)
         return due
 
     def log(self) -> Log:
         """What happened so far."""
         times, observations, extras = zip(*self.seen, strict=True) if self.seen else [()] * 3
-        asked, actions, targets, held, lateness = zip(*self.slots, strict=True) if self.slots else [()] * 5
+        asked, actions, targets, held, lateness, ages = zip(*self.slots, strict=True) if self.slots else [()] * 6
         table = lambda rows: np.reshape(np.array(rows, float), (len(rows), self.loop.count))
         return Log(
             times=np.array(times),
@@ -336,4 +349,7 @@ class _Episode:
             over=self.over,
             stopped=self.stopped,
             period=self.loop.period,
+            ages=np.array(ages, float),
+            ended=self.ended,
+            failed=self.failed,
         )

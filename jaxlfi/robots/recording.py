@@ -116,7 +116,10 @@ def _write(path: Path, recording: Recording, report: Mapping[str, Any], rate: fl
 
 
 def timing(log: Log) -> dict[str, Any]:
-    """How the rate was kept: measured periods, lateness and missed deadlines; times in s, None where there are none."""
+    """How the rate was kept: measured periods, lateness and missed deadlines; times in s, None where there are none.
+
+    The age is the median one of measurements as the commands made from them were sent.
+    """
     sent = np.isfinite(log.lateness)
     moments = np.arange(len(log.lateness))[sent] * log.period + log.lateness[sent]
     late = log.lateness[sent]
@@ -128,6 +131,7 @@ def timing(log: Log) -> dict[str, Any]:
         "measured_period": of(periods, np.mean),
         "jitter": of(periods, np.std),
         "lateness": {f"{q}": of(late, lambda values, q=q: np.quantile(values, q / 100)) for q in (50, 95, 99, 100)},
+        "age": of(log.ages[np.isfinite(log.ages)], np.median),
         "missed": log.missed,
         "skipped": int(np.sum(~sent)),
         "held": int(log.held.sum()),

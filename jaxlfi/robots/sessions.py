@@ -21,6 +21,8 @@ from jaxlfi.robots.settings import Settings
 Mode = Literal["control", "dry run", "shadow"]
 SET_POINT = "set-point "
 """What stands before the name of a measured position, for where it is to be."""
+DOUBTFUL = 0.1
+"""Part of a control period by which ages of measurements may be beyond those of the training without a word."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +64,10 @@ class Session:
             report = {**about, **self.report(log), "robot": itself}
             recording.write(out, self.recorded(log), log, report, self._signals)
             say(f"{recording.timing_line(log)}; wrote {out}")
+            if aged := self._aged(log):
+                say(aged)
+            if log.ended:
+                say(f"the episode ended after {len(log.actions)} of {loop.steps} controls, as in training: {log.ended}")
 
         log = loop.run(made, self.policy, on_end=ended)
         if log.stopped:
@@ -79,6 +85,18 @@ class Session:
             robot = Driven(robot, _measured(self.policy), _set_points(self.policy), self.settings.names)
         loop = dataclasses.replace(self.loop, clock=getattr(robot, "simulated_clock", self.loop.clock))
         return robot, loop, dict(getattr(robot, "about", {}))
+
+    def _aged(self, log: Log) -> str:
+        """Where observations were older or newer than the policy was trained with, a line that says so; else ""."""
+        if not isinstance(self.loop, Drive) or (age := recording.timing(log)["age"]) is None:
+            return ""
+        low, high = self.loop.preparation.observation_delay
+        if low - DOUBTFUL * log.period <= age <= high + DOUBTFUL * log.period:
+            return ""
+        return (
+            f"measurements were {1e3 * age:.3g} ms old when the controls made from them were sent (median); the policy "
+            f"was trained with {1e3 * low:.3g} to {1e3 * high:.3g} ms: give [policy] an observation_delay that holds it"
+        )
 
     @property
     def _signals(self) -> tuple[str, ...]:
@@ -112,6 +130,8 @@ class Session:
             "environment": self.policy.schema["environment"],
             "mode": self.mode,
             "stopped": log.stopped,
+            "failed": log.failed,
+            "ended": log.ended,
             "over": log.over,
             "controls": len(log.targets),
             "timing": recording.timing(log),

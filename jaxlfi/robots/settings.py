@@ -5,6 +5,7 @@ watchdog = 0.1                      # s that a call of the driver may take befor
 holds = 3                           # control periods in a row without a usable observation; then the robot is stopped
 max_age = 0.02                      # s, of an observation; by default a control period
 record = ["tip"]                    # signals that the policy does not see, and inference is to have
+ignored_terminations = ["fallen"]   # of the training, that do not end episodes here: the robot does not measure them
 units = { tip = "m" }               # of such signals; those of a MuJoCo model are known
 
 [robot.limits]                      # of signals: beyond them, in the workspace or elsewhere, the robot is stopped
@@ -59,6 +60,7 @@ class Settings:
         watchdog: in s.
         holds: in control periods.
         max_age: in s.
+        ignored_terminations: names of those that do not end episodes on this robot.
     """
 
     limits: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
@@ -70,6 +72,7 @@ class Settings:
     watchdog: float | None = None
     holds: int | None = None
     max_age: float | None = None
+    ignored_terminations: tuple[str, ...] = ()
 
     @property
     def further(self) -> tuple[str, ...]:
@@ -102,10 +105,15 @@ def of_table(table: Mapping[str, Any]) -> Settings:
         if isinstance(table["holds"], bool) or not isinstance(table["holds"], int) or table["holds"] < 0:
             raise ValueError(f"robot: holds: expected a whole number of at least 0, got {table['holds']!r}")
         found["holds"] = table["holds"]
-    record = table.get("record", [])
-    if not isinstance(record, Sequence) or isinstance(record, str) or not all(isinstance(one, str) for one in record):
-        raise ValueError(f"robot: record: expected names of signals, got {record!r}")
-    return Settings(**found, record=tuple(record))
+    for key, what in {"record": "signals", "ignored_terminations": "terminations"}.items():
+        found[key] = _names(table.get(key, []), key, what)
+    return Settings(**found)
+
+
+def _names(value: Any, key: str, what: str) -> tuple[str, ...]:
+    if not isinstance(value, Sequence) or isinstance(value, str) or not all(isinstance(one, str) for one in value):
+        raise ValueError(f"robot: {key}: expected names of {what}, got {value!r}")
+    return tuple(value)
 
 
 def _each(table: Mapping[str, Any], key: str, of: Callable[[Any, str], Any]) -> dict[str, Any]:

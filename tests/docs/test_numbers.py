@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import design, embedding, misspecification, mujoco_sysid, widths
+from experiments import design, embedding, misspecification, mujoco_loop, mujoco_sysid, widths
 from experiments.benchmarks import accelerators
 from experiments.policies import report
 from experiments.policies import results as policies
@@ -825,3 +825,41 @@ def test_design():
     assert f"expected to become {np.median(load['narrower']):.0f} times narrower" in page("design")
     held = load["held"][:, 1]
     assert f"90 % intervals is {held.mean():.0%} of {held.size}".replace("0%", "0 %") in page("design")
+
+
+def loop_of(name: str) -> dict:
+    return json.loads((RESULTS / "mujoco-loop" / f"{name}.json").read_text())
+
+
+@pytest.mark.parametrize("name", ["furuta"])
+def test_loops_of_mujoco_models(name):
+    found = loop_of(name)
+    for line in [*mujoco_loop.believed(found), *mujoco_loop.fared(found)]:
+        assert line in PAGES["mujoco-loop"]
+
+
+def test_what_the_loop_of_the_pendulum_says():
+    found, text = loop_of("furuta"), page("mujoco-loop")
+    rows = {(row["policy"], row["parameter"]): row for row in found["believed"]}
+    ends = lambda row: [float(end) for end in row["90 % interval"].split(" to ")]
+    for iteration, damping in ((1, False), (2, True)):
+        for parameter, inside in (("joint/pendulum/damping", damping), ("joint/arm/frictionloss", False)):
+            row = rows[f"iteration {iteration}", parameter]
+            assert (ends(row)[0] <= row["truth"] <= ends(row)[1]) == inside
+        row = rows[f"iteration {iteration}", "body/arm/mass"]
+        assert ends(row)[0] <= row["truth"] <= ends(row)[1]
+        row = rows[f"iteration {iteration}", "joint/arm/frictionloss"]
+        assert f"{float(row['median']) - row['truth']:.4f}" == "0.0008"
+        assert rows[f"iteration {iteration}", "joint/pendulum/damping"]["last support"].startswith("0.00018")
+    assert f"moved by {found['moved'][0]:.2f} half-widths" in text and found["moved"][0] < 0.5
+    assert all(one["arm angle off"]["mean"] < 0.01 for one in found["policies"])
+
+
+def test_settings_of_trainings_of_the_pendulum():
+    found = loop_of("settings")
+    names = {"whips-settings": "the whip's", "own-settings": "those of MuJoCo models", "nothing": "no torque"}
+    for name, said in names.items():
+        assert mujoco_loop.line(said, found[name]) in PAGES["mujoco-loop"]
+    means = {name: np.mean(found[name]["achieved"]) for name in names}
+    assert means["own-settings"] > max(means["whips-settings"], means["nothing"]) + 2.0
+    assert means["whips-settings"] < means["nothing"]

@@ -1,14 +1,16 @@
 """`jaxlfi control`: from the words of a command to a recording, and what is refused before anything moves."""
 
 import json
+import re
 import threading
 import time
 
 import numpy as np
 import pytest
-from robots.machines import Wheel, a_policy, expected
+from robots.machines import Wheel, a_policy, expected, prepared
 
 from jaxlfi.cli.control import main
+from jaxlfi.rl.termination import parsed
 from jaxlfi.robots import server
 from jaxlfi.robots.clock import Simulated
 from jaxlfi.robots.interrupts import Interrupted
@@ -67,6 +69,15 @@ def test_a_command_controls_and_records(folder, capsys):
     assert out.startswith("100 controls at 50 Hz: a period of 20 ms") and out.endswith(f"wrote {folder / 'log.csv'}\n")
     np.testing.assert_allclose(np.load(folder / "log.loop.npz")["targets"][:, 0], expected(100)[0], atol=1e-5)
     assert json.loads((folder / "log.json").read_text())["policy"] == str(folder / "policy.npz")
+
+
+def test_a_termination_ends_a_command_with_status_0(folder, capsys):
+    a_policy(prepared(terminations={"turned": parsed("angle < -0.2")})).save(folder / "policy.npz")
+    assert main(words(folder)) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert re.fullmatch(
+        r"the episode ended after \d+ of 100 controls, as in training: turned \(angle < -0.2: .*\)", last
+    )
 
 
 def test_options_change_what_a_robot_is_let(folder, capsys):

@@ -14,6 +14,7 @@ from robots.machines import INTERVAL, MOTOR, SIGNALS, Wheel, a_policy, expected,
 from jaxlfi.rl.deployment import ControlLimits
 from jaxlfi.rl.policy import Policy
 from jaxlfi.rl.preparation import Command, Control, Signal
+from jaxlfi.rl.termination import parsed
 from jaxlfi.robots import driving, recording, sessions
 from jaxlfi.robots.clock import Monotonic, Simulated
 from jaxlfi.robots.driver import Called, Driven, Driver
@@ -92,6 +93,68 @@ def test_a_robot_is_stopped_outside_of_the_bounds_of_its_signals(tmp_path):
     assert report_of(tmp_path)["stopped"].endswith("outside of its limits [-0.2, 0.6]")
     table = table_of(tmp_path / "log.csv")
     assert len(table["battery"]) == first + 1 and set(table["battery"]) == {11.0}
+
+
+ENDS = {"turned": parsed("angle < -0.2", cost=3.0), "flat": parsed("abs(battery) < 10")}
+
+
+def test_terminations_of_the_training_end_an_episode_which_is_no_fault(tmp_path):
+    """At the measurement at which the condition first holds; the robot is stopped, and the recording goes up to it."""
+    driver, said = Wheel(seen=("angle", "joint/wheel/qvel", "battery"), angle=0.5), []
+    session = sessions.of(a_policy(prepared(terminations=ENDS)), Settings())
+    log = session.run(driver, tmp_path / "log.csv", {}, said.append)
+    _, seen = expected(100)
+    first = int(np.flatnonzero(seen[:, 0] < -0.2)[0])
+    assert len(driver.torques) == first and driver.stops == 1 and log.stopped == "" and not log.failed
+    where = f"turned (angle < -0.2: angle was measured at {log.observations[-1, 0]:.6g})"
+    assert said[-1] == f"the episode ended after {first} of 100 controls, as in training: {where}"
+    report = report_of(tmp_path)
+    assert report["ended"] == where and report["stopped"] == "" and report["failed"] is False
+    assert set(table_of(tmp_path / "log.csv")["battery"]) == {11.0}  # which the policy does not see
+
+
+def test_a_termination_needs_its_signal_or_is_ignored_by_name(tmp_path):
+    """A number that is not finite does not pass for one at which the episode goes on."""
+    policy, plain = a_policy(prepared(terminations=ENDS)), ("angle", "joint/wheel/qvel")
+    with pytest.raises(ValueError, match="robot: expected signals among angle, joint/wheel/qvel, got battery"):
+        run(Wheel(seen=plain), tmp_path, policy=policy, name="none.csv")
+    lost = lambda seen: dataclasses.replace(seen, values={**seen.values, "battery": math.nan})
+    driver = Wheel(seen=(*plain, "battery"), given=dict.fromkeys(range(3, 9), lost))
+    with pytest.raises(RobotError, match="4 observations in a row could not be used, the last one was non-finite"):
+        run(driver, tmp_path, policy=policy, name="lost.csv")
+    log = run(Wheel(seen=plain), tmp_path, {"ignored_terminations": ["turned", "flat"]}, policy, name="whole.csv")
+    assert len(log.targets) == 100 and log.ended == ""
+    with pytest.raises(ValueError, match="ignored_terminations: expected some of turned, flat, got turnt"):
+        run(Wheel(), tmp_path, {"ignored_terminations": ["turnt"]}, policy)
+
+
+@pytest.mark.parametrize(("age", "trained", "said"), [(0.011, (0.0, 0.0), True), (0.011, (0.005, 0.015), False)])
+def test_ages_of_measurements_that_a_policy_was_not_trained_with_are_said(age, trained, said, tmp_path):
+    """As long as they are let: a tenth of a period more or less is not worth a word."""
+    older = dict.fromkeys(range(101), lambda seen: dataclasses.replace(seen, age=age))
+    session, lines = sessions.of(a_policy(prepared(observation_delay=trained)), Settings()), []
+    log = session.run(Wheel(given=older), tmp_path / "log.csv", {}, lines.append)
+    np.testing.assert_allclose(log.ages, age, atol=1e-9)
+    assert report_of(tmp_path)["timing"]["age"] == pytest.approx(age)
+    expected = (
+        "measurements were 11 ms old when the controls made from them were sent (median); the policy was trained with "
+        "0 to 0 ms: give [policy] an observation_delay that holds it"
+    )
+    assert lines[1:] == ([expected] if said else [])
+
+
+def test_what_an_error_cut_short_is_marked_so(tmp_path):
+    """And what a limit ended is not: the loop itself stopped the robot there."""
+    with pytest.raises(RobotError, match="bus"):
+        run(Wheel(given={5: lambda seen: failing("bus")}), tmp_path)
+    assert report_of(tmp_path)["failed"] is True and len(table_of(tmp_path / "log.csv")["angle [rad]"]) == 5
+    with pytest.raises(RobotError, match="outside of its limits"):
+        run(Wheel(angle=0.5), tmp_path, {"limits": {"angle": [-0.2, 0.6]}}, name="limit.csv")
+    assert report_of(tmp_path, "limit")["failed"] is False
+
+
+def failing(why):
+    raise RobotError(why)
 
 
 def test_targets_of_the_operator_are_within_what_was_trained_with(tmp_path):
@@ -254,7 +317,7 @@ def test_settings_that_a_policy_carries_are_used():
 @pytest.mark.parametrize(
     ("table", "expected"),
     [
-        ({"limit": {}}, "robot: expected keys among controls, holds, limits, max_age, names, record, units"),
+        ({"limit": {}}, "robot: expected keys among controls, holds, ignored_terminations, limits, max_age, names, "),
         ({"limits": {"angle": [1, -1]}}, r"robot: limits: angle: expected LOW below HIGH, got \[1, -1\]"),
         ({"limits": {"angle": [0, "x"]}}, "robot: limits: angle: expected a number, got 'x'"),
         ({"limits": 3}, "robot: limits: expected a table, got 3"),
@@ -460,10 +523,12 @@ def test_only_recordings_that_are_known_are_written(tmp_path):
 def test_how_the_rate_was_kept_is_told():
     """Against the definitions, for a period of 20 ms, where one slot was passed over."""
     late = np.array([0.0, 0.001, np.inf, 0.003, 0.0])
-    log = type("Log", (), {"period": 0.02, "lateness": late, "missed": 2, "held": np.zeros(5, bool)})()
+    ages = np.array([0.004, 0.006, np.nan, 0.01, 0.002])
+    log = type("Log", (), {"period": 0.02, "lateness": late, "missed": 2, "held": np.zeros(5, bool), "ages": ages})()
     found = recording.timing(log)
     periods = [0.02 + 0.001, 0.02 - 0.003]
     assert found["measured_period"] == pytest.approx(np.mean(periods)) and found["skipped"] == 1
+    assert found["age"] == pytest.approx(0.005)
     assert found["jitter"] == pytest.approx(np.std(periods)) and found["lateness"]["100"] == 0.003
     assert found["lateness"]["50"] == pytest.approx(np.median([0.0, 0.001, 0.003, 0.0]))
 

@@ -216,7 +216,8 @@ def test_figures_know_no_task(path):
 
 
 ON_ROBOTS = {
-    *("jaxlfi.robots", "jaxlfi.rl.policy", "jaxlfi.rl.deployment", "jaxlfi.rl.preparation", "jaxlfi.registry"),
+    *("jaxlfi.robots", "jaxlfi.rl.policy", "jaxlfi.rl.deployment", "jaxlfi.rl.preparation", "jaxlfi.rl.termination"),
+    "jaxlfi.registry",
     *("jaxlfi.io.files", "jaxlfi.io.lerobot", "jaxlfi.io.mcap", "jaxlfi.io.rollout", "jaxlfi.io.serialise"),
     *("jaxlfi.io.units", "numpy"),
 }

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from envs_mujoco import ARM
 
 from jaxlfi.envs.mujoco import config, goal
-from jaxlfi.envs.mujoco.environment import MujocoEnvironment, environment
+from jaxlfi.envs.mujoco.environment import TRAINING, MujocoEnvironment, environment
 from jaxlfi.envs.mujoco.goal import Goal
 from jaxlfi.envs.mujoco.parameters import Parameter
 from jaxlfi.rl import ppo
@@ -321,7 +321,7 @@ def test_a_file_without_a_policy_is_refused(tmp_path):
         environment(file)
 
 
-@pytest.mark.parametrize("name", ["furuta", "arm"])
+@pytest.mark.parametrize("name", ["furuta", "arm", "shuffle"])
 def test_the_example_has_the_parameters_of_its_task(name):
     from jaxlfi.envs.mujoco import task
 
@@ -330,6 +330,22 @@ def test_the_example_has_the_parameters_of_its_task(name):
     assert env.space == inferred.space and env.units == tuple(inferred.units) and env.name == inferred.name
     for support in ("initial", "feasible"):
         chex.assert_trees_all_equal(env.supports[support], inferred.supports[support])
+
+
+def test_trainings_begin_with_settings_for_rewards_in_every_step():
+    """Of the preset `quick`; flags win, and `paper` is the paper's."""
+    from jaxlfi.cli import train
+    from jaxlfi.rl.settings import PAPER, QUICK
+
+    file = config.Path(__file__).parents[3] / "examples/mujoco/furuta.toml"
+
+    def settings(*more):
+        words = [f"mujoco,config={file}", "--domain", "uniform", "--out", "runs/policy", *more]
+        return train._plan(train.main.parser().parse_args(words)).settings
+
+    assert settings() == QUICK.replace(**TRAINING["quick"]) != QUICK
+    assert settings("--epochs", "3", "--total-steps", "640") == settings().replace(epochs=3, total_steps=640)
+    assert settings("--preset", "paper") == PAPER
 
 
 def test_the_error_of_the_model_is_what_inference_says(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxlfi.envs.mujoco.goal import Goal, Target, of_table
-from jaxlfi.envs.mujoco.termination import Termination, parsed
+from jaxlfi.rl.termination import Termination, parsed
 
 TABLE = """
 interval = 0.02

@@ -5,6 +5,7 @@ one that is served, in this process.
 """
 
 import contextlib
+import itertools
 import json
 import re
 from pathlib import Path
@@ -15,51 +16,16 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("brax")
 
+from envs_mujoco_cart import MODEL, PREPARATION, TASK
 from robots.machines import a_policy
 
 import jaxlfi
 from jaxlfi.cli import loops
 from jaxlfi.cli.r2s2r import main as any_loop
 from jaxlfi.distributions.space import Space
-from jaxlfi.envs.mujoco import excitation, logs, r2s2r, r2s2r_page
+from jaxlfi.envs.mujoco import excitation, logs, r2s2r, r2s2r_beside, r2s2r_machine, r2s2r_page
 from jaxlfi.envs.mujoco.served import Machine
-from jaxlfi.rl.preparation import Control, Preparation, Signal
 from jaxlfi.robots.clock import Simulated
-
-MODEL = """
-<mujoco model="cart">
-  <option timestep="0.01" gravity="0 0 0"/>
-  <worldbody>
-    <body name="cart">
-      <joint name="rail" type="slide" axis="1 0 0" damping="5"/>
-      <geom size="0.1" mass="2"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="push" joint="rail" ctrlrange="-4 6"/></actuator>
-  <sensor><jointpos name="place" joint="rail"/></sensor>
-</mujoco>
-"""
-TASK = """
-model = "cart.xml"
-[parameters."body/cart/mass"]
-support = [1.0, 3.0]
-truth = 2.5
-[noise]
-place = 0.0
-[initial]
-"rail/qpos" = -0.5
-[policy]
-interval = 0.1
-duration = 1.0
-observed = ["joint/rail/qvel"]
-costs = { push = 0.5 }
-[policy.targets.place]
-value = 0.25
-weight = 2.0
-[policy.initial]
-"rail/qpos" = [1.0, 2.0]
-"""
-PREPARATION = Preparation((Signal("joint/rail/qvel", "m/s"),), (Control("push", -4.0, 6.0),), 0.1, 10)
 
 
 class Run:
@@ -93,23 +59,30 @@ def task(tmp_path, monkeypatch):
             if kind == "train":
                 (out / "domain/seed_000").mkdir(parents=True, exist_ok=True)
                 a_policy(PREPARATION, [[-1.5]]).save(out / "domain/seed_000/policy.npz")
-            for name in ("curves.png", "report.html"):
+                (out / "table.csv").write_text("domain,seed,return,place off\ndomain,0,-0.75,0.1\n")
+            if kind == "fit":
+                point = {"names": ["body/cart/mass"], "theta": [2.25], "interval": [[2.125, 2.375]]}
+                (out / "fit.json").write_text(json.dumps({"points": [point, {**point, "theta": [9.0]}]}))
+            for name in ("curves.png", "report.html", "pairs.png"):
                 (out / name).write_bytes(b"")
+            if kind == "infer":
+                (out / "figures").mkdir(exist_ok=True)
+                (out / "figures/curves.png").write_bytes(b"")  # of errors, and not shown
             return 0
 
         return run
 
     @contextlib.contextmanager
-    def machine(arguments, config, seed, scattered=False):
-        made = Machine.of(config, seed=seed, scattered=scattered)
+    def machine(arguments, config, seed, scattered=False, first=0):
+        made, episodes = Machine.of(config, seed=seed, scattered=scattered), itertools.count(first)
 
         def driver():
             clock = Simulated()
-            one = made.driver(clock)
+            one = made.driver(clock, next(episodes))
             one.simulated_clock = clock
             return one
 
-        ran.append(["machine", seed, scattered])
+        ran.append(["machine", seed, scattered, first])
         yield driver
 
     def load(folder):
@@ -119,7 +92,8 @@ def task(tmp_path, monkeypatch):
     monkeypatch.setattr(r2s2r.command_line, "main", command("infer"))
     monkeypatch.setattr(r2s2r.command_line, "parse", lambda words: None)
     monkeypatch.setattr(r2s2r.train.main, "parser", r2s2r.train.parser, raising=False)
-    monkeypatch.setattr(r2s2r, "_machine", machine)
+    monkeypatch.setattr(r2s2r_beside.mujoco_command, "main", command("fit"))
+    monkeypatch.setattr(r2s2r_machine, "connected", machine)
     monkeypatch.setattr("jaxlfi.runs.load.load", load)
     monkeypatch.setattr(r2s2r_page, "load", load)
     return tmp_path / "task.toml", ran
@@ -129,21 +103,41 @@ def test_the_loop_ends_once_the_posterior_has_stopped_moving(task, tmp_path, cap
     config, ran = task
     out = tmp_path / "loop"
     words = [f"mujoco,config={config}", "--out", str(out), "--episodes", "2", "--seed", "3", "--infer", "--rounds 2"]
+    words += ["--beside", "uniform", "point"]
     assert r2s2r.main(words) == 0
     kinds = [one[0] for one in ran]
     # Its machine is excited; the second iteration moves by far, the third by a twentieth of a half-width.
-    assert kinds == ["machine", *["infer", "train", "machine"] * 2, "infer", "train", "train", *["machine"] * 4]
+    stages = ["machine", *["infer", "train", "machine"] * 2, "infer", "train"]
+    assert kinds == [*stages, "train", "fit", "train", *["machine"] * 5]
     infers = [one for one in ran if one[0] == "infer"]
     logs_of = lambda one: [Path(path).name for path in one[2].partition("log=")[2].split(";")]
     assert [logs_of(one) for one in infers] == [["excitation.csv", *["rollout.csv"] * i] for i in range(3)]
     assert all("--rounds" in one and one[one.index("--first-seed") + 1] == "3" for one in infers)
     trained = [one[one.index("--domain") + 1] for one in ran if one[0] == "train"]
-    assert trained == [*(str(out / f"iteration_{i}/posterior") for i in (1, 2, 3)), "uniform"]
-    assert [one[2] for one in ran if one[0] == "machine"] == [False] * 3 + [True] * 4
+    assert trained == [*(str(out / f"iteration_{i}/posterior") for i in (1, 2, 3)), "uniform", "point:2.25"]
+    fitted = next(one for one in ran if one[0] == "fit")
+    assert fitted[2] == infers[-1][2]  # given the same recordings
+    assert [one[2] for one in ran if one[0] == "machine"] == [False] * 3 + [True] * 5  # [initial] has a number
     assert "the posterior has moved by 17 half-widths" in capsys.readouterr().out
     page = (out / "page.html").read_text()
     for part in ("body/cart/mass", "<td>2.3</td>", "<td>2.5</td>", "uniform box", "iteration 3", "excitation.json"):
         assert part in page
+    pictures = re.findall(r'src="([^"]*)"', page)
+    iterations = [f"iteration_{i}/policy/curves.png" for i in (1, 2, 3)]
+    assert pictures == [*iterations, "uniform/policy/curves.png", "point/policy/curves.png"]
+    found = json.loads((out / "results.json").read_text())
+    assert [one["policy"] for one in found["policies"]] == [*(f"iteration {i}" for i in (1, 2, 3)), "uniform", "point"]
+    assert all(one["trained"] == -0.75 and one["episodes"] == 2 and not one["stopped"] for one in found["policies"])
+    assert len({one["return"]["mean"] for one in found["policies"]}) == 1  # one policy on the same starts
+    assert found["believed"][-1] == {
+        "policy": "point",
+        "parameter": "body/cart/mass",
+        "median": "2.25",
+        "90 % interval": "2.125 to 2.375",
+        "last support": "",
+        "truth": 2.5,
+    }
+    assert found["believed"][-2]["last support"] == "1 to 3" and "point of least squares (jaxlfi mujoco fit)" in page
     ran.clear()
     (out / "page.html").unlink()
     (out / "iteration_2/rollout.json").unlink()
@@ -154,9 +148,9 @@ def test_the_loop_ends_once_the_posterior_has_stopped_moving(task, tmp_path, cap
 def test_what_was_achieved_is_the_return_of_the_training(task, tmp_path):
     """Against the reward's own formula, for an episode on the machine."""
     config, _ = task
-    with r2s2r._machine(None, config, 0) as driver:
+    with r2s2r_machine.connected(None, config, 0) as driver:
         policy = a_policy(PREPARATION, [[-1.5]]).save(tmp_path / "policy.npz")
-        r2s2r._controlled(driver(), policy, config, tmp_path / "a.csv")
+        r2s2r_machine.controlled(driver(), policy, config, tmp_path / "a.csv")
     log = logs.read(tmp_path / "a.csv")
     assert set(log.signals) == {"push", "place", "joint/rail/qvel"}
     place, push = log.samples("place")[1], log.samples("push")[1]
@@ -166,9 +160,44 @@ def test_what_was_achieved_is_the_return_of_the_training(task, tmp_path):
     assert found["place off"] == pytest.approx(abs(place[-1] - 0.25), rel=1e-6)
 
 
+def test_an_interval_without_a_measurement_is_rewarded_by_the_one_before(task, tmp_path):
+    """So that an episode of lost measurements does not come off better than one of all."""
+    config, _ = task
+    with r2s2r_machine.connected(None, config, 0) as driver:
+        policy = a_policy(PREPARATION, [[-1.5]]).save(tmp_path / "policy.npz")
+        one = driver()
+        plain, count = one.observe, itertools.count()
+        one.observe = lambda: None if next(count) in (4, 5, 10) else plain()
+        r2s2r_machine.controlled(one, policy, config, tmp_path / "a.csv")
+    seen = logs.read(tmp_path / "a.csv").samples("place")
+    assert len(seen[0]) == 8
+    ends = 0.1 * np.arange(1, 11)
+    place = seen[1][np.searchsorted(seen[0], ends + 0.05) - 1]
+    assert place[3] == place[4] == place[2] and place[9] == place[8]
+    push = np.load(tmp_path / "a.loop.npz")["targets"][:, 0]
+    rewards = -0.1 * (2.0 * (place - 0.25) ** 2 + 0.5 * ((push - 1.0) / 5.0) ** 2)
+    assert excitation.achieved(config, tmp_path / "a.csv")["return"] == pytest.approx(rewards.sum(), rel=1e-6)
+
+
+def test_episodes_that_were_stopped_before_their_time_are_counted_and_not_averaged(tmp_path):
+    """Where rewards are costs, a robot that stops at once would seem to be the best."""
+    (tmp_path / "table.csv").write_text(
+        "policy,episode,return,controls,ended,stopped,place off\n"
+        "point,0,-3.0,10,,,0.5\n"
+        "point,1,-0.1,1,,place was measured at 9,9.0\n"
+        "point,2,-5.0,8,fallen,,0.7\n"
+        "uniform,0,-1.0,10,,,0.1\n"
+    )
+    found = r2s2r_page.achieved(tmp_path / "table.csv", "point")
+    assert (found["episodes"], found["stopped"], found["ended"]) == (3, 1, {"fallen": 1})
+    assert found["return"] == {"mean": -4.0, "error": 1.0}
+    assert found["place off"]["mean"] == pytest.approx(0.6) and "episode" not in found
+    assert r2s2r_page.achieved(tmp_path / "table.csv", "uniform")["return"] == {"mean": -1.0, "error": None}
+
+
 def test_a_machine_is_excited_within_the_limits_of_its_policies(task, tmp_path):
     config, _ = task
-    with r2s2r._machine(None, config, 0) as driver:
+    with r2s2r_machine.connected(None, config, 0) as driver:
         excitation.record(driver(), config, tmp_path / "a.csv", 3.0, seed=1)
     log = logs.read(tmp_path / "a.csv")
     assert set(log.signals) == {"push", "place"} and log.units == {"time": "s", "place": "m"}
@@ -198,6 +227,8 @@ def test_how_far_a_posterior_has_moved():
         (["TASK", "--settled", "-1"], "settled: expected a number above 0, got -1"),
         (["TASK", "--heuristic", "egde"], "heuristic: expected "),
         (["TASK", "--total-steps", "0"], "total_steps: expected "),
+        (["TASK", "--beside", "point", "point"], "beside: expected each once, got point point"),
+        (["TASK", "--confirm"], "remote, token, confirm: expected with --address only, got a simulated machine"),
         (["TASK", "--address", "10.0.0.7:5005"], "expected this very host, as 127.0.0.1, got '10.0.0.7'"),
         (["TASK", "--address", "10.0.0.7:5005", "--remote"], "token: expected the one that the robot at 10.0.0.7"),
     ],
@@ -209,6 +240,48 @@ def test_bad_input_is_one_line_and_leaves_nothing(words, expected, task, tmp_pat
     error = capsys.readouterr().err
     assert error.startswith("jaxlfi r2s2r: error: ") and expected in error and error.count("\n") == 1
     assert not (tmp_path / "loop").exists() and not ran
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (('[initial]\n"rail/qpos" = -0.5\n', ""), True),
+        (('"rail/qpos" = -0.5', 'from = "log"'), True),
+        (('"rail/qpos" = -0.5', 'from = "model"'), False),
+        (("", ""), False),
+        (('[initial]\n"rail/qpos" = -0.5\n', 'measured = ["joint/rail/qvel"]\n'), False),
+        (('[initial]\n"rail/qpos" = -0.5\n', '[parameters."initial/rail/qpos"]\nsupport = [-1.0, 1.0]\n'), False),
+    ],
+)
+def test_policies_are_recorded_from_anywhere_if_recordings_say_where_they_began(change, says, task, tmp_path):
+    config, _ = task
+    text = TASK.replace(*change)
+    config.write_text(
+        text if "measured" not in text else 'measured = ["joint/rail/qvel"]\n' + TASK.replace(change[0], "")
+    )
+    assert excitation.says_its_start(config) is says
+
+
+def test_a_machine_that_moves_can_wait_for_an_operator(monkeypatch):
+    """Who is told where to bring it, each time; where nobody can answer, nothing moves."""
+    words = ["mujoco", "--out", "runs/loop", "--address", "127.0.0.1:5005", "--confirm"]
+    arguments, told = r2s2r.parser().parse_args(words), []
+    monkeypatch.setattr("builtins.input", lambda text: told.append(text) or "")
+    for scattered in (False, True):
+        with r2s2r_machine.connected(arguments, Path("task.toml"), 0, scattered) as driver:
+            assert driver()._address == "127.0.0.1:5005"
+    assert [text.partition(",")[0] for text in told] == [
+        "bring the machine to where recordings begin",
+        "bring the machine to where policies' episodes begin",
+    ]
+
+    def ended(text):
+        raise EOFError
+
+    monkeypatch.setattr("builtins.input", ended)
+    with r2s2r_machine.connected(arguments, Path("task.toml"), 0) as driver:
+        with pytest.raises(ValueError, match="confirm: expected Enter on a terminal before each recording"):
+            driver()
 
 
 def test_the_folder_of_another_loop_is_refused(task, tmp_path, capsys):

@@ -20,8 +20,8 @@ from jaxlfi.envs.mujoco.mjx_models import added, with_forces
 from jaxlfi.envs.mujoco.model_task import compile_spec, specification
 from jaxlfi.envs.mujoco.parameters import Parameter, edit
 from jaxlfi.envs.mujoco.reading import Reading, add_signals
-from jaxlfi.envs.mujoco.termination import parsed
 from jaxlfi.rl.preparation import Command, Control, Signal
+from jaxlfi.rl.termination import parsed
 
 CARRIAGE = """
 <mujoco model="carriage">
@@ -166,6 +166,10 @@ def test_it_says_what_a_robot_measures_and_is_commanded(carriage):
     assert (prepared.interval, prepared.steps, prepared.history, prepared.actions) == (0.05, 20, 2, 1)
     assert prepared.names == carriage.observations.names
     assert prepared.commands == (Command("speed", -0.5, 2.0, "m/s"),)
+    assert {name: (str(one), one.unit) for name, one in prepared.terminations.items()} == {
+        "wound": ("turn > 21", "rad"),
+        "back": ("abs(place) < 0.1", "m"),
+    }
     assert carriage.observations.scale == (1.0, 1.0, 4.0, 1.0, 1.0, 4.0, 0.8, 1.25, 1.25)
     np.testing.assert_allclose(carriage.observations.centre, (*[0.0] * 6, -0.2, 0.75, 0.75), atol=1e-12)
     np.testing.assert_allclose([carriage.actions.centre, carriage.actions.scale], [[0.0, 0.75], [0.1, 1.25]])

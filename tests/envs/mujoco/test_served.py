@@ -70,10 +70,10 @@ def task(tmp_path):
     return written
 
 
-def driven(machine, controls, signals=("place",)):
+def driven(machine, controls, signals=("place",), episode=0):
     """What a machine measures under controls, one every 20 ms."""
     clock, rows = Simulated(), []
-    driver = MachineDriver(machine, clock)
+    driver = MachineDriver(machine, clock, episode)
     driver.connect(dict.fromkeys(signals, ""), {"push": ""})
     for control in controls:
         rows.append([driver.observe().values[name] for name in signals])
@@ -114,8 +114,31 @@ def test_sensors_have_the_noise_of_the_task_and_a_seed_of_their_own(task):
 
 def test_scattered_episodes_begin_where_those_of_the_training_do(task):
     machine = Machine.of(task(), scattered=True)
-    begins = [driven(machine, [0.0])[0, 0] for _ in range(20)]
+    begins = [driven(machine, [0.0], episode=episode)[0, 0] for episode in range(20)]
     assert all(1.0 <= place <= 2.0 for place in begins) and max(begins) - min(begins) > 0.3
+    assert begins[7] == driven(machine, [0.0], episode=7)[0, 0]  # whatever went before it
+
+
+def test_a_served_machine_begins_at_any_episode_and_ends_with_who_started_it(task):
+    path = task()
+    words = [sys.executable, "-m", "jaxlfi.envs.mujoco.cli", "serve", str(path), "--scattered", "--until-closed"]
+    words += ["--seed", "2", "--first-episode", "4"]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        address, found = process.stdout.readline().split()[-1], []
+        for _ in range(2):
+            driver = SocketDriver(address)
+            driver.connect({"place": "m"}, {"push": ""})
+            found.append(driver.observe().values["place"])
+            driver.stop()
+        machine = Machine.of(path, seed=2, scattered=True)
+        assert found == [driven(machine, [0.0], episode=episode)[0, 0] for episode in (4, 5)]
+        process.stdin.close()
+        assert process.wait(30) == 0
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
 
 
 def test_a_machine_in_another_process_is_controlled_and_its_recording_is_a_task(task, tmp_path):

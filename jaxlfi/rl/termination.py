@@ -2,6 +2,8 @@
 
 condition  = signal comparison number | "abs(" signal ")" comparison number
 comparison = "<" | "<=" | ">" | ">="
+
+A policy's preparation carries them (`jaxlfi.rl.preparation`), so that its episodes end by them on a robot, too.
 """
 
 import dataclasses
@@ -21,11 +23,12 @@ class Termination:
     """An episode ends with a control interval at whose end this holds.
 
     Attributes:
-        signal: that is compared, as the model has it, without noise.
+        signal: that is compared: in training as the model has it, without noise, and on a robot as it is measured.
         comparison: "<", "<=", ">" or ">=".
         number: that it is compared with.
         magnitude: whether it is the signal's absolute value that is.
         cost: of such an end; negative where it is a good one.
+        unit: of the signal; "" where there is none, or it is not known.
 
     Raises:
         ValueError: for numbers that are not finite.
@@ -36,14 +39,22 @@ class Termination:
     number: float
     magnitude: bool = False
     cost: float = 0.0
+    unit: str = ""
 
     def __post_init__(self):
         if not (math.isfinite(self.number) and math.isfinite(self.cost)):
             raise ValueError(f"expected finite numbers, got {self.number:g} and a cost of {self.cost:g}")
+        if self.comparison not in _COMPARISONS:
+            raise ValueError(f"expected a comparison among {', '.join(_COMPARISONS)}, got {self.comparison!r}")
 
     def holds(self, value: Any) -> Any:
         """Whether it does, at this value of the signal; never at NaN."""
         return _COMPARISONS[self.comparison](abs(value) if self.magnitude else value, self.number)
+
+    def __str__(self) -> str:
+        """As it is written in a file."""
+        what = f"abs({self.signal})" if self.magnitude else self.signal
+        return f"{what} {self.comparison} {self.number:g}"
 
 
 def parsed(text: str, cost: float = 0.0) -> Termination:
@@ -54,7 +65,7 @@ def parsed(text: str, cost: float = 0.0) -> Termination:
 
     Example:
         >>> parsed("abs(pole angle) >= 1.5")
-        Termination(signal='pole angle', comparison='>=', number=1.5, magnitude=True, cost=0.0)
+        Termination(signal='pole angle', comparison='>=', number=1.5, magnitude=True, cost=0.0, unit='')
     """
     match = _FORM.fullmatch(text)
     try:
