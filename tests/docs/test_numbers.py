@@ -70,7 +70,7 @@ def ablation(variant: str) -> dict[str, np.ndarray]:
     "line",
     [
         line
-        for study in ("widths", "normaliser", "threshold", "quotient", "regression")
+        for study in ("widths", "normaliser", "threshold", "quotient", "regression", "bounds")
         for folder in sorted((RESULTS / study).glob("*/*"))
         for line in widths.table(folder).splitlines()[2:]
     ],
@@ -102,6 +102,16 @@ def test_held_out_problems(problem):
     if all(budgets):
         cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}" for row in budgets]
         assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+
+
+@pytest.mark.parametrize("problem", ["friction", "leaning_2", "leaning_4", "leaning_3"])
+def test_problems_at_a_bound(problem):
+    cells = []
+    for settings in ("onto-bounds", "today"):
+        (line,) = sharpness(RESULTS / "sharpness/bounds" / settings, [problem]).splitlines()[2:]
+        row = [cell.strip() for cell in line.strip("| ").split("|")]
+        cells.append(", ".join([f"{row[7]} ({row[8]})", row[9], *filter(None, [row[14]])]))
+    assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
 
 
 @pytest.mark.parametrize("problem", ["thermocouple", "decay_offset"])
@@ -483,9 +493,9 @@ def test_predictions_for_an_accelerator():
 
 def test_front_page():
     """The figures below the example of the project's README."""
-    error = arrays("regression/lotka_volterra/misspecified+edge/quick-own")["error"]
-    assert len(error) == 100 and np.sum(error > widths.LOST) == 4
-    text = f"the summed error with EDGE is {error.mean():.2f} on average over 100 seeds, and four runs are lost"
+    error = arrays("bounds/lotka_volterra/misspecified+edge/quick-own")["error"]
+    assert len(error) == 100 and np.sum(error > widths.LOST) == 2
+    text = f"the summed error with EDGE is {error.mean():.2f} on average over 100 seeds, and two runs are lost"
     assert text in " ".join((ROOT.parent / "README.md").read_text().split())
 
 
