@@ -179,7 +179,8 @@ def _weights(network: Network, lesson: Lesson) -> Float[Array, " member"]:
     own = lesson.rows.take(held_out)
     module: Any = estimator.embedded(network.scale.dim)
     score = lambda params, view: module.apply(params, viewed(own.given, view)).log_prob(own.value)
-    return stacked(jax.vmap(score)(network.params, network.views), jnp.asarray(places < count) * lesson.late[held_out] * 1.0)
+    counts = jnp.asarray(places < count) * lesson.late[held_out] * 1.0
+    return stacked(jax.vmap(score)(network.params, network.views), counts)
 
 
 def _fit_one(key_epochs, params, lesson, expected_size):
