@@ -491,6 +491,15 @@ def test_predictions_for_an_accelerator():
         assert f"{line}\n" in body
 
 
+def test_knowing_the_object():
+    from experiments.knowing import report as knowing
+
+    found = knowing.arms(arrays("knowing/episodes"))
+    for rows in (knowing.table(found), knowing.contrasts(found)):
+        for row in rows:
+            assert f"| {' | '.join(row.values())} |" in page("knowing")
+
+
 def test_front_page():
     """The figures below the example of the project's README."""
     error = arrays("bounds/lotka_volterra/misspecified+edge/quick-own")["error"]
