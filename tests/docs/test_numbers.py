@@ -850,7 +850,7 @@ def loop_of(name: str) -> dict:
     return json.loads((RESULTS / "mujoco-loop" / f"{name}.json").read_text())
 
 
-@pytest.mark.parametrize("name", ["furuta"])
+@pytest.mark.parametrize("name", ["furuta", "shuffle"])
 def test_loops_of_mujoco_models(name):
     found = loop_of(name)
     for line in [*mujoco_loop.believed(found), *mujoco_loop.fared(found)]:
