@@ -1,9 +1,9 @@
 """The Gaussians that, cut off at a box, are what a network learnt of draws that were cut off there.
 
 A mixture of Gaussians fitted to draws inside a box has the moments of those draws, and a posterior that leans on a
-bound ends there. Truncated to the box, as a posterior is, such a mixture is cut off a second time: half an exponential
-or half a normal distribution comes out a quarter too narrow. Here each component is replaced by one whose part inside
-the box has the moments that the component has as a whole.
+bound ends there. Truncated to the box, as a posterior is, such a mixture is cut off a second time: an exponential
+distribution comes out a fifth too narrow, half a normal one a seventh. Here each component is replaced by one whose part
+inside the box has the moments that the component has as a whole.
 """
 
 import jax
