@@ -2,8 +2,8 @@
 
 A mixture of Gaussians fitted to draws inside a box has the moments of those draws, and a posterior that leans on a
 bound ends there. Truncated to the box, as a posterior is, such a mixture is cut off a second time: an exponential
-distribution comes out a fifth too narrow, half a normal one a seventh. Here each component is replaced by one whose part
-inside the box has the moments that the component has as a whole.
+distribution comes out a fifth too narrow, half a normal one a seventh. Here each component is replaced by one whose
+part inside the box has the moments that the component has as a whole.
 """
 
 import jax
