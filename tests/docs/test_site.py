@@ -94,7 +94,7 @@ def test_links_and_modules_exist(page):
         module, _, name = reference.rpartition(".")
         found = importlib.import_module(module)
         # A module of a package is an attribute of it only once it has been imported.
-        named = hasattr(found, name) or hasattr(found, "__path__") and importlib.util.find_spec(reference)
+        named = hasattr(found, name) or (hasattr(found, "__path__") and importlib.util.find_spec(reference))
         assert named, reference
     for snippet in re.findall(r'^--8<-- "([^"]+)"$', body, re.MULTILINE):
         assert (ROOT / snippet).exists()
