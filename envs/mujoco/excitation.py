@@ -144,17 +144,17 @@ def achieved(config: Path, path: Path) -> dict[str, Any]:
 
     Args:
         config: of the task.
-        path: of the recording, with the report of the episode in files beside it (`jaxlfi.robots.recording`).
+        path: of the recording; the files next to it hold the episode's report (`jaxlfi.robots.recording`).
 
     Returns:
         Also which termination ended it, and why the robot was stopped before its time, "" where it was not: its return
         lacks what was still to come then.
     """
     goal, reading = _goal(config)
-    report, loop = recording.beside(path)
-    log, told = np.load(loop), json.loads(report.read_text())
+    report_path, log_path = recording.beside(path)
+    log, report = np.load(log_path), json.loads(report_path.read_text())
     names = [str(name) for name in log["signals"]]
-    ends = told["timing"]["period"] * (np.arange(len(log["targets"])) + 1.5)
+    ends = report["timing"]["period"] * (np.arange(len(log["targets"])) + 1.5)
     last = np.maximum(np.searchsorted(log["times"], ends) - 1, 0)
     rows = log["observations"][np.append(0, last)][:, [names.index(name) for name in goal.signals]]
     commands = np.array([0.5 * (one.low + one.high) for one in reading.preparation.commands])
@@ -163,8 +163,8 @@ def achieved(config: Path, path: Path) -> dict[str, Any]:
     for after, before, control in zip(rows[1:], controls[:-1], controls[1:], strict=True):
         total += float(reading.reward(after, control, before, commands, np))
     off = {f"{name} off": abs(float(value)) for name, value in reading.off(rows[-1], commands, np).items()}
-    ended = str(told.get("ended", "")).partition(" (")[0]
-    return {"return": total, "controls": len(log["targets"]), "ended": ended, "stopped": told["stopped"]} | off
+    ended = str(report.get("ended", "")).partition(" (")[0]
+    return {"return": total, "controls": len(log["targets"]), "ended": ended, "stopped": report["stopped"]} | off
 
 
 def _goal(config: Path) -> tuple[Goal, Reading]:

@@ -1,4 +1,4 @@
-"""What `jaxlfi r2s2r mujoco,config=FILE` came to: believed, trained and achieved, by iteration, and beside it.
+"""Results of `jaxlfi r2s2r mujoco,config=FILE`: posteriors and returns by iteration, and those of the other arms.
 
 results.json       numbers
 page.html          the same in words, with pictures

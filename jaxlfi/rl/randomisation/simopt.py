@@ -49,7 +49,7 @@ def discrepancy(
 ) -> Float[Array, "*n"]:
     """How far simulated trajectories are from a real one: D = w_l1 sum |W (o - o_real)| + w_l2 sum (W (o - o_real))^2.
 
-    The paper smooths the errors over time besides, against delays; smooth both trajectories where that is wanted.
+    The paper also smooths the errors over time, which makes them robust to delays; to do so, smooth both trajectories.
 
     Args:
         settings: weights of the norms.

@@ -263,14 +263,14 @@ def test_policies_are_recorded_from_anywhere_if_recordings_say_where_they_began(
 
 
 def test_a_machine_that_moves_can_wait_for_an_operator(monkeypatch):
-    """Who is told where to bring it, each time; where nobody can answer, nothing moves."""
+    """The operator is prompted before each recording; without a terminal, nothing moves."""
     words = ["mujoco", "--out", "runs/loop", "--address", "127.0.0.1:5005", "--confirm"]
-    arguments, told = r2s2r.parser().parse_args(words), []
-    monkeypatch.setattr("builtins.input", lambda text: told.append(text) or "")
+    arguments, prompts = r2s2r.parser().parse_args(words), []
+    monkeypatch.setattr("builtins.input", lambda text: prompts.append(text) or "")
     for scattered in (False, True):
         with r2s2r_machine.connected(arguments, Path("task.toml"), 0, scattered) as driver:
             assert driver()._address == "127.0.0.1:5005"
-    assert [text.partition(",")[0] for text in told] == [
+    assert [text.partition(",")[0] for text in prompts] == [
         "bring the machine to where recordings begin",
         "bring the machine to where policies' episodes begin",
     ]

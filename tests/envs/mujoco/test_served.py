@@ -9,6 +9,7 @@ import pytest
 
 mujoco = pytest.importorskip("mujoco")
 
+import envs_mujoco_cart
 from robots.machines import a_policy
 
 from jaxlfi.envs.mujoco import config, logs
@@ -21,19 +22,7 @@ from jaxlfi.robots.clock import Simulated
 from jaxlfi.robots.robot import RobotError
 from jaxlfi.robots.settings import Settings
 
-MODEL = """
-<mujoco model="cart">
-  <option timestep="0.005" gravity="0 0 0"/>
-  <worldbody>
-    <body name="cart">
-      <joint name="rail" type="slide" axis="1 0 0" damping="5"/>
-      <geom size="0.1" mass="2"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="push" joint="rail" ctrlrange="-4 4"/></actuator>
-  <sensor><jointpos name="place" joint="rail"/></sensor>
-</mujoco>
-"""
+MODEL = envs_mujoco_cart.MODEL.replace('timestep="0.01"', 'timestep="0.005"').replace("-4 6", "-4 4")
 TASK = """
 model = "cart.xml"
 [parameters."body/cart/mass"]
