@@ -16,6 +16,7 @@ from experiments import design, embedding, misspecification, mujoco_loop, mujoco
 from experiments.benchmarks import accelerators
 from experiments.policies import report
 from experiments.policies import results as policies
+from experiments.sharpness import fresh
 from experiments.sharpness.held_out import HELD_OUT
 from experiments.sharpness.tables import table as sharpness
 from experiments.sota import rows as sota
@@ -79,9 +80,11 @@ def test_widths(line):
     assert " ".join(line.split()) in page("widths")
 
 
-def sharpness_row(problem: str, box: str, heuristic: str, simulations: str = "1,000") -> list[str]:
+def sharpness_row(
+    problem: str, box: str, heuristic: str, simulations: str = "1,000", results: str = "held-out"
+) -> list[str]:
     """Of the table that the study's arrays make."""
-    folder = RESULTS / "sharpness" / ("held-out" if simulations == "1,000" else "budgets")
+    folder = RESULTS / "sharpness" / results
     for line in sharpness(folder, [problem]).splitlines()[2:]:
         cells = [cell.strip() for cell in line.strip("| ").split("|")]
         if cells[2:4] == [box, heuristic] and cells[5] == simulations:
@@ -98,10 +101,39 @@ def test_held_out_problems(problem):
     if wrong := [sharpness_row(problem, box, "edge") for box in ("one", "all")]:
         cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[16]}" for row in wrong if row]
         assert not cells or f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
-    budgets = [sharpness_row(problem, "right", "fixed", simulations) for simulations in ("300", "3,000")]
+    budgets = [sharpness_row(problem, "right", "fixed", simulations, "budgets") for simulations in ("300", "3,000")]
     if all(budgets):
         cells = [f"{row[7]} ({row[8]}), {row[9]}, {row[10]} and {row[11]}" for row in budgets]
         assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+
+
+@pytest.mark.parametrize("problem", [problem.name for problem in fresh.PROBLEMS])
+def test_fresh_problems(problem):
+    row = lambda box, heuristic: sharpness_row(problem, box, heuristic, results="fresh")
+    fixed, edge = row("right", "fixed"), row("right", "edge")
+    cells = [f"{fixed[7]} ({fixed[8]}), {fixed[9]}, {fixed[10]} and {fixed[11]}", f"{edge[7]} ({edge[8]}), {edge[16]}"]
+    cells += [
+        f"{wrong[7]} ({wrong[8]}), {wrong[16]}, {wrong[15]}" for wrong in (row("one", "edge"), row("all", "edge"))
+    ]
+    assert f"| `{problem}` | {' | '.join(cells)} |" in page("sharpness")
+
+
+def test_coverage_over_fresh_problems():
+    ranks = {"density_rank": [], "exact_density_rank": []}
+    for problem in fresh.PROBLEMS:
+        found = arrays(f"sharpness/fresh/{problem.name}/bayessim-1000")
+        chosen = (found["box"] == "right") & (found["heuristic"] == "fixed") & (found["kind"] == "near")
+        for name, values in ranks.items():
+            values.append(found[name][chosen])
+    ours, exact = (np.concatenate(values) for values in ranks.values())
+    share = lambda ranks, level: f"{np.mean(ranks < level):.2f}"
+    assert_printed(
+        "sharpness",
+        [
+            f"cover {share(ours, 0.5)} and {share(ours, 0.9)} of the {len(ours)} truths",
+            f"exact posteriors {share(exact, 0.5)} and {share(exact, 0.9)}",
+        ],
+    )
 
 
 @pytest.mark.parametrize("problem", ["friction", "leaning_2", "leaning_4", "leaning_3"])
