@@ -31,7 +31,7 @@ importance = jax.jit(importance_weights, static_argnums=0)
 
 
 def gaussian(mean, factor) -> GaussianMixture:
-    return GaussianMixture(jnp.zeros(1), jnp.asarray([mean]), jnp.asarray([factor]))
+    return GaussianMixture(np.zeros(1, np.float32), np.float32([mean]), np.float32([factor]))
 
 
 def density(mixture: GaussianMixture):
@@ -150,7 +150,7 @@ def data(theta, capacity: int = 40) -> Dataset:
 def proposals(*beliefs: Belief) -> Belief:
     """Of three rounds, the last of which repeats the last that is given."""
     beliefs += beliefs[-1:] * (3 - len(beliefs))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *beliefs)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *beliefs)
 
 
 THETA = np.random.default_rng(0).uniform([-4, -3], [4, 3], (30, 2))

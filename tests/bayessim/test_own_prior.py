@@ -37,11 +37,11 @@ _product = jax.jit(lambda a, b: product(a, b)[0])
 
 
 def gaussian(mean, covariance) -> GaussianMixture:
-    return GaussianMixture(jnp.zeros(1), jnp.asarray(mean)[None], jnp.linalg.cholesky(jnp.asarray(covariance))[None])
+    return GaussianMixture(np.zeros(1, np.float32), np.float32([mean]), np.float32([np.linalg.cholesky(covariance)]))
 
 
 AS_MIXTURE = gaussian(CENTRE, np.diag(DEVIATION**2))
-EXACT = _product(gaussian_linear.posterior(X), AS_MIXTURE)
+EXACT = _product(jax.jit(gaussian_linear.posterior)(X), AS_MIXTURE)
 
 
 @pytest.mark.parametrize("restriction", ["clip", "reject", "mixed"])

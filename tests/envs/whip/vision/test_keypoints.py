@@ -39,7 +39,7 @@ def swinging(steps: int) -> Frames:
     dlo = np.concatenate([start, start + np.cumsum(links, axis=1)], axis=1)
     cubes = np.array([0.6, 0.0, 0.0]) + np.arange(6)[:, None] * [0.01, 0.002, 0.025] * (1 + time[..., None])
     orientations = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (steps, 6, 4))
-    return Frames(*(jnp.asarray(part, jnp.float32) for part in (gripper, dlo, cubes, orientations)))
+    return Frames(*(jnp.asarray(np.float32(part)) for part in (gripper, dlo, cubes, orientations)))
 
 
 FRAMES = swinging(16)
@@ -49,8 +49,8 @@ many = jax.jit(jax.vmap(detect, in_axes=(0, None, None, None)))
 start_many = jax.jit(jax.vmap(begin, in_axes=(0, None)))
 at = jax.jit(lambda arcs: project(CAMERA, jax.vmap(along, in_axes=(0, None))(FRAMES.dlo, arcs)))
 """The true places of fractions of the DLO in all frames."""
-CUBES = project(CAMERA, FRAMES.cubes)
-TRUTH = jnp.concatenate([at(jnp.array([0.25, 0.5, 0.75, 1.0])), CUBES], axis=1)
+CUBES = jax.jit(project)(CAMERA, FRAMES.cubes)
+TRUTH = np.concatenate([at(np.float32([0.25, 0.5, 0.75, 1.0])), CUBES], axis=1)
 
 
 # ------------------------------------------------------------------------------------------------ along the DLO
