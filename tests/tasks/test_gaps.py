@@ -91,10 +91,6 @@ def test_distances_are_over_what_is_there():
     np.testing.assert_allclose(whole.trajectory_error, trajectory_distance(trajectory[0], RECORDING), rtol=1e-5)
 
 
-QUICK = jaxlfi.QUICK.replace(rounds=3, min_rounds=0, simulations_per_round=200, simulation_budget=200)
-"""Six hundred simulations in few rounds: each trains on all so far."""
-
-
 def exact_sd(counts):
     """Of the mean of so many records with a standard deviation of 0.5 and a wide prior."""
     return 0.5 / np.sqrt(np.asarray(counts))
@@ -105,7 +101,8 @@ def test_posteriors_are_those_given_what_was_recorded(embedding):
     """Most of the second channel is missing, so that its parameter is known half as well."""
     observed = np.random.default_rng(2).normal([1.0, -1.0], 0.5, (20, 2))
     observed[4:, 1] = np.nan
-    chosen = QUICK.replace(estimator=QUICK.estimator.replace(embedding=embedding))
+    estimator = jaxlfi.QUICK.estimator.replace(embedding=embedding)
+    chosen = jaxlfi.QUICK.replace(estimator=estimator, rounds=6, min_rounds=0)
     run = jaxlfi.infer(3, recording(), observed, heuristic="none", settings=chosen)
     draws = np.asarray(run.posterior.sample(jax.random.key(1), 4000))
     expected = np.nanmean(observed, axis=0)
@@ -119,7 +116,9 @@ def test_trials_of_different_lengths_are_one_posterior():
     task, joined = trials_of(recording("series"), trials)
     assert joined.shape == (60, 2) and np.isnan(joined).sum() == 2 * 28
     assert with_gaps_of(task, joined).summary(jnp.asarray(joined, jnp.float32)).shape == (18,)
-    run = jaxlfi.infer(0, recording("series"), trials, heuristic="none", settings=QUICK)
+    run = jaxlfi.infer(
+        0, recording("series"), trials, heuristic="none", settings=jaxlfi.QUICK.replace(rounds=6, min_rounds=0)
+    )
     mean = np.mean([trial.mean(0) for trial in trials], axis=0)  # of the trials' means: its sd is known, too
     sd = 0.5 * np.sqrt(sum(1 / len(trial) for trial in trials)) / 3
     draws = np.asarray(run.posterior.sample(jax.random.key(1), 4000))
