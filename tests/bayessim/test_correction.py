@@ -124,9 +124,8 @@ def test_mixtures_keep_their_number_of_components():
 
 
 def test_before_any_data_there_is_no_reference():
-    nothing = uninformed(BOX, 1)
     for prior in (None, PRIOR):
-        posterior, bad = multiplied(prior_of(prior), Q, nothing)
+        posterior, bad = multiplied(prior_of(prior), Q, NOTHING)
         np.testing.assert_array_equal(posterior.means, Q.means)
         np.testing.assert_array_equal(posterior.scale_tril, Q.scale_tril)
         assert int(bad) == 0
@@ -157,7 +156,8 @@ def proposals(*beliefs: Belief) -> Belief:
 
 
 THETA = np.random.default_rng(0).uniform([-4, -3], [4, 3], (30, 2))
-ROUNDS = proposals(uninformed(BOX, 1), INFORMED, dataclasses.replace(INFORMED, mixture=Q))
+NOTHING = jax.jit(uninformed, static_argnums=1)(BOX, 1)
+ROUNDS = proposals(NOTHING, INFORMED, dataclasses.replace(INFORMED, mixture=Q))
 
 
 def relative(weights, size=len(THETA)):
@@ -219,7 +219,7 @@ def test_a_proposal_restricted_to_its_box_is_denser_inside():
     nothing.
     """
     half = Support([0.2, -7.0], [9.0, 7.0])
-    rounds = proposals(uninformed(BOX, 1), Belief(PREVIOUS, half, jnp.asarray(True)))
+    rounds = proposals(NOTHING, Belief(PREVIOUS, half, jnp.asarray(True)))
     weights = importance(None, data(THETA), rounds, 1)
     inside = THETA[:, 0] > 0.2
     expected = 1 / (1 / 252 + np.where(inside, 2 * density(PREVIOUS)(THETA), 0.0))
