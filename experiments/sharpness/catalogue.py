@@ -1,6 +1,6 @@
 """All problems by name, in the order of tables."""
 
-from experiments.sharpness import counts, curves, held_out, series
+from experiments.sharpness import counts, curves, fresh, held_out, series
 from experiments.sharpness.problem import Problem
 
 PROBLEMS: dict[str, Problem] = {
@@ -8,16 +8,16 @@ PROBLEMS: dict[str, Problem] = {
     for name in held_out.NAMES
     for problem in (*curves.PROBLEMS, *counts.PROBLEMS, *series.PROBLEMS)
     if problem.name == name
-} | {problem.name: problem for problem in curves.LEANING}
+} | {problem.name: problem for problem in (*curves.LEANING, *fresh.PROBLEMS)}
 MODELS = ("mujoco_puck", "mujoco_arm", "mujoco_furuta")
 """Examples of MuJoCo models."""
 
 
 def chosen(words: list[str]) -> list[Problem]:
-    """The problems that words name: "tuning", "held-out", "all", "leaning", "mujoco", or names.
+    """The problems that words name: "tuning", "held-out", "all", "leaning", "fresh", "mujoco", or names.
 
-    Those that lean on bounds and those of MuJoCo are not among "all": they are neither held out nor tuned on, and the
-    latter need an extra.
+    Those that lean on bounds, fresh ones and those of MuJoCo are not among "all": they are neither held out nor tuned
+    on, and the last need an extra.
 
     Raises:
         ValueError: for a word that is none of these.
@@ -25,6 +25,7 @@ def chosen(words: list[str]) -> list[Problem]:
     """
     sets = {"tuning": held_out.TUNING, "held-out": held_out.HELD_OUT, "all": held_out.NAMES}
     sets["leaning"] = tuple(problem.name for problem in curves.LEANING)
+    sets["fresh"] = tuple(problem.name for problem in fresh.PROBLEMS)
     names = [name for word in words for name in sets.get(word, (word,))]
     models = [name for name in MODELS if name in names or "mujoco" in names]
     if unknown := [name for name in names if name not in (*PROBLEMS, *MODELS, "mujoco")]:

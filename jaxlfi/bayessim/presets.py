@@ -104,8 +104,8 @@ def npe(settings: Settings) -> Settings:
 
     One round leaves time for an ensemble: averaged over four, flows are better than each. And as no round follows,
     there is no need to hold back where nothing was simulated: ReLU fits better than tanh where something was. Two of
-    the four start from a linear regression: where parameters are nearly linear in the summaries they are far better,
-    and where not, the other two are there.
+    the four start from a linear regression: where parameters are nearly linear in the summaries they are far better.
+    Where not, they are far worse, and simulations held out leave them little weight.
     """
     estimator = FLOW.replace(loss="likelihood", activation="relu", ensemble_size=4, regression=2)
     settings = with_estimator(all_rounds(settings), estimator)

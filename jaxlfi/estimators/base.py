@@ -56,7 +56,8 @@ class Estimator(Checked, abc.ABC):
         weight_decay: decoupled weight decay (AdamW), per step and relative to the learning rate.
         clip_norm: global norm the gradients are clipped to.
         components: Gaussians K of each network's mixture, its own or the one fitted to it.
-        ensemble_size: networks E; the posterior is their equally weighted mixture, of E K Gaussians.
+        ensemble_size: networks E; the posterior is their mixture, of E K Gaussians, equally weighted unless they are of
+            different kinds.
         epochs: full passes over the dataset each round (docs/paper.md, reading B), after twenty rounds over a part of
             it, in turn; 0 where `steps` counts instead.
         steps: gradient steps each round, rounded up to epochs of equal length; 0 where `epochs` counts.
@@ -242,6 +243,11 @@ class Estimator(Checked, abc.ABC):
         """Which networks of the ensemble see features of regressions, shape [E]."""
         first = 0 if self.sees == "regression" else (self.ensemble_size + 1) // 2
         return np.arange(self.ensemble_size) >= (self.ensemble_size if self.sees == "none" else first)
+
+    @property
+    def stacked(self) -> bool:
+        """Whether networks of different kinds make up the ensemble, so that the reported posterior weights them."""
+        return self.sees != "none"
 
     @property
     def equal_weights(self) -> Float[Array, " member"]:
@@ -440,10 +446,8 @@ def untrained(
     estimator = jax.tree.map(jnp.asarray, estimator).reading((obs, 1))  # its leaves are carried through loops
     nothing = empty(1, scale.dim, obs)
     params = estimator.initialise(key, scale.dim, obs)
-    regression = log_weights = None
-    if estimator.sees != "none":
-        regression = unfitted(scale.dim, obs, estimator.record_size)
-        log_weights = estimator.equal_weights
+    regression = None if estimator.sees == "none" else unfitted(scale.dim, obs, estimator.record_size)
+    log_weights = estimator.equal_weights if estimator.stacked else None
     normalisers = _normalisers(estimator, nothing, scale)
     return Network(estimator, params, *normalisers, scale, space, prior, regression=regression, log_weights=log_weights)
 

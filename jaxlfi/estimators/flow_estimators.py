@@ -61,7 +61,9 @@ class SplineFlow(FlowEstimator):
         regression: how many networks of the ensemble start from a ridge regression of the parameters on the summaries
             (`jaxlfi.estimators.ridge`), which is trained with the rest: what they have left to learn is how the
             posterior differs from a shifted normal. They are the better ones where parameters are about linear in the
-            summaries, and extrapolate more boldly. None do behind an embedding, whose features are not known before.
+            summaries, and extrapolate more boldly: where the loss is the likelihood, the posterior weights both kinds
+            by their log score on held-out simulations (`jaxlfi.estimators.stacking`). None do behind an embedding,
+            whose features are not known before.
 
     Example:
         >>> SplineFlow(bins=8).check().bins
@@ -94,6 +96,11 @@ class SplineFlow(FlowEstimator):
         linear = params["params"][REGRESSION]
         chosen = jnp.arange(len(linear)) < self.regression
         return {"params": params["params"] | {REGRESSION: jnp.where(chosen[:, None, None], starts, linear)}}
+
+    @property
+    def stacked(self) -> bool:
+        """Whether some networks start from a regression and others do not, or networks see different inputs."""
+        return super().stacked or (0 < self.regression < self.ensemble_size and self.embedding == "none")
 
     def module(self, dim: int) -> nn.Module:
         """The Flax network of one ensemble member for D parameters."""

@@ -577,6 +577,22 @@ def test_so_many_networks_of_a_spline_flow_start_from_a_linear_regression(regres
         np.testing.assert_allclose(found, left if number < regression else seen, atol=0.1)
 
 
+def test_spline_flows_are_weighted_by_held_out_rows_where_some_start_from_a_regression():
+    still = change(VALIDATED, learning_rate=STILL, epochs=1)
+    shared = {name: getattr(still, name) for name in ("learning_rate", "epochs", "batch_size", "validation")}
+    estimator = SplineFlow(hidden=(8,), transforms=1, ensemble_size=2, regression=1, **shared)
+    for alike in ({"regression": 0}, {"regression": 2}, {"embedding": "mlp"}):
+        assert not change(estimator, **alike).stacked
+    network = jax.tree.map(jnp.asarray, fitted(estimator)[0])
+    # Untrained, one is the regression and the other a standard normal: of rows neither has seen, all but a few
+    # are likelier by the former.
+    weights = np.exp(network.log_weights)
+    np.testing.assert_allclose(weights.sum(), 1, rtol=1e-5)
+    assert weights[0] > 0.8
+    density = lambda network: np.asarray(estimator.density(network, DATA.x[0]).log_prob(DATA.theta[:SIZE]))
+    assert np.abs(density(network) - density(network.replace(log_weights=estimator.equal_weights))).max() > 0.1
+
+
 def test_behind_an_embedding_a_spline_flow_starts_without_a_regression():
     estimator = SplineFlow(hidden=(8,), transforms=1, regression=1, embedding="mlp", features=2)
     network = start(estimator)

@@ -10,7 +10,7 @@ import pytest
 from scipy import special, stats
 
 from experiments.sharpness import __main__ as command
-from experiments.sharpness import held_out, measures, oracle, references, runner, series, tables
+from experiments.sharpness import fresh, held_out, measures, oracle, references, runner, series, tables
 from experiments.sharpness.catalogue import PROBLEMS, chosen
 from experiments.sharpness.problem import NEAR, Case, case_of
 from experiments.sota.measures import Found
@@ -18,6 +18,7 @@ from jaxlfi.io import files as atomic
 from tests.small import whole_runs  # noqa: F401
 
 LEANING = ("leaning_2", "leaning_4", "leaning_3")
+FRESH = tuple(problem.name for problem in fresh.PROBLEMS)
 RESULTS = Path(command.__file__).parents[1] / "results" / "sharpness"
 SMALL = oracle.Effort(particles=500, moves=4, centres=200, draws=4000)
 
@@ -122,7 +123,8 @@ def test_linear_models_follow_truncated_ones():
 
 
 @pytest.mark.parametrize(
-    "name", ["friction", "poisson_regression", "negative_binomial", "epidemic", "ar1", "ornstein_uhlenbeck"]
+    "name",
+    ["friction", "poisson_regression", "negative_binomial", "epidemic", "ar1", "ornstein_uhlenbeck", *FRESH],
 )
 def test_a_likelihood_is_that_of_its_simulator(name):
     """The gradient of its logarithm is zero in the mean over simulations at the same parameters."""
@@ -174,7 +176,7 @@ def test_the_queue_s_likelihood_is_a_density_of_departures(monkeypatch):
 
 
 def test_the_held_out_are_those_of_the_smallest_digests():
-    assert len(held_out.NAMES) == 22 and tuple(PROBLEMS) == (*held_out.NAMES, *LEANING)
+    assert len(held_out.NAMES) == 22 and tuple(PROBLEMS) == (*held_out.NAMES, *LEANING, *FRESH)
     assert held_out.HELD_OUT == (
         *("thermocouple", "decay_offset", "linear_20", "negative_binomial", "ornstein_uhlenbeck", "ridge"),
     )
@@ -186,7 +188,7 @@ def test_the_held_out_are_those_of_the_smallest_digests():
         chosen(["rigde"])
 
 
-@pytest.mark.parametrize("name", held_out.NAMES)
+@pytest.mark.parametrize("name", [*held_out.NAMES, *FRESH])
 def test_boxes_are_right_or_wrong_as_they_say(name):
     problem = PROBLEMS[name]
     truth = np.asarray(problem.task.inference.truth, float)

@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 
 import jaxlfi
+from jaxlfi.estimators.base import untrained
+from jaxlfi.estimators.flow_estimators import SplineFlow
 from jaxlfi.heuristics import Choice, Edge, Fixed, Matched, Mode
 from jaxlfi.io import files as atomic
-from jaxlfi.io import formats
+from jaxlfi.io import formats, trees
 from jaxlfi.io.workfolder import StoreError
 from jaxlfi.runs.describe import settings_to_json
-from jaxlfi.runs.load import load
+from jaxlfi.runs.load import _network, load
 from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, whole_runs  # noqa: F401 - a fixture
 
 OBSERVED = np.array([0.8, -0.6], np.float32)
@@ -246,3 +248,16 @@ def test_folders_that_hold_no_whole_run_are_one_line(saved, tmp_path, damage, me
     with pytest.raises(ValueError, match=message) as refused:
         load(folder)
     assert "\n" not in str(refused.value) and str(folder) in str(refused.value)
+
+
+def test_flows_saved_without_weights_count_the_same(tmp_path):
+    settings = SETTINGS.replace(estimator=SplineFlow(hidden=(4,), transforms=1, ensemble_size=2, regression=1, bins=2))
+    feasible, space = gaussian().feasible, gaussian().space
+    network = untrained(jax.random.key(1), settings.estimator, 2, feasible, space)
+    weighted = trees.named_leaves(network.replace(log_weights=jnp.log(jnp.array([0.9, 0.1]))))
+    atomic.write_arrays(tmp_path / "now.npz", weighted)
+    atomic.write_arrays(tmp_path / "before.npz", {name: v for name, v in weighted.items() if name != ".log_weights"})
+    loaded = lambda name: _network(tmp_path / name, settings, (2,), feasible, space, None, formats.VERSION)
+    np.testing.assert_allclose(np.exp(loaded("now.npz").log_weights), [0.9, 0.1], rtol=1e-6)
+    assert loaded("before.npz").log_weights is None
+    same_leaves(loaded("before.npz"), network.replace(log_weights=None))
