@@ -28,6 +28,7 @@ from jax.experimental.compilation_cache import compilation_cache
 # the newer fusions of XLA, which later versions cannot do without, and a tenth of the rest into making code in pieces.
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 os.environ.setdefault("XLA_FLAGS", "")
+jax.config.update("jax_disable_most_optimizations", True)  # for what modules make as they are imported, too
 if jax.__version_info__ < (0, 10):
     os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 
@@ -51,10 +52,10 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("jaxlfi")
 
-MEMORY = min(max(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 10, 1600 * 2**20), 2400 * 2**20)
+MEMORY = min(max(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 6, 1600 * 2**20), 3600 * 2**20)
 """Bytes beyond which a process forgets, between two files, the programs it compiled, which are most of its memory.
 
-A tenth of the machine's, within limits: what is forgotten has to be traced and read again.
+A sixth of the machine's, within limits: what is forgotten has to be traced and read again.
 """
 
 MAX_MEMORY = MEMORY + 100 * 2**20
@@ -62,9 +63,10 @@ MAX_MEMORY = MEMORY + 100 * 2**20
 
 
 LONG = (
-    "test_fuzzing", "test_cli", "test_estimators", "test_infer", "test_resume", "test_sharpness", "test_engines",
-    "test_algorithm", "test_default_widths", "test_real2sim", "test_apt", "test_training", "test_draws", "test_grid",
-    "test_load", "test_from_brax",
+    "test_posterior_statistics", "test_infer", "test_default_widths", "test_mjx_simulator", "test_fuzzing",
+    "test_priors", "test_resume", "test_sharpness", "test_engines", "test_algorithm", "test_estimators",
+    "test_real2sim", "test_apt", "test_cli", "test_training", "test_draws", "test_grid", "test_load", "test_commands",
+    "test_from_brax",
 )  # fmt: skip
 """Files of twenty seconds of a processor and more, in the order in which they begin: the longest first."""
 

@@ -30,11 +30,6 @@ def seen(engine: Engine, parameters: WhipParameters, actions: Float[Array, "time
     return view, states.failed[-1]
 
 
-def states_of(gripper: Float[Array, "time 2"], keypoints: Float[Array, "time 10 2"]) -> Float[Array, "time 28"]:
-    """Observations of a trajectory, with the flags of the cubes that have been hit so far."""
-    return observation(gripper, keypoints, hits_so_far(keypoints))
-
-
 def trajectory(
     key: jax.Array,
     engine: Engine,
@@ -53,4 +48,5 @@ def trajectory(
     key_keypoints, key_gripper = jax.random.split(key)
     keypoints, _ = detect(key_keypoints, detector, camera, view)
     gripper = measured(key_gripper, detector, view.gripper)
-    return jnp.concatenate([states_of(gripper, keypoints), actions], axis=-1), ~failed
+    states = observation(gripper, keypoints, hits_so_far(keypoints))
+    return jnp.concatenate([states, actions], axis=-1), ~failed

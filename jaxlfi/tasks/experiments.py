@@ -98,12 +98,6 @@ def single(task: Task) -> Task:
     return function.one if isinstance(function, Experiments) else task
 
 
-def designs_of(task: Task) -> tuple[tuple[float, ...], ...]:
-    """The designs of the experiments that a task is of, one or several."""
-    function = _function(task)
-    return function.points if isinstance(function, Experiments) else (function.point,)
-
-
 def simulator_at(task: Task, design: Any) -> Callable[[Any, Any], Any]:
     """The simulator of a task of one experiment at another design, which may be traced."""
     function = _function(task).function

@@ -24,7 +24,7 @@ from jaxlfi.tasks.task import Task
 TASK = gaussian_linear.task()
 X = jnp.asarray(gaussian_linear.MIXING @ np.array([1.0, -0.5], np.float32))
 """The observation whose exact posterior has its mean at the truth."""
-EXACT = gaussian_linear.posterior(X)
+EXACT = jax.jit(gaussian_linear.posterior)(X)
 
 
 # ------------------------------------------------------------------------------ the spine: exact posteriors
@@ -339,7 +339,7 @@ def test_a_simulator_that_always_fails_leaves_a_finite_state():
 # ------------------------------------------------------------------------------------------------ proposals
 
 NARROW = Belief(
-    GaussianMixture(jnp.zeros(1), jnp.array([[-1.0, 2.0]]), jnp.full((1, 2, 2), 1e-3) * jnp.eye(2)),
+    GaussianMixture(np.zeros(1, np.float32), np.float32([[-1.0, 2.0]]), 1e-3 * np.eye(2, dtype=np.float32)[None]),
     BOX,
     jnp.asarray(True),
 )

@@ -1,6 +1,7 @@
 """Rounds while the posterior moves: the rule against NumPy, and runs that end by themselves when they settle."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -25,19 +26,26 @@ from tests.tasks.test_host import Counting
 SETTINGS = settings(predictive=False, rounds=8, min_rounds=4, inflation=2.0, restriction="reject")
 OBSERVED = np.array([0.8, -0.6], np.float32)
 SEEDS = range(6)
+advance = jax.jit(advanced, static_argnames="min_rounds")
+start = functools.cache(not_begun)
+
+
+def gaussians(means, factors) -> GaussianMixture:
+    """Of equal weights."""
+    return GaussianMixture(np.zeros(len(means), np.float32), np.float32(means), np.float32(factors))
 
 
 def narrow(mean, sd) -> GaussianMixture:
     """One Gaussian."""
-    return GaussianMixture(jnp.zeros(1), jnp.asarray([mean]), jnp.diag(jnp.asarray(sd))[None])
+    return gaussians([mean], [np.diag(sd)])
 
 
 def test_movement_is_that_of_the_mean_in_standard_deviations_over_the_last_rounds():
     rng = np.random.default_rng(0)
     means, sd = rng.normal(size=(9, 3)).cumsum(axis=0), np.array([0.5, 2.0, 7.0])
-    progress, moved = not_begun(3), []
+    progress, moved = start(3), []
     for mean in means:
-        progress = advanced(progress, narrow(mean, sd), min_rounds=1)
+        progress = advance(progress, narrow(mean, sd), min_rounds=1)
         moved.append(float(progress.moved))
         assert bool(progress.settled) == (moved[-1] < STILL)
     expected = [np.max(np.abs(means[i] - means[i - LAG]) / sd) if i >= LAG else np.inf for i in range(len(means))]
@@ -47,18 +55,19 @@ def test_movement_is_that_of_the_mean_in_standard_deviations_over_the_last_round
 
 def mixtures(rounds: int, dim: int, rng: np.random.Generator) -> list[GaussianMixture]:
     """Random mixtures of two Gaussians."""
-    parts = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)
-    tril = lambda: jnp.tril(parts(2, dim, dim), -1) + jnp.eye(dim) * (0.2 + jnp.abs(parts(2, dim, dim)))
+    parts = lambda *shape: rng.normal(size=shape).astype(np.float32)
+    tril = lambda: np.tril(parts(2, dim, dim), -1) + np.eye(dim, dtype=np.float32) * (0.2 + np.abs(parts(2, dim, dim)))
     return [GaussianMixture(parts(2), parts(2, dim), tril()) for _ in range(rounds)]
 
 
 def test_widths_and_correlations_are_those_of_draws():
     """NumPy's, of 200,000 draws of each posterior."""
     posteriors = mixtures(5, 3, np.random.default_rng(1))
-    draws = [np.asarray(one.sample(jax.random.key(i), 200_000)) for i, one in enumerate(posteriors)]
-    progress, found = not_begun(3), []
+    many = jax.jit(lambda key, one: one.sample(key, 200_000))
+    draws = [np.asarray(many(jax.random.key(i), one)) for i, one in enumerate(posteriors)]
+    progress, found = start(3), []
     for posterior in posteriors:
-        progress = advanced(progress, posterior, min_rounds=1)
+        progress = advance(progress, posterior, min_rounds=1)
         found.append([float(progress.moved), float(progress.rescaled), float(progress.turned)])
     assert np.all(np.isinf(found[:LAG]))
     for i in (3, 4):
@@ -74,7 +83,7 @@ def test_widths_and_correlations_are_those_of_draws():
 
 def correlated(sd, correlation: float) -> GaussianMixture:
     covariance = np.outer(sd, sd) * [[1, correlation], [correlation, 1]]
-    return GaussianMixture(jnp.zeros(1), jnp.zeros((1, 2)), jnp.linalg.cholesky(jnp.asarray(covariance))[None])
+    return gaussians(np.zeros((1, 2)), np.linalg.cholesky(covariance)[None])
 
 
 @pytest.mark.parametrize(
@@ -90,27 +99,28 @@ def correlated(sd, correlation: float) -> GaussianMixture:
     ],
 )
 def test_a_posterior_settles_once_its_widths_and_correlations_have(last, settled):
-    progress = not_begun(2)
+    progress = start(2)
     for posterior in [correlated([1.0, 1.0], 0.2)] * LAG + [last]:
-        progress = advanced(progress, posterior, min_rounds=1)
+        progress = advance(progress, posterior, min_rounds=1)
     assert float(progress.moved) == 0 and bool(progress.settled) is settled
 
 
 def test_the_unit_of_a_parameter_does_not_matter():
-    posteriors, unit = mixtures(4, 3, np.random.default_rng(2)), jnp.asarray([1e-6, 1.0, 1e5])
-    one = other = not_begun(3)
+    posteriors, unit = mixtures(4, 3, np.random.default_rng(2)), np.float32([1e-6, 1.0, 1e5])
+    one = other = start(3)
+    scaled = jax.jit(GaussianMixture.affine)
     for posterior in posteriors:
-        one = advanced(one, posterior, min_rounds=1)
-        other = advanced(other, posterior.affine(unit, jnp.zeros(3)), min_rounds=1)
+        one = advance(one, posterior, min_rounds=1)
+        other = advance(other, scaled(posterior, unit, np.zeros(3, np.float32)), min_rounds=1)
     for name in ("moved", "rescaled", "turned"):
         np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=1e-3)
 
 
 def test_a_run_does_not_settle_before_its_least_rounds():
-    progress = not_begun(1)
+    progress = start(1)
     settled = []
     for _ in range(7):
-        progress = advanced(progress, narrow([1.0], [1.0]), min_rounds=6)
+        progress = advance(progress, narrow([1.0], [1.0]), min_rounds=6)
         settled.append(bool(progress.settled))
     assert settled == [False] * 5 + [True] * 2  # it stands still from the fourth round on
 

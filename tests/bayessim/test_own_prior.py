@@ -1,6 +1,7 @@
 """A prior that the task brings: sequential rounds keep it in the posterior, whatever they propose."""
 
 import dataclasses
+import functools
 
 import distrax
 import jax
@@ -23,7 +24,6 @@ from tests.small import settings, whole_runs  # noqa: F401 - a fixture
 CENTRE, DEVIATION = np.array([-1.0, 0.5], np.float32), np.array([0.3, 0.6], np.float32)
 PRIOR = distrax.MultivariateNormalDiag(jnp.asarray(CENTRE), jnp.asarray(DEVIATION))
 PLAIN = gaussian_linear.task()
-TASK = dataclasses.replace(PLAIN, prior=PRIOR)
 X = jnp.asarray(gaussian_linear.MIXING @ np.array([0.2, -0.6], np.float32))
 
 BELIEF = Belief(
@@ -37,20 +37,43 @@ _product = jax.jit(lambda a, b: product(a, b)[0])
 
 
 def gaussian(mean, covariance) -> GaussianMixture:
-    return GaussianMixture(jnp.zeros(1), jnp.asarray(mean)[None], jnp.linalg.cholesky(jnp.asarray(covariance))[None])
+    return GaussianMixture(np.zeros(1, np.float32), np.float32([mean]), np.float32([np.linalg.cholesky(covariance)]))
 
 
 AS_MIXTURE = gaussian(CENTRE, np.diag(DEVIATION**2))
-EXACT = _product(gaussian_linear.posterior(X), AS_MIXTURE)
+
+
+@functools.cache
+def task():
+    """The Gaussian task with that prior, which is judged as it is made."""
+    return dataclasses.replace(PLAIN, prior=PRIOR)
+
+
+@functools.cache
+def exact() -> GaussianMixture:
+    """The posterior of X under that prior."""
+    return _product(jax.jit(gaussian_linear.posterior)(X), AS_MIXTURE)
+
+
+def many(restriction):
+    """Settings of 4000 proposals, a program of each restriction."""
+    return settings(inflation=2.0, restriction=restriction, simulation_budget=4000)
+
+
+@functools.cache
+@jax.jit
+def wide_times_prior():
+    """Mean and covariance of what is proposed."""
+    expected, _ = product(BELIEF.mixture.inflated(2.0), AS_MIXTURE)
+    return expected.mean, expected.covariance
 
 
 @pytest.mark.parametrize("restriction", ["clip", "reject", "mixed"])
 def test_proposals_are_the_wide_posterior_times_the_prior(restriction, key):
-    drawn = settings(inflation=2.0, restriction=restriction, simulation_budget=4000)
-    theta = np.asarray(_propose(key, TASK.inference.prior, drawn, BELIEF))
-    expected = _product(BELIEF.mixture.inflated(2.0), AS_MIXTURE)
+    theta = np.asarray(_propose(key, task().inference.prior, many(restriction), BELIEF))
+    mean, covariance = wide_times_prior()
     for d in range(2):
-        marginal = stats.norm(float(expected.mean[d]), float(jnp.sqrt(expected.covariance[d, d])))
+        marginal = stats.norm(float(mean[d]), np.sqrt(float(covariance[d, d])))
         # 4,000 of 128,000 without replacement, of which about a fifth are likely: nearly independent
         assert stats.kstest(theta[:, d], marginal.cdf).pvalue > 1e-3
 
@@ -58,9 +81,8 @@ def test_proposals_are_the_wide_posterior_times_the_prior(restriction, key):
 @pytest.mark.parametrize("restriction", ["clip", "reject", "mixed"])
 def test_they_stay_in_the_support(restriction, key):
     box = Support([-0.5, 0.0], [0.5, 0.3])
-    drawn = settings(inflation=2.0, restriction=restriction, simulation_budget=500)
-    theta = np.asarray(_propose(key, TASK.inference.prior, drawn, BELIEF.replace(support=box)))
-    assert theta.shape == (500, 2) and ((theta >= np.asarray(box.low)) & (theta <= np.asarray(box.high))).all()
+    theta = np.asarray(_propose(key, task().inference.prior, many(restriction), BELIEF.replace(support=box)))
+    assert theta.shape == (4000, 2) and ((theta >= np.asarray(box.low)) & (theta <= np.asarray(box.high))).all()
 
 
 @pytest.mark.parametrize(
@@ -77,7 +99,7 @@ def test_they_stay_in_the_support(restriction, key):
 )
 def test_what_accounts_for_the_prior_by_itself_proposes_as_without_one(accounting, key):
     accounting = accounting.replace(defensive=0.0)
-    theta = [_propose(jax.random.clone(key), task.inference.prior, accounting, BELIEF) for task in (TASK, PLAIN)]
+    theta = [_propose(jax.random.clone(key), own.inference.prior, accounting, BELIEF) for own in (task(), PLAIN)]
     np.testing.assert_array_equal(*theta)
 
 
@@ -86,8 +108,8 @@ def test_rounds_settle_at_the_exact_mean_and_three_quarters_of_the_variance():
     q = likelihood
     for _ in range(40):
         q = _product(likelihood, _product(q.inflated(2.0), AS_MIXTURE))
-    np.testing.assert_allclose(q.mean, EXACT.mean, atol=1e-4)
-    np.testing.assert_allclose(q.covariance, 0.75 * EXACT.covariance, rtol=1e-3)
+    np.testing.assert_allclose(q.mean, exact().mean, atol=1e-4)
+    np.testing.assert_allclose(q.covariance, 0.75 * exact().covariance, rtol=1e-3)
 
 
 def test_a_sequential_run_keeps_the_prior():
@@ -110,11 +132,11 @@ def test_a_sequential_run_keeps_the_prior():
         inflation=2.0,
         restriction="mixed",
     )
-    run = lambda key: algorithm.run(key, TASK, sequential, Fixed(), X, TASK.support("ok"), lambda *_: ())[0].belief
+    run = lambda key: algorithm.run(key, task(), sequential, Fixed(), X, task().support("ok"), lambda *_: ())[0].belief
     mixtures = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(3), 5)).mixture
-    deviation = np.sqrt(np.diag(EXACT.covariance))
-    off = (np.median(jax.vmap(lambda mixture: mixture.mean)(mixtures), axis=0) - EXACT.mean) / deviation
-    without = (np.asarray(gaussian_linear.posterior(X).mean) - EXACT.mean) / deviation
+    deviation = np.sqrt(np.diag(exact().covariance))
+    off = (np.median(jax.vmap(lambda mixture: mixture.mean)(mixtures), axis=0) - exact().mean) / deviation
+    without = (np.asarray(gaussian_linear.posterior(X).mean) - exact().mean) / deviation
     assert np.abs(off).max() < 0.5 and np.abs(without).max() > 2.0
 
 
@@ -131,7 +153,10 @@ class Disc:
         return jnp.where(jnp.sum(value**2, axis=-1) <= 1, -jnp.log(jnp.pi), jnp.nan)
 
 
-BOUNDED = dataclasses.replace(PLAIN, prior=Disc())
+@functools.cache
+def bounded():
+    """The Gaussian task with that prior."""
+    return dataclasses.replace(PLAIN, prior=Disc())
 
 
 @pytest.mark.parametrize("correction", ["none", "importance"])
@@ -141,7 +166,7 @@ def test_nothing_is_proposed_where_the_prior_is_zero(restriction, correction, ke
     drawn = settings(inflation=2.0, restriction=restriction, correction=correction, simulation_budget=500)
     for shift in (0.0, 8.0):
         belief = BELIEF.replace(mixture=BELIEF.mixture.affine(jnp.ones(2), jnp.full(2, shift)))
-        theta = np.asarray(_propose(jax.random.clone(key), BOUNDED.inference.prior, drawn, belief))
+        theta = np.asarray(_propose(jax.random.clone(key), bounded().inference.prior, drawn, belief))
         assert theta.shape == (500, 2) and (np.sum(theta**2, axis=1) <= 1).all()
         assert len(np.unique(theta, axis=0)) > 400
 
@@ -154,7 +179,7 @@ def test_a_run_stays_where_its_prior_is_not_zero(method):
     estimator = small.estimator.replace(hidden=(16,), epochs=0, steps=100, ensemble_size=2)
     quick = small.replace(estimator=estimator, rounds=3, min_rounds=0, predictive=False)
     observed = gaussian_linear.MIXING @ np.array([1.5, 0.5], np.float32)  # beyond the disc
-    run = infer(jax.random.key(0), BOUNDED, observed, support="ok", heuristic=Fixed(), settings=quick)
+    run = infer(jax.random.key(0), bounded(), observed, support="ok", heuristic=Fixed(), settings=quick)
     proposed = run.history["theta"][np.asarray(run.history["counted"], bool)]
     draws = np.asarray(run.posterior.sample(jax.random.key(1), 2000))
     for theta in (proposed, draws, run.posterior.map()[None]):

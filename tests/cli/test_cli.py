@@ -401,6 +401,7 @@ parser.main(sys.argv[1:])
 """A command whose process dies as it has made a round."""
 
 
+@pytest.mark.slow  # in runs/, a process is killed that simulates on the host, and writes fail at any moment of others
 def test_a_killed_process_resumes_to_the_same_bits(tmp_path, capsys):
     arguments = ["infer", TASK, *FLAGS, "--out"]
     words = [sys.executable, "-c", KILLED, *arguments, str(tmp_path / "killed")]

@@ -16,7 +16,9 @@ from jaxlfi.distributions.space import Space
 from jaxlfi.distributions.support import Support
 from jaxlfi.estimators import dataset as datasets
 from jaxlfi.estimators.base import Estimator, Network, converted, untrained
-from jaxlfi.estimators.flow_estimators import SplineFlow
+from jaxlfi.estimators.flow_estimators import MaskedFlow
+from jaxlfi.estimators.likelihood_estimators import MixtureLikelihood
+from jaxlfi.estimators.mixture_network import MixtureNetwork
 from jaxlfi.estimators.posterior import MAP_DRAWS, Posterior
 from jaxlfi.estimators.training import fit
 from jaxlfi.fields import declared, option
@@ -174,9 +176,22 @@ def test_families_are_found_by_their_names_and_written_to_json(case):
 
 
 def test_conditioning_is_the_same_compiled_and_not(case):
-    """Of one family of each way: hundreds of operations are compiled one by one, and others differ in layers alone."""
-    if isinstance(case.estimator, SplineFlow | OneFile):
-        pytest.skip("it shares the code of conditioning with MaskedFlow, which tests it")
+    """Here of the family with the fewest operations: each is compiled by itself."""
+    if not isinstance(case.estimator, MixtureNetwork):
+        pytest.skip("hundreds of operations: a slow test has other families")
+    assert_same_compiled_and_not(case)
+
+
+@pytest.mark.slow
+def test_conditioning_of_other_families_is_the_same_compiled_and_not(case):
+    """Of one family of each way: others differ in layers alone."""
+    if not isinstance(case.estimator, MaskedFlow | MixtureLikelihood):
+        pytest.skip("it shares the code of conditioning with a family that is tested")
+    assert_same_compiled_and_not(case)
+
+
+def assert_same_compiled_and_not(case: Case) -> None:
+    """The posterior of X is the same, whether each operation is a program or all are one."""
     eager = case.network.condition(X, BOX)
     theta = np.stack([BOX.centre, BOX.low, BOX.high])
     np.testing.assert_allclose(

@@ -1,5 +1,7 @@
 """Posterior: a density truncated to a box, in either space, against closed forms."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,8 +35,12 @@ def posterior(density: GaussianMixture, space: Space = SPACE, box: Support = BOX
     return _truncated(density, density, box, space)
 
 
-POSTERIOR = posterior(gaussian(MU, np.diag(SD**2)))
-"""Independent in inference space: a truncated log-normal rate, and a truncated normal shift."""
+@functools.cache
+def plain() -> Posterior:
+    """In inference space: a truncated log-normal rate, and a truncated normal shift."""
+    return posterior(gaussian(MU, np.diag(SD**2)))
+
+
 LOW, HIGH = np.asarray(BOX.low, float), np.asarray(BOX.high, float)
 LAWS = [stats.truncnorm(*((np.array([LOW[d], HIGH[d]]) - MU[d]) / SD[d]), MU[d], SD[d]) for d in range(2)]
 MASS = np.prod([np.diff(stats.norm(MU[d], SD[d]).cdf([LOW[d], HIGH[d]]))[0] for d in range(2)])
@@ -60,13 +66,13 @@ def grid(low, high) -> tuple[np.ndarray, float]:
 
 def test_the_mass_inside_is_the_densitys():
     tolerance = 5 * np.sqrt(MASS * (1 - MASS) / MASS_DRAWS)
-    assert float(POSTERIOR.mass_inside) == pytest.approx(MASS, abs=tolerance)
+    assert float(plain().mass_inside) == pytest.approx(MASS, abs=tolerance)
     assert 0.5 < MASS < 0.95  # a posterior wholly inside would say nothing
 
 
 def test_the_density_is_one_in_all_in_inference_space():
     theta, area = grid(LOW, HIGH)
-    log_prob = np.asarray(POSTERIOR.log_prob(theta, space="inference"), float)
+    log_prob = np.asarray(plain().log_prob(theta, space="inference"), float)
     assert np.exp(log_prob).sum() * area == pytest.approx(1, abs=0.02)
     expected = LAWS[0].logpdf(theta[..., 0]) + LAWS[1].logpdf(theta[..., 1])
     np.testing.assert_allclose(log_prob, expected, atol=0.02)  # the truncation constant is a Monte Carlo estimate
@@ -75,7 +81,7 @@ def test_the_density_is_one_in_all_in_inference_space():
 def test_the_density_is_one_in_all_in_natural_units():
     """Not so, by a factor of up to e^1.5, without the Jacobian of the logarithm."""
     theta, area = grid([np.exp(LOW[0]), LOW[1]], [np.exp(HIGH[0]), HIGH[1]])
-    log_prob = np.asarray(POSTERIOR.log_prob(theta), float)
+    log_prob = np.asarray(plain().log_prob(theta), float)
     assert np.exp(log_prob).sum() * area == pytest.approx(1, abs=0.02)
     rate = theta[..., 0].astype(float)
     expected = LAWS[0].logpdf(np.log(rate)) - np.log(rate) + LAWS[1].logpdf(theta[..., 1])
@@ -84,23 +90,23 @@ def test_the_density_is_one_in_all_in_natural_units():
 
 def test_outside_of_the_support_there_is_nothing():
     inside = jnp.array([1.0, 0.0])
-    assert np.isfinite(POSTERIOR.log_prob(inside)) and np.isfinite(POSTERIOR.log_prob(inside, space="inference"))
+    assert np.isfinite(plain().log_prob(inside)) and np.isfinite(plain().log_prob(inside, space="inference"))
     for outside in ([5.0, 0.0], [1.0, 2.6], [0.0, 0.0], [-1.0, 0.0]):  # the last two have no logarithm
-        assert np.isneginf(POSTERIOR.log_prob(jnp.array(outside)))
+        assert np.isneginf(plain().log_prob(jnp.array(outside)))
     for outside in ([1.6, 0.0], [0.0, -2.1]):
-        assert np.isneginf(POSTERIOR.log_prob(jnp.array(outside), space="inference"))
-    mixed = POSTERIOR.log_prob(jnp.array([[1.0, 0.0], [-1.0, 0.0]]))
+        assert np.isneginf(plain().log_prob(jnp.array(outside), space="inference"))
+    mixed = plain().log_prob(jnp.array([[1.0, 0.0], [-1.0, 0.0]]))
     np.testing.assert_array_equal(np.isfinite(mixed), [True, False])
 
 
 def test_gradients_at_places_without_a_logarithm_are_no_nan():
-    gradient = jax.grad(lambda theta: POSTERIOR.log_prob(theta))
+    gradient = jax.grad(lambda theta: plain().log_prob(theta))
     assert np.isfinite(gradient(jnp.array([1.2, 0.4]))).all()
 
 
 def test_draws_have_the_density_in_either_space(key):
-    inner = sampled(POSTERIOR, jax.random.clone(key), "inference")
-    natural = sampled(POSTERIOR, key)
+    inner = sampled(plain(), jax.random.clone(key), "inference")
+    natural = sampled(plain(), key)
     np.testing.assert_allclose(natural, np.stack([np.exp(inner[:, 0]), inner[:, 1]], axis=1), rtol=1e-5)
     assert ((inner > LOW) & (inner < HIGH)).all()
     assert len(np.unique(inner, axis=0)) == 4000
@@ -110,7 +116,7 @@ def test_draws_have_the_density_in_either_space(key):
 
 @pytest.mark.parametrize("n", [1, 7])
 def test_draws_are_as_many_as_were_asked_for(n, key):
-    assert POSTERIOR.sample(key, n).shape == (n, 2)
+    assert plain().sample(key, n).shape == (n, 2)
 
 
 @pytest.mark.parametrize("distance", [3.0, 8.0, 30.0])
@@ -128,7 +134,7 @@ def test_where_next_to_nothing_is_inside_draws_are_the_truncated_mixtures(distan
 
 
 def test_the_mean_is_the_closed_form_in_either_space():
-    inner, natural = np.asarray(POSTERIOR.mean(space="inference")), np.asarray(POSTERIOR.mean())
+    inner, natural = np.asarray(plain().mean(space="inference")), np.asarray(plain().mean())
     errors = [5 * law.std() / np.sqrt(MASS_DRAWS) for law in LAWS]
     for d in range(2):
         assert inner[d] == pytest.approx(LAWS[d].mean(), abs=errors[d])
@@ -159,7 +165,7 @@ def test_a_maximum_on_a_bound_of_a_logarithm_has_a_density(bound):
     """Its logarithm, rounded twice, may lie beyond the bound: of many bounds, about half did."""
     for offset in np.linspace(0.0, 0.1, 40):
         box = Support([-1.0 - offset, -2.0], [1.5 + offset, 2.5])
-        one = POSTERIOR.replace(support=box)
+        one = plain().replace(support=box)
         corner = SPACE.to_natural(jnp.stack([box.low, box.high])[bound])
         assert np.isfinite(one.log_prob(corner))
         outside = corner * jnp.array([0.99999 if bound == 0 else 1.00001, 1.0])
@@ -170,7 +176,7 @@ def test_a_maximum_on_a_bound_of_a_logarithm_has_a_density(bound):
 
 def test_below_the_lower_bound_of_many_decades_there_is_no_density():
     """A rounding of the upper bound is larger than the lower one."""
-    wide = POSTERIOR.replace(support=Support([-10.0, -2.0], [20.0, 2.5]))
+    wide = plain().replace(support=Support([-10.0, -2.0], [20.0, 2.5]))
     low = float(np.exp(-10.0))
     assert np.isfinite(wide.log_prob(jnp.array([1.001 * low, 0.5])))
     assert np.isneginf(wide.log_prob(jnp.array([0.999 * low, 0.5])))
@@ -178,8 +184,8 @@ def test_below_the_lower_bound_of_many_decades_there_is_no_density():
 
 def test_maxima_in_natural_units_and_in_inference_space_differ():
     """Of a log-normal: exp(mu - sigma^2) over the parameter, exp(mu) over its logarithm."""
-    np.testing.assert_allclose(POSTERIOR.map(), [np.exp(MU[0] - SD[0] ** 2), MU[1]], rtol=5e-3)
-    np.testing.assert_allclose(POSTERIOR.map(space="inference"), MU, atol=5e-3)
+    np.testing.assert_allclose(plain().map(), [np.exp(MU[0] - SD[0] ** 2), MU[1]], rtol=5e-3)
+    np.testing.assert_allclose(plain().map(space="inference"), MU, atol=5e-3)
 
 
 def test_the_highest_of_two_modes_is_taken():
@@ -194,7 +200,7 @@ def test_the_highest_of_two_modes_is_taken():
 
 def test_another_support_truncates_anew(key):
     narrow = Support([0.0, 0.0], [1.0, 2.0])
-    moved = POSTERIOR.on(narrow)
+    moved = plain().on(narrow)
     assert moved.space == SPACE and moved.support is narrow
     inner = sampled(moved, key, "inference")
     for d in range(2):
@@ -206,17 +212,17 @@ def test_another_support_truncates_anew(key):
 
 
 def test_it_is_a_pytree_that_can_be_compiled_and_mapped(key):
-    leaves, structure = jax.tree.flatten(POSTERIOR)
+    leaves, structure = jax.tree.flatten(plain())
     assert all(isinstance(leaf, jax.Array) for leaf in leaves)
     again = jax.tree.unflatten(structure, leaves)
     theta = jnp.array([[1.0, 0.2], [0.7, -1.0]])
-    np.testing.assert_array_equal(again.log_prob(theta), POSTERIOR.log_prob(theta))
+    np.testing.assert_array_equal(again.log_prob(theta), plain().log_prob(theta))
     other = posterior(gaussian([-0.2, 0.0], np.diag([0.1, 0.4])))
-    both = jax.tree.map(lambda *parts: jnp.stack(parts), POSTERIOR, other)
+    both = jax.tree.map(lambda *parts: jnp.stack(parts), plain(), other)
     log_prob = jax.jit(jax.vmap(lambda p: p.log_prob(theta)))(both)
     keys = jax.random.split(key)
     draws = jax.jit(jax.vmap(lambda p, k: p.sample(k, 7)))(both, jax.random.clone(keys))
-    for i, one in enumerate((POSTERIOR, other)):
+    for i, one in enumerate((plain(), other)):
         np.testing.assert_allclose(log_prob[i], one.log_prob(theta), rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(draws[i], one.sample(keys[i], 7), rtol=1e-4, atol=1e-4)
 
@@ -224,22 +230,22 @@ def test_it_is_a_pytree_that_can_be_compiled_and_mapped(key):
 def test_wrong_arguments_are_refused(key):
     for wrong in (0.5, jax.random.split(key), None):
         with pytest.raises(ValueError, match=r"^key: expected one key such as jax.random.key\(0\), or a seed, got"):
-            POSTERIOR.sample(wrong, 7)
+            plain().sample(wrong, 7)
     for wrong in (0, -1, 2.5, "3"):
         with pytest.raises(ValueError, match=r"^n: expected a whole number of at least 1, got"):
-            POSTERIOR.sample(jax.random.key(0), wrong)
+            plain().sample(jax.random.key(0), wrong)
     for wrong in (jnp.ones(3), jnp.ones((4, 1)), 1.0):
         with pytest.raises(ValueError, match=r"^theta: expected shape \[..., 2\], got"):
-            POSTERIOR.log_prob(wrong)
-    for call in (POSTERIOR.mean, POSTERIOR.map, lambda space: POSTERIOR.sample(jax.random.key(0), 7, space)):
+            plain().log_prob(wrong)
+    for call in (plain().mean, plain().map, lambda space: plain().sample(jax.random.key(0), 7, space)):
         with pytest.raises(ValueError, match=r"^space: expected 'natural' or 'inference', got 'log'"):
             call("log")
 
 
 def test_lists_and_numpy_are_taken_as_they_are():
-    expected = POSTERIOR.log_prob(jnp.array([1.0, 0.5]))
+    expected = plain().log_prob(jnp.array([1.0, 0.5]))
     for theta in ([1.0, 0.5], (1, 0.5), np.array([1.0, 0.5])):
-        np.testing.assert_allclose(POSTERIOR.log_prob(theta), expected, rtol=1e-6)
+        np.testing.assert_allclose(plain().log_prob(theta), expected, rtol=1e-6)
 
 
 class Ramp:

@@ -1,6 +1,7 @@
 """Moments, quantiles, marginals and conditionals of a posterior: closed forms, quadrature and plain rejection."""
 
 import contextlib
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +22,9 @@ from tests import strategies
 NAMES = ("a", "b", "c")
 PLAIN, LOGS = Space(NAMES, (False,) * 3), Space(NAMES, (True, False, True))
 MIXTURE = GaussianMixture(
-    logits=jnp.log(jnp.array([0.7, 0.3])),
-    means=jnp.array([[0.2, -0.3, 0.5], [-0.6, 0.8, 0.1]]),
-    scale_tril=jnp.array(
+    logits=jnp.asarray(np.log([0.7, 0.3]), jnp.float32),
+    means=jnp.asarray([[0.2, -0.3, 0.5], [-0.6, 0.8, 0.1]]),
+    scale_tril=jnp.asarray(
         [[[0.5, 0, 0], [0.4, 0.3, 0], [-0.2, 0.3, 0.4]], [[0.3, 0, 0], [-0.5, 0.4, 0], [0.1, 0.1, 0.6]]], jnp.float32
     ),
 )
@@ -36,7 +37,10 @@ def posterior(mixture=MIXTURE, box=BOX, space=PLAIN) -> Posterior:
     return _truncated(mixture, mixture, box, space)
 
 
-CUT = posterior()
+@functools.cache
+def cut() -> Posterior:
+    """The mixture in that box."""
+    return posterior()
 
 
 def components(mixture: GaussianMixture) -> list[tuple[float, np.ndarray, np.ndarray]]:
@@ -61,7 +65,7 @@ def drawn() -> np.ndarray:
 
 def test_the_box_cuts_much_off(drawn):
     assert 0.4 < len(drawn) / 2_000_000 < 0.6
-    assert float(CUT.mass_inside) == pytest.approx(len(drawn) / 2_000_000, abs=0.003)
+    assert float(cut().mass_inside) == pytest.approx(len(drawn) / 2_000_000, abs=0.003)
 
 
 @pytest.mark.parametrize("space", [PLAIN, LOGS], ids=["plain", "logs"])
@@ -133,14 +137,14 @@ def test_a_marginal_of_three_integrates_the_joint_density():
     for low, high in zip(np.asarray(BOX.low), np.asarray(BOX.high), strict=True):
         grid.append(low + (high - low) * (np.arange(cells) + 0.5) / cells)
     theta = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1)
-    joint = np.exp(np.asarray(CUT.log_prob(theta.astype(np.float32)), float))
+    joint = np.exp(np.asarray(cut().log_prob(theta.astype(np.float32)), float))
     widths = np.asarray(BOX.width, float) / cells
     for names, axes in ((("a",), (1, 2)), (("c", "a"), (1,))):
         kept = [NAMES.index(name) for name in names]
         expected = joint.sum(axis=axes) * widths[list(axes)].prod()
         expected = expected if len(kept) == 1 else expected.T
         points = np.stack(np.meshgrid(*(grid[d] for d in kept), indexing="ij"), axis=-1).astype(np.float32)
-        marginal = CUT.marginal(names)
+        marginal = cut().marginal(names)
         np.testing.assert_allclose(np.exp(marginal.log_prob(points)), expected, rtol=0.05, atol=0.01)
         assert marginal.space.names == names and marginal.support.low.tolist() == [float(BOX.low[d]) for d in kept]
 
@@ -159,7 +163,9 @@ def test_a_marginals_draws_and_statistics_are_those_of_the_whole(key):
     moved = marginal.on(Support([0.0, -0.5], [0.5, 0.5]))
     whole = logs.on(Support([-0.5, -1.0, 0.0], [0.5, 0.6, 0.5]))
     np.testing.assert_allclose(moved.mean(), np.asarray(whole.mean())[[2, 0]], rtol=1e-5)
-    np.testing.assert_allclose(CUT.marginal(NAMES).log_prob([0.1, 0.2, 0.3]), CUT.log_prob([0.1, 0.2, 0.3]), rtol=1e-5)
+    np.testing.assert_allclose(
+        cut().marginal(NAMES).log_prob([0.1, 0.2, 0.3]), cut().log_prob([0.1, 0.2, 0.3]), rtol=1e-5
+    )
 
 
 def test_a_conditional_is_the_slice_of_the_joint_density():
@@ -191,7 +197,7 @@ def test_a_conditional_of_a_gaussian_is_the_textbooks():
 
 def test_conditional_and_marginal_commute():
     points = jnp.array([[-0.2], [0.0], [0.4]])
-    one, other = CUT.marginal(["a", "b"]).conditional(b=0.1), CUT.conditional(b=0.1).marginal("a")
+    one, other = cut().marginal(["a", "b"]).conditional(b=0.1), cut().conditional(b=0.1).marginal("a")
     np.testing.assert_allclose(one.log_prob(points), other.log_prob(points), atol=1e-5)
     np.testing.assert_allclose(one.quantile([0.1, 0.6]), other.quantile([0.1, 0.6]), atol=1e-5)
 
@@ -248,7 +254,7 @@ def flow(space=PLAIN) -> Posterior:
     """The mixture behind another class of densities, as a flow's posterior is."""
     each = jax.tree.map(lambda leaf: leaf[None], MIXTURE)
     density = EnsembleDensity(each, jnp.zeros(3), jnp.ones(3), jnp.zeros(1))
-    return jax.jit(truncated, static_argnums=3)(density, MIXTURE, BOX, space)
+    return _truncated(density, MIXTURE, BOX, space)
 
 
 def test_without_a_closed_form_statistics_are_of_draws(drawn):
@@ -288,7 +294,7 @@ def test_only_a_prior_that_is_zero_in_places_stands_in_the_way(drawn):
     under = lambda cut: jax.jit(lambda mixture: truncated(mixture, mixture, BOX, PLAIN, Everywhere(cut)))(MIXTURE)
     points = jnp.array([[0.1], [0.3]])
     np.testing.assert_allclose(
-        under(False).marginal("b").log_prob(points), CUT.marginal("b").log_prob(points), atol=1e-3
+        under(False).marginal("b").log_prob(points), cut().marginal("b").log_prob(points), atol=1e-3
     )
     assert under(False).conditional(b=0.0).prior is None
     with pytest.raises(ValueError, match=r"got a mixture of 2 Gaussians under a prior$"):
@@ -301,28 +307,28 @@ def test_only_a_prior_that_is_zero_in_places_stands_in_the_way(drawn):
 def test_wrong_arguments_are_refused():
     for level in (1.5, [-0.1, 0.5], float("nan")):
         with pytest.raises(ValueError, match=r"^level: expected numbers from 0 to 1, got"):
-            CUT.quantile(level)
+            cut().quantile(level)
     for mass in (0.0, 1.0, 2.0):
         with pytest.raises(ValueError, match=r"^mass: expected a number between 0 and 1, got"):
-            CUT.interval(mass)
+            cut().interval(mass)
     for names in ("d", [], ["a", "a"], 3, -1):
         with pytest.raises(ValueError, match=r"^names: expected some of \['a', 'b', 'c'\], each once, got"):
-            CUT.marginal(names)
+            cut().marginal(names)
     with pytest.raises(ValueError, match=r"^b: expected a value inside the support, -1 to 0.6, got 0.7"):
-        CUT.conditional(b=0.7)
+        cut().conditional(b=0.7)
     with pytest.raises(ValueError, match=r"^conditional: expected some of .*, not all, got 3"):
-        CUT.conditional(a=0.0, b=0.0, c=0.0)
+        cut().conditional(a=0.0, b=0.0, c=0.0)
     with pytest.raises(ValueError, match=r"^names: expected some of"):
-        CUT.conditional()
+        cut().conditional()
     with pytest.raises(ValueError, match=r"^conditional: expected one number for each name, got"):
         posteriors._numbers({"b": "much"})  # before that, the hints refuse it here
 
 
 def test_statistics_can_be_compiled_and_mapped():
     other = posterior(MIXTURE.affine(jnp.ones(3), jnp.full(3, 0.1)))
-    both = jax.tree.map(lambda *parts: jnp.stack(parts), CUT, other)
+    both = jax.tree.map(lambda *parts: jnp.stack(parts), cut(), other)
     found = jax.jit(jax.vmap(lambda one: (one.mean(), one.quantile(0.9), one.marginal("b").std())))(both)
-    for i, one in enumerate((CUT, other)):
+    for i, one in enumerate((cut(), other)):
         np.testing.assert_allclose(found[0][i], one.mean(), rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(found[1][i], one.quantile(0.9), rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(found[2][i], one.std()[1:2], rtol=1e-4, atol=1e-5)
@@ -338,7 +344,7 @@ def test_a_posterior_shows_a_line_for_each_parameter():
     many = Space(tuple(f"p{d}" for d in range(30)), (False,) * 30)
     wide = GaussianMixture(jnp.zeros(1), jnp.zeros((1, 30)), jnp.eye(30)[None])
     assert len(repr(posterior(wide, Support([-5.0] * 30, [5.0] * 30), many)).splitlines()) == 22
-    assert repr(CUT.marginal("a")).startswith("Marginal of a: a marginal of a mixture of 2 Gaussians")
-    both = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), CUT)
+    assert repr(cut().marginal("a")).startswith("Marginal of a: a marginal of a mixture of 2 Gaussians")
+    both = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), cut())
     assert repr(both) == "Posterior of a, b, c; bounds [2, 3]" and both._repr_html_() is None
-    assert "Traced" not in str(jax.eval_shape(lambda one: one.mean(), CUT))
+    assert "Traced" not in str(jax.eval_shape(lambda one: one.mean(), cut()))

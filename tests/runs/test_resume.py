@@ -17,7 +17,7 @@ from tests.small import FLAGS, SETTINGS, TASK, command, gaussian, read_ledger, w
 
 ARGUMENTS = ("infer", TASK, "--support", "misspecified", *FLAGS, "--seeds", "2", "--out")
 """One program for all tests; what is killed has two runs, and so two of some files."""
-MORE = 6
+MORE = SETTINGS.rounds + 2
 """Rounds that finished runs are given: for all of them, as each number is a program."""
 
 
@@ -151,9 +151,9 @@ def test_a_finished_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
     assert len(before["theta"]) == 4 and before["settled"][-1]
     lines = (out / "ledger.jsonl").read_text()
     shutil.copytree(out, tmp_path / "killed")
-    assert command("resume", out, "--rounds", MORE, "--no-figures") == 0
+    assert command("resume", out, "--rounds", 6, "--no-figures") == 0
     after = atomic.read_arrays(out / "history.npz")
-    assert len(after["theta"]) == MORE and (after["attempted"] > 0).all() and not after["settled"].any()
+    assert len(after["theta"]) == 6 and (after["attempted"] > 0).all() and not after["settled"].any()
     for name in before.keys() - {"settled", "names", "reasons"}:
         if not name.startswith("final_"):
             assert after[name][:4].tobytes() == before[name].tobytes(), name
@@ -161,21 +161,21 @@ def test_a_finished_run_goes_on_for_more_rounds(tmp_path, monkeypatch, capsys):
         assert rows[: len(made[name])].tobytes() == made[name].tobytes(), name
     assert len(rows) > 0 and (out / "ledger.jsonl").read_text().startswith(lines)
     config = json.loads((out / "config.json").read_text())
-    assert config["status"] == "finished" and config["settings"]["rounds"] == MORE
+    assert config["status"] == "finished" and config["settings"]["rounds"] == 6
     assert config["extended"] == [{"rounds": 9, "min_rounds": 4, "made": 4}]
     with monkeypatch.context() as patch:
         kill_at(patch, 4, midway=False)
         with pytest.raises(Killed):
-            command("resume", tmp_path / "killed", "--rounds", MORE, "--no-figures")
+            command("resume", tmp_path / "killed", "--rounds", 6, "--no-figures")
     assert command("resume", tmp_path / "killed", "--no-figures") == 0
     for name in ("posterior.npz", "dataset.npz"):
         assert_same_arrays(out / name, tmp_path / "killed" / name)
     capsys.readouterr()
-    assert command("resume", out, "--simulations", 20 * MORE) == 2
+    assert command("resume", out, "--simulations", 20 * 6) == 2
     assert "error: simulations: expected more than the 120 of" in capsys.readouterr().err
-    for rounds, message in ((MORE, "expected more than the 6 of"), (0, "expected more than the 6 of")):
+    for rounds in (6, 0):
         assert command("resume", out, "--rounds", rounds) == 2
-        assert f"error: rounds: {message}" in capsys.readouterr().err
+        assert "error: rounds: expected more than the 6 of" in capsys.readouterr().err
     shutil.rmtree(out / "checkpoint")  # as earlier versions and run.save leave it
     assert command("resume", out, "--rounds", 8) == 2
     assert "error: rounds: expected a run with" in capsys.readouterr().err
@@ -188,12 +188,12 @@ def test_a_total_of_simulations_becomes_the_rounds_it_takes(tmp_path, capsys):
     made = int(atomic.read_arrays(tmp_path / "rounds" / "history.npz")["succeeded"].sum())
     per_round = SETTINGS.simulations_per_round
     wanted = made + per_round + 1
-    executing.extend(tmp_path / "rounds", rounds=SETTINGS.rounds + 2)
+    executing.extend(tmp_path / "rounds", rounds=MORE)
     executing.extend(tmp_path / "simulations", simulations=wanted)
     configs = [folders.read_config(tmp_path / name)["settings"] for name in ("rounds", "simulations")]
     assert configs[0] == configs[1]
     run = jaxlfi.resume(tmp_path / "python", gaussian(), simulations=wanted)
-    assert int(run.dataset.size) >= wanted > made and run.settings.rounds == SETTINGS.rounds + 2
+    assert int(run.dataset.size) >= wanted > made and run.settings.rounds == MORE
     np.testing.assert_array_equal(jaxlfi.resume(tmp_path / "rounds", gaussian()).draws(), run.draws())
     np.testing.assert_array_equal(jaxlfi.resume(tmp_path / "python", gaussian()).draws(), run.draws())  # it is complete
     size = int(run.dataset.size)

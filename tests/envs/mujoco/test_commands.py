@@ -40,7 +40,7 @@ truth = 1.5
 angle = 0.002
 """
 
-FLAGS = [*small.FLAGS, "--rounds", 1]
+FLAGS = [*small.FLAGS, "--rounds", 1, "--no-predictive"]
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ def task():
                        noises={"angle": NOISE})  # fmt: skip
 
 
-def exact(task, low, high, points=60):
+def exact(task, low, high, points=30):
     """Mean and covariance over (ln damping, gear) by the likelihood of white noise on a grid."""
     axes = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
