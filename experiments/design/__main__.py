@@ -1,7 +1,7 @@
 """Does the experiment that is chosen tell most, and is a ridge named that no experiment breaks?
 
     python -m experiments.design --out experiments/results/design
-    python -m experiments.design --out experiments/results/design --problems times starts --truths 40
+    python -m experiments.design --out experiments/results/design --problems times starts --seed 7100
     python -m experiments.design --out experiments/results/design --tables    # only the tables
 
 For each truth, drawn anew, the nominal experiment is made first. Its posterior is exact: the likelihood is known, and
@@ -14,6 +14,9 @@ intervals are, whether they hold the truth, and which designs they were.
     load    the same, and a load of known mass may be fastened to the arm's end
     times   Lotka-Volterra: at which ten times both populations are counted
     starts  Lotka-Volterra: how many predators and prey are released
+    furuta  a Furuta pendulum in MuJoCo: three chirps, against three of an expert's and three at random
+    belt    a cart on an elastic belt in MuJoCo: the same
+    queue   M/G/1: how many jobs are served before the queue is emptied, by a regression in place of posteriors
 """
 
 import argparse
@@ -25,7 +28,7 @@ from jaxlfi.io import compile_cache
 if __name__ == "__main__":  # before jax starts
     compile_cache.enable()
 
-from experiments.design import tables
+from experiments.design import queue, tables
 from experiments.design.comparison import measured
 from experiments.design.problems import PROBLEMS
 from jaxlfi.io import files
@@ -42,7 +45,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--truths", type=int, default=TRUTHS, metavar="N")
     parser.add_argument("--seed", type=int, default=SEED, metavar="N")
-    parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=PROBLEMS)
+    parser.add_argument("--problems", nargs="+", default=[*PROBLEMS, "queue"], choices=[*PROBLEMS, "queue"])
     parser.add_argument("--tables", action="store_true", help="only make the tables anew")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -51,7 +54,11 @@ def main() -> None:
         config = json.loads(path.read_text()) if path.exists() else {}
         config[name] = {"truths": arguments.truths, "seed": arguments.seed} | environment()
         files.write_json(path, config)
-        measured(PROBLEMS[name], arguments.truths, arguments.seed, arguments.out / f"{name}.npz")
+        kept = arguments.out / f"{name}.npz"
+        if name == "queue":
+            queue.measured(arguments.truths, arguments.seed, kept)
+        else:
+            measured(PROBLEMS[name], arguments.truths, arguments.seed, kept)
     files.write_bytes(arguments.out / "table.md", tables.table(arguments.out, PROBLEMS).encode())
 
 

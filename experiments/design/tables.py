@@ -62,7 +62,31 @@ def ridges(folder: Path, names: Iterable[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def queue(folder: Path) -> str:
+    """Widths of a queue's parameters by how many jobs are served before it is emptied, and what is chosen."""
+    kept = np.load(folder / "queue.npz")
+    alone, width = kept["width"][0], kept["width"][1:]
+    lines = [
+        "| second experiment | service min | service width | arrival rate | product | truths held |",
+        "|---|---|---|---|---|---|",
+    ]
+
+    def row(what: str, ratio: np.ndarray, held: np.ndarray) -> str:
+        cells = " | ".join(f"{one:.2f}" for one in np.exp(np.log(ratio).mean(axis=0)))
+        return f"| {what} | {cells} | {np.exp(np.log(ratio).sum(axis=1).mean()):.2f} | {held.mean():.0%} |"
+
+    for jobs, own, held in zip(kept["jobs"], width, kept["held"][1:], strict=True):
+        what = f"{jobs:g} job{'s' if jobs > 1 else ''} each" if jobs < kept["jobs"][-1] else f"{jobs:g} jobs in one go"
+        lines.append(row(what, (own / alone)[None], held))
+    for place, what in enumerate(("chosen", RANDOM)):
+        low, middle, high = np.quantile(kept["second"][:, place], [0.1, 0.5, 0.9])
+        jobs = f"{what}, {middle:.0f} [{low:.0f}, {high:.0f}] jobs"
+        lines.append(row(jobs, kept["second_width"][:, place] / alone, kept["second_held"][:, place]))
+    return "\n".join(lines) + "\n"
+
+
 def table(folder: Path, names: Iterable[str]) -> str:
-    """All of them, of those problems that have been measured."""
+    """All of them, of what has been measured."""
     there = [name for name in names if (folder / f"{name}.npz").exists()]
-    return "\n".join([widths(folder, there), ridges(folder, there)])
+    parts = [widths(folder, there), ridges(folder, there)]
+    return "\n".join(parts + ([queue(folder)] if (folder / "queue.npz").exists() else []))
