@@ -4,6 +4,8 @@
     python -m experiments.design --out experiments/results/design --problems times starts --seed 7100
     python -m experiments.design --out experiments/results/design --tables    # only the tables
 
+Truths of another seed are added to those that are there.
+
 For each truth, drawn anew, the nominal experiment is made first. Its posterior is exact: the likelihood is known, and
 importance sampling or tempered particles find it, so that what is measured is the choice of designs and not a network.
 From this posterior `jaxlfi.design` chooses the next experiments; they are made, as are the nominal one again and
@@ -52,7 +54,7 @@ def main() -> None:
     for name in [] if arguments.tables else arguments.problems:
         path = arguments.out / "config.json"
         config = json.loads(path.read_text()) if path.exists() else {}
-        config[name] = {"truths": arguments.truths, "seed": arguments.seed} | environment()
+        config.setdefault(name, []).append({"truths": arguments.truths, "seed": arguments.seed} | environment())
         files.write_json(path, config)
         kept = arguments.out / f"{name}.npz"
         if name == "queue":

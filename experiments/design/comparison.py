@@ -86,13 +86,20 @@ def chosen_for(
 def measured(problem: Problem, truths: int, seed: int, path: Path) -> None:
     """Write widths [truths, 1 + arms, D] of 90 % intervals, and whether the truth is inside, truth by truth.
 
-    Of the first experiment alone, and with each arm: the chosen ones and their rivals.
+    Of the first experiment alone, and with each arm: the chosen ones and their rivals. Truths are added to those that
+    are there, of another seed.
+
+    Raises:
+        ValueError: for a seed whose truths are there.
     """
     task, rng = problem.task(), np.random.default_rng(seed)
-    found: dict[str, list] = {}
+    there = files.read_arrays(path) if path.exists() else {}
+    found = {name: list(values) for name, values in there.items() if name != "arms"}
     for number in range(truths):
         keys = jax.random.split(jax.random.key(seed + number), 3)
         truth = task.truth * SPREAD ** rng.uniform(-1, 1, task.dim)
+        if any(np.allclose(truth, other) for other in found.get("truth", [])):
+            raise ValueError(f"seed: expected another one, as {path} has the truths of {seed}")
         inner = np.asarray(task.space.to_inference(truth))
         nominal = np.array([task.design.nominal])
         first = recorded_at(keys[0], task, truth, nominal)

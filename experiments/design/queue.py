@@ -2,10 +2,12 @@
 
 Its likelihood is not known, so what stands for a posterior is a regression of the parameters on the summaries of two
 experiments, the nominal one and a second: quadratic in their logarithms, and trained at each design on simulations of
-truths such as the study's. An interval is 1.645 standard deviations of the residuals either way, on simulations that the
-regression has not seen; how many truths those hold is counted.
+truths such as the study's. An interval is 1.645 standard deviations of the residuals either way, on simulations that
+the regression has not seen; how many truths those hold is counted.
 """
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -34,10 +36,16 @@ def truths(rng: np.random.Generator, task: Task, count: int) -> np.ndarray:
 
 def summaries(key: jax.Array, task: Task, theta: np.ndarray, jobs: float) -> np.ndarray:
     """Logarithms of the summaries of an experiment at each of some truths, shape [N, S]."""
-    one = lambda key, theta, design: task.summary(task.simulate.function(key, theta, design))
-    single = (jnp.asarray(theta, jnp.float32), jnp.asarray([jobs], jnp.float32))
-    x = jax.jit(jax.vmap(one, (0, 0, None)))(jax.random.split(key, len(theta)), *single)
+    x = _summarised(task)(
+        jax.random.split(key, len(theta)), jnp.asarray(theta, jnp.float32), jnp.asarray([jobs], jnp.float32)
+    )
     return np.log(np.maximum(np.asarray(x, float), 1e-3))
+
+
+@functools.lru_cache
+def _summarised(task: Task) -> Callable:
+    one = lambda key, theta, design: task.summary(task.simulate.function(key, theta, design))
+    return jax.jit(jax.vmap(one, (0, 0, None)))
 
 
 def features(x: np.ndarray, centre: np.ndarray, scale: np.ndarray) -> np.ndarray:
