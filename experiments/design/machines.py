@@ -53,7 +53,7 @@ BELT = """
 """
 
 
-def furuta() -> Task:
+def furuta(step: float = STEP, duration: float = DURATION) -> Task:
     """The example's pendulum, with the example's noise and truth; the pendulum may be let go from anywhere below."""
     spec = mujoco.MjSpec.from_file(str(EXAMPLES / "furuta.xml"))
     parameters = [
@@ -66,7 +66,7 @@ def furuta() -> Task:
         "initial": {"pendulum/qpos": [-1.0, 1.0]},
         "limits": {"arm angle": [-2.0, 2.0]},
     }
-    return _task(spec, parameters, {"arm angle": 0.002, "pendulum angle": 0.002}, table)
+    return _task(spec, parameters, {"arm angle": 0.002, "pendulum angle": 0.002}, table, step, duration)
 
 
 def belt() -> Task:
@@ -84,10 +84,17 @@ def belt() -> Task:
     return _task(mujoco.MjSpec.from_string(BELT), parameters, {"place": 0.0005}, table)
 
 
-def _task(spec: mujoco.MjSpec, parameters: list[Parameter], noise: dict[str, float], table: dict[str, Any]) -> Task:
+def _task(
+    spec: mujoco.MjSpec,
+    parameters: list[Parameter],
+    noise: dict[str, float],
+    table: dict[str, Any],
+    step: float = STEP,
+    duration: float = DURATION,
+) -> Task:
     """Of one experiment of a model."""
-    spec.option.timestep = STEP
-    times = INTERVAL * np.arange(round(DURATION / INTERVAL) + 1)
+    spec.option.timestep = step
+    times = INTERVAL * np.arange(round(duration / INTERVAL) + 1)
     rest = Log(times, {name: np.zeros(len(times)) for name in ("motor", *noise)})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # nothing has been recorded yet
