@@ -61,7 +61,7 @@ def main() -> None:
             queue.measured(arguments.truths, arguments.seed, kept)
         else:
             measured(PROBLEMS[name], arguments.truths, arguments.seed, kept)
-    files.write_bytes(arguments.out / "table.md", tables.table(arguments.out, PROBLEMS).encode())
+    files.write_bytes(arguments.out / "table.md", tables.table(arguments.out).encode())
 
 
 if __name__ == "__main__":

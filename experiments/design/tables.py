@@ -10,6 +10,8 @@ from jaxlfi.diagnostics.bootstrap import bootstrap_interval
 ARMS = ("chosen", "nominal again", "at random", "at random")
 """Of arrays that do not say so."""
 RANDOM = "at random"
+ORDER = ("arm", "load", "times", "starts", "furuta", "belt")
+"""Of problems."""
 
 
 def arms_of(kept: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -85,8 +87,8 @@ def queue(folder: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def table(folder: Path, names: Iterable[str]) -> str:
+def table(folder: Path) -> str:
     """All of them, of what has been measured."""
-    there = [name for name in names if (folder / f"{name}.npz").exists()]
+    there = [name for name in ORDER if (folder / f"{name}.npz").exists()]
     parts = [widths(folder, there), ridges(folder, there)]
     return "\n".join(parts + ([queue(folder)] if (folder / "queue.npz").exists() else []))

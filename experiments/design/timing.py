@@ -74,7 +74,6 @@ def main() -> None:
     found = {
         "load": in_jax(arms.arm(True)),
         "times": in_jax(designed.times()),
-        "starts": in_jax(designed.starts()),
         "furuta": on_host(machines.furuta(step=0.002, duration=3.0)),
     }
     for name, row in found.items():
