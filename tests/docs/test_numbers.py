@@ -853,7 +853,11 @@ def test_design():
     assert f"after {len(furuta['truth'])} truths" in page("design")
     products = np.prod(furuta["width"][:, 1:3] / furuta["width"][:, 3:], axis=2)
     said = " and ".join(f"{one:.2f}" for one in np.exp(np.log(products).mean(axis=0)))
+    again = arrays("design/furuta_coverage")["held"].mean(axis=(0, 2, 3))
+    assert f"{again[0]:.0%}, {again[1]:.0%} and {again[2]:.0%} do" in page("design")
     assert f"{said} of random's for chosen and expert" in page("design")
+    index = f"leave {np.exp(np.log(products[:, 0]).mean()):.2f} times the product of random ones' widths"
+    assert f"{index}, of {len(products)} truths" in page("index")
     queue = kept["queue"]
     assert (np.argmin(queue["width"][1:].prod(axis=1)), queue["jobs"][-1]) == (len(queue["jobs"]) - 1, 60)
     assert f"chosen for all {len(queue['second'])} truths" in page("design") and queue["second"][:, 0].min() > 59.5
