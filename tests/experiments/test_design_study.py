@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from experiments.design import importance, laplace, queue, tables, tempered
 from jaxlfi.distributions.support import Support
@@ -128,27 +127,6 @@ def test_experiments_of_experts_and_at_random_are_safe():
             assert np.abs(task.design.response(natural, design)[:, :, 0]).max() <= 2.0
     strongest = np.array([0.06, 0.2, 3.0, 0.0])
     assert np.abs(task.design.response(natural, strongest)[:, :, 0]).max() > 2.0  # the limit does matter
-
-
-def test_a_cart_on_a_belt_moves_as_two_masses_and_a_spring():
-    """Without friction, by SciPy; the model's own steps are of a hundredth of a second."""
-    pytest.importorskip("mujoco")
-    from experiments.design import machines
-
-    task = machines.belt()
-    stiffness, damping, cart, pulley = 1000.0, 3.0, 1.0, 0.4
-    force = lambda t: 5.0 * np.sin(2 * np.pi * (0.5 * t + 0.5 * (2.0 - 0.5) * t**2 / machines.DURATION))
-
-    def slope(t, state):
-        first, second, v_first, v_second = state
-        pull = stiffness * (second - first) + damping * (v_second - v_first)
-        return [v_first, v_second, (force(t) - 2.0 * v_first + pull) / pulley, -pull / cart]
-
-    times = machines.INTERVAL * np.arange(101)
-    exact = solve_ivp(slope, (0, times[-1]), np.zeros(4), t_eval=times, rtol=1e-8, atol=1e-10, max_step=0.01).y[1]
-    found = task.design.response(np.array([[stiffness, damping, cart, 0.0]]), np.array([5.0, 0.5, 2.0]))[0, :, 0]
-    assert np.ptp(exact) > 0.2
-    np.testing.assert_allclose(found, exact, atol=0.06 * np.ptp(exact))
 
 
 def test_tables_compare_with_random(tmp_path: Path):
