@@ -88,7 +88,7 @@ class Played:
             >>> chirp.samples(np.array([0.5, 1.0, 1.0]), np.array([0.0, 0.25, 1.0])).round(3).tolist()
             [0.0, 0.5, -0.0]
         """
-        middle = 0.5 * (self.low + self.high)
+        middle = _centre(self.low, self.high)
         return np.clip(KINDS[self.kind](self, np.asarray(numbers, float), times, middle), self.low, self.high)
 
 
@@ -293,7 +293,11 @@ def _range(model: mujoco.MjModel, name: str) -> tuple[float, float]:
 
 
 def _middle(model: mujoco.MjModel, name: str) -> float:
-    low, high = _range(model, name)
+    return _centre(*_range(model, name))
+
+
+def _centre(low: float, high: float) -> float:
+    """Of a control's range; 0 of one without."""
     return 0.5 * (low + high) if math.isfinite(low) else 0.0
 
 

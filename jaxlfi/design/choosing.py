@@ -19,8 +19,8 @@ STARTS = 0.3
 """Part of them that is spread over all designs."""
 TOLERANCE = 0.05
 """Share of draws for which a chosen experiment may fail, by default."""
-SAFETY_DRAWS = 64
-"""Draws of the posterior, inflated, that safety is judged by."""
+SAFETY_DRAWS, SAFETY_DRAWS_ON_HOST = 64, 32
+"""Draws of the posterior, inflated, that safety is judged by; fewer outside JAX."""
 REFUSED = -1e6
 """What a design that fails too often is worth, and as much less again as it fails."""
 APART = 0.15
@@ -112,8 +112,9 @@ def rate(
     slot: int = 0,
     given: tuple[np.ndarray, ...] | None = None,
     tolerance: float = TOLERANCE,
+    failing: np.ndarray | None = None,
 ) -> Rated:
-    """Rate designs.
+    """Rate designs; those that are refused are not simulated any further.
 
     Args:
         rater: by a method.
@@ -121,18 +122,22 @@ def rate(
         slot: place in a batch, whose noise is its own.
         given: evidence of experiments that will be made besides.
         tolerance: share of draws for which a design may fail; others are refused.
+        failing: that share, where it is known.
     """
     designs = np.asarray(designs, float)
-    value, error = _averages(rater, _given(rater.evidence(designs, slot), given))
-    if given is not None:
-        value = value - _averages(rater, given)[0]
-    failing = failures(rater, designs)
-    return Rated(designs, np.where(failing > tolerance, REFUSED * (1 + failing), value), error, failing)
+    failing = failures(rater, designs) if failing is None else failing
+    value, error = REFUSED * (1 + failing), np.zeros(len(designs))
+    fine = failing <= tolerance
+    if fine.any():
+        value[fine], error[fine] = _averages(rater, _given(rater.evidence(designs[fine], slot), given))
+        if given is not None:
+            value[fine] -= _averages(rater, given)[0]
+    return Rated(designs, value, error, failing)
 
 
 def failures(rater: Rater, designs: np.ndarray) -> np.ndarray:
     """Share of draws of the posterior, inflated, for which designs fail or are unsafe, shape [M]."""
-    draws = rater.regions[0].draws[:SAFETY_DRAWS]
+    draws = rater.regions[0].draws[: SAFETY_DRAWS_ON_HOST if rater.task.on_host else SAFETY_DRAWS]
     key = jax.random.fold_in(jax.random.clone(rater.key), 0x5AFE)
     return 1 - simulated(key, rater.task, draws, designs).fine.mean(axis=1)
 
@@ -164,12 +169,13 @@ def choose(
     """
     task = rater.task
     starts = spread(task, int(np.ceil(STARTS * rated)), rng)
+    failing = _remembered(rater)
     tried: Rated | None = None
     batch: list[Rated] = []
     evidence: list[tuple[np.ndarray, ...]] = []
     for slot in range(count):
         total = _total(evidence)
-        judge = _judge(rater, slot, total, tolerance, advanced)
+        judge = _judge(rater, failing, slot, total, tolerance, advanced)
         first, others = _search(judge, task, starts, rng, rated)
         if tried is None:
             tried = first.joined(others)
@@ -178,7 +184,7 @@ def choose(
         evidence.append(rater.evidence(batch[-1].designs, slot))
     for slot in range(count if count > 1 else 0):
         rest = _total(evidence[:slot] + evidence[slot + 1 :])
-        judge = _judge(rater, slot, rest, tolerance, advanced)
+        judge = _judge(rater, failing, slot, rest, tolerance, advanced)
         found = _climb(judge, task, batch[slot].designs[0], FINER, rated // 3, rng)
         better = _best(found.joined(judge(batch[slot].designs)))
         if not np.array_equal(better.designs, batch[slot].designs):
@@ -216,12 +222,26 @@ def distinct(task: Task, rated: Rated, count: int) -> Iterator[int]:
             return
 
 
-def _judge(rater: Rater, slot: int, given: Any, tolerance: float, advanced: Callable) -> Callable[[np.ndarray], Rated]:
+def _remembered(rater: Rater) -> Callable[[np.ndarray], np.ndarray]:
+    """`failures`, simulated once for each design."""
+    known: dict[bytes, float] = {}
+
+    def failing(designs: np.ndarray) -> np.ndarray:
+        if len(new := [one for one in designs if one.tobytes() not in known]):
+            known.update(zip((one.tobytes() for one in new), failures(rater, np.stack(new)), strict=True))
+        return np.array([known[one.tobytes()] for one in designs])
+
+    return failing
+
+
+def _judge(
+    rater: Rater, failing: Callable, slot: int, given: Any, tolerance: float, advanced: Callable
+) -> Callable[[np.ndarray], Rated]:
     def judge(designs: np.ndarray) -> Rated:
         parts = []
         for first in range(0, len(designs), CHUNK):
-            part = designs[first : first + CHUNK]
-            parts.append(rate(rater, part, slot, given, tolerance))
+            part = np.asarray(designs[first : first + CHUNK], float)
+            parts.append(rate(rater, part, slot, given, tolerance, failing(part)))
             advanced(len(part))
         result = parts[0]
         for other in parts[1:]:

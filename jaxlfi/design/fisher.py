@@ -31,6 +31,8 @@ from jaxlfi.tasks.task import Task
 
 DRAWS, DRAWS_ON_HOST = 64, 16
 """Parameter vectors that a design's information is averaged over, in each region; fewer outside JAX."""
+LEAST_ON_HOST = 4
+"""And in a region of little weight, of which fewer will do."""
 REPEATS = 64
 """Simulations at each of them where the noise is not declared."""
 STEP = 0.1
@@ -53,7 +55,8 @@ class FisherRater:
             parameters.
         criterion: "information" in bits, or "variance": minus the mean of the variances of `about` (or all parameters)
             after it as fractions of those before, which is A-optimality.
-        draws: of each region; by default 64, and 16 outside JAX.
+        draws: of each region; by default 64, and outside JAX 16 of the one of the largest weight, and of others in
+            proportion to theirs, at least 4.
         repeats: simulations at each, where the noise is not declared.
     """
 
@@ -64,6 +67,8 @@ class FisherRater:
     criterion: Criterion = "information"
     draws: int | None = None
     repeats: int = REPEATS
+    _known: dict[tuple[int, bytes], np.ndarray] = dataclasses.field(default_factory=dict, init=False, repr=False)
+    """Matrices outside JAX by region and design: batches rate the same designs several times."""
 
     @property
     def ceiling(self) -> float:
@@ -72,13 +77,13 @@ class FisherRater:
 
     def evidence(self, designs: Float[np.ndarray, "designs k"], slot: int = 0) -> tuple[np.ndarray, ...]:
         """Fisher information of designs in each region, in inference space, zero where a simulation fails."""
-        return tuple(self._matrices(region, designs) for region in self.regions)
+        return tuple(self._matrices(place, designs) for place in range(len(self.regions)))
 
     def precision(
         self, designs: Float[np.ndarray, "designs k"], slot: int = 0
     ) -> Float[np.ndarray, "designs n dim dim"]:
         """The same in the first region: that of the posterior."""
-        return self._matrices(self.regions[0], designs)
+        return self._matrices(0, designs)
 
     def terms(self, evidence: tuple[np.ndarray, ...]) -> list[Float[np.ndarray, "designs n"]]:
         """What designs are worth at each parameter vector, region by region: bits, or minus a share of variance."""
@@ -87,16 +92,26 @@ class FisherRater:
             for region, matrices in zip(self.regions, evidence, strict=True)
         ]
 
-    def _matrices(self, region: Region, designs: np.ndarray) -> np.ndarray:
-        theta = region.draws[: self.draws or (DRAWS_ON_HOST if self.task.on_host else DRAWS)]
+    def _matrices(self, place: int, designs: np.ndarray) -> np.ndarray:
+        region = self.regions[place]
+        theta = region.draws[: self.draws or self._usual(region)]
         steps = STEP * np.sqrt(np.diagonal(region.covariance))
         if self.task.on_host:
-            return np.stack([_on_host(self.task, theta, steps, design) for design in designs])
+            for design in designs:
+                if (place, design.tobytes()) not in self._known:
+                    self._known[place, design.tobytes()] = _on_host(self.task, theta, steps, design)
+            return np.stack([self._known[place, design.tobytes()] for design in designs])
         inner = jnp.asarray(theta, jnp.float32), jnp.asarray(steps, jnp.float32)
         if noise_of(self.task) is not None:
             return in_chunks(lambda part: _declared(self.task, jax.random.clone(self.key), *inner, part), designs)
         keys = jax.random.split(jax.random.clone(self.key), self.repeats)
         return in_chunks(lambda part: _estimated(self.task, jax.random.clone(keys), *inner, part), designs)
+
+    def _usual(self, region: Region) -> int:
+        """Draws of a region."""
+        if not self.task.on_host:
+            return DRAWS
+        return max(round(DRAWS_ON_HOST * region.weight / max(one.weight for one in self.regions)), LEAST_ON_HOST)
 
 
 def worth(

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import design, embedding, misspecification, mujoco_loop, mujoco_sysid, widths
+from experiments import embedding, misspecification, mujoco_loop, mujoco_sysid, widths
 from experiments.benchmarks import accelerators
+from experiments.design import tables
 from experiments.policies import report
 from experiments.policies import results as policies
 from experiments.sharpness import fresh
@@ -864,20 +865,43 @@ def test_the_table_of_observations_unlike_simulations():
 
 
 def test_design():
-    made = design.table(RESULTS / "design")
+    made = tables.table(RESULTS / "design")
     assert made == (RESULTS / "design/table.md").read_text()
     assert all(line in PAGES["design"] for line in made.splitlines())
-    arm, load = (arrays(f"design/{name}") for name in ("arm", "load"))
-    ratio = np.exp(np.log(load["width"][:, 1:] / load["width"][:, :1]).mean(axis=2))
-    ratio = [np.exp(np.log(part).mean()) for part in (ratio[:, 0], ratio[:, 2:])]
-    assert f"leaves intervals of {ratio[0]:.2f} of the first ones, and {ratio[0] / ratio[1]:.2f} times" in page(
-        "design"
+    kept = {name: arrays(f"design/{name}") for name in ("arm", "load", "times", "starts", "furuta", "queue")}
+    ratio = {name: tables.log_ratios(one) for name, one in kept.items() if name != "queue"}
+    mean = lambda name, arm: float(np.exp(ratio[name][arm].mean()))
+    against = lambda name, arm: float(np.exp((ratio[name][arm] - ratio[name][tables.RANDOM]).mean()))
+    load = f"{mean('load', 'chosen'):.2f} of the first ones, and {against('load', 'chosen'):.2f} times"
+    assert f"leaves intervals of {load}" in page("design")
+    assert f"with a known load the chosen one leaves {against('load', 'chosen'):.2f} times the intervals" in page(
+        "index"
     )
-    assert f"with a known load the chosen one leaves {ratio[0] / ratio[1]:.2f} times the intervals" in page("index")
-    assert f"said to make it at most {arm['reach'].max():.2f} times narrower" in page("design")
-    assert f"expected to become {np.median(load['narrower']):.0f} times narrower" in page("design")
-    held = load["held"][:, 1]
+    assert f"said to make it at most {kept['arm']['reach'].max():.2f} times narrower" in page("design")
+    assert f"expected to become {np.median(kept['load']['narrower']):.0f} times narrower" in page("design")
+    held = kept["load"]["held"][:, 1]
     assert f"90 % intervals is {held.mean():.0%} of {held.size}".replace("0%", "0 %") in page("design")
+    assert f"leaves {against('times', 'chosen'):.2f} times the intervals of random times" in page("design")
+    assert f"{against('starts', 'chosen'):.2f} times those of random ones" in page("design")
+    furuta = kept["furuta"]
+    assert f"after {len(furuta['truth'])} truths" in page("design")
+    products = np.prod(furuta["width"][:, 1:3] / furuta["width"][:, 3:], axis=2)
+    said = " and ".join(f"{one:.2f}" for one in np.exp(np.log(products).mean(axis=0)))
+    again = arrays("design/furuta_coverage")["held"].mean(axis=(0, 2, 3))
+    assert f"{again[0]:.0%}, {again[1]:.0%} and {again[2]:.0%} do" in page("design")
+    assert f"{said} of random's for chosen and expert" in page("design")
+    index = f"leave {np.exp(np.log(products[:, 0]).mean()):.2f} times the product of random ones' widths"
+    assert f"{index}, of {len(products)} truths" in page("index")
+    queue = kept["queue"]
+    assert (np.argmin(queue["width"][1:].prod(axis=1)), queue["jobs"][-1]) == (len(queue["jobs"]) - 1, 60)
+    assert f"chosen for all {len(queue['second'])} truths" in page("design") and queue["second"][:, 0].min() > 59.5
+
+
+def test_time_of_a_choice():
+    found = json.loads((RESULTS / "design/timing.json").read_text())
+    for name in ("load", "times", "furuta"):
+        row = found[name]
+        assert f"| {name} | {row['rated']:.0f} | {row['first']:.0f} s | {row['again']:.1f} s |" in PAGES["design"]
 
 
 def loop_of(name: str) -> dict:

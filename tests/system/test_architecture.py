@@ -256,6 +256,7 @@ ASKED = {
         "jaxlfi.tasks.task": "declares it",
         "jaxlfi.tasks.experiments": "gives a simulator another design, inside of what calls it",
         "jaxlfi.design.simulations": "calls it for one design after another",
+        "jaxlfi.design.choosing": "judges safety by fewer simulations outside JAX",
         "jaxlfi.design.fisher": "differentiates a response outside JAX by differences",
         "jaxlfi.design.contrastive": "knows the likelihood of a response in JAX",
         "jaxlfi.design.recommendation": "asks slower simulators for less",

@@ -108,4 +108,7 @@ def test_what_a_model_does_not_allow_is_refused(design, message):
 def test_an_actuator_without_a_range_needs_bounds():
     with pytest.raises(ValueError, match="amplitude: expected bounds, as the actuator has no ctrlrange"):
         task({}, ARM)
-    assert task({"controls": {"motor": {"amplitude": [0, 2]}}}, ARM).design.high[0] == 2.0
+    own = task({"controls": {"motor": {"amplitude": [0, 2]}}}, ARM)
+    assert own.design.high[0] == 2.0
+    rows = own.design.controls(np.array([1.5, 1.0]))[1]
+    np.testing.assert_allclose(rows[:, 1], 1.5 * np.sin(2 * np.pi * rows[:, 0]), atol=1e-12)

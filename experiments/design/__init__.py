@@ -1,0 +1,1 @@
+"""Does the experiment that `jaxlfi.design` chooses tell most? See `__main__`."""

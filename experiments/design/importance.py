@@ -1,0 +1,97 @@
+"""Exact posteriors of few simulations: importance sampling by normals, whose likelihood is tempered in steps."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from experiments.design.likelihood import log_likelihood
+from jaxlfi.tasks.task import Task
+
+POINTS = 1024
+"""Of a posterior, in each step."""
+FIRST = 8
+"""Times as many are drawn from the box."""
+STEPS = 100
+"""At most."""
+WIDER = 1.5
+"""How many times as wide as a step's draws the next ones are proposed."""
+
+
+def posterior(
+    rng: np.random.Generator,
+    task: Task,
+    recorded: np.ndarray,
+    designs: np.ndarray,
+    before: np.ndarray | None = None,
+    points: int = POINTS,
+    first: int = FIRST * POINTS,
+) -> np.ndarray:
+    """Draws in inference space, shape [N, D].
+
+    Each step weighs draws by as much of the likelihood as leaves a fifth of them effective, and draws the next ones
+    from a normal that is half as wide again, in the box. The first ones are drawn from the box, or where the posterior
+    of some of the recordings is known, from a normal that is half as wide again as that.
+
+    Args:
+        rng: of the draws.
+        task: with a response and noise that are known.
+        recorded: of all experiments, shape [E, T, ...].
+        designs: theirs, shape [E, K].
+        before: draws of the first recording's posterior, where to begin; from the box if not.
+        points: N.
+        first: how many are drawn from the box.
+
+    Raises:
+        RuntimeError: where the whole likelihood is not reached.
+    """
+    box = task.support(None)
+    low, high = np.asarray(box.low, float), np.asarray(box.high, float)
+    of = log_likelihood(task)
+    if before is None:
+        theta, log_proposal = rng.uniform(low, high, (first, len(low))), np.zeros(first)
+    else:
+        theta, log_proposal = _proposed(rng, low, high, points, before, np.full(len(before), 1 / len(before)))
+    power = 0.0
+    for _ in range(STEPS):
+        log = np.concatenate([of(recorded, designs, part).sum(axis=1) for part in _parts(theta, points)])
+        done, power = power, _power(log, log_proposal, len(theta) / 5)
+        weight = _weights(power * log - log_proposal)
+        if power == 1.0 and done == 1.0:
+            return theta[rng.choice(len(theta), points, p=weight)]
+        theta, log_proposal = _proposed(rng, low, high, points, theta, weight)
+    raise RuntimeError(f"{task.name}: expected a posterior after {STEPS} steps, got none")
+
+
+def _proposed(rng: np.random.Generator, low: np.ndarray, high: np.ndarray, points: int, theta, weight):
+    """Draws of the normal that is wider than weighted ones, in the box, and its logarithm there."""
+    mean = weight @ theta
+    centred = theta - mean
+    factor = np.linalg.cholesky(WIDER**2 * (weight[:, None] * centred).T @ centred + 1e-12 * np.eye(len(mean)))
+    kept = np.empty((0, len(mean)))
+    while len(kept) < points:
+        tried = mean + rng.standard_normal((4 * points, len(mean))) @ factor.T
+        kept = np.concatenate([kept, tried[((tried > low) & (tried < high)).all(axis=1)]])
+    theta = kept[:points]
+    return theta, -0.5 * np.sum(np.linalg.solve(factor, (theta - mean).T) ** 2, axis=0)
+
+
+def _parts(theta: np.ndarray, size: int) -> Iterator[np.ndarray]:
+    for first in range(0, len(theta), size):
+        yield theta[first : first + size]
+
+
+def _power(log: np.ndarray, log_proposal: np.ndarray, effective: float) -> float:
+    """How much of the likelihood leaves so many draws effective; all of it where it can."""
+    enough = lambda power: 1 / np.sum(_weights(power * log - log_proposal) ** 2) >= effective
+    if enough(1.0):
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if enough(middle) else (low, middle)
+    return max(low, 1e-6)
+
+
+def _weights(log: np.ndarray) -> np.ndarray:
+    weight = np.exp(log - log.max())
+    return weight / weight.sum()

@@ -1,0 +1,93 @@
+"""A MuJoCo model whose motor plays chirps: a Furuta pendulum."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from jaxlfi.envs.mujoco.logs import Log
+from jaxlfi.envs.mujoco.model_task import mujoco_task
+from jaxlfi.envs.mujoco.parameters import Parameter
+from jaxlfi.tasks.experiments import single
+from jaxlfi.tasks.task import Task
+
+EXAMPLES = Path(__file__).parents[2] / "examples/mujoco"
+DURATION, INTERVAL = 2.0, 0.02
+"""Of a recording, and between its samples, in s."""
+STEP = 0.01
+"""Of the model, in s."""
+SAFE_FOR = 8
+"""Draws of the posterior that an expert's and a random experiment must be safe for."""
+STRENGTHS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.1)
+"""Parts of the largest amplitude that an expert tries, one after another."""
+
+
+def furuta(step: float = STEP, duration: float = DURATION) -> Task:
+    """The example's pendulum, with the example's noise and truth; the pendulum may be let go from anywhere below."""
+    spec = mujoco.MjSpec.from_file(str(EXAMPLES / "furuta.xml"))
+    parameters = [
+        Parameter("joint/pendulum/damping", (2e-5, 2e-2), unit="N m s/rad", log=True, truth=3e-4),
+        Parameter("joint/arm/frictionloss", (0.0, 0.03), unit="N m", truth=0.006),
+        Parameter("body/arm/mass", (0.01, 0.5), unit="kg", log=True, truth=0.09),
+    ]
+    table = {
+        "controls": {"motor": {"kind": "chirp", "amplitude": [0.0, 0.06], "frequency": [0.2, 3.0]}},
+        "initial": {"pendulum/qpos": [-1.0, 1.0]},
+        "limits": {"arm angle": [-2.0, 2.0]},
+    }
+    return _task(spec, parameters, {"arm angle": 0.002, "pendulum angle": 0.002}, table, step, duration)
+
+
+def _task(
+    spec: mujoco.MjSpec,
+    parameters: list[Parameter],
+    noise: dict[str, float],
+    table: dict[str, Any],
+    step: float = STEP,
+    duration: float = DURATION,
+) -> Task:
+    """Of one experiment of a model."""
+    spec.option.timestep = step
+    times = INTERVAL * np.arange(round(duration / INTERVAL) + 1)
+    rest = Log(times, {name: np.zeros(len(times)) for name in ("motor", *noise)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # nothing has been recorded yet
+        return single(mujoco_task(spec, parameters, rest, list(noise), noise, design=table, name=spec.modelname))
+
+
+def experts_and_random(
+    rng: np.random.Generator, task: Task, draws: np.ndarray, experiments: int = 3
+) -> list[tuple[str, np.ndarray]]:
+    """Three chirps of an expert's, and as many at random.
+
+    The expert plays the whole range of frequencies, the lower half and the upper half of it, as strong as is safe,
+    each from rest. Random experiments are uniform among the designs that are safe. Safe is what keeps within the limits
+    for some draws of the posterior.
+    """
+    natural = np.asarray(task.space.to_natural(draws[:SAFE_FOR]), float)
+
+    def fine(design: np.ndarray) -> bool:
+        rows = task.design.response(natural, design)
+        return bool(np.isfinite(rows).all()) and (task.design.safe is None or all(map(task.design.safe, rows)))
+
+    names = list(task.design.names)
+    least, most = (dict(zip(names, map(float, bounds), strict=True)) for bounds in (task.design.low, task.design.high))
+    slow, fast = least["motor frequency first"], most["motor frequency first"]
+    middle = np.sqrt(slow * fast)
+    expert = []
+    for first, last in ((slow, fast), (slow, middle), (middle, fast)):
+        for strength in STRENGTHS:
+            amplitude = strength * most["motor amplitude"]
+            own = {"motor amplitude": amplitude, "motor frequency first": first, "motor frequency last": last}
+            design = np.array([own.get(name, 0.0) for name in names])
+            if fine(design):
+                break
+        expert.append(design)
+    found: list[np.ndarray] = []
+    while len(found) < experiments:
+        design = task.design.of_unit(rng.random(len(names)))
+        if fine(design):
+            found.append(design)
+    return [("expert", np.stack(expert)), ("at random", np.stack(found))]

@@ -1,0 +1,107 @@
+"""Exact posteriors of any shape: particles that are led from the box to the posterior, and moved by differences.
+
+Sequential Monte Carlo with tempered likelihoods (Del Moral, Doucet and Jasra 2006). A particle's move is along the
+difference of two others (ter Braak 2006), which are of the other half of the particles, so that each half is moved by a
+Markov chain whose proposals do not depend on itself (Foreman-Mackey, Hogg, Lang and Goodman 2013).
+"""
+
+import numpy as np
+
+from experiments.design.likelihood import log_likelihood
+from jaxlfi.tasks.task import Task
+
+PARTICLES = 2048
+FIRST = 4
+"""Times as many are drawn from the box."""
+SWEEPS, LAST = 8, 24
+"""Moves of all particles at each temperature, and at the end."""
+EFFECTIVE = 0.5
+"""Part of the particles that is effective after each step."""
+LEAPS = 0.1
+"""Part of the moves that are as long as the difference, from one mode to another."""
+
+
+def posterior(
+    rng: np.random.Generator,
+    task: Task,
+    recorded: np.ndarray,
+    designs: np.ndarray,
+    before: np.ndarray | None = None,
+) -> np.ndarray:
+    """Draws in inference space, shape [N, D].
+
+    Args:
+        rng: of particles and moves.
+        task: with a response and noise that are known.
+        recorded: of all experiments, shape [E, T, ...].
+        designs: theirs, shape [E, K].
+        before: the posterior's draws of the first experiment, where they are known already; from the box if not.
+    """
+    box, of = task.support(None), log_likelihood(task)
+    low, high = np.asarray(box.low, float), np.asarray(box.high, float)
+    known = 0 if before is None else 1
+
+    def parts(theta: np.ndarray) -> np.ndarray:
+        """Logarithms of what is known already and of what is added, shape [2, N]."""
+        log = of(recorded, designs, theta)
+        inside = ((theta > low) & (theta < high)).all(axis=1)
+        found = np.stack([log[:, :known].sum(axis=1), log[:, known:].sum(axis=1)])
+        return np.where(inside, found, -np.inf)
+
+    if before is None:
+        theta = rng.uniform(low, high, (FIRST * PARTICLES, len(low)))
+        log = np.concatenate([parts(part) for part in np.split(theta, FIRST)], axis=1)
+    else:
+        theta = before[rng.permutation(len(before))]
+        log = parts(theta)
+    power = 0.0
+    while power < 1.0:
+        step = _step(log[1], 1.0 - power, EFFECTIVE * PARTICLES)
+        power += step
+        chosen = _systematic(rng, _weights(step * log[1]), PARTICLES)
+        theta, log = theta[chosen], log[:, chosen]
+        for _ in range(SWEEPS if power < 1.0 else LAST):
+            theta, log = _moved(rng, parts, theta, log, power)
+    return theta
+
+
+def _moved(rng: np.random.Generator, parts, theta: np.ndarray, log: np.ndarray, power: float):
+    """Both halves moved once, by differences within the other."""
+    order = rng.permutation(len(theta))
+    theta, log = theta[order].copy(), log[:, order].copy()
+    half, dim = len(theta) // 2, theta.shape[1]
+    for own, other in ((slice(0, half), slice(half, None)), (slice(half, None), slice(0, half))):
+        pairs = np.argsort(rng.random((half, 12)), axis=1)[:, :2]  # two of a dozen random ones
+        dozen = rng.integers(half, size=(half, 12))
+        first, second = (theta[other][dozen[np.arange(half), pairs[:, i]]] for i in (0, 1))
+        scale = 2.38 / np.sqrt(2 * dim) * np.exp(rng.uniform(np.log(0.2), np.log(1.2), (half, 1)))
+        scale = np.where(rng.random((half, 1)) < LEAPS, 1.0, scale)
+        tried = theta[own] + scale * (first - second)
+        new = parts(tried)
+        gain = (new[0] - log[0, own]) + power * (new[1] - log[1, own])
+        taken = np.log(rng.random(half)) < gain
+        theta[own] = np.where(taken[:, None], tried, theta[own])
+        log[:, own] = np.where(taken, new, log[:, own])
+    return theta, log
+
+
+def _step(log: np.ndarray, most: float, effective: float) -> float:
+    """The next part of the likelihood, which leaves so many particles effective."""
+    enough = lambda step: 1 / np.sum(_weights(step * log) ** 2) >= effective
+    if enough(most):
+        return most
+    low, high = -30.0, np.log(most)
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if enough(np.exp(middle)) else (low, middle)
+    return float(np.exp(low))
+
+
+def _systematic(rng: np.random.Generator, weights: np.ndarray, count: int) -> np.ndarray:
+    points = (np.arange(count) + rng.random()) / count
+    return np.minimum(np.searchsorted(np.cumsum(weights), points), len(weights) - 1)
+
+
+def _weights(log: np.ndarray) -> np.ndarray:
+    weight = np.exp(log - log.max())
+    return weight / weight.sum()

@@ -1,0 +1,145 @@
+"""The study of designs: its posteriors are those of closed forms, and its rivals keep to the rules."""
+
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.design import importance, laplace, queue, tables, tempered
+from jaxlfi.distributions.support import Support
+from jaxlfi.envs import mg1, mg1_repetitions
+from jaxlfi.tasks.design import Design
+from jaxlfi.tasks.experiments import at
+from jaxlfi.tasks.host import HostSimulator
+from jaxlfi.tasks.task import Task
+
+SIGMA = 0.3
+BOX = Support([-9.0, -9.0], [9.0, 9.0])
+
+
+def rows(design, numpy=jnp):
+    """What is measured of two parameters, in three directions about the chosen one, [3, 2]."""
+    angles = design[0] + numpy.asarray([0.0, 0.1, 0.2])
+    return numpy.stack([numpy.cos(angles), 2 * numpy.sin(angles)], axis=-1)
+
+
+def linear() -> Task:
+    return Task(
+        lambda key, theta, design: rows(design) @ theta + SIGMA * jax.random.normal(key, (3,)),
+        ["a", "b"],
+        {"guess": BOX},
+        BOX,
+        design=Design({"angle": (0.0, 3.0)}, response=lambda theta, design: rows(design) @ theta, noise=SIGMA),
+    )
+
+
+def linear_on_host() -> Task:
+    clean = lambda theta, design: (theta @ rows(design, np).T)[:, :, None]
+    simulate = lambda rng, theta, design: clean(theta, design) + SIGMA * rng.standard_normal((len(theta), 3, 1))
+    return Task(
+        HostSimulator(simulate),
+        ["a", "b"],
+        {"guess": BOX},
+        BOX,
+        design=Design({"angle": (0.0, 3.0)}, response=clean, noise=SIGMA),
+    )
+
+
+@pytest.mark.parametrize(
+    ("sampler", "task"),
+    [
+        (importance.posterior, linear),
+        (tempered.posterior, linear),
+        (functools.partial(importance.posterior, points=1024), linear_on_host),
+        (laplace.posterior, linear_on_host),
+    ],
+    ids=["importance", "tempered", "on host", "laplace"],
+)
+def test_posteriors_are_those_of_the_closed_form(sampler, task):
+    """Of one recording, which leaves a ridge, and of two, from the box and from the first one's posterior."""
+    task, rng = task(), np.random.default_rng(0)
+    designs = np.array([[0.3], [1.6]])
+    matrix = np.stack([rows(design, np) for design in designs])
+    recorded = matrix @ np.array([1.0, -0.5]) + SIGMA * rng.standard_normal((2, 3))
+    shaped = recorded if not task.on_host else recorded[:, :, None]
+    first = sampler(rng, task, shaped[:1], designs[:1])
+    for draws, used in ((first, 1), (sampler(rng, task, shaped, designs, first), 2)):
+        stacked = matrix[:used].reshape(-1, 2) / SIGMA
+        covariance = np.linalg.inv(stacked.T @ stacked)
+        mean = covariance @ stacked.T @ recorded[:used].ravel() / SIGMA
+        deviation = np.sqrt(np.diagonal(covariance))
+        assert deviation.max() < 2.2  # the box does not matter
+        np.testing.assert_allclose(draws.mean(axis=0), mean, atol=0.35 * deviation.max())
+        np.testing.assert_allclose(draws.std(axis=0) / deviation, 1.0, atol=0.2)
+
+
+def test_both_halves_of_a_mixture_are_found():
+    """The sign of the parameter is not measured: half of the particles stay on either side."""
+    box = Support([-3.0], [3.0])
+    response = lambda theta, design: theta**2 * design
+    task = Task(
+        lambda key, theta, design: response(theta, design) + 0.1 * jax.random.normal(key, (1,)),
+        ["a"],
+        {"guess": box},
+        box,
+        design=Design({"gain": (0.5, 2.0)}, response=response, noise=0.1),
+    )
+    draws = tempered.posterior(np.random.default_rng(1), task, np.full((1, 1), 4.0), np.array([[1.0]]))
+    assert 0.35 < np.mean(draws > 0) < 0.65
+    np.testing.assert_allclose(np.abs(draws).mean(), 2.0, atol=0.01)
+    assert 0.02 < np.abs(draws).std() < 0.03  # 0.1 / (2 * 2)
+
+
+def test_a_queue_that_is_never_emptied_is_the_one_without_a_design():
+    one_go = at(mg1_repetitions.task(), [mg1_repetitions.COST])
+    times, kind = one_go.simulate(jax.random.key(3), jnp.array([1.0, 4.0, 0.2]))
+    jobs = mg1.draw_jobs(jax.random.key(3), jnp.array([1.0, 5.0, 0.2]), mg1_repetitions.COST)
+    np.testing.assert_allclose(times, mg1.interdeparture_times(*jobs), rtol=1e-4)
+    assert kind.tolist() == [2.0] + [1.0] * (mg1_repetitions.COST - 1)
+
+
+def test_intervals_of_a_regression_are_the_residuals():
+    rng = np.random.default_rng(0)
+    theta = rng.standard_normal((20_000, 2))
+    x = np.stack([theta[:, 0] + 0.5 * rng.standard_normal(20_000), theta[:, 1]], axis=1)
+    found = queue.Regression(x, theta)
+    left = np.sqrt(0.5**2 / (1 + 0.5**2))
+    assert found.widths[0] == pytest.approx(2 * 1.645 * left, rel=0.03) and found.widths[1] < 0.1
+    assert found.held[0] == pytest.approx(0.9, abs=0.01)
+    np.testing.assert_allclose(found.mean(np.array([[1.0, 0.5]])), [[0.8, 0.5]], atol=0.05)
+
+
+def test_experiments_of_experts_and_at_random_are_safe():
+    pytest.importorskip("mujoco")
+    from experiments.design import machines
+
+    task, rng = machines.furuta(), np.random.default_rng(0)
+    inner = np.asarray(task.space.to_inference(task.truth))
+    draws = inner + 0.01 * rng.standard_normal((16, 3)) * np.array([1.0, 0.001, 1.0])
+    arms = dict(machines.experts_and_random(rng, task, draws))
+    assert {name: designs.shape for name, designs in arms.items()} == {"expert": (3, 4), "at random": (3, 4)}
+    natural = np.asarray(task.space.to_natural(draws[:8]), float)
+    for designs in arms.values():
+        for design in designs:
+            assert np.abs(task.design.response(natural, design)[:, :, 0]).max() <= 2.0
+    strongest = np.array([0.06, 0.2, 3.0, 0.0])
+    assert np.abs(task.design.response(natural, strongest)[:, :, 0]).max() > 2.0  # the limit does matter
+
+
+def test_tables_compare_with_random(tmp_path: Path):
+    """Chosen ones half as wide in each of two parameters: a quarter of the product."""
+    width = np.ones((5, 4, 2)) * np.array([1.0, 0.2, 0.3, 0.4])[:, None]
+    np.savez(
+        tmp_path / "made.npz",
+        width=width,
+        held=np.ones((5, 4, 2), bool),
+        arms=np.array(["chosen", "expert", "at random"]),
+        reach=np.ones(5),
+        narrower=np.ones(5),
+    )
+    lines = tables.widths(tmp_path, ["made"]).splitlines()
+    assert lines[2] == "| made | 5 | chosen | 0.20 [0.20, 0.20] | 0.50 times | 0.25 [0.25, 0.25] | 100% of 10 |"
+    assert lines[3].startswith("| made | 5 | expert | 0.30 [0.30, 0.30] | 0.75 times | 0.56 [0.56, 0.56] |")
