@@ -64,20 +64,20 @@ examples:
 DIAGNOSE_EXAMPLES = """\
 Truths are drawn from the run's own posterior and from the prior over a support, and simulated; the run's method then
 infers a posterior for each. If the run had one round and kept its network (--method npe, or --rounds 1
---keep-network), the network gives it at once. Otherwise the whole inference is repeated for each truth, side by side
-in chunks that are saved as they end, which takes about as long as that many runs. Repeating the command continues an
-interrupted one. A failed check does not change the exit status, 0.
+--keep-network), the network is evaluated once per truth. Otherwise the whole inference is repeated for each truth, in
+parallel, which takes about as long as that many runs. Chunks are saved as they finish, and repeating the command
+continues an interrupted one. The exit status is 0 even if checks fail.
 
 widths of each parameter's intervals, at each reference:
-  honest        90 % intervals held 90 % of the truths, and are known to be of the right width to within 1.5
-  too narrow    they held fewer; the number is how many times as wide they would have to be. too wide: more
+  calibrated    90 % intervals covered 90 % of the truths, and their width is known to be right to within 1.5
+  too narrow    they covered fewer; the number says how many times as wide they would have to be. too wide: more
   biased        truths lie to one side of the intervals' medians
   undecided     too few truths to tell
-  At the posterior: is the method honest where this run ended up? Over a support: for objects of all kinds?
+  At the posterior: is the method calibrated near this run's result? Over a support: for all kinds of objects?
 
 checks, over a support:
   rank          of each truth among its draws, by parameter (simulation-based calibration)
-  coverage      how often the densest region of a level holds the truth; around random points (TARP)
+  coverage      how often the densest region of a level contains the truth; around random points (TARP)
   classifier    accuracy of a classifier that separates truths from draws, given the simulation
   predictive    whether the run's own observation looks like simulations of its own posterior
 verdicts:

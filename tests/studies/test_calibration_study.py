@@ -100,7 +100,7 @@ def results(out) -> dict[str, dict]:
 
 NAMES = ("rank of first", "rank of second", "coverage of densest regions", "coverage from random points (TARP)")
 CASES = {
-    "exact": ((1.0,), ("ok", "ok", "ok", "ok"), ("honest", "honest")),
+    "exact": ((1.0,), ("ok", "ok", "ok", "ok"), ("calibrated", "calibrated")),
     "narrow": ((0.4,), (OVER, OVER, OVER, OVER), ("too narrow", "too narrow")),
     "wide": ((2.5,), (UNDER, UNDER, UNDER, UNDER), ("too wide", "too wide")),
     "shifted": (
@@ -457,8 +457,8 @@ def test_at_the_posterior_alone_only_what_holds_there_is_asked(folder, tmp_path,
     assert command("diagnose", folder, *asked) == 0
     assert list(results(out)) == ["posterior predictive"]
     (widths,) = json.loads((out / "diagnostics.json").read_text())["widths"]
-    # Two lines say that 20 truths do not tell, or what even they show; none that intervals are honest.
-    assert "honest" not in {row["verdict"] for row in widths["found"][:2]}
+    # Two lines say that 20 truths do not tell, or what even they show; none that intervals are calibrated.
+    assert "calibrated" not in {row["verdict"] for row in widths["found"][:2]}
     assert "At this run's posterior (20 truths drawn from it)" in capsys.readouterr().out
     arrays = atomic.read_arrays(out / "diagnostics.npz")
     assert "ranks" not in arrays and arrays["widths_held"].shape == (1, 2, 2, 3)
