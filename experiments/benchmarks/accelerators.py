@@ -113,7 +113,7 @@ def predicted(found: Iterable[Part]) -> dict[str, float]:
 def table(saved: dict[str, Any]) -> str:
     """The table of the page."""
     lines = [
-        "| program | sequential steps | GFLOP | GB | kernels | predicted, s | waits for | without launches, s |",
+        "| program | sequential steps | GFLOP | GB | kernels | predicted, s | limited by | without launches, s |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, found in saved["programs"].items():
