@@ -40,7 +40,7 @@ class Settings(Checked):
         default=0,
         low=0,
         high=100_000,
-        help="rounds after which a run may end once its posterior has settled; 0: make all rounds",
+        help="smallest number of rounds; the run then ends once its posterior has settled; 0: always run all rounds",
     )
     simulations_per_round: int = option(
         default=100, low=1, high=100_000_000, help="largest number of valid simulations added per round"
@@ -59,7 +59,7 @@ class Settings(Checked):
         default=0.0, low=0.0, high=1.0, help="fraction of proposals drawn from the prior over the support"
     )
     inflation: Float[Array, "*batch"] | float = hyperparameter(
-        default=1.0, low=1.0, high=100.0, help="width of the proposals, in widths of the posterior"
+        default=1.0, low=1.0, high=100.0, help="width of the proposals, relative to the posterior"
     )
     predictive: bool = option(
         default=True, help="simulate 20 draws of each round's posterior and compare them with the observation"

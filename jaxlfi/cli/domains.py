@@ -10,10 +10,10 @@ if TYPE_CHECKING:
 DOMAINS = """\
 domains:
   RUN             the posterior of a finished run (jaxlfi infer): low-variance draws of its mixture, clipped to Phi, or
-                  to the run's support where that was fixed
-  uniform         uniform over the environment's first support, Theta_0 (PPO-U); uniform:NAME over another
+                  to the run's support if it was fixed
+  uniform         uniform over the environment's first support, Theta_0 (PPO-U); uniform:NAME over another one
   median          the environment's nominal point (PPO-mu)
-  point:X,Y,...   a point of your own, in natural units
+  point:X,Y,...   a single point, in natural units
 """
 """For `--help`."""
 

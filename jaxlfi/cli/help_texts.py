@@ -1,8 +1,8 @@
-"""What `--help` says below the flags."""
+"""The part of `--help` below the flags."""
 
 GLOSSARY = """\
 names and symbols:
-  support         Theta, the box the parameters are drawn from; it is what the heuristics adapt
+  support         Theta, the box that parameters are drawn from; heuristics adapt it
   feasible        Phi, the limits that no adapted support leaves
 """
 """The part of the glossary in `--help` that is not made from the heuristics' hyperparameters."""
@@ -33,9 +33,8 @@ examples:
 """
 
 COMPARE_EXAMPLES = """\
-A configuration is SUPPORT (kept fixed) or SUPPORT+HEURISTIC. All configurations and seeds run side by side;
-the same seed means the same observation in all of them. All make the same number of rounds, whether their
-posteriors have settled or not.
+A configuration is SUPPORT (kept fixed) or SUPPORT+HEURISTIC. All configurations and seeds run in parallel, with the
+same observation for the same seed, and with the same number of rounds, whether or not their posteriors settle.
 
 examples:
   jaxlfi compare lotka_volterra --seeds 10 --out runs/comparison
@@ -44,8 +43,8 @@ examples:
 """
 
 GRID_EXAMPLES = """\
-Every combination of values is run with every seed, side by side in chunks that fit the memory; the same seed means
-the same observation in all of them. Hyperparameters on no axis keep the paper's values, or those of their flags.
+Every combination of values is run with every seed, in parallel, in chunks that fit into memory; the same seed means
+the same observation in all of them. Hyperparameters that do not vary keep the values of their flags, or the defaults.
 
 examples:
   jaxlfi grid lotka_volterra --support misspecified --out runs/edge-grid \\
@@ -56,7 +55,7 @@ examples:
 
 RESUME_EXAMPLES = """\
 examples:
-  jaxlfi resume runs/edge                        finish what was interrupted; the result is bit-for-bit the same
+  jaxlfi resume runs/edge                        finish an interrupted run; the result is bit-for-bit the same
   jaxlfi resume runs/edge --simulations 3000     continue until the run has 3,000 simulations in all
   jaxlfi resume runs/edge --rounds 30            continue to 30 rounds in all
 """

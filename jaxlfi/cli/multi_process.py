@@ -30,7 +30,7 @@ def add_flags(command: argparse.ArgumentParser) -> None:
     hosts.add_argument(
         "--coordinator",
         metavar="HOST:PORT",
-        help="address that process 0 listens on; auto: ask Slurm, Open MPI or Kubernetes for it and for the process id",
+        help="address that process 0 listens on; auto: get it and the process id from Slurm, Open MPI or Kubernetes",
     )
     hosts.add_argument("--process-id", type=int, metavar="I", help="index of this process, from 0")
     hosts.add_argument("--processes", type=int, metavar="N", help="number of processes")

@@ -95,7 +95,7 @@ class Estimator(Checked, abc.ABC):
         default=math.inf,
         above=0.0,
         high=math.inf,
-        help="largest norm of a gradient, to which longer ones are clipped; inf: no clipping",
+        help="gradients are clipped to this norm; inf: no clipping",
     )
     components: int = option(default=4, low=1, high=1_000_000, help="number K of Gaussians in each network's mixture")
     ensemble_size: int = option(default=1, low=1, high=1_000_000, help="number of networks in the ensemble")
@@ -104,12 +104,12 @@ class Estimator(Checked, abc.ABC):
     batch_size: int = option(default=100, low=1, help="simulations per minibatch")
     schedule: str = option(default="constant", choices=tuple(SCHEDULES), help="learning-rate schedule within a round")
     validation: float = option(
-        default=0.0, low=0.0, high=0.9, help="fraction of the data held out for validation, which selects the weights"
+        default=0.0, low=0.0, high=0.9, help="fraction of the data held out for validation, to select the best weights"
     )
     patience: int = option(
-        default=0, low=0, help="epochs without a better validation loss before training stops; 0: it never stops early"
+        default=0, low=0, help="epochs without a better validation loss before training stops; 0: no early stopping"
     )
-    warm_start: bool = option(default=True, help="start each round from the last round's weights, or from new ones")
+    warm_start: bool = option(default=True, help="start each round from the last round's weights instead of new ones")
     loss: str = option(
         default="likelihood",
         choices=tuple(LOSSES),
@@ -119,18 +119,18 @@ class Estimator(Checked, abc.ABC):
     embedding: str = option(
         default="none",
         choices=("none", *EMBEDDINGS),
-        help="network that extracts features from long summaries, trained together with the density",
+        help="network that extracts features from long summaries, trained jointly with the density",
     )
     features: int = option(default=16, low=1, help="number of features that the embedding extracts")
     reduction: str = option(
         default="none",
         choices=("none", "regression", "half"),
-        help="whether networks see what regressions predict: none, all of them, or half",
+        help="which networks see predictions of regressions: none, all (regression) or half",
     )
     record_size: int = option(
         default=0,
         low=0,
-        help="numbers per record of the summary (channels of a series, length of a trial); 0: the task's",
+        help="numbers per record of the summary (channels of a series, length of a trial); 0: as the task says",
     )
 
     closed_form: ClassVar[bool] = False

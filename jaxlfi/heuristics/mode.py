@@ -42,7 +42,7 @@ class Mode(Heuristic):
     )
     mass_threshold: Value = hyperparameter(
         default=0.05,
-        help="weight of the modes that move towards a bound, above which the bound moves",
+        help="total weight of the modes moving towards a bound, above which the bound moves",
         symbol="tau",
         low=0,
         high=1,
