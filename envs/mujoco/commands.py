@@ -121,8 +121,8 @@ def task_of(run: Run) -> Task:
     """
     if run.task is None:
         raise ValueError(
-            f"run: expected to find its task, {run.origin.reference or 'which was made in Python'}: "
-            "where paths are relative, go to the folder that the run was made in"
+            f"run: cannot find its task, {run.origin.reference or 'which was made in Python'}: if paths are "
+            "relative, change to the folder that the run was made in"
         )
     return run.task
 

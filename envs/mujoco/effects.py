@@ -103,7 +103,7 @@ def effects(
     for d, (name, support, tie) in enumerate(zip(names, supports, tied, strict=True)):
         kind, _, rest = name.partition("/")
         if kind in ("sensor", "initial", "control", "clock", "option") and tie not in (None, "shared"):
-            raise ValueError(f"parameters: {name!r}: tie: expected shared, as the model has no numbers of them")
+            raise ValueError(f"parameters: {name!r}: tie: expected shared, as the model has no values of them to scale")
         if kind == "sensor":
             what, several = _of_sensor(rest, name, signals)
             found[what] += [(signal, d) for signal in several]

@@ -300,7 +300,7 @@ def environment(config: Path) -> MujocoEnvironment:
     """
     table = tables.load(config)
     if "policy" not in table:
-        raise ValueError(f"{config}: expected a table [policy] that says what policies are to do, got none")
+        raise ValueError(f"{config}: expected a table [policy], which defines the control task, got none")
     policy = table["policy"]
     if not isinstance(wanted := policy.get(goals.MODEL_ERROR, False), bool):
         raise ValueError(f"{config}: policy: {goals.MODEL_ERROR}: expected true or false, got {wanted!r}")

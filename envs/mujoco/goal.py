@@ -174,7 +174,7 @@ class Goal:
             raise ValueError(f"observed: expected at least one signal, each once, got {list(self.observed)}")
         if not 0 < self.interval <= self.duration < math.inf:
             raise ValueError(
-                f"interval: expected one of more than 0 s, and at most the duration, got {self.interval:g} s "
+                f"interval: expected more than 0 s and at most the duration, got {self.interval:g} s "
                 f"and {self.duration:g} s"
             )
         if not self.targets and self.reward is None and not self.alive:
@@ -287,9 +287,9 @@ def _target(name: str, table: Any) -> Target:
     where = f"policy: targets: {name}"
     known = {"value", "command", "weight", "within"}
     if not isinstance(table, dict) or set(table) - known or ("value" in table) == ("command" in table):
-        raise ValueError(f"{where}: expected value or command, and weight, within where they matter, got {table!r}")
+        raise ValueError(f"{where}: expected keys value or command, and optionally weight and within, got {table!r}")
     if not isinstance(command := table.get("command", ""), str):
-        raise ValueError(f"{where}: command: expected the name of one, got {command!r}")
+        raise ValueError(f"{where}: command: expected the name of a command, got {command!r}")
     number = lambda key, other: tables.number(table[key], f"{where}: {key}") if key in table else other
     return Target(number("value", command), number("weight", 1.0), number("within", None))
 

@@ -118,8 +118,8 @@ class Residuals:
             )
         if constant := [name for name, own in zip(simulator.signals, self.noise, strict=True) if not own > 0]:
             raise ValueError(
-                "noise: expected standard deviations above 0 of signals that are constant in the recording, "
-                f"got none of {', '.join(constant)}"
+                "noise: expected standard deviations above 0 for signals that are constant in the recording, got "
+                f"none for {', '.join(constant)}"
             )
         self.defect = np.zeros(self.observed.shape)
         self._by_starts: list[tuple[slice, np.ndarray, np.ndarray]] = []

@@ -176,8 +176,8 @@ def _check_increasing(times: np.ndarray, where: str) -> None:
         resolution = float(np.spacing(np.abs(times[np.isfinite(times)]).max(initial=0.0)))
         if np.isfinite(times).all() and resolution > 0.1 * float(np.ptp(times)) / (len(times) - 1):
             raise ValueError(
-                f"{where}: expected times that tell rows apart, got {times.dtype} of about {times[0]:.6g}, which has "
-                f"steps of {resolution:.3g}: save them in double precision, or from the first one on"
+                f"{where}: expected times that distinguish rows, got {times.dtype} of about {times[0]:.6g}, which has "
+                f"steps of {resolution:.3g}: save them in double precision, or relative to the first one"
             )
     if fault := clocks.order(times).fault:
         raise ValueError(f"{where}: expected at least two increasing times, got {fault}")

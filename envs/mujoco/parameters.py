@@ -253,7 +253,8 @@ def check_effect(spec: mujoco.MjSpec, one: Edit, support: tuple[float, float]) -
     if saved(compiled[0]) == saved(compiled[1]):
         raise ValueError(
             f"parameters: {one.name!r}: expected a number that the model depends on: it is the same with "
-            f"{support[0]:g} and {support[1]:g} (another attribute may override it, as an explicit inertial a density)"
+            f"{support[0]:g} and {support[1]:g} (another attribute may override it, as an explicit inertial "
+            "overrides a density)"
         )
 
 

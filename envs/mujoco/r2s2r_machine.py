@@ -165,7 +165,7 @@ def _kept(path: Path) -> Iterator[None]:
             print(f"{error}; the recording ends there")
             return
         where = path if report["recording"] else "nowhere: there was nothing yet"
-        raise RobotError(f"{error}; what was measured until then is in {where}") from error
+        raise RobotError(f"{error}; the measurements until then are in {where}") from error
 
 
 def _informative(path: Path) -> Path:

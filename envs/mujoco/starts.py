@@ -417,7 +417,7 @@ def polynomial(
     series = [_near(*one, at) for one in series]
     away = np.sort(np.abs(series[0][0] - at))
     if len(away) < 2:
-        raise ValueError(f"{where}: expected at least 2 samples to begin an episode by, got {len(away)}")
+        raise ValueError(f"{where}: expected at least 2 samples to estimate the initial state from, got {len(away)}")
     counts = [count for count in COUNTS if count <= len(away)] or [len(away)]
     longest = 0
     before: list[tuple[np.ndarray, np.ndarray]] = []

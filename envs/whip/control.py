@@ -149,9 +149,11 @@ def described(about: Mapping[str, Any]) -> dict[str, Any]:
         ValueError: for what a recording does not have, or has of another type.
     """
     if not isinstance(about, Mapping):
-        raise ValueError(f"robot: expected a mapping as what it says of itself, got {about!r}")
+        raise ValueError(f"robot: expected a mapping as information about itself, got {about!r}")
     if unknown := set(about) - set(ABOUT):
-        raise ValueError(f"robot: expected it to say {', '.join(ABOUT)} of itself, got {', '.join(sorted(unknown))}")
+        raise ValueError(
+            f"robot: expected {', '.join(ABOUT)} as information about itself, got {', '.join(sorted(unknown))}"
+        )
     fields = {"source": "real", "description": "a policy on a robot", **about}
     for name, value in fields.items():
         if name != "camera" and (type(value) is not ABOUT[name] or not _is_json(value)):

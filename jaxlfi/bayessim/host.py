@@ -44,9 +44,7 @@ def engine_for(
     """
     if processes.count > 1:
         if task.on_host:
-            raise ValueError(
-                "processes: expected a simulator in JAX; simulations of others are spread by --workers or --scheduler"
-            )
+            raise ValueError("processes: expected a simulator in JAX; for others use --workers or --scheduler")
         return SharedEngine(task, settings, inputs, processes, first)
     if task.on_host:
         return HostEngine(task, settings, inputs, first, journal)

@@ -38,7 +38,7 @@ def domains_of(environment: "Environment", words: Sequence[str]) -> dict[str, Ca
         alike = lambda n, parts=parts, rivals=rivals: sum(other[-n:] == parts[-n:] for other in rivals) > 1
         own = "-".join(parts[-next((n for n in range(1, len(parts)) if not alike(n)), len(parts)) :])
         if own in names:
-            raise ValueError(f"domain: expected different ones, got {name!r} twice")
+            raise ValueError(f"domain: expected distinct ones, got {name!r} twice")
         names[own] = draw
     return names
 

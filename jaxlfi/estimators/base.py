@@ -153,7 +153,7 @@ class Estimator(Checked, abc.ABC):
         if (self.epochs > 0) == (self.steps > 0):
             raise ValueError(f"epochs, steps: expected one of them above 0, got {self.epochs} and {self.steps}")
         if self.patience and not self.validation:
-            raise ValueError("patience: expected validation above 0 to stop by, got validation=0")
+            raise ValueError("patience: expected validation above 0 for early stopping, got validation=0")
         if self.loss != "likelihood" and self.batch_size < 2:
             raise ValueError(
                 f"batch_size: expected at least 2, as the loss {self.loss!r} compares the simulations of a minibatch, "

@@ -339,7 +339,7 @@ def _info(path: Path) -> dict[str, Any]:
         ) from error
     if major < 3:
         raise ValueError(
-            f"{path}: expected a LeRobot data set of {VERSION}, got {version}: convert it by LeRobot's "
+            f"{path}: expected a LeRobot data set of {VERSION}, got {version}: convert it with LeRobot's "
             "convert_dataset_v21_to_v30"
         )
     if major > 3:
@@ -354,7 +354,7 @@ def _table(path: Path, columns: Sequence[str] | None = None, filters: Any = None
         table.validate()
     except Exception as error:  # pyarrow and the operating system each have their own for a damaged file
         raise ValueError(
-            f"expected a whole Parquet file {path.name} with {columns}, got {files.first_line(error)}"
+            f"expected a complete Parquet file {path.name} with {columns}, got {files.first_line(error)}"
         ) from error
     return table
 
@@ -368,7 +368,7 @@ def _episodes(path: Path) -> dict[int, dict[str, Any]]:
         try:
             names = parquet.read_schema(file).names
         except Exception as error:
-            raise ValueError(f"expected a whole Parquet file {file.name}, got {files.first_line(error)}") from error
+            raise ValueError(f"expected a complete Parquet file {file.name}, got {files.first_line(error)}") from error
         needed += [name for name in ("tasks", COLUMN) if name in names]
         found |= {row["episode_index"]: row for row in _table(file, needed).to_pylist()}
     if not found:

@@ -95,7 +95,7 @@ class Control:
         if self.rate is not None and not 0 < self.rate < math.inf:
             raise ValueError(f"{self.name}: expected a rate of more than 0 per second, got {self.rate:g}")
         if self.displacing and self.rate is None:
-            raise ValueError(f"{self.name}: expected a rate, by which actions displace it at most; got none")
+            raise ValueError(f"{self.name}: expected a rate, which limits its displacement; got none")
 
 
 @dataclasses.dataclass(frozen=True)

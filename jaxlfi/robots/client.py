@@ -204,5 +204,5 @@ class SocketDriver:
 
 def _proof(token: str | None, challenge: Mapping[str, Any]) -> str:
     if token is None:
-        raise RobotError("it asks for a shared token, got none")
+        raise RobotError("it requires a shared token, got none")
     return wire.proof(token, wire.texts({"nonce": [challenge.get("nonce")]}, "nonce")[0])

@@ -168,7 +168,7 @@ class Driven:
             return dict(about)
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"robot: expected a mapping that JSON can hold as what it says of itself, got {str(about)[:60]}"
+                f"robot: expected a mapping for JSON as information about itself, got {str(about)[:60]}"
             ) from error
 
     def observe(self) -> Observation | None:

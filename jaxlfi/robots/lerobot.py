@@ -45,7 +45,7 @@ class LeRobotDriver:
             if missing := [name for name in names if name not in known]:
                 raise ValueError(
                     f"robot: expected {what} among {', '.join(known)} of LeRobot's {self._robot.name}, got "
-                    f"{', '.join(missing)}: say in [robot.names] what it calls them"
+                    f"{', '.join(missing)}: map their names in [robot.names]"
                 )
         self._signals, self._controls = tuple(signals), tuple(controls)
         if not self._robot.is_connected:

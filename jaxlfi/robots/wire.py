@@ -254,5 +254,5 @@ def address(text: str, remote: bool = False) -> tuple[str, int]:
     except OSError as error:
         raise ValueError(f"robot: expected a host, got {host!r}: {error}") from error
     if not (remote or is_local(found)):
-        raise ValueError(f"robot: expected this very host, as 127.0.0.1, got {host!r}; --remote lets other hosts")
+        raise ValueError(f"robot: expected this host, such as 127.0.0.1, got {host!r}; --remote allows others")
     return found, int(port)

@@ -452,7 +452,9 @@ def extend(folder: Path, rounds: int | None = None, simulations: int | None = No
     elif rounds is not None and rounds <= least:
         raise ValueError(f"rounds: expected more than the {max(done, settings.rounds)} of {folder}, got {rounds}")
     if settings.rounds == 1:
-        raise ValueError(f"{what}: expected a run of several rounds, got one, whose network is for any observation")
+        raise ValueError(
+            f"{what}: expected a run of several rounds, got one round, whose network already serves any observation"
+        )
     settled = bool(np.all(rows[-1]["settled"]))
     more = settings.replace(rounds=rounds, min_rounds=0 if settled else settings.min_rounds).check()
     asked = {"rounds": settings.rounds, "min_rounds": settings.min_rounds, "made": done}

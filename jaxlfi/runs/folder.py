@@ -176,7 +176,7 @@ def _require_replaceable(folder: Path) -> None:
     if not workfolder.is_finished(config) or not (folder / "posterior.npz").exists():
         raise StoreError(f"save: expected a finished run to replace, got {str(folder)!r}, which is not")
     if others := sorted(path.name for path in folder.iterdir() if path.name not in OF_RUN):
-        raise StoreError(f"save: expected the folder of a run alone to replace, got {str(folder)!r} with {others[0]!r}")
+        raise StoreError(f"save: expected a folder with only a run to replace, got {str(folder)!r} with {others[0]!r}")
 
 
 def write_table(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:

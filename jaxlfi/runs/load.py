@@ -61,7 +61,7 @@ def load(folder: str | Path, task: Task | None = None) -> Run:
         one = next((run["folder"] for run in config.get("runs", ())), "seed_000")
         raise StoreError(f"{folder}: expected the folder of one run, such as {folder / one}")
     if not workfolder.is_finished(config) or not (folder / "posterior.npz").exists():
-        raise StoreError(f"{folder}: expected a finished run; go on with it by {quoted('jaxlfi', 'resume', folder)}")
+        raise StoreError(f"{folder}: expected a finished run; continue it with {quoted('jaxlfi', 'resume', folder)}")
     try:
         return _read(folder, config, task)
     except StoreError as error:

@@ -56,8 +56,8 @@ class Run(Result):
         """
         if self.settings.rounds != 1:
             raise ValueError(
-                f"posterior_of: expected a run of one round, got one of {self.settings.rounds}, whose network "
-                "has learnt the posterior of its own observation alone: infer with settings.replace(rounds=1), or "
+                f"posterior_of: expected a run of one round, got one of {self.settings.rounds}, whose network has "
+                "only learnt the posterior of its own observation: infer with settings.replace(rounds=1), or "
                 "--method npe"
             )
         if self.network is None:

@@ -61,7 +61,7 @@ class Command:
         except ValueError as error:
             raise ValueError(f"command: expected words as in a shell, got {self.template!r}: {error}") from error
         if not words or shutil.which(words[0]) is None:
-            raise ValueError(f"command: expected a program that can be run first, got {self.template!r}")
+            raise ValueError(f"command: expected an executable program as its first word, got {self.template!r}")
         if Path(words[0]).parent != Path():  # a place, and no name to be looked up: it has to hold in other folders
             words[0] = str(Path(words[0]).absolute())
         used = {field for word in words for field in _FIELD.findall(word)}

@@ -106,7 +106,9 @@ def _next(arrived: queue.SimpleQueue, alive: Callable[[], bool]) -> tuple[int, F
             return arrived.get(timeout=LOOK)
         except queue.Empty:
             if not alive():
-                raise ExecutorError("executor: lost while it simulated (its scheduler does not answer)") from None
+                raise ExecutorError(
+                    "executor: connection lost while simulating (its scheduler does not answer)"
+                ) from None
 
 
 def _submitted(submit: Submit, request: Request) -> Future:

@@ -216,8 +216,8 @@ def _require_own(given: Any, theta: np.ndarray, trajectory: np.ndarray, outcome:
         first = rows.setdefault(place, row) if place is not None else row
         if not np.array_equal(theta[first], theta[row]):
             raise SimulatorError(
-                f"simulate: expected an array of its own for each simulation, got the same one for rows {first} and "
-                f"{row}, with the numbers of the last: append a copy"
+                f"simulate: expected a separate array for each simulation, got the same one for rows {first} and "
+                f"{row}, with the last one's numbers: append a copy"
             )
 
 

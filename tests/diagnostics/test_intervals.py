@@ -77,14 +77,15 @@ def test_faults_are_called_by_name(scale, shift, verdict):
 
 @pytest.mark.slow
 def test_calibrated_posteriors_are_rarely_called_wrong():
-    """None of 4 parameters, with a probability of 94 % at least; most are found calibrated with 100 truths, few with 40."""
+    """None of 4 parameters, with a probability of 94 % at least; most are calibrated with 100 truths, few with 40."""
     found = {count: [check_intervals(*case(seed, 1.0, 0.0, count, 4)) for seed in range(50)] for count in (40, 100)}
     words = {count: [[one.verdict for one in four] for four in of_seeds] for count, of_seeds in found.items()}
     for of_seeds in words.values():
         right = sum(set(four) <= {"calibrated", "undecided"} for four in of_seeds)
         assert right >= scipy.stats.binom.ppf(0.001, 50, 0.94)
     share = {
-        count: np.mean([word == "calibrated" for four in of_seeds for word in four]) for count, of_seeds in words.items()
+        count: np.mean([word == "calibrated" for four in of_seeds for word in four])
+        for count, of_seeds in words.items()
     }
     assert share[40] < 0.2 and share[100] > 0.6
 

@@ -122,7 +122,7 @@ def test_bad_input_is_refused_in_one_line(trained, saved, tmp_path, capsys):
         ([saved, "--out", tmp_path / "x.onnx"], "out: expected a new .npz file"),
         ([saved, "--out", saved], "out: expected a new .npz file"),
         ([saved, "--format", "onnx", "--out", tmp_path / "x.npz"], "out: expected a new .onnx file"),
-        ([tmp_path / "none.npz", "--out", tmp_path / "x.npz"], "expected a whole .npz file"),
+        ([tmp_path / "none.npz", "--out", tmp_path / "x.npz"], "expected a complete .npz file"),
         (
             [broken.save(tmp_path / "broken.npz"), "--out", tmp_path / "x.npz"],
             "deployment in its schema, got one that is",

@@ -252,7 +252,7 @@ def test_what_is_no_number_of_each_signal_is_refused(found, expected, tmp_path):
 def test_what_a_robot_says_of_itself_is_refused_where_it_could_not_be_recorded(tmp_path):
     driver = Wheel()
     driver.connect = lambda signals, controls: {"bus": object()}
-    with pytest.raises(ValueError, match="robot: expected a mapping that JSON can hold as what it says of itself"):
+    with pytest.raises(ValueError, match="robot: expected a mapping for JSON as information about itself"):
         run(driver, tmp_path)
     assert driver.stops == 1 and not list(tmp_path.iterdir())
 

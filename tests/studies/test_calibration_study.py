@@ -312,13 +312,13 @@ def refused(capsys, *arguments) -> str:
 @pytest.mark.slow
 def test_other_settings_need_another_folder(repeated, folder, tmp_path, capsys):
     asked = (folder, "--no-figures", "--out", repeated, "--draws", 20)
-    assert "another truths: take another folder by --out" in refused(capsys, *asked, "--truths", 21)
+    assert "another truths: choose another folder with --out" in refused(capsys, *asked, "--truths", 21)
     assert "another reference" in refused(capsys, *asked, "--truths", 20, "--reference", "posterior,broad")
     out = tmp_path / "out"
     shutil.copytree(repeated, out)
     (out / "box" / "chunks" / "001.npz").write_bytes(b"cut")
     asked = (folder, "--no-figures", "--draws", 20, "--truths", 20, "--out", out)
-    assert "001.npz: expected a whole .npz" in refused(capsys, *asked)
+    assert "001.npz: expected a complete .npz" in refused(capsys, *asked)
     (out / "plan.json").write_text("{")
     assert "plan.json: expected a plan" in refused(capsys, *asked)
     (out / "plan.json").unlink()

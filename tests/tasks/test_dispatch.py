@@ -262,7 +262,7 @@ class Broken(Executor):
 
 
 def test_the_loss_of_an_executor_is_told_apart_from_a_failing_simulation():
-    with pytest.raises(ExecutorError, match=r"^executor: lost while it simulated \(OSError: gone\)$"):
+    with pytest.raises(ExecutorError, match=r"^executor: connection lost while simulating \(OSError: gone\)$"):
         made(one_by_one(troubled(), Broken(OSError("gone"))))
     executor = ThreadPoolExecutor(1)
     executor.shutdown()

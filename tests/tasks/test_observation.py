@@ -223,7 +223,7 @@ def test_arrays_are_read_as_they_are(tmp_path):
         ({"a": np.ones(3), "b": np.ones(3)}, "expected an array called 'trajectory'"),
         ({"trajectory": np.ones(3) + 1j}, "expected numbers or texts, got complex128 as trajectory"),
         ({"trajectory": np.array(["8.0", "5.3"])}, "expected real numbers, got an array of type <U3"),
-        ({"trajectory": np.array([[1.0], None], object)}, "expected a whole .npz file"),
+        ({"trajectory": np.array([[1.0], None], object)}, "expected a complete .npz file"),
     ],
 )
 def test_arrays_that_are_no_numbers_are_refused(tmp_path, arrays, message):

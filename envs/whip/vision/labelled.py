@@ -231,7 +231,7 @@ def _outline(numbers: Sequence[Any], extent: tuple[int, int], where: str) -> Flo
     """A polygon's points of x1, y1, x2, y2, ...; the extent is what the picture's width and height are in its unit."""
     if len(numbers) % 2 or len(numbers) < 6:
         raise ValueError(
-            f"{where}: expected x and y of at least 3 points (boxes are no masks), got {len(numbers)} numbers"
+            f"{where}: expected x and y of at least 3 points (boxes are not masks), got {len(numbers)} numbers"
         )
     for number, limit in zip(numbers, extent * (len(numbers) // 2), strict=True):
         if type(number) not in (int, float) or not -limit <= number <= 2 * limit:  # NaN is not, either

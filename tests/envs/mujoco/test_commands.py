@@ -172,7 +172,8 @@ def test_without_sysid_it_says_what_to_install(runs, tmp_path, monkeypatch, caps
     monkeypatch.setitem(sys.modules, "mujoco.sysid", types.ModuleType("mujoco.sysid"))  # as MuJoCo alone brings it
     assert mujoco("fit", runs / "arm.toml", "--sysid", "--out", tmp_path / "fit") == 2
     error = capsys.readouterr().err
-    assert "points of mujoco.sysid need its packages: pip install 'mujoco[sysid]'" in error and error.count("\n") == 1
+    assert "the estimate of mujoco.sysid needs its packages: pip install 'mujoco[sysid]'" in error
+    assert error.count("\n") == 1
     assert not (tmp_path / "fit").exists()
 
 
@@ -226,8 +227,8 @@ def test_a_run_whose_task_is_gone(runs, tmp_path, capsys):
     for words in (("film", moved, "--out", tmp_path / "new.gif"), ("fit", moved)):
         assert mujoco(*words) == 2
         error = capsys.readouterr().err
-        assert "expected to find its task, mujoco,config=gone/arm.toml" in error and error.count("\n") == 1
-        assert "go to the folder that the run was made in" in error
+        assert "cannot find its task, mujoco,config=gone/arm.toml" in error and error.count("\n") == 1
+        assert "change to the folder that the run was made in" in error
 
 
 def test_where_there_is_no_renderer(runs, tmp_path, monkeypatch, capsys):

@@ -294,7 +294,7 @@ def test_what_cannot_be_read_is_one_line(folder, tmp_path, capsys):
     for words, expected in (
         ([folder / "none.csv"], "none.csv: expected a CSV file"),
         ([tmp_path / "empty.csv"], "empty.csv: expected signals with finite samples, got none"),
-        ([cut], "cut.mcap: expected a whole MCAP file, got a truncated or damaged one"),
+        ([cut], "cut.mcap: expected a complete MCAP file, got a truncated or damaged one"),
         ([f"{folder}/set"], "one of its 2 episodes, got none: name it as set#episode=0"),
         ([f"{folder}/set#episodes=0-7"], "expected an episode from 0 to 1, got 2"),
         ([folder / "swing.csv", "--out", tmp_path / "there.toml"], "--out: expected a new file, got"),

@@ -469,7 +469,7 @@ class TestRefusedOfYolo:
         ("text", "match"),
         [
             ("0 0 0 1 0 1 1\n0 0 0 1 0 1", r"a\.txt, line 2: .*at least 3 points.* got 5 numbers"),
-            ("\n0 0.5 0.5 0.1 0.1", r"a\.txt, line 2: .*at least 3 points \(boxes are no masks\), got 4 numbers"),
+            ("\n0 0.5 0.5 0.1 0.1", r"a\.txt, line 2: .*at least 3 points \(boxes are not masks\), got 4 numbers"),
             ("0 0 0 1 0 nan 1", r"a\.txt, line 1: expected a number from 0 to about 1, got nan"),
             ("0 0 0 1 0 inf 1", r"a\.txt, line 1: .*got inf"),
             ("0 0 0 300 0 300 300", r"a\.txt, line 1: expected a number from 0 to about 1, got 300\.0"),
