@@ -504,7 +504,7 @@ def test_front_page():
     """The figures below the example of the project's README."""
     error = arrays("bounds/lotka_volterra/misspecified+edge/quick-own")["error"]
     assert len(error) == 100 and np.sum(error > widths.LOST) == 2
-    text = f"the summed error with EDGE is {error.mean():.2f} on average over 100 seeds, and two runs are lost"
+    text = f"EDGE's summed error averages {error.mean():.2f} over 100 seeds, and exceeds {widths.LOST} in two of them"
     assert text in " ".join((ROOT.parent / "README.md").read_text().split())
 
 
