@@ -71,7 +71,7 @@ def row(name: str, box: str, summary: str, several: Sequence[dict[str, np.ndarra
 def table(out: Path) -> str:
     """All that there is, as Markdown."""
     lines = [
-        "| example | box | summary | recordings | error, median (worst 10th) | 90 % intervals hold | half-width | "
+        "| example | box | summary | recordings | error, median (worst 10th) | 90 % intervals cover | half-width | "
         "truth found | s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]

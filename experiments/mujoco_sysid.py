@@ -282,7 +282,7 @@ def says_wrong(task: Task, arrays: dict[str, np.ndarray], box: str) -> np.ndarra
 def table(out: Path) -> str:
     """All that there is, as Markdown."""
     lines = [
-        "| example | box | method | recordings | error, median (worst 10th) | 90 % intervals hold | half-width | "
+        "| example | box | method | recordings | error, median (worst 10th) | 90 % intervals cover | half-width | "
         "held-out misfit | truth found | says wrong | simulations | s |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]

@@ -233,7 +233,7 @@ def save(path: Path, arrays: dict[str, np.ndarray], settings: Settings, **more: 
 def table(folder: Path) -> str:
     """The comparison as Markdown, from the saved arrays."""
     lines = [
-        "| candidate | rounds | error, own truth | lost | 90 % holds it | 50 % | 90 % | SBC p | on the box | lp | s |",
+        "| candidate | rounds | error, own truth | lost | 90 % covers it | 50 % | 90 % | SBC p | on the box | lp | s |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for path in sorted(folder.glob("*-own.npz")):

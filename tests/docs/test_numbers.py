@@ -749,11 +749,11 @@ def test_summaries_of_mujoco_models():
     error = lambda *key: found[key]["error, median (worst 10th)"].split()[0]
     assert recordings("all", "right", "samples") == recordings("all", "wrong", "samples")
     others = [recordings("all", box, name) for name in ("cross-correlation", "spectrum") for box in BOXES]
-    spectra = [100 * float(found["all", box, "spectrum"]["90 % intervals hold"]) for box in BOXES]
+    spectra = [100 * float(found["all", box, "spectrum"]["90 % intervals cover"]) for box in BOXES]
     half = [" and ".join(found["puck", box, name]["half-width"] for box in BOXES) for name in ("learnt", "samples")]
     correlations = [error("arm", box, "cross-correlation") for box in BOXES]
     held = [
-        float(own["90 % intervals hold"])
+        float(own["90 % intervals cover"])
         for (name, _, summary), own in found.items()
         if name == "furuta" and summary in ("samples", "cross-correlation")
     ]
