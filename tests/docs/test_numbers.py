@@ -708,8 +708,8 @@ def test_points_and_posteriors_of_mujoco_models():
             "finds {}: {}, {} and {} of 50. From the right boxes it finds {}, {} and {}.".format(
                 sum(by_edge["wrong"]), *by_edge["wrong"], *by_edge["right"]
             ),
-            f"Intervals of least squares hold {min(least):.0f} to {max(least):.0f} % of truths",
-            f"EDGE's posterior holds {min(edge):.0f} to {max(edge):.0f} % on the furuta and the arm",
+            f"Intervals of least squares cover {min(least):.0f} to {max(least):.0f} % of truths",
+            f"EDGE's posterior covers {min(edge):.0f} to {max(edge):.0f} % on the furuta and the arm",
             f"and {puck.pop()} % on the puck, from either box",
             f"half-widths are {ratios.min():.1f} to {ratios.max():.1f} times the errors that 90 % of sysid's points",
             "worst, {:.0f} and {:.0f} %,".format(*(100 * one["held"][:, 0].mean() for one in damping)),
@@ -768,12 +768,12 @@ def test_summaries_of_mujoco_models():
             f"It finds the truth in {recordings('all', 'right', 'samples')} recordings from either box",
             f"{correlations[0]} and {correlations[1]} against {error('arm', 'right', 'samples')}",
             "cross-correlations in {} and {}, spectra in {} and {}".format(*others),
-            f"Their intervals hold {spectra[0]:.0f} and {spectra[1]:.0f} % of truths",
-            f"({half[0]} against {half[1]}), hold all truths, and the truth is found in "
+            f"Their intervals cover {spectra[0]:.0f} and {spectra[1]:.0f} % of truths",
+            f"({half[0]} against {half[1]}), cover all truths, and the truth is found in "
             f"{recordings('puck', 'wrong', 'learnt')} recordings",
             f"the truth is found in {recordings('puck', 'right', 'cross-correlation')} recordings",
             f"has a half-width of {delay['spectrum']:.3f} from the right box in place of {delay['samples']:.3f}",
-            f"hold {100 * min(held):.0f} to {100 * max(held):.0f} % of truths by samples and correlations",
+            f"cover {100 * min(held):.0f} to {100 * max(held):.0f} % of truths by samples and correlations",
         ],
     )
 
