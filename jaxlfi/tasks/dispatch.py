@@ -138,7 +138,7 @@ def _answer(future: Future) -> Answer:
 
 def _lost(error: BaseException) -> ExecutorError:
     words: Any = " ".join(str(error).split()) or "no more is known"
-    return ExecutorError(f"executor: lost while it simulated ({type(error).__name__}: {words})")
+    return ExecutorError(f"executor: connection lost while simulating ({type(error).__name__}: {words})")
 
 
 def stacked(answers: Sequence[Answer], shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -71,7 +71,7 @@ def test_other_files_are_refused(policy, tmp_path, damage, expected):
 def test_damaged_files_are_refused(policy, tmp_path):
     path = policy.save(tmp_path / "policy.npz")
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(ValueError, match="expected a whole"):
+    with pytest.raises(ValueError, match="expected a complete"):
         load(path)
 
 

@@ -161,7 +161,7 @@ def test_what_cannot_be_gone_on_with_is_refused(finished, tmp_path):
     with pytest.raises(StoreError, match="expected a training of line, got one of whip"):
         training.resumed(tmp_path, LINE, print)
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(StoreError, match=r"domains\.npz: expected a whole"):
+    with pytest.raises(StoreError, match=r"domains\.npz: expected a complete"):
         training.resumed(tmp_path, LINE, print)
     files.write_arrays(tmp_path / "domains.npz", files.read_arrays(out / "domains.npz"))
     files.write_sealed(tmp_path / "checkpoint.npz", {"done": np.asarray(3)})

@@ -139,7 +139,7 @@ def test_a_spoiled_chunk_that_is_deleted_is_computed_again(complete):
 
 def test_results_of_an_incomplete_study_are_refused(complete):
     complete.path(2).unlink()
-    with pytest.raises(StoreError, match=r"002\.npz: expected a whole"):
+    with pytest.raises(StoreError, match=r"002\.npz: expected a complete"):
         complete.results()
 
 

@@ -342,7 +342,7 @@ def test_an_interrupted_data_set_goes_on(tmp_path, monkeypatch):
     np.testing.assert_array_equal(data.rgb, whole.rgb)
     np.testing.assert_array_equal(data.labels, whole.labels)
     assert data.entries == whole.entries
-    with pytest.raises(ValueError, match="whole data set"):
+    with pytest.raises(ValueError, match="complete data set"):
         from_yolo(tmp_path, texts, "out")
 
 
