@@ -1,4 +1,4 @@
-"""Fields that say what they are: hyperparameters and options with a help text, a symbol and a range.
+"""Self-describing fields: hyperparameters and options with a help text, a symbol and a range.
 
 Checks, flags of the command line, the glossary and the documentation are all made from this metadata. The module
 imports neither jax nor numpy before they are needed, so that the command line can use it before jax starts.
@@ -158,7 +158,7 @@ def described(every: Mapping[str, dataclasses.Field]) -> dict[str, Declared]:
 
 
 def check_fields(value: Any) -> None:
-    """Refuse the fields of a dataclass that are known and wrong: out of range, not finite, none of the choices.
+    """Refuse invalid fields of a dataclass: out of range, not finite, not among the choices.
 
     Only what is a value is looked at. In a leaf, tracers and shapes are not known yet, and None, truth values (masks)
     and foreign objects stand in a value's place in trees that describe others. Integers may be axes (`in_axes`), but

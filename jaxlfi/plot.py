@@ -1,4 +1,4 @@
-"""Plots of anybody's arrays; matplotlib is imported when the first of them is drawn."""
+"""Plots of arrays from any source; matplotlib is imported when the first one is drawn."""
 
 import textwrap
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""References as text: a name, and options for what makes the thing of that name, as in "whip,object=dlo-0".
+"""References as text: a name and options of its factory, as in "whip,object=dlo-0".
 
 Options are converted to the types that a signature declares: int, float, bool, str, Path, Literal, unions of them, and
 tuples of any number of one of them, whose items ";" separates. A value may be put in quotation marks, within which

@@ -1,4 +1,4 @@
-"""What is found by name: tasks, heuristics, estimators, environments, robots, drivers and commands.
+"""Registry of named objects: tasks, heuristics, estimators, environments, robots, drivers and commands.
 
 A name is an entry point of an installed package, or "module:name" in a module that can be imported from the current
 folder; ours are registered in pyproject.toml as a third party's are. Nothing is imported before it is named, so that
@@ -49,7 +49,7 @@ class Family:
         return list(self.points())
 
     def find(self, reference: str) -> Any:
-        """The object of that name, imported.
+        """Import and return the object of that name.
 
         Args:
             reference: a registered name, or "module:name" in a module that can be imported from the current folder.

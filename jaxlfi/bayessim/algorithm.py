@@ -62,7 +62,7 @@ class State(struct.PyTreeNode):
 
 
 class Gathered(struct.PyTreeNode):
-    """What a round has before it trains the network.
+    """The state of a round before it trains the network.
 
     Attributes:
         simulations: of the round.
@@ -152,7 +152,7 @@ def proposal(settings: Settings, belief: Belief) -> Belief:
 
 
 def support_before(state: State, round: Int[Array, ""] | int) -> Support:
-    """The support that the round before proposed in; in the first round the one that it is going to."""
+    """The support that the previous round proposed in; in the first round, its own."""
     return jax.tree.map(lambda leaf: leaf[jnp.maximum(round - 1, 0)], state.proposals.support)
 
 
@@ -215,7 +215,7 @@ def gather(
     round: Int[Array, ""] | int,
     simulations: Simulations,
 ) -> Gathered:
-    """Add the round's simulations to all others, and make the network ready to learn from them (line 9).
+    """Add the round's simulations to the dataset, and prepare the network for training on it (line 9).
 
     Args:
         key: of the fit, consumed; the other part of it is for training.
@@ -243,7 +243,7 @@ def gather(
 
 
 def expected_size(settings: Settings, state: State, round: Int[Array, ""] | int) -> Int[Array, ""] | int:
-    """Simulations that an epoch of a round without failures goes through: all so far, in the first `WHOLE` rounds.
+    """Number of simulations per epoch in a round without failures: all so far, in the first `WHOLE` rounds.
 
     Thereafter as many as the epochs of those rounds did on average, other ones each time until all had their turn: the
     time of a run is in proportion to its rounds.
@@ -271,7 +271,7 @@ def conclude(
     gathered: Gathered,
     learnt: tuple[dict, FitInfo],
 ) -> tuple[State, Round]:
-    """The posterior of the observation by the trained network, and the support adapted to it (lines 11-17).
+    """Compute the posterior with the trained network, and adapt the support to it (lines 11-17).
 
     Args:
         key: consumed; None for an estimator of closed form.

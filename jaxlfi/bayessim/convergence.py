@@ -87,7 +87,7 @@ def advanced(progress: Progress, posterior: GaussianMixture, min_rounds: int) ->
 
 
 def changes(moved: float, rescaled: float, turned: float) -> list[str]:
-    """In words, how a posterior still changed over the last rounds; nothing for one that has settled.
+    """Describe how a posterior still changed over the last rounds; empty if it has settled.
 
     Example:
         >>> changes(1.26, 1.1, 0.2)

@@ -20,7 +20,7 @@ from jaxlfi.tasks.priors import InferencePrior
 
 
 class CorrectionInfo(struct.PyTreeNode):
-    """What a correction did in a round.
+    """Record of a correction in a round.
 
     Attributes:
         effective_size: effective number of simulations under the loss weights, (sum w)^2 / sum w^2, shape [].
@@ -38,7 +38,7 @@ class CorrectionInfo(struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class Correction:
-    """A way from q_phi to p-hat: weights in the loss before the fit, and a change of the mixture after it.
+    """A correction from q_phi to p-hat: loss weights before the fit, and a change of the mixture after it.
 
     Attributes:
         row_weights: (prior, dataset, proposals, round, defensive fraction) -> weights of rows in the loss, shape [C].
@@ -74,7 +74,7 @@ def unchanged(prior: Any, q: GaussianMixture, previous: Belief) -> tuple[Gaussia
 
 
 def times_reference(prior: Any, q: GaussianMixture, previous: Belief) -> tuple[GaussianMixture, Array]:
-    """p-hat proportional to (p_i / p~) q, to the letter of line 11, reduced to as many components as q has.
+    """p-hat proportional to (p_i / p~) q, exactly as in line 11, reduced to as many components as q has.
 
     p~ is the prior: uniform, and then a constant, or a Gaussian that the task brings, which is divided out.
     """

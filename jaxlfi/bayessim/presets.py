@@ -80,7 +80,7 @@ lost.
 
 
 def all_rounds(settings: Settings) -> Settings:
-    """Settings by which every run makes the same number of rounds, whether its posterior has settled or not."""
+    """The same settings with a fixed number of rounds, whether or not the posterior settles."""
     return settings.replace(rounds=min(settings.min_rounds or settings.rounds, settings.rounds), min_rounds=0)
 
 
@@ -142,7 +142,7 @@ METHODS: dict[str, Callable[[Settings], Settings]] = {
 
 
 def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") -> Settings:
-    """The settings that `jaxlfi infer` begins with: a method's at a preset, changed as the task asks.
+    """The settings that `jaxlfi infer` starts from: those of a method and preset, with the task's own changes.
 
     Args:
         task: whose `settings` name fields of `Settings`, or of the estimators of the methods; those of estimators that
@@ -166,7 +166,7 @@ def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") ->
 
 
 def with_fields(settings: Settings, given: Mapping[str, Any]) -> Settings:
-    """Settings with the named numbers replaced, be they the run's or its estimator's.
+    """Settings with the named fields replaced, whether of the run or of its estimator.
 
     Raises:
         ValueError: for a name that neither has.

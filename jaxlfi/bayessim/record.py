@@ -1,4 +1,4 @@
-"""Records: what each round did, as named arrays, and the ledger that is derived from them."""
+"""Records of rounds as named arrays, and the ledger that is derived from them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

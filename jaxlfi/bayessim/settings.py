@@ -1,4 +1,4 @@
-"""Settings: the numbers of one inference run."""
+"""Settings of an inference run."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ from jaxlfi.fields import Checked, check_fields, hyperparameter, option
 
 
 class Settings(Checked):
-    """The numbers of one inference run. The defaults are the paper's.
+    """Settings of an inference run. The defaults are the paper's.
 
     Attributes:
         estimator: the density estimator and its training: an instance of one of the families

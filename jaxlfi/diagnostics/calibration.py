@@ -1,4 +1,4 @@
-"""Calibration: whether truths fall among posterior draws as often as the posteriors say, over many observations.
+"""Calibration: do posteriors cover truths as often as they should, over many observations?
 
 Every check here turns a truth into its rank among L draws from its posterior: of the parameter itself, of the
 density, or of the distance from a random point. Of a calibrated posterior, the truth and the draws are draws of the
@@ -226,7 +226,7 @@ def histogram(rank: Int[Array | np.ndarray, " n"], draws: int) -> Histogram:
 
 
 def ranks_verdict(result: Uniformity) -> str:
-    """The verdict of a parameter's ranks, in words.
+    """The verdict on a parameter's ranks, in words.
 
     Ranks that crowd at both ends are those of posteriors too narrow, in the middle of posteriors too wide; truths
     below their draws are those of posteriors too high.
@@ -239,14 +239,14 @@ def ranks_verdict(result: Uniformity) -> str:
 
 
 def coverage_verdict(result: Uniformity) -> str:
-    """What ranks of the density say: truths at low densities are of posteriors too narrow, or in a wrong place."""
+    """The verdict on density ranks: truths at low densities mean posteriors too narrow, or in the wrong place."""
     if result.p_value > SIGNIFICANCE:
         return OK
     return OVER if result.shift > 0 else UNDER
 
 
 def distance_verdict(result: Uniformity) -> str:
-    """What ranks of the distance from random points say.
+    """The verdict on ranks of distances from random points.
 
     Where the points are near, truths beyond the draws are those of posteriors too narrow (or in a wrong place); where
     they are far to one side or the other, truths at either end of the draws.

@@ -43,7 +43,7 @@ class Arm:
 
 @dataclasses.dataclass(frozen=True)
 class Contrast:
-    """How far one arm is ahead of another.
+    """The difference between two arms.
 
     Attributes:
         difference: of the means.

@@ -41,7 +41,7 @@ NAMED = 3
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Something in which an observation is unlike the simulations.
+    """One respect in which an observation is unlike the simulations.
 
     Attributes:
         name: of the summary or channel.

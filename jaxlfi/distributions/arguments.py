@@ -1,4 +1,4 @@
-"""Checks of arguments at the doors of the library, each a ValueError that names the argument."""
+"""Checks of arguments at the library's public functions, each a ValueError that names the argument."""
 
 import operator
 from typing import Any

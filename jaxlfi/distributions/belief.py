@@ -14,7 +14,7 @@ from jaxlfi.distributions.truncation import TRIES, rejection_sample, weighted_sa
 
 
 class Belief(struct.PyTreeNode):
-    """What is believed of the parameters after a round: p_(Theta) in the paper.
+    """The belief about the parameters after a round: p_(Theta) in the paper.
 
     Attributes:
         mixture: the posterior as a mixture of Gaussians (unbounded).

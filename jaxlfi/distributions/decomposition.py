@@ -1,4 +1,4 @@
-"""Singular values that are found whatever else runs beside."""
+"""Singular value decomposition that is robust on every platform."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""A mixture of Gaussians with full covariances: what a posterior is in this library."""
+"""A mixture of Gaussians with full covariances: the form of a posterior in this library."""
 
 import functools
 from collections.abc import Sequence

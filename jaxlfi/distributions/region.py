@@ -1,4 +1,4 @@
-"""Region: the part of a box where a prior is not zero."""
+"""The part of a box where a prior is not zero."""
 
 from typing import Any
 

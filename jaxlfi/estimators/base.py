@@ -1,4 +1,4 @@
-"""Estimators: the settings a family of density estimators has, and the network that is trained by them."""
+"""Estimators: the settings of a family of density estimators, and the network trained with them."""
 
 import abc
 import dataclasses
@@ -43,7 +43,7 @@ SCHEDULES = {"constant": jnp.ones_like, "cosine": lambda progress: 0.5 * (1 + jn
 
 
 class Estimator(Checked, abc.ABC):
-    """Base of all families of density estimators: the ensemble and its training.
+    """Base class of all density estimators: the ensemble and its training.
 
     A family is one subclass with the settings that it alone has and one method, `module`; the class is then a frozen
     dataclass and a pytree, without a decorator. Its Flax module maps a normalised summary to a conditional density: a
@@ -321,7 +321,7 @@ def viewed(given: Float[Array, "*n given"], view: Float[Array | np.ndarray, " gi
 
 
 class Network(struct.PyTreeNode):
-    """A density estimator: its settings, the weights of the ensemble, and what they were normalised by.
+    """A trained density estimator: its settings, the weights of the ensemble, and its normalisers.
 
     Attributes:
         estimator: the settings it was made with.

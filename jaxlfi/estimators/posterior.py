@@ -131,7 +131,7 @@ class Posterior(struct.PyTreeNode):
         return self._moments(is_natural(space))[1]
 
     def quantile(self, level: ArrayLike | Sequence[float], space: SpaceName = "natural") -> Float[Array, "*levels dim"]:
-        """Where a share of the posterior lies below, for each parameter by itself, shape [D] or [..., D].
+        """Quantiles of each parameter's marginal, shape [D] or [..., D].
 
         Of a mixture, the marginal distribution function is integrated and inverted: to the last digit for one or two
         parameters, and to some thousandths of the level for more. Of other densities, they are the quantiles of
@@ -160,7 +160,7 @@ class Posterior(struct.PyTreeNode):
         return self.space.to_natural(inner) if natural else inner
 
     def interval(self, mass: float = 0.9, space: SpaceName = "natural") -> Float[Array, "2 dim"]:
-        """The central interval of each parameter that holds a share of the posterior: lower and upper ends, [2, D].
+        """The central interval of each parameter with a given mass: lower and upper ends, shape [2, D].
 
         Args:
             mass: in the interval, as much of the rest on either side.
@@ -174,7 +174,7 @@ class Posterior(struct.PyTreeNode):
         return self.quantile(jnp.stack([0.5 - 0.5 * jnp.asarray(mass), 0.5 + 0.5 * jnp.asarray(mass)]), space)
 
     def marginal(self, names: Names) -> "Marginal":
-        """The posterior of some parameters, whatever the others are.
+        """The marginal posterior of some parameters.
 
         Draws and statistics are those of the whole posterior. The density of a mixture is exact as well: every
         component's marginal, times its mass inside the box of the others given these. That is a closed form where at
@@ -198,7 +198,7 @@ class Posterior(struct.PyTreeNode):
         return _marginal(self._plain(), self._places(names))
 
     def conditional(self, values: Mapping[str, float] | None = None, /, **named: float) -> "Posterior":
-        """The posterior of the other parameters, where some are known; exact.
+        """The posterior of the other parameters given values of some; exact.
 
         It is the mixture's conditional, a closed form, truncated to the bounds of the others: all that the support has
         to say. The likelihood of the values is not part of it.
@@ -357,7 +357,7 @@ class MarginalDensity(struct.PyTreeNode):
 
 
 class Marginal(Posterior, repr=False):
-    """The posterior of some parameters, whatever the others are: `Posterior.marginal` makes it.
+    """The marginal posterior of some parameters, as returned by `Posterior.marginal`.
 
     `mass_inside` is that of the whole posterior, inside the bounds of all parameters.
     """

@@ -1,4 +1,4 @@
-"""Validity: the probability that a simulation succeeds, learnt from all that were attempted.
+"""Validity: the probability that a simulation succeeds, learnt from all attempts.
 
 Networks learn from simulations that succeeded. Where success depends on the parameters, those have been selected by it,
 as they have by what was proposed; and whatever takes no account of proposals (a likelihood, the atomic losses) takes

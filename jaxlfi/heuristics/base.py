@@ -1,4 +1,4 @@
-"""The interface of heuristics: (previous belief, posterior, Phi) -> (belief, what it saw and did)."""
+"""The interface of heuristics: (previous belief, posterior, Phi) -> (belief, record of the adaptation)."""
 
 import abc
 from typing import ClassVar
@@ -17,7 +17,7 @@ Value = Float[Array, ""] | Float[Array, " dim"] | float | int
 
 
 class Adaptation(struct.PyTreeNode):
-    """What a heuristic saw and what it did in one round; only to be looked at.
+    """Record of what a heuristic evaluated and did in one round.
 
     Attributes:
         evidence: named arrays with a trailing axis of length D (edge masses, accumulated weights, means, ...).

@@ -10,7 +10,7 @@ from jaxlfi.heuristics.base import Adaptation, Heuristic, Value, adapted, stretc
 
 
 class Edge(Heuristic):
-    """Edge-driven Gaussian expansion (Algorithm 2; defaults of section V, but for the threshold).
+    """Edge-driven Gaussian expansion (Algorithm 2; defaults of section V, except the threshold).
 
     A bound moves out by `expansion` times the width where the marginal mass in the zone along it exceeds
     `mass_threshold`. A parameter that the observation says nothing of has a uniform posterior, with a tenth of its mass

@@ -49,7 +49,7 @@ class Matched(Heuristic):
 
 
 def paired(rule: Heuristic, warm_start: bool) -> Heuristic:
-    """The rule as it has to be for such networks: `Matched` where it compares components of networks that start anew.
+    """The rule adapted to such networks: wrapped in `Matched` if it compares components of retrained networks.
 
     Example:
         >>> from jaxlfi.heuristics import Edge, Mode

@@ -1,4 +1,4 @@
-"""What can be trained on: environments of unknown parameters theta, and the signals that they exchange."""
+"""Environments with unknown parameters theta, and the signals that they exchange with policies."""
 
 import dataclasses
 import math
@@ -80,7 +80,7 @@ class EnvState(struct.PyTreeNode):
 
 @runtime_checkable
 class Environment(Protocol):
-    """An environment of unknown parameters: pure, for one episode, batched by `vmap`.
+    """An environment with unknown parameters: pure, for one episode, batched by `vmap`.
 
     What a robot must know of it, it may have as attributes besides, which its policies then carry: `deployment`, where
     its actions displace set-points (`jaxlfi.rl.deployment.Deployment`); `preparation`, where its observations and

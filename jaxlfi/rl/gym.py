@@ -1,4 +1,4 @@
-"""Environments of unknown parameters for other people's learners: those of gymnasium, one or many side by side.
+"""Environments with unknown parameters as gymnasium environments, single or vectorised.
 
     gymnasium.make("jaxlfi.rl.gym:jaxlfi/Environment-v0", environment="mujoco,config=arm.toml")
     gymnasium.make_vec("jaxlfi.rl.gym:jaxlfi/Environment-v0", num_envs=12, environment="mujoco,config=arm.toml",

@@ -1,4 +1,4 @@
-"""Policy: what a training leaves behind, as one file that NumPy alone can run.
+"""A trained policy as one file that NumPy alone can run.
 
 This module imports neither jax nor Brax, so that a robot's computer needs neither.
 """

@@ -1,4 +1,4 @@
-"""PPO (Schulman et al., 2017) by Brax's parts, as init / update / train.
+"""PPO (Schulman et al., 2017) built from Brax's parts, as init / update / train.
 
 The losses, networks and acting are Brax's own; the loop around them is ours, because all that the next update needs is
 in one pytree here: a training that was stopped goes on to the same bits, and trainings with other seeds, domains and

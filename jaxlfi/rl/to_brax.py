@@ -1,4 +1,4 @@
-"""Environments of unknown parameters for learners that train on those of Brax; the way back is `from_brax`."""
+"""Environments with unknown parameters as Brax environments; `from_brax` does the opposite."""
 
 import contextlib
 import io

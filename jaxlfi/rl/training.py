@@ -1,4 +1,4 @@
-"""Trainings side by side: domains times seeds as one compiled program, in a folder that can be resumed.
+"""Parallel trainings: domains times seeds as one compiled program, in a folder that can be resumed.
 
 config.json domains.npz start.npz      what was asked for, the points that are trained and evaluated on, and an
                                        earlier policy, where one was to begin with

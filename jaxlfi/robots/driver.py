@@ -1,4 +1,4 @@
-"""A driver: what a robot of your own needs to be controlled by any policy, in one class of four methods.
+"""A driver: the interface of your own robot to any policy, a class with four methods.
 
     class Driver:
         def connect(self, signals, controls): ...     # names and units that a policy needs; refuse what there is not

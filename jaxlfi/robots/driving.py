@@ -41,7 +41,7 @@ class Driving(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Drive(Paced):
-    """How a robot is controlled whose actuators a policy drives.
+    """The control loop for a policy that drives a robot's actuators.
 
     A robot is stopped, too, if a signal is measured outside of its bounds. Where there is no usable observation the
     last control is held.

@@ -1,4 +1,4 @@
-"""An episode of control: at a set rate, within limits, and the robot is stopped whatever happens.
+"""A control episode: at a fixed rate, within limits, with the robot stopped whatever happens.
 
 Time is divided into control periods ("slots") that begin at multiples of the period after the first command, by a clock
 that never goes back, so that delays do not add up. In each slot the loop observes, asks the policy, and commands. What

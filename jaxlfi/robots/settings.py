@@ -1,4 +1,4 @@
-"""What is known of a robot besides a policy's training: the table `robot` of a task's file, which its policies carry.
+"""Settings of a robot: the table `robot` of a task file, which policies trained from it carry with them.
 
 [robot]
 watchdog = 0.1                      # s that a call of the driver may take before the robot is stopped

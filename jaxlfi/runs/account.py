@@ -1,4 +1,4 @@
-"""What a run says of itself, in sentences: whether the model fits, what failed, whether it had settled, what is next.
+"""A run's account of itself in sentences: does the model fit, what failed, has it settled, what to do next.
 
 As in `jaxlfi.runs.summarise`, nothing is said that was not measured on this run.
 """
@@ -34,7 +34,7 @@ DIAGNOSE_OWN = (
 
 
 def summary(run: Result, draws: Float[Array | np.ndarray, "n dim"]) -> RunSummary:
-    """All that a run says of its parameters, by draws of its posterior in natural units, and of itself."""
+    """The summary of a run: its parameters, from posterior draws in natural units, and the run itself."""
     rule = getattr(run.heuristic, "rule", run.heuristic)
     found = summarised(
         np.asarray(draws),

@@ -262,7 +262,7 @@ def run_row(row: Mapping[str, np.ndarray], index: int, place: int | None) -> dic
 
 
 def begin(folder: Path, plan: BatchPlan, observed: Observed, processes: Processes = ALONE) -> None:
-    """Bring the plan's folder into being; nothing is written before everything was checked.
+    """Create the plan's folder; nothing is written before everything has been checked.
 
     Args:
         folder: new or empty.
@@ -412,7 +412,7 @@ def clean(folder: Path) -> None:
 
 
 def extend(folder: Path, rounds: int | None = None, simulations: int | None = None) -> None:
-    """Ask a run for more than it was begun with; `reopen` and `execute` then continue it.
+    """Raise the number of rounds or simulations of a run; `reopen` and `execute` then continue it.
 
     The rounds that were made stay as they are, bit for bit. Those to come differ by chance from the same rounds of a
     run that was begun with as many, whose simulations have more room from the start: sums over them round differently.

@@ -1,4 +1,4 @@
-"""A task's own prior, and its draws within a support."""
+"""A task's own prior, and draws from it within a support."""
 
 import dataclasses
 import functools

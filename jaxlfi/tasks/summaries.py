@@ -1,4 +1,4 @@
-"""Named summaries: what the network sees of a trajectory."""
+"""Named summaries of a trajectory, the network's input."""
 
 import functools
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Task: a simulator with its parameters named, bounded and, where known, observed."""
+"""Task: a simulator with named, bounded parameters and, optionally, an observation."""
 
 import dataclasses
 import functools

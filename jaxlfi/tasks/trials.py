@@ -20,7 +20,7 @@ MAX_TRIALS = 1000
 
 
 def repeated(task: Task, trials: int, pooling: str = "moments") -> Task:
-    """The task of observing several independent trials of the same parameters.
+    """The task of observing several independent trials with the same parameters.
 
     A simulation is then so many of the given task's, each with noise of its own; it fails where one of them fails. Its
     trajectory is theirs, one after another along the first axis. Its summary pools theirs by moments, in any order to

@@ -30,7 +30,7 @@ LONGEST_MESSAGE = 300
 
 
 class Answer(NamedTuple):
-    """What came of one simulation.
+    """The result of one simulation.
 
     Attributes:
         outcome: 0 for success, i for the task's i-th reason, -i for the i-th of `REASONS`.

@@ -1,4 +1,4 @@
-"""SimOpt: a Gaussian over parameters moves, a bounded step at a time, to where simulations resemble what is real.
+"""SimOpt: a Gaussian over parameters moves, in bounded steps, to where simulations resemble a recording.
 
 Chebotar et al., "Closing the Sim-to-Real Loop: Adapting Simulation Randomization with Real World Experience" (2019). A
 policy that was trained on p_phi acts on the real object and in simulations of xi_1..xi_N ~ p_phi. The next phi makes
