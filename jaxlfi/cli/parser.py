@@ -108,10 +108,10 @@ def own_commands(families: Families) -> list[Command]:
         ),
         Command(
             "compare",
-            "run supports and heuristics side by side",
+            "compare supports and heuristics over several seeds",
             lambda command: _compare(command, families),
             _work,
-            "Run supports and heuristics side by side, over several seeds, and tabulate the errors.",
+            "Run supports and heuristics over several seeds, and tabulate their errors.",
             help_texts.COMPARE_EXAMPLES + glossary,
         ),
         Command(

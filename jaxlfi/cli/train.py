@@ -175,8 +175,8 @@ def run(
     tables.show(table, output.results)
     say = lambda line: output.notes.print(line, markup=False, soft_wrap=True, highlight=False)
     say(
-        "return: the rewards of an episode added up, averaged over the points; worst tenth: over the points with the "
-        "lowest; at first: as the training began, with noise in the actions"
+        "return: sum of an episode's rewards, mean over the points; worst tenth: mean over the tenth of the points "
+        "with the lowest returns; at first: at the start of training, with exploration noise"
     )
     say(f"policies: {out}/DOMAIN/seed_NNN/policy.npz")
     evaluate = f"jaxlfi evaluate {quoted(config['environment'])} {out}/*/*/policy.npz --domain DOMAIN ..."

@@ -1,4 +1,4 @@
-"""Singular value decomposition that is robust on every platform."""
+"""Singular value decomposition that cannot deadlock in batches on a CPU."""
 
 import functools
 

@@ -149,7 +149,7 @@ class Result(struct.PyTreeNode):
 
     @property
     def failures(self) -> list[Failure]:
-        """Why simulations failed, the commonest first; messages that differ in numbers only are counted as one.
+        """Why simulations failed, the most common first; messages that differ in numbers only are counted as one.
 
         Example:
             >>> run.failures  # doctest: +SKIP

@@ -107,8 +107,8 @@ class Run(Result):
     def summary(self, draws: Float[Array, "n dim"] | None = None) -> RunSummary:
         """The answer, stated: each parameter's median and intervals, and in sentences what follows from them.
 
-        Whether the first guess was wrong, what the observation does not determine, whether simulations of the posterior
-        fit it, what failed, whether the run had settled, and what to do next.
+        Whether the first guess was wrong, what the observation does not determine, whether simulations from the
+        posterior fit it, what failed, whether the run had settled, and what to do next.
 
         Args:
             draws: of the posterior, in natural units, where they were made already.

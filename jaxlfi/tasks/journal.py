@@ -69,7 +69,7 @@ class Journal:
         self._count(request, answer)
 
     def failures(self) -> dict[int, list[Failure]]:
-        """The commonest failures since this was last called, by the run."""
+        """The most common failures since this was last called, by the run."""
         found = {run: tally.commonest()[:KEPT] for run, tally in self._failures.items()}
         self._failures = {}
         return found
