@@ -175,7 +175,7 @@ def round_one(
     return state, record(info, state.progress, check_one(task, settings, run, state))
 
 
-def given_one(
+def given_round_one(
     task: Task, settings: Settings, run: RunInputs, state: State, index: Int[Array, ""] | int, simulations: Simulations
 ) -> tuple[State, dict[str, Array]]:
     """One round of one run on given simulations, and its record."""
@@ -227,7 +227,7 @@ class BatchEngine:
         self.load(inputs)
 
     @property
-    def known_failures(self) -> str:
+    def failure_messages(self) -> str:
         """Known failure reasons, as the end of an error message; compiled simulations have none."""
         return ""
 
@@ -279,7 +279,7 @@ class BatchEngine:
     def _one(self, index: int) -> tuple[Callable, tuple]:
         """What one run does in a round, and its further arguments."""
         if index == 0 and self.first is not None:
-            return given_one, (self.first_round(),)
+            return given_round_one, (self.first_round(),)
         return round_one, ()
 
     def _compiled(self, one: Callable, state: State, index: int, *more: Any) -> Any:

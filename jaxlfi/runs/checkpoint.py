@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlfi.bayessim.record import FINAL, apart
+from jaxlfi.bayessim.record import FINAL, split_final
 from jaxlfi.io import files as atomic
 from jaxlfi.io import trees
 from jaxlfi.io.formats import written_by
@@ -65,8 +65,8 @@ class Checkpoint:
             raise CheckpointError(f"{self.folder / 'start.npz'}: expected whole simulations, got: {error}") from error
 
     def write_round(self, index: int, state: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
-        """Keep a round's record and the state after it; of some arrays, only the last round's (`record.apart`)."""
-        rows, final = apart(rows)
+        """Keep a round's record and the state after it; some arrays only of the last round (`split_final`)."""
+        rows, final = split_final(rows)
         atomic.write_sealed(self.folder / _round_name(index), rows | {"seconds": np.asarray(seconds)})
         leaves = trees.to_arrays(state)
         done = {_DONE: np.asarray(index + 1)}

@@ -18,7 +18,7 @@ from jaxlfi.bayessim.host import engine_for
 from jaxlfi.bayessim.keys import key_of, run_keys
 from jaxlfi.bayessim.memory import budget, state_bytes
 from jaxlfi.bayessim.multi_process import SharedEngine
-from jaxlfi.bayessim.record import FINAL, apart, own_evidence, stacked_rounds, theta_error, trajectory_error
+from jaxlfi.bayessim.record import FINAL, own_evidence, split_final, stacked_rounds, theta_error, trajectory_error
 from jaxlfi.bayessim.settings import Settings
 from jaxlfi.distributions.precision import single
 from jaxlfi.io import files as atomic
@@ -186,7 +186,7 @@ def execute(
         if not processes.writes:
             return
         seconds.append(elapsed / len(plan.specs))
-        kept, final = apart(row)
+        kept, final = split_final(row)
         for run, found in journal.failures().items():
             of_round = [Message(index, *failure) for failure in found]
             messages[run] += of_round

@@ -160,7 +160,7 @@ def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
         if failure == 0:
             return np.asarray(trajectory)
     raise SimulatorError(
-        f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries{journal.known}"
+        f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries{journal.failure_messages}"
     )
 
 

@@ -285,7 +285,7 @@ def test_a_simulator_that_always_fails_is_refused(finished, monkeypatch):
     class Hopeless:
         """An engine whose simulations fail."""
 
-        task, known_failures = TASK, ""
+        task, failure_messages = TASK, ""
         start = begin = compile = lambda *_: None
 
         def round(self, state, index):
