@@ -160,7 +160,8 @@ def simulate_observation(key: jax.Array, task: Task) -> np.ndarray:
         if failure == 0:
             return np.asarray(trajectory)
     raise SimulatorError(
-        f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries{journal.failure_messages}"
+        f"simulate: expected a valid simulation at the truth, got {TRIES} failures in {TRIES} tries"
+        f"{journal.failure_messages}"
     )
 
 
