@@ -18,20 +18,20 @@ class Settings(Checked):
         estimator: the density estimator and its training: an instance of one of the families
             (`jaxlfi.MixtureNetwork`, `jaxlfi.SplineFlow`, `jaxlfi.MaskedFlow`).
         rounds: inference iterations N_LFI, at most.
-        min_rounds: rounds after which a run ends as soon as its posterior has settled
-            (`jaxlfi.bayessim.convergence`); 0 is the paper: all rounds are made.
+        min_rounds: smallest number of rounds; the run then ends as soon as its posterior has settled
+            (`jaxlfi.bayessim.convergence`). 0: always run all rounds, as in the paper.
         simulations_per_round: valid simulations added to the dataset each round, at most.
         simulation_budget: simulations attempted each round, at most, failures included.
         correction: how q_phi becomes the posterior, "none", "paper", "quotient", "pooled" or "importance"
             (docs/paper.md, reading A).
         restriction: how proposals are kept in the support, "clip", "reject" or "mixed" (docs/paper.md, reading E).
         defensive: fraction of each round's proposals drawn from the prior over the current support instead of the
-            posterior. 0 is the paper. A leaf.
-        inflation: how many times as wide as the posterior the proposals are drawn, about its mean; 1 is the paper.
-            Uncorrected, with proposals s times as wide, a Gaussian posterior settles at sqrt(1 - 1/s^2) of its width,
-            where with s = 1 it narrows every round (docs: calibration). A leaf.
+            posterior; 0 in the paper. A leaf.
+        inflation: width of the proposals relative to the posterior, about its mean; 1 in the paper. Without a
+            correction, a Gaussian posterior settles at sqrt(1 - 1/s^2) of its true width if proposals are s times as
+            wide; with s = 1 it narrows every round (docs: calibration). A leaf.
         predictive: whether 20 draws of each round's posterior are also simulated, to compare them with the
-            observation (section V). These simulations are reported in the ledger; inference does not see them.
+            observation (section V). The ledger reports these simulations; inference does not use them.
     """
 
     estimator: Estimator = dataclasses.field(default=MixtureNetwork())

@@ -50,13 +50,12 @@ ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
 class Posterior(struct.PyTreeNode):
     """The posterior of an observation: a density on a box, as a pytree.
 
-    It is always the density truncated to the support, and zero where a prior that the task brings is zero. Draws are
-    rejected until they lie inside, never moved there; where next to no mass is inside, they are picked by weight from
-    draws of the mixture that do (`jaxlfi.distributions.mass`).
-    Arguments and results are in natural units, or in inference space (logarithms of log parameters) where
-    `space="inference"` is passed. Statistics of a mixture of Gaussians are numerical integrals of it, without a draw;
-    those of other densities, and where a prior is zero in places, are of draws that are the same each time. Those of
-    some parameters are those of a marginal: `posterior.marginal("mass").std()`.
+    The density is always truncated to the support, and zero where the task's own prior is zero. Draws outside are
+    rejected, never moved inside; if almost no mass is inside, draws are resampled by weight from points inside
+    (`jaxlfi.distributions.mass`). Arguments and results are in natural units, or in inference space (logarithms of log
+    parameters) with `space="inference"`. Statistics of a Gaussian mixture are computed by numerical integration; those
+    of other densities, and with priors that are zero in places, from draws with a fixed seed. For statistics of some
+    parameters use a marginal: `posterior.marginal("mass").std()`.
 
     Attributes:
         density: q before truncation, over inference space: a `GaussianMixture`, or a flow's density.
