@@ -132,7 +132,8 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
     best, lines = fits[0], []
     if len(least_squares.as_good(fits)) > 1:
         lines.append(
-            f"{len(least_squares.as_good(fits))} points explain the recording as well: it does not tell which is right."
+            f"{len(least_squares.as_good(fits))} points explain the recording equally well: it does not determine "
+            "which is right."
         )
     for name, bound in zip(task.names, best.at_bound, strict=True):
         if bound:
@@ -145,8 +146,8 @@ def said(task: Task, fits: Sequence[Fit]) -> list[str]:
     found = identifiability.trade_offs(names, np.asarray(task.space.to_natural(_normal_draws(task, best)))[:, rows])
     lines += [identifiability.trade_off_sentence(names, one) for one in found]
     lines.append(
-        f"Residuals are {best.misfit:.2f} times the noise; of a model without error they would be 1. "
-        f"The integrator's own error is {best.defect:.2f} times the noise, and is taken off."
+        f"Residuals are {best.misfit:.2f} times the noise; for a model without error they would be 1. "
+        f"The integrator's error is {best.defect:.2f} times the noise, and is subtracted."
     )
     lines.append("What the model gets wrong, for the file of the task; the first line goes above its tables:\n")
     lines.append(f"unmodelled_force = {best.unmodelled_force:.2g}\n\n[discrepancy]")

@@ -132,7 +132,7 @@ def whole(path: Path) -> bool:
         aside.mkdir()
         for one in filter(Path.exists, (path, loop, report)):  # the report last: after a kill in between the rest
             one.replace(aside / one.name)
-        loops.say(f"{path} was cut short: it is kept in {aside}, and recorded anew")
+        loops.say(f"{path} was cut short: it is kept in {aside}, and recorded again")
     for left in (path, loop, report):  # of a recording that was not written to its end
         left.unlink(missing_ok=True)
     return False

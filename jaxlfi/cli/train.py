@@ -148,7 +148,7 @@ def run(
     settings = training.settings_of(config)
     names = [(one["domain"], one["seed"]) for one in config["trainings"]]
     count = len(names)
-    label = f"{environment.name}: {count} {'policy' if count == 1 else 'policies side by side'}"
+    label = f"{environment.name}: {count} {'policy' if count == 1 else 'policies in parallel'}"
     with contextlib.ExitStack() as stack:
         progress = RoundProgress(output.notes, settings.updates, training.updates_done(out), label, unit="update")
         stack.enter_context(progress)

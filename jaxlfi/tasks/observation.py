@@ -445,16 +445,16 @@ def _channels(headings: list[str], table: np.ndarray, columns: Columns, say: Say
         if left_out := [repr(name) for name in headings if name not in columns.names]:
             say(f"{', '.join(left_out)} left out: no channel has that name")
         if places != sorted(places):
-            say(f"columns taken by their names, in the order {', '.join(columns.names)}")
+            say(f"columns matched by name, in the order {', '.join(columns.names)}")
         return table[:, places]
     lacking = [name for name in columns.names if name not in headings]
     if 0 < len(lacking) < len(columns.names):
         raise ValueError(f"expected columns {', '.join(columns.names)}, got none for {', '.join(lacking)}")
     if table.shape[1] > 1 and headings and _is_time(headings[0]) and np.all(np.diff(table[:, 0]) > 0):
         if table.shape[1] != columns.count:
-            say(f"the first column, {headings[0]!r}, is taken for the time and left out")
+            say(f"the first column, {headings[0]!r}, is taken as the time and skipped")
             return table[:, 1:]
-        say(f"the first column, {headings[0]!r}, is taken for a channel, as {columns.count} columns are expected")
+        say(f"the first column, {headings[0]!r}, is taken as a channel, because {columns.count} columns are expected")
     return table
 
 

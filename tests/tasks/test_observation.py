@@ -143,7 +143,7 @@ def test_nothing_is_left_out_of_as_many_columns_as_are_expected(tmp_path, count,
     said = []
     assert read(tmp_path / "x.csv", Columns(count=count), said.append).shape == shape
     (line,) = said
-    assert ("taken for a channel" in line) == (count == 3)
+    assert ("taken as a channel" in line) == (count == 3)
 
 
 def test_headings_that_name_the_channels_say_which_column_is_which(tmp_path):

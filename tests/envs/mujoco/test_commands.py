@@ -112,7 +112,7 @@ def test_what_a_fit_says(runs):
         covariance=1e-4 * np.array([[1.0, 0.99], [0.99, 1.0]]),
     )
     lines = "\n".join(commands.said(task, [bound, *changed]))
-    assert "2 points explain the recording as well" in lines
+    assert "2 points explain the recording equally well" in lines
     assert "joint/shoulder/damping ended on a bound of Phi" in lines and "gear[0] ended" not in lines
     assert "joint/shoulder/damping and actuator/motor/gear[0]" in lines and "(correlation 0.99)" in lines
     assert "Residuals are 1.00 times the noise" in lines and '\n"angle" = { deviation = ' in lines

@@ -192,7 +192,7 @@ def test_a_machine_that_dies_leaves_what_it_measured(tmp_path, monkeypatch, caps
     dies = 0
     assert r2s2r_machine.rolled_out(arguments, config, policy, path, 1) == path
     assert (
-        f"{path} was cut short: it is kept in {tmp_path / 'rollout.cut-1'}, and recorded anew"
+        f"{path} was cut short: it is kept in {tmp_path / 'rollout.cut-1'}, and recorded again"
         in capsys.readouterr().out
     )
     assert len(np.load(path.with_suffix(".loop.npz"))["targets"]) == 10
