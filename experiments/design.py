@@ -2,7 +2,7 @@
 
     python -m experiments.design --out experiments/results/design
 
-For each of 20 truths, drawn anew, the nominal experiment is made first. Its posterior is exact: the likelihood is
+For each of 20 newly drawn truths, the nominal experiment is made first. Its posterior is exact: the likelihood is
 known, and importance sampling that is adapted in steps from the whole box finds it, so that what is measured is the
 choice of designs and not a network. From this posterior `jaxlfi.design` chooses the next experiment; it is made, as are
 the nominal one again and experiments at random, and the posterior of both recordings is exact, too. What is saved is,

@@ -107,7 +107,7 @@ class Cases:
 
 
 def own_cases(task: Task, first: int, count: int) -> Cases:
-    """The task's own truth, simulated anew for each seed."""
+    """The task's own truth, simulated again for each seed."""
     seeds = first + np.arange(count)
     observed = np.stack([simulate_observation(run_keys(key_of(int(seed))).observe, task) for seed in seeds])
     theta = np.broadcast_to(np.asarray(task.inference.truth, np.float32), (count, task.dim))

@@ -379,7 +379,7 @@ def make_simulator(process: JumpProcess = JumpProcess(), schedule: Schedule = Sc
         of predators and prey, and an int32 failure code, `SUCCESS` or `TOO_MANY_EVENTS`. After a
         failure the trajectory is finite and otherwise unspecified.
     """
-    # Calls outside a jit of the caller's would compile the loops anew each time.
+    # Calls outside a jit of the caller's would recompile the loops each time.
     process_queue = jax.jit(single(functools.partial(_process_queue, process, schedule)))
 
     @jax.custom_batching.custom_vmap

@@ -147,7 +147,7 @@ def effects(
 
 
 def built(spec: mujoco.MjSpec, does: Effects, theta: Float[np.ndarray, " dim"]) -> mujoco.MjModel:
-    """The model of a parameter vector, compiled anew.
+    """The model of a parameter vector, recompiled.
 
     Raises:
         ValueError: where MuJoCo refuses it.

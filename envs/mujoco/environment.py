@@ -120,7 +120,7 @@ class MujocoEnvironment:
             initial: numbers of the state that episodes begin in, by JOINT/qpos and JOINT/qvel; others are the model's.
             name: of the environment; by default the model's.
             begins: "keyframe NAME", for episodes that begin there; by default they begin as the model does.
-            forces: that the model lacks, drawn anew for each episode.
+            forces: that the model lacks, redrawn for each episode.
             discrepancies: what the model gets wrong of signals, likewise.
 
         Raises:

@@ -7,7 +7,7 @@ observed = ["arm angle", "joint/arm/qvel"]      # sensors, and joints and bodies
 scales = { "joint/arm/qvel" = 5.0 } # what is a large number of a signal; 1 by default
 limits = { motor = [-0.05, 0.05] }  # of the actuators; by default their ctrlrange
 
-[policy.initial]                    # drawn anew for each episode, uniformly; else as for inference
+[policy.initial]                    # drawn uniformly for each episode; else as for inference
 "arm/qpos" = [-1.0, 1.0]
 
 The reward of a control interval is its length times the sum of these terms, per second, at its end:
@@ -26,7 +26,7 @@ costs = { motor = 0.02 }            # - of a control at its limit; half as large
 change_costs = { motor = 0.1 }      # - of a control that has changed by half its range since the last interval
 alive = 0.5                         # + for every second that does not end the episode
 
-[policy.commands]                   # drawn anew for each episode, uniformly; a policy sees them
+[policy.commands]                   # drawn uniformly for each episode; a policy sees them
 speed = [-1.0, 2.0]
 
 [policy.terminations]               # besides the duration; `jaxlfi.rl.termination`

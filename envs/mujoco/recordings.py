@@ -1,7 +1,7 @@
 """Recordings as a model's sensors would have made them.
 
-What can be told is put right, and said in one line: angles of encoders that begin anew after a turn (`angles`),
-orientations of another norm or order (`orientations`), and samples that only repeat the one before.
+What can be told is put right, and said in one line: angles of encoders that wrap after a turn (`angles`), orientations
+of another norm or order (`orientations`), and samples that only repeat the one before.
 """
 
 import dataclasses
@@ -162,7 +162,7 @@ def _continuous(log: Log, name: str, start: float, limits: Sequence[float] | Non
     if not (found.count or turns):
         return log.signals[name]
     period = found.period or angles.TURN
-    what = [f"begins anew after {period:.4g} rad, {_times(found.count)}: made continuous"] if found.count else []
+    what = [f"wraps after {period:.4g} rad, {_times(found.count)}: made continuous"] if found.count else []
     if turns:
         done = "added" if turns > 0 else "taken off"
         what.append(f"{period:.4g} rad {done} {_times(abs(turns))}, as the model begins there")

@@ -11,8 +11,7 @@ that measures all joints of which nothing is given, and begins elsewhere than th
 
 A recording's first samples say position and velocity by a polynomial through them, of the third degree, over half of
 the longest time that it fits to within the noise and in which it says the same as over shorter times (Lepskii 1991).
-What they leave open, most of all of velocities, is drawn anew in each simulation, and so is no part of the answer but
-counts in its width.
+What they leave open, velocities above all, is redrawn in each simulation; it is not inferred but counts in its width.
 """
 
 import dataclasses

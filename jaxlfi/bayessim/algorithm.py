@@ -342,7 +342,7 @@ def _outcomes(simulations: Simulations) -> Simulations:
 def _started(state: State, dataset: Dataset) -> Network:
     """A network that is trained on takes its normalisers from the first round that has simulations."""
     if not state.network.estimator.warm_start:
-        return state.network  # it starts anew with each fit
+        return state.network  # each fit reinitialises it
     fresh, _ = state.network.begun(dataset)
     return jax.tree.map(lambda kept, new: jnp.where(state.dataset.size > 0, kept, new), state.network, fresh)
 

@@ -13,8 +13,8 @@ STILL = 0.5
 SAME_WIDTH = 2.0
 """Factor between standard deviations below which a posterior has settled.
 
-Networks that start anew differ by chance: between rounds of a linear Gaussian that has converged, the parameter that
-changes most has a factor of 1.3 in the median, and of 1.7 in one round of ten.
+Networks that are reinitialised differ by chance: between rounds of a linear Gaussian that has converged, the parameter
+that changes most has a factor of 1.3 in the median, and of 1.7 in one round of ten.
 """
 SAME_CORRELATION = 0.5
 """Change of a correlation below which a posterior has settled; by chance, 0.2 is reached in one round of ten."""

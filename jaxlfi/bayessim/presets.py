@@ -22,7 +22,7 @@ ENSEMBLE: dict[str, Any] = {
     "warm_start": False,
     "normaliser": "asinh",
 }
-"""Four networks that start anew every round."""
+"""Four networks that are reinitialised every round."""
 
 QUICK = Settings(
     estimator=MixtureNetwork(
@@ -41,7 +41,7 @@ QUICK = Settings(
     restriction="mixed",
     inflation=2.0,
 )
-"""An ensemble of four small networks that start anew every round: seconds to minutes on two cores.
+"""An ensemble of four small networks, reinitialised every round: seconds to minutes on two cores.
 
 Chosen by two studies, experiments/studies/ablation.md and widths.md. Where an observation is unlike everything
 simulated, as it is on a wrong support, one network extrapolates confidently to one place, and the next round learns

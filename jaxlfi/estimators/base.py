@@ -64,7 +64,7 @@ class Estimator(Checked, abc.ABC):
         schedule: "constant", or "cosine" to zero within the round.
         validation: fraction of the simulations held out to choose the best weights by; 0 keeps the last weights.
         patience: stop after so many epochs without a better validation loss; 0 runs all epochs.
-        warm_start: continue from the last round's weights, or start anew each round (docs/paper.md, reading C).
+        warm_start: continue from the last round's weights, or reinitialise them each round (docs/paper.md, reading C).
         loss: "likelihood", or "atomic" or "combined", which need no correction for the proposals
             (`jaxlfi.estimators.losses.LOSSES`).
         normaliser: "zscore", "asinh" or "none" (`jaxlfi.estimators.normaliser`): how raw summaries are normalised. It

@@ -88,7 +88,7 @@ def fit(
     Args:
         key: consumed.
         network: the last round's; its weights are the start under `warm_start`, else replaced by fresh ones. Its
-            normalisers are replaced where the network starts anew.
+            normalisers are replaced where the network is reinitialised.
         dataset: simulations; only the filled rows are used.
         weights: weight of each row in the loss, shape [C]; all ones without importance correction.
         expected_size: rows that an epoch goes through: filled ones if no simulation had failed, or fewer. It sets the

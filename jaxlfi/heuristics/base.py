@@ -41,7 +41,7 @@ class Heuristic(Checked, abc.ABC):
     Attributes:
         grows: whether the support can grow. Where it cannot, posterior mass at a bound has to be reported to the user.
         compares_components: whether components are compared by their index with those of the previous posterior. They
-            are matched first (`Matched`) where networks start anew each round.
+            are matched first (`Matched`) where networks are reinitialised each round.
         proposes_from_prior: whether parameters to simulate are always drawn from the prior truncated to the support,
             and never from the posterior. `informed` is then false in every belief that it returns.
 

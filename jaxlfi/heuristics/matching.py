@@ -17,7 +17,7 @@ MAX_EXACT = 6
 class Matched(Heuristic):
     """Another heuristic, on a posterior whose components were first paired with the previous ones.
 
-    Networks that start anew every round (docs/paper.md, reading C) label their components arbitrarily; without
+    Networks that are reinitialised every round (docs/paper.md, reading C) label their components arbitrarily; without
     matching, MODE would see shifts that are mere relabelling.
 
     Attributes:

@@ -272,7 +272,9 @@ def of_schema(schema: Mapping[str, Any]) -> Deployment:
     """
     found = schema.get(KEY)
     if found is None:
-        raise ValueError("policy: expected a deployment (limits, control interval) in its schema, got none: train anew")
+        raise ValueError(
+            "policy: expected a deployment (limits, control interval) in its schema, got none: train it again"
+        )
     try:
         deployment = Deployment(**{**found, "limits": Limits(**found["limits"])})
     except (TypeError, KeyError) as error:

@@ -261,7 +261,9 @@ def preparation_of(policy: Policy, rate: float | None = None) -> Preparation:
     if found is not None:
         return found
     if rate is None:
-        raise ValueError("policy: expected a control interval in its schema, got none: train anew, or give the rate")
+        raise ValueError(
+            "policy: expected a control interval in its schema, got none: train it again, or give the rate"
+        )
     names, units = list(policy.observed["names"]), list(policy.observed["units"])
     signals, place = [], 0
     while place < len(names):

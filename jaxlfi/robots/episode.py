@@ -309,7 +309,7 @@ class _Episode:
         return None, fault
 
     def _count(self, number: int, last: int) -> None:
-        """Notice a robot that counts its measurements anew: it was restarted, and knows of no command."""
+        """Notice a robot whose count of measurements restarts: the robot was restarted and knows of no command."""
         if self.behind is not None and self.behind < number < last:
             self.began_anew = f"it began anew: its measurement {number} came after {last}"
         self.behind = number if number < last else None

@@ -171,7 +171,7 @@ def test_a_schema_says_what_a_robot_must_keep_to(trained):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (None, "expected a deployment .* got none: train anew"),
+        (None, "expected a deployment .* got none: train it again"),
         ({"moved": ["c"]}, "expected limits of"),
         ({"moved": ["c", "z"]}, "whose actions .* each move an observation"),
         ({"control_interval": 0.0}, "a positive interval"),

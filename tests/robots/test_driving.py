@@ -301,7 +301,9 @@ def test_a_policy_from_before_there_were_preparations_is_read_by_its_names(tmp_p
     made = driving.preparation_of(policy, rate=50.0)
     assert made.signals == (Signal("a", "rad", True), Signal("v", "rad/s")) and made.names == ("cos a", "sin a", "v")
     assert made.controls == (Control("motor", -1.0, 2.0, ""),) and made.interval == 0.02
-    with pytest.raises(ValueError, match="expected a control interval in its schema, got none: train anew, or give"):
+    with pytest.raises(
+        ValueError, match="expected a control interval in its schema, got none: train it again, or give"
+    ):
         driving.preparation_of(policy)
 
 

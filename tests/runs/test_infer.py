@@ -383,7 +383,7 @@ def test_seeds_and_names_stand_for_keys_and_heuristics(monkeypatch):
     assert run.heuristic == same.heuristic
     np.testing.assert_array_equal(run.mixture.means, same.mixture.means)
     np.testing.assert_array_equal(run.posterior.sample(4, 7), same.posterior.sample(jax.random.key(4), 7))
-    # With the hyperparameters that a task asks for: of what would be run, as it would be compiled anew.
+    # With the hyperparameters that a task asks for: of what would be run, as it would be recompiled.
     plans, task = [], dataclasses.replace(gaussian(), hyperparameters={"edge": {"expansion": 0.5}})
     monkeypatch.setattr(infer_module, "_run", lambda plan, *_: plans.append(plan) or same)
     infer(3, task, heuristic="edge")

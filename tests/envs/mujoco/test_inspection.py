@@ -100,7 +100,7 @@ def test_angles_that_wrap_and_angles_in_degrees(arm):
     turning = 2.5 * times + 0.4 * np.sin(2 * times)
     wrapped = (turning + np.pi) % (2 * np.pi) - np.pi
     found = looked(arm, {"motor": np.zeros(300), "angle": wrapped}, times)
-    assert "begins anew after 6.283 rad, twice: made continuous" in odd(found, "angle")
+    assert "wraps after 6.283 rad, twice: made continuous" in odd(found, "angle")
     assert found.signals["angle"].high == pytest.approx(turning.max())
     in_degrees = looked(arm, {"motor": np.zeros(300), "angle": np.rad2deg(turning)}, times)
     assert "looks like degrees, from 0 to" in odd(in_degrees, "angle")
