@@ -53,7 +53,8 @@ def pairs(
         A matplotlib figure that pyplot does not hold on to; a notebook shows it where it is the last value of a cell.
 
     Raises:
-        ValueError: for samples that are no finite [n, D] array or too few, or for other arguments that do not fit them.
+        ValueError: for samples that are not finite [n, D] array or too few, or for other arguments that do not fit
+            them.
         ImportError: without matplotlib.
 
     Example:

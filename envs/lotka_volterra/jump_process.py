@@ -366,8 +366,8 @@ def make_simulator(process: JumpProcess = JumpProcess(), schedule: Schedule = Sc
 
     Algorithm: direct method of Gillespie (1977); reactions in the order of their rates are predator
     birth (rate r1 X Y), predator death (r2 X), prey birth (r3 Y) and prey death (r4 X Y). When the
-    total rate is zero the state stays frozen, which is no failure. A NaN among the rates is
-    reported as a failure; log-rates above 60 count as 60.
+    total rate is zero the state stays frozen, which is not a failure. A NaN among the rates is reported as a failure;
+    log-rates above 60 count as 60.
 
     Args:
         process: what is simulated and recorded.

@@ -168,7 +168,7 @@ def numbers(config: Mapping[str, Any], table: str) -> dict[str, float]:
     """A table of numbers by name; empty where there is none.
 
     Raises:
-        ValueError: for what is no table, or no number.
+        ValueError: for anything but a table of numbers.
     """
     found = config.get(table, {})
     if not isinstance(found, dict):
@@ -180,7 +180,7 @@ def initial(config: Mapping[str, Any]) -> tuple[Any, dict[str, float | list[floa
     """What the table `initial` says: where episodes begin (`starts.modes`), and numbers, one for all or one for each.
 
     Raises:
-        ValueError: for what is no table, or no number.
+        ValueError: for anything but a table of numbers.
     """
     table = dict(config.get("initial", {}))
     begins, given = table.pop("from", None), {}

@@ -137,7 +137,7 @@ def _next(out: Path) -> Iterator[str]:
             warnings.simplefilter("ignore")  # which are in the table
             task = config.read(out)
     except ValueError as error:
-        yield f"{out}: written; it is no task yet: {str(error).removeprefix(f'{out}: ')}"
+        yield f"{out}: written; it is not a task yet: {str(error).removeprefix(f'{out}: ')}"
         return
     yield f"{out}: written, a task with the parameters {', '.join(task.names)}; choose others in it, then"
     yield f"  jaxlfi infer mujoco,config={out} --heuristic edge --out runs/{out.stem}"

@@ -38,7 +38,7 @@ class Log:
         units: of signals and, as "time", of times, where they are known: those of the given numbers, then SI units.
 
     Raises:
-        ValueError: for what is no recording, and units that are not known.
+        ValueError: for what is not a recording, and units that are not known.
 
     Example:
         >>> log = Log([0, 10, 20], {"angle": [0.0, 90.0, 180.0]}, units={"time": "ms", "angle": "deg"})
@@ -149,7 +149,7 @@ def _seconds(times: np.ndarray, unit: Unit, where: str) -> tuple[Float[np.ndarra
     """Times in s from the first one, and their unit, "s", where it is known.
 
     Raises:
-        ValueError: for what is no increasing times, in one line that names the rows.
+        ValueError: for times that do not increase, in one line that names the rows.
     """
     if times.dtype.kind == "M":
         _check_increasing(times.astype("M8[ns]").astype(np.int64), where)

@@ -38,7 +38,7 @@ INERTIAL = ("mass", "inertia", "ipos", "iquat")
 PATTERN = re.compile(r"[*?]")
 TIES = ("shared", "scaled", "mirrored")
 AT_LEAST_ZERO = re.compile(r"sensor/.+/(delay|noise)|clock/jitter")
-"""Parameters that are no numbers below 0."""
+"""Parameters that cannot be below 0."""
 FORM = re.compile(r"(?P<element>.+)/(?P<attribute>[a-z_]+)(?:\[(?P<index>\d+)\])?")
 
 

@@ -26,7 +26,7 @@ def check(model: mujoco.MjModel, log: Log, signals: Sequence[str]) -> None:
     """Check units and times of a recording.
 
     Raises:
-        ValueError: for units that the model's sensors and actuators cannot have, and times that are no seconds, in one
+        ValueError: for units that the model's sensors and actuators cannot have, and times that are not seconds, in one
             line.
     """
     for name in signals:

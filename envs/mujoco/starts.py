@@ -40,7 +40,7 @@ COUNTS = np.unique(np.round(np.geomspace(FEWEST, MOST, 24)).astype(int)).tolist(
 AGREES = 3.0
 """Standard deviations within which a recording begins where the model does."""
 STRAIGHT = {1: 1, 4: 0, 7: 3}
-"""Positions of a joint that are no quaternion, by the number of all its positions."""
+"""Positions of a joint that are not quaternions, by the number of all its positions."""
 APART = 2.5
 """Standard deviations that a start by fewer samples may be from that by more."""
 _TINY = 1e-9

@@ -76,7 +76,7 @@ def _write_rollout(path: Path, arrays: dict[str, np.ndarray], arguments: argpars
         recordings.write(path, recordings.simulated(arrays, side_camera(scene), f"Simulated DLO: {words}"), arrays)
     except ValueError as error:
         atomic.write_arrays(path, arrays)
-        print(f"rollout.npz cannot be inferred from, as it is no recording of an object: {error}")
+        print(f"rollout.npz cannot be inferred from, as it is not a recording of an object: {error}")
 
 
 def plan(arguments: argparse.Namespace) -> None:
@@ -177,7 +177,7 @@ def _write_log(out: Path, log: Log, about: Mapping[str, Any]) -> None:
         recordings.write(out, controlling.recording_of(log, about), others)
     except ValueError as error:
         atomic.write_arrays(out, others)
-        print(f"{out} cannot be inferred from, as it is no recording of an object: {error}")
+        print(f"{out} cannot be inferred from, as it is not a recording of an object: {error}")
     print(f"{controlling.summary(log)}, wrote {out}")
 
 

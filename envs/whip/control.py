@@ -58,7 +58,7 @@ def recording_of(log: Log, about: Mapping[str, Any]) -> Recording:
         about: fields of `Recording` (`described`).
 
     Raises:
-        ValueError: for a log that is no recording, such as one of a robot that was stopped before the end.
+        ValueError: for a log that is not a recording, such as one of a robot that was stopped before the end.
     """
     steps, observations = len(log.actions), np.asarray(log.observations)
     if log.stopped or steps != rules.STEPS:
@@ -123,7 +123,7 @@ def robot_of(
         token: that a driver asks for; needed where it is on another host.
 
     Raises:
-        ValueError: for other words, and for what is no robot.
+        ValueError: for other words, and for what is not a robot.
         RobotError: where no driver answers.
     """
     if word.startswith("socket:"):

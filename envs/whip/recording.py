@@ -137,7 +137,7 @@ def simulated(arrays: Mapping[str, np.ndarray], camera: Camera, description: str
         description: free text.
 
     Raises:
-        ValueError: for a rollout that is no recording, such as one whose DLO never enters the image.
+        ValueError: for a rollout that is not a recording, such as one whose DLO never enters the image.
     """
     inside = (np.abs(arrays["keypoints"] - 0.5) <= 0.5).all(axis=-1)
     return Recording(

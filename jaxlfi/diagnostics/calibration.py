@@ -184,7 +184,7 @@ def uniformity(rank: Int[Array | np.ndarray, " n"], draws: int, tests: int = 1) 
             Bonferroni.
 
     Raises:
-        ValueError: for ranks that are no whole numbers from 0 to L, or too few.
+        ValueError: for ranks that are not whole numbers from 0 to L, or too few.
     """
     rank = checked_ranks(rank, draws)
     count = len(rank)
@@ -215,7 +215,7 @@ def histogram(rank: Int[Array | np.ndarray, " n"], draws: int) -> Histogram:
     """A histogram of ranks from 0 to L with its binomial band, of some ten truths a bin and at most 20 bins.
 
     Raises:
-        ValueError: for ranks that are no whole numbers from 0 to L, or too few.
+        ValueError: for ranks that are not whole numbers from 0 to L, or too few.
     """
     rank = checked_ranks(rank, draws)
     bins = int(np.clip(len(rank) // 10, 2, min(20, draws + 1)))

@@ -136,7 +136,7 @@ def holm(p: Sequence[float] | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"
         p: of the hypotheses of one family, in any order.
 
     Raises:
-        ValueError: for numbers that are no probabilities.
+        ValueError: for numbers that are not probabilities.
 
     Example:
         >>> holm([0.04, 0.01, 0.03]).round(3).tolist()

@@ -118,7 +118,7 @@ def check_regions(rank: Int[np.ndarray, " n"], draws: int) -> Intervals:
         draws: L, at least `FEWEST_DRAWS`.
 
     Raises:
-        ValueError: for ranks that are no whole numbers from 0 to L, and too few truths or draws.
+        ValueError: for ranks that are not whole numbers from 0 to L, and too few truths or draws.
     """
     rank = checked_ranks(rank, draws, FEWEST_DRAWS)
     held = _held([(rank + 0.5) / (draws + 1) <= level for level in LEVELS], 1 - CONFIDENCE)

@@ -38,7 +38,7 @@ class Region(struct.PyTreeNode):
         return self.box.contains(theta) & (self.log_prior(theta) > -jnp.inf)
 
     def log_prior(self, theta: Float[Array, "*n dim"]) -> Float[Array, "*n"]:
-        """The prior's log-density, -inf where it is no finite number."""
+        """The prior's log-density, -inf where it is not a finite number."""
         log_prob = self.prior.log_prob(theta)
         return jnp.where(jnp.isfinite(log_prob), log_prob, -jnp.inf)
 

@@ -92,7 +92,7 @@ class Posterior(struct.PyTreeNode):
             space: "natural" units, or "inference" space.
 
         Raises:
-            ValueError: for what is no key, or a number that is not whole and from 1 to `MAX_DRAWS`.
+            ValueError: for what is not a key, or a number that is not whole and from 1 to `MAX_DRAWS`.
         """
         require_count(n, "n", most=MAX_DRAWS)
         natural = is_natural(space)
@@ -178,7 +178,7 @@ class Posterior(struct.PyTreeNode):
         Draws and statistics are those of the whole posterior. The density of a mixture is exact as well: every
         component's marginal, times its mass inside the box of the others given these. That is a closed form where at
         most one parameter is left out, and a sum over a lattice for more. The parameters left out stay truncated to
-        their bounds, so that it is no mixture of Gaussians unless nothing has leaked.
+        their bounds, so that it is not a mixture of Gaussians unless nothing has leaked.
 
         Args:
             names: of the parameters, or their places, in the order wanted; one or several.
@@ -208,8 +208,8 @@ class Posterior(struct.PyTreeNode):
 
         Raises:
             ValueError: for names that are none of the parameters', all of them or none, a value outside of the support,
-                and posteriors that are no mixture of Gaussians on a box: those of flows and likelihoods, and where the
-                task's prior is zero in places.
+                and posteriors that are not mixtures of Gaussians on a box: those of flows and likelihoods, and where
+                the task's prior is zero in places.
 
         Example:
             >>> box = Support([-9.0, -9.0], [9.0, 9.0])

@@ -119,7 +119,7 @@ def read(folder: Path, *formats: str) -> dict[str, Any]:
     """
     what = FORMATS[formats[0]].what
     if not folder.is_dir():
-        raise StoreError(f"expected {what}, got {str(folder)!r} which is no folder")
+        raise StoreError(f"expected {what}, got {str(folder)!r}, which is not a folder")
     path = folder / CONFIG
     try:
         config = files.read_json(path)

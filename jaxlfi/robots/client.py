@@ -50,7 +50,7 @@ class SocketRobot:
             units: of the observations and of the actions, which drivers need to know (`jaxlfi.robots.driver`).
 
         Raises:
-            ValueError: for what is no address, or one of another host that is not let, or without a token.
+            ValueError: for anything but an address, and for another host without permission or a token.
             RobotError: where no driver answers, or one of another protocol.
         """
         host, port = wire.address(address, remote)
@@ -159,7 +159,7 @@ class SocketDriver:
         """Connect to the driver, which may refuse; its own words about itself are returned.
 
         Raises:
-            ValueError: for what is no address, or one of another host that is not let, or without a token.
+            ValueError: for anything but an address, and for another host without permission or a token.
             RobotError: where no driver answers, or it refuses.
         """
         self._names = tuple(signals), tuple(controls)

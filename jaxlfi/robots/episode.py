@@ -190,7 +190,7 @@ class Paced(abc.ABC):
 
 
 def positive(name: str, value: float, infinite: bool = False) -> None:
-    """Refuse what is no positive number.
+    """Refuse what is not a positive number.
 
     Raises:
         ValueError: naming it.

@@ -70,7 +70,7 @@ class LeRobotDriver:
             return
         try:
             if self._controls:
-                with contextlib.suppress(KeyError):  # actions that are no positions have nothing to be held at
+                with contextlib.suppress(KeyError):  # actions that are not positions have nothing to be held at
                     found = self._robot.get_observation()
                     self._robot.send_action({name: float(found[name]) for name in self._controls})
         finally:

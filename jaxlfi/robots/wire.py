@@ -66,7 +66,7 @@ class Lines:
 
         Raises:
             OSError: for a connection that has ended, and where nothing comes in time.
-            RobotError: for what is no message, and where somebody else came, who is refused.
+            RobotError: for what is not a message, and where somebody else came, who is refused.
         """
         timeout = self._socket.gettimeout()
         ends = time.monotonic() + (timeout or math.inf)

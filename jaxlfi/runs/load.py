@@ -195,7 +195,7 @@ def _belief(path: Path, space: Space, prefix: str = "") -> Belief:
 
 
 def _records(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What every round did; arrays that are no numbers, or none of rounds, are not of the record."""
+    """What every round did; arrays that are not numbers, or none of rounds, are not of the record."""
     rounds = arrays["theta"].shape[:1]
     return {
         name: array

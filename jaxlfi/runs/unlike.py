@@ -26,7 +26,7 @@ def names_of(task: Task, trajectory: Sequence[int], size: int) -> tuple[tuple[st
     The summary is of a trajectory of this shape, and of this size S.
 
     Returns:
-        S names; and C names, or none where it is no series.
+        S names; and C names, or none where it is not a series.
     """
     names, channels = task.named_summaries(size), tuple(task.channels)
     if task.summary is not summaries.identity or task.summary_names or len(trajectory) > 2:

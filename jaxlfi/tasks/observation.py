@@ -33,8 +33,8 @@ TIME_COLUMNS = (
     *TIME_UNITS,
     *(f"{unit}s" for unit in TIME_UNITS),
 )
-"""Headings, without a unit in brackets, of a first column that is no channel where it increases; case does not matter.
-pandas' index has an empty one. A small t is one, too, but no T, which may be a temperature."""
+"""Headings, without a unit in brackets, of a first column that is not a channel where it increases; case does not
+matter. pandas' index has an empty one. A small t is one, too, but no T, which may be a temperature."""
 
 MISSING = ("", "NA", "N/A", "null")
 """Cells of a table, besides NaN, that say that a number is missing."""

@@ -27,7 +27,7 @@ ELSEWHERE = 0.1
 
 
 def check_prior(prior: Any, dim: int) -> None:
-    """Refuse what is no distribution over D parameters.
+    """Refuse what is not a distribution over D parameters.
 
     Raises:
         ValueError: naming what came.

@@ -143,7 +143,7 @@ class OneOfBatch:
         result = self.function(rng, theta[None])
         if isinstance(result, tuple) and len(result) == 2:
             (trajectory,), outcome = result
-            with contextlib.suppress(TypeError):  # it is no list, and is refused for what it is
+            with contextlib.suppress(TypeError):  # it is not a list, and is refused for what it is
                 (outcome,) = outcome
             return trajectory, outcome
         (trajectory,) = result

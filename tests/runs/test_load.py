@@ -211,7 +211,7 @@ COMPARED = {"format": formats.COMPARE, "runs": [{"folder": "misspecified/seed_00
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda folder: shutil.rmtree(folder), "expected a run folder, got .* which is no folder"),
+        (lambda folder: shutil.rmtree(folder), "expected a run folder, got .*, which is not a folder"),
         (lambda folder: (folder / "config.json").unlink(), "without a readable config.json"),
         (cut("config.json"), "without a readable config.json"),
         (config_with(format="other"), "config.json is not of jaxlfi"),

@@ -70,7 +70,7 @@ def actions_of(path: str | Path) -> np.ndarray:
     """The array "actions" of an .npz, which may be a plan, a rollout or a recording, in m, shape [16, 2].
 
     Raises:
-        ValueError: for a file without it, another shape, and what is no finite number.
+        ValueError: for a file without it, another shape, and what is not a finite number.
     """
     actions = files.read_arrays(Path(path)).get("actions")
     if actions is None or actions.shape != (rules.STEPS, 2) or actions.dtype.kind not in "fiu":

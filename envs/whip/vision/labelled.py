@@ -119,7 +119,7 @@ def from_yolo(
         on_picture: called after each picture.
 
     Raises:
-        ValueError: for files that are missing or damaged, names that are not known, and lines that are no shapes,
+        ValueError: for files that are missing or damaged, names that are not known, and lines that are not shapes,
             naming the file and the line.
     """
     objects = {path: _objects(text, classes) for path, text in _paired(labels, images).items()}

@@ -183,7 +183,7 @@ def test_without_sysid_it_says_what_to_install(runs, tmp_path, monkeypatch, caps
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ("film none --out new.gif", "expected a run folder, got 'none' which is no folder"),
+        ("film none --out new.gif", "expected a run folder, got 'none', which is not a folder"),
         ("film . --out new.gif", "expected a run folder, got '.' without a readable config.json"),
         ("film run --out swing.csv", "--out: expected a new .gif file, got swing.csv"),
         ("film run --out taken.gif", "no .png beside it, but there is taken.gif"),

@@ -91,7 +91,7 @@ def test_what_is_odd_about_values(arm, swing):
     assert odd(infinite, "velocity[0]") == "is infinite in row 7" and infinite.usable
     assert "velocity[0]" not in infinite.log.signals and infinite.signals["angle"].samples == 101
     unknown = looked(arm, swing, units={"angle": "furlong"})
-    assert "is in 'furlong', which is no unit that is known" in odd(unknown, "angle")
+    assert "is in 'furlong', which is not a known unit" in odd(unknown, "angle")
     assert unknown.signals["angle"].called == Called(read=False)
 
 
