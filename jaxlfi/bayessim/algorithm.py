@@ -131,7 +131,7 @@ def init(
         key, settings.estimator, obs, task.inference.feasible.hull(support), task.space, task.inference.prior
     )
     attempts = None
-    if settings.estimator.accounts_for_prior:  # whatever was proposed, and so whatever succeeded of it
+    if settings.estimator.accounts_for_prior:  # whatever was proposed, and whichever of it succeeded
         key_validity = jax.random.fold_in(jax.random.clone(key), 1)
         network = network.replace(validity=validity.unknown(key_validity, network.scale, task.space))
         attempts = datasets.empty(room(settings.simulation_budget), task.dim, 1)
@@ -235,7 +235,7 @@ def gather(
         attempts = datasets.augment(attempts, _outcomes(simulations), round)
         learnt = network.validity.learnt(jax.random.fold_in(jax.random.clone(key), 1), attempts)
         network = network.replace(validity=learnt)
-        # Success is a part of the prior of the simulations that the atomic losses compare.
+        # Atomic losses compare successful simulations, so success is part of their prior.
         log_prior = (0.0 if log_prior is None else log_prior) + learnt.log_prob(dataset.theta)
     key_prepare, _ = fit_keys(key)
     lesson = prepare(key_prepare, network, dataset, weights, log_prior, _rows_after(settings, state, WHOLE - 1))
@@ -293,7 +293,7 @@ def conclude(
     belief, adaptation = heuristic(state.belief, mixture, state.feasible)
     reported, effective_share = belief, jnp.ones(())
     if correction.report is not None:
-        estimator: Any = network.estimator  # one with a closed form: `Settings.check` sees to it
+        estimator: Any = network.estimator  # it has a closed form: `Settings.check` ensures that
         q = estimator.weighted(network, observed)
         divided, effective_share = correction.report(
             prior, q, gathered.proposals, round, settings.defensive, state.belief.support

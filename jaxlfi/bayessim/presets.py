@@ -161,7 +161,7 @@ def settings_for(task: Task, method: str = "bayessim", preset: str = "quick") ->
         raise ValueError(f"{task.name}: settings: expected names of Settings or of an estimator, got {unknown[0]!r}")
     wanted = lambda of: {name: value for name, value in task.settings.items() if name in declared(of)}
     settings = PRESETS[preset]
-    settings = METHODS[method](settings.replace(**wanted(settings)))  # it divides the rounds in its way
+    settings = METHODS[method](settings.replace(**wanted(settings)))  # the method splits the budget into rounds
     return with_fields(settings, wanted(settings.estimator))
 
 

@@ -61,7 +61,7 @@ class Region(struct.PyTreeNode):
         found = jnp.any(log_weight > -jnp.inf, axis=1)
         picked = jax.random.categorical(key_pick, log_weight)
         theta = jnp.take_along_axis(theta, picked[:, None, None], axis=1)[:, 0]
-        # A draw for which there is nothing takes that of another one.
+        # A draw without an accepted point takes that of another draw.
         others = jnp.argsort(~found)[jnp.arange(n) % jnp.maximum(jnp.sum(found), 1)]
         theta = jnp.where(found[:, None], theta, theta[others])
         return jnp.where(jnp.any(found), theta, self._anywhere(key_prior, n))

@@ -476,7 +476,7 @@ def _mixture_moments(posterior: Posterior, natural: bool) -> tuple[Array, Array]
 
 
 def _weighted_moments(points: Array, weights: Array) -> tuple[Array, Array]:
-    start = points[0]  # counted from it, a large offset costs no precision
+    start = points[0]  # differences to it, so that a large offset costs no precision
     offset = weights @ (points - start)
     centred = points - start - offset
     return start + offset, (weights[:, None] * centred).T @ centred

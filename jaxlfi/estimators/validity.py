@@ -98,7 +98,7 @@ class Validity(struct.PyTreeNode):
         """
         failures = jnp.sum(attempts.valid & (attempts.x[:, 0] < 0.5))
         weights = attempts.valid.astype(jnp.float32)
-        # As plain numbers: the checker of keys that are used twice takes a branch under vmap for such.
+        # As plain numbers: JAX's check for reused keys mistakes a branch under vmap for reuse.
         numbers, kind = jax.random.key_data(key), jax.random.key_impl(key)
 
         def trained() -> Network:

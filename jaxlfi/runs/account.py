@@ -122,7 +122,7 @@ def channels(run: Result) -> tuple[list[str], np.ndarray, np.ndarray]:
     named = run.task is not None and run.task.summary_names
     if named or len(x) < RECORDS:
         return list(names), simulated[:, None], x[None]
-    # Many numbers without a name, each in a unit of its own: all together, in units of their scatter.
+    # Many unnamed numbers with different units: all together, in units of their scatter.
     finite = simulated[np.isfinite(simulated).all(axis=1)]
     scale = finite.std(axis=0) if len(finite) else np.ones(len(x))
     scale = np.where(scale > 0, scale, np.inf)[:, None]

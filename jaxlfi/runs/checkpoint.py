@@ -57,7 +57,7 @@ class Checkpoint:
         given: dict[str, Any] = {
             name.removeprefix(GIVEN): leaf for name, leaf in start.items() if name.startswith(GIVEN)
         }
-        given |= {name: jnp.asarray(leaf) for name, leaf in given.items() if name != "x"}  # which may be more precise
+        given |= {name: jnp.asarray(leaf) for name, leaf in given.items() if name != "x"}  # x may be double
         observed, x = (self._named(start, "start.npz", name) for name in ("observed", "x"))
         try:
             return observed, x, Simulations(**given) if given else None
@@ -160,7 +160,7 @@ def _with_room(arrays: dict[str, np.ndarray], fresh: Mapping[str, Any]) -> dict[
             continue
         if (old.shape[0], *old.shape[2:]) == (leaf.shape[0], *leaf.shape[2:]):
             whole = np.concatenate([old, np.asarray(leaf)[:, old.shape[1] :]], axis=1)
-            found[name] = whole[:, : leaf.shape[1]]  # less room, too, where it had ended long before its last round
+            found[name] = whole[:, : leaf.shape[1]]  # shorter, too, if it had ended long before its last round
     return found
 
 

@@ -59,7 +59,7 @@ class BatchPlan:
     settings: Settings  # all of them
     specs: tuple[RunSpec, ...]  # the runs
     keep_network: bool = False  # leave the trained networks in the folder
-    polish: bool = False  # sharpen posteriors by what the task knows besides (`jaxlfi.runs.polishing`)
+    polish: bool = False  # refine posteriors by the task's own method (`jaxlfi.runs.polishing`)
 
     def folders(self) -> list[str]:
         """Each run's folder, relative to the plan's."""
@@ -190,7 +190,7 @@ def execute(
         for run, found in journal.failures().items():
             of_round = [Message(index, *failure) for failure in found]
             messages[run] += of_round
-            if folder is not None:  # before the checkpoint: they are taken back where the round is made again
+            if folder is not None:  # before the checkpoint: they are withdrawn if the round is repeated
                 failures.append(folder / plan.folders()[run], of_round)
         if checkpoint is not None:
             checkpoint.require_records(rows[0] if rows else kept, kept)
@@ -203,7 +203,7 @@ def execute(
                 folders.append_ledger(folder / name, index, own, plan.task.reasons, seconds[-1])
         on_round(index, row)
 
-    if not plan.settings.min_rounds:  # one that had settled was given more rounds
+    if not plan.settings.min_rounds:  # a run that had settled was given more rounds
         rows = [row | {"settled": np.zeros_like(row["settled"])} for row in rows]
     last = done if rows and np.all(rows[-1]["settled"]) else plan.settings.rounds
     done, last = map(int, processes.broadcast((np.asarray(done), np.asarray(last))))
@@ -394,7 +394,7 @@ def finish(folder: Path, plan: BatchPlan, runs: Sequence[Run]) -> None:
     """Write every run's results and a comparison's table, and then that the folder is complete."""
     for run, name in zip(runs, plan.folders(), strict=True):
         folders.write_run(folder / name, run, plan.keep_network)
-        atomic.flush(folder / name / "ledger.jsonl")  # the checkpoint, which could complete it, is going to be removed
+        atomic.flush(folder / name / "ledger.jsonl")  # the checkpoint, which could restore it, is removed next
         if (said := folder / name / failures.FILE).exists():
             atomic.flush(said)
     if plan.kind == COMPARE:

@@ -153,7 +153,7 @@ def save(run: Result, folder: Path, exist_ok: bool = False) -> Path:
             row = {name: value[index] for name, value in run.history.items() if not name.startswith(FINAL)}
             try:
                 append_ledger(staging, index, jax.device_get(row), task.reasons, seconds)
-            except KeyError as missing:  # of a folder from before there was such a record
+            except KeyError as missing:  # a folder from before this record existed
                 raise StoreError(
                     f"save: expected a run whose history has {missing}, got one without, as earlier versions made it: "
                     "copy its folder"

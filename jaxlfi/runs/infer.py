@@ -127,8 +127,8 @@ def infer(
     if isinstance(heuristic, str):
         heuristic = build(HEURISTICS.load(heuristic), task.hyperparameters.get(heuristic, {}), task.dim)
     check(heuristic, task.dim)
-    heuristic = paired(heuristic, getattr(settings.estimator, "warm_start", True))  # what it is, is checked later
-    embedding = getattr(settings.estimator, "embedding", "none")  # what it is, is checked later
+    heuristic = paired(heuristic, getattr(settings.estimator, "warm_start", True))  # its type is checked later
+    embedding = getattr(settings.estimator, "embedding", "none")  # its type is checked later
     if executor is not None or simulation_timeout is not None:
         task = one_by_one(task, executor, simulation_timeout)
     task, observation = trials_of(task, observation, "all" if embedding == "trials" else "moments")
@@ -192,7 +192,7 @@ def executed(plan: BatchPlan, observed: Observed, progress: bool, callback: Call
             bar.advance()
             if callback is not None:
                 own = executing.run_row(row, 0, None)
-                callback(index, {name: np.array(value) for name, value in own.items()})  # theirs to change
+                callback(index, {name: np.array(value) for name, value in own.items()})  # copies: it may change them
 
         (run,) = executing.execute(plan, observed, out, each, bar.compiled, bar.simulated)
     return polished(run, console) if plan.polish else run

@@ -31,7 +31,7 @@ def names_of(task: Task, trajectory: Sequence[int], size: int) -> tuple[tuple[st
     names, channels = task.named_summaries(size), tuple(task.channels)
     if task.summary is not summaries.identity or task.summary_names or len(trajectory) > 2:
         return names, ()
-    # A vector may be a series or single numbers, each in a unit of its own.
+    # A vector may be a series, or single numbers with different units.
     if len(trajectory) == 1 and (size < RECORDS or (not channels and task.times is None)):
         return names, ()
     count = 1 if len(trajectory) == 1 else trajectory[1]

@@ -114,7 +114,7 @@ def _next(arrived: queue.SimpleQueue, alive: Callable[[], bool]) -> tuple[int, F
 def _submitted(submit: Submit, request: Request) -> Future:
     try:
         return submit(request)
-    except (RuntimeError, OSError) as error:  # an executor that is shut down or broken
+    except (RuntimeError, OSError) as error:  # the executor is shut down or broken
         raise _lost(error) from error
 
 

@@ -120,7 +120,7 @@ class HostSimulator:
             return self._through(self.executor, requests, wanted, journal)
         if self.timeout is None:
             return simulate_each(here(lambda request: simulated(self.function, request)), requests, wanted, journal, 1)
-        with ThreadPoolExecutor(1) as executor:  # what hangs can only be ended in a process of its own
+        with ThreadPoolExecutor(1) as executor:  # only a separate process can be ended when it hangs
             return self._through(executor, requests, wanted, journal)
 
     def _through(

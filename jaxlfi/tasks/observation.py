@@ -211,7 +211,7 @@ def observe(key: jax.Array, task: Task, observation: Any, concrete: bool = True)
         x = jnp.asarray(task.summary(observed), jnp.float32)
     if not isinstance(x, jax.core.Tracer) and not np.isfinite(np.asarray(x)).all():
         raise ValueError(f"observation: expected a finite summary, got {np.asarray(x).tolist()}")
-    task.named_summaries(x.shape[-1])  # refuses names that are not the summary's
+    task.named_summaries(x.shape[-1])  # refuses unknown summary names
     return observed, x
 
 
@@ -385,7 +385,7 @@ def read(path: str | Path, columns: Columns = Columns(), say: Say = lambda line:
         if path.suffix.lower() == ".npz":
             return _read_npz(path)
         return _channels(*_read_csv(path), columns, lambda line: say(f"observation: {path}: {line}"))
-    except Exception as error:  # zipfile, numpy and the operating system each have their own
+    except Exception as error:  # zipfile, numpy and the operating system each raise their own
         text = files.first_line(error)
         raise ValueError(f"observation: expected a readable file, got {str(path)!r}: {text}") from error
 
@@ -406,7 +406,7 @@ def read_for(task: Task, *paths: str | Path, say: Say = lambda line: None) -> np
 
 def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
     """The headings, where there are some, and the numbers."""
-    with path.open(newline="", encoding="utf-8-sig") as file:  # a byte-order mark is no part of the first cell
+    with path.open(newline="", encoding="utf-8-sig") as file:  # drops a byte-order mark from the first cell
         lines = [line for line in file if not line.startswith("#")]
         rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if any(cell.strip() for cell in row)]
     if not rows:

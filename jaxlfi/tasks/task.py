@@ -169,7 +169,7 @@ class Task:
             if bool(np.any(noise < 0)):
                 raise ValueError(f"channel_noise: expected standard deviations of at least 0, got {noise}")
             store("channel_noise", noise)
-        for field in ("observation", "times"):  # who made them may go on to change them
+        for field in ("observation", "times"):  # the caller may change them later
             store(field, own_arrays.copied(getattr(self, field)))
         if self.prior is not None:
             prior_checks.check_prior(self.prior, len(names))
@@ -229,7 +229,7 @@ class Task:
     @functools.cached_property
     def inference(self) -> InferenceView:
         """Phi, supports, truth and prior in inference space."""
-        with jax.ensure_compile_time_eval():  # it is kept, so it must not be made of tracers
+        with jax.ensure_compile_time_eval():  # it is cached, so it must not contain tracers
             boxes = {label: self.space.box_to_inference(box) for label, box in self.supports.items()}
             truth = None if self.truth is None else self.space.to_inference(jnp.asarray(self.truth))
             feasible = self.space.box_to_inference(self.feasible)

@@ -129,7 +129,7 @@ def together(trials: Sequence[Any], length: int | None = None) -> np.ndarray:
 
 STATISTICS: dict[str, Callable[[Array], Array]] = {
     "mean": lambda each: each[0] + jnp.mean(each - each[0], axis=0),
-    "sd": lambda each: jnp.std(each - each[0], axis=0, ddof=1),  # exact where the trials are nearly equal
+    "sd": lambda each: jnp.std(each - each[0], axis=0, ddof=1),  # exact if the trials are nearly equal
 }
 """Statistics of the trials' summaries [n, S], each a vector [S]."""
 

@@ -71,7 +71,7 @@ class CrashError(RuntimeError):
 def failed(reason: str, message: str = "") -> Answer:
     """A failure for one of `REASONS`."""
     words = " ".join(message.split())[:LONGEST_MESSAGE]
-    printable = "".join(letter if letter.isprintable() else "?" for letter in words)  # no colours of a terminal
+    printable = "".join(letter if letter.isprintable() else "?" for letter in words)  # strips terminal colours
     return Answer(-1 - REASONS.index(reason), message=printable)
 
 
@@ -166,7 +166,7 @@ class Trials:
         for _ in range(self.trials):
             trajectory, outcome = with_outcome(self.function(rng, theta.copy()))
             own_arrays.require_own_rows(trajectory)
-            trajectories.append(own_arrays.array(trajectory))  # at once: the next trial may use the same memory
+            trajectories.append(own_arrays.array(trajectory))  # copied at once: the next trial may use the same memory
             codes.append(code_of(outcome))
         return np.concatenate(trajectories), next(filter(None, codes), 0)
 
