@@ -225,7 +225,7 @@ def _is_known(value: Any) -> bool:
     jax = sys.modules.get("jax")
     if jax is None or not isinstance(value, jax.Array) or isinstance(value, jax.core.Tracer):
         return False
-    # Large arrays are not waited for, and those of other processes cannot be seen.
+    # Large arrays are not awaited, and other processes' cannot be seen.
     seen = value.size <= MAX_CHECKED and value.is_fully_addressable and not value.is_deleted()
     return seen and jax.numpy.issubdtype(value.dtype, jax.numpy.number)
 
@@ -257,7 +257,7 @@ class Checked:
         super().__init_subclass__(**kwargs)
         dataclasses.dataclass(frozen=True)(cls)
         _register(cls)
-        cls._flax_dataclass = True  # flax's mark of a class that it need not make a dataclass of
+        cls._flax_dataclass = True  # tells flax that this class is a dataclass already
 
     def __post_init__(self):
         check_fields(self)

@@ -102,7 +102,7 @@ def pairs(
         figure = style.new_figure(width, 0.65 * width + 0.5 if dim == 1 else width + 0.3)
         draw_overlay(figure, clouds, scale, marks)
         if path is None:
-            figure.draw_without_rendering()  # makes ticks and layout in this style, before the settings are restored
+            figure.draw_without_rendering()  # lays out in this style before the settings are restored
         else:
             style.save(figure, Path(path), dpi)
     return figure

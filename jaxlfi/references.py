@@ -42,7 +42,7 @@ def parse(reference: str, word: str = "task") -> tuple[str, dict[str, str]]:
     name, *parts = _split(reference, ",")
     options: dict[str, str] = {}
     while parts:
-        # A value may be a path with commas: as many parts belong to it as name a file, or begin no option.
+        # A value may be a path with commas: it takes all parts that name a file, or that begin no option.
         key, _, first = parts[0].partition("=")
         values = [first, *parts[1:]]
         whole = _length_of_path(values, ",")

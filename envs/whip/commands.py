@@ -155,7 +155,7 @@ def control(arguments: argparse.Namespace) -> None:
     loop = controlling.loop_of(act, arguments)
     token = None if arguments.token is None else wire.token_of(arguments.token)
     seen_by = sights(arguments.detector, arguments.renderer, arguments.weights)
-    with interrupts.orderly(), seen_by as seeing:  # a robot that has been found is stopped
+    with interrupts.orderly(), seen_by as seeing:  # a robot that was found is stopped
         sight = seeing(jax.random.fold_in(jax.random.key(arguments.seed), 2**31 - 1))
         robot, about = controlling.robot_of(arguments.robot, arguments.seed, arguments.remote, sight, token)
         loop = dataclasses.replace(loop, clock=getattr(robot, "simulated_clock", loop.clock))

@@ -122,7 +122,7 @@ def _control(arguments: argparse.Namespace) -> None:
     changes: dict[str, Any] = {name: getattr(arguments, name) for name in ("rate", "holds", "max_age", "watchdog")}
     changes = {name: value for name, value in changes.items() if value is not None}
     session = sessions.of(trained, settings, dict(arguments.command), mode, arguments.duration, changes)
-    with interrupts.orderly():  # a robot that has been found is stopped
+    with interrupts.orderly():  # a robot that was found is stopped
         session.run(_robot(arguments), arguments.out, {"policy": str(path)}, say=print)
 
 
@@ -156,7 +156,7 @@ def _robot(arguments: argparse.Namespace) -> Any:
         if arguments.remote or arguments.token:
             raise ValueError("--remote, --token: expected with --address only, got --robot")
         own = ":" in arguments.robot.partition(",")[0]
-        family = ROBOTS if own else DRIVERS  # one's own may be of either kind
+        family = ROBOTS if own else DRIVERS  # a user's class may be of either kind
         return family.load(arguments.robot)
     token = None if arguments.token is None else wire.token_of(arguments.token)
     return SocketDriver(arguments.address, arguments.remote, token)

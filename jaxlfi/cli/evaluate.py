@@ -51,7 +51,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.out is not None and (arguments.out.exists() or arguments.out.suffix != ".csv"):
         raise ValueError(f"out: expected a new .csv file, got {arguments.out}")
     if arguments.out is not None:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)  # which may fail, and then does so before the work
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)  # if this fails, it fails before the work
     environment = ENVIRONMENTS.load(arguments.environment)
     policies = {str(path): load(path) for path in arguments.policies}
     draws = domains_of(environment, arguments.domain)

@@ -86,7 +86,7 @@ def work(command: Callable[[], int], advice: Callable[[], str], program: str, de
     Returns:
         The exit status: the child's own; 2 where it was ended.
     """
-    if not hasattr(os, "fork"):  # Windows: jax's own words must do
+    if not hasattr(os, "fork"):  # Windows: jax's own message must do
         return command()
     log, child_log = os.pipe()
     life, parent_life = os.pipe()
@@ -99,7 +99,7 @@ def work(command: Callable[[], int], advice: Callable[[], str], program: str, de
     os.close(life)
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, lambda number, frame: _pass_on(child, number))  # the child says what came of it
+        signal.signal(signal.SIGINT, lambda number, frame: _pass_on(child, number))  # the child reports the outcome
     kept = b""
     while text := os.read(log, KEPT):
         kept = (kept + text)[-KEPT:]

@@ -321,7 +321,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     """
     families = Families()
     if {"-h", "--help"} & set(words):
-        with contextlib.suppress(ValueError):  # help has to be shown, whatever is wrong with a package
+        with contextlib.suppress(ValueError):  # show help whatever is wrong with a package
             families += _imported(_foreign(_named_by(words)))
     arguments, unknown = parser(families).parse_known_args(words)
     if not unknown:
@@ -452,7 +452,7 @@ def prepare_jax(arguments: argparse.Namespace) -> None:
     """
     from jaxlfi.io import compile_cache, host_devices
 
-    if hasattr(arguments, "joined"):  # it was started already, for a class of another package
+    if hasattr(arguments, "joined"):  # already started, for a class of another package
         return
     if getattr(arguments, "no_cache", True):
         os.environ[compile_cache.SWITCH] = "0"
@@ -479,7 +479,7 @@ def _runs(arguments: argparse.Namespace) -> int:
     if arguments.command == "resume":
         recorded = _recorded(arguments)
         if "trainings" in recorded:
-            return 1  # those of policies fill all cores as one device
+            return 1  # policies fill all cores as one device
         runs = recorded.get("runs")
         return len(runs) if isinstance(runs, list) else 2  # a grid does not list its runs
     if arguments.command == "compare":
@@ -584,10 +584,10 @@ def _refuse_early(arguments: argparse.Namespace) -> None:
     Raises:
         ValueError: for a task that is not there, or a folder that something is in.
     """
-    from jaxlfi.io import workfolder  # NumPy, which help does without
+    from jaxlfi.io import workfolder  # loads NumPy, which help does not need
 
     TASKS.require(references.parse(arguments.task, TASKS.word)[0])
-    if not multi_process.wanted(arguments):  # one of several may have begun with the folder
+    if not multi_process.wanted(arguments):  # another process may have created files in it
         workfolder.refuse_occupied(arguments.out)
 
 

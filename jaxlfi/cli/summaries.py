@@ -126,7 +126,7 @@ def widths_lines(plan: BatchPlan, runs: Sequence[Run]) -> list[str]:
 
 
 def _effective_share(history: Mapping[str, np.ndarray]) -> float:
-    shares = history.get("effective_share", np.ones(1))  # runs from before it was recorded
+    shares = history.get("effective_share", np.ones(1))  # runs from before it was recorded lack it
     return float(shares[-1]) if len(shares) else 1.0
 
 

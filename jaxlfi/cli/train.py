@@ -158,14 +158,14 @@ def run(
 
         def on_chunk(updates: int, curves: Mapping[str, Any]) -> None:
             values = curves["value"][-updates:]
-            known = values[np.isfinite(values)]  # of updates in which an episode ended
+            known = values[np.isfinite(values)]  # updates in which an episode ended
             progress.advance(updates, f", return {known.mean():.2f}" if known.size else "")
             if scalars:
                 scalars.write(curves)
 
         result = training.resumed(out, environment, on_chunk, processes or ALONE)
         if scalars:
-            scalars.write(result.curves)  # where nothing was left to train, it was not called
+            scalars.write(result.curves)  # not called if nothing was left to train
     rows = [result.fared(place) for place in range(len(result.names))]
     table = Table("domain", "seed", *rows[0], title=f"on {training.HELD_OUT} other points of each domain")
     for (trained_on, seed), row in zip(result.names, rows, strict=True):
@@ -208,7 +208,7 @@ def resume(out: Path, output: "Output", figures: bool, processes: "Processes") -
     if training.finished(out):
         if processes.writes:
             training.clean(out)
-            if figures and not (out / "curves.png").exists():  # it was stopped while it drew them
+            if figures and not (out / "curves.png").exists():  # it was stopped while drawing them
                 draw(out, output.notes)
         output.notes.print(f"{out} is complete: nothing to resume", markup=False, soft_wrap=True)
         return

@@ -143,7 +143,7 @@ def judged(
     helps, degrees = gain >= GAIN, len(model.residual)
     if helps.any() and (after <= _usual(degrees, 2.33) or before - after >= EXPLAINED * before):
         wrong = helps
-    elif before <= _usual(degrees, 3.09):  # explained within the box
+    elif before <= _usual(degrees, 3.09):  # the box explains it
         wrong = (mass > MASS_BEYOND) | (some & (gain >= WEAK_GAIN))
     elif helps.any() and some.any() and np.argmax(gain) == np.argmax(mass):  # both point to one bound
         wrong = gain == np.max(gain)

@@ -263,7 +263,7 @@ def _edges(draws: int) -> np.ndarray:
 
 def _two_sided(count: int, probability: np.ndarray) -> np.ndarray:
     """Probability that a binomial count is as far out as each of 0 to N, or farther, shape [K, N + 1]."""
-    # Not SciPy's tails: those of mirrored counts would be rounded differently, and equal probabilities not tie.
+    # Not SciPy's tails: they round mirrored counts differently, so that equal probabilities would not tie.
     log_factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, count + 1)))])
     k = np.arange(count + 1)
     log_choose = log_factorial[-1] - log_factorial - log_factorial[::-1]

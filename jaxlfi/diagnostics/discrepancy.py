@@ -70,7 +70,7 @@ def compared(
         failure: 0 where the simulation succeeded and its summary is finite, shape [N].
         observed: the real trajectory.
     """
-    # A difference is taken before it is rounded: trajectories from the host are in double precision.
+    # Subtract before rounding: trajectories from the host are in double precision.
     missing = gaps_of(task)
     first = observed[:1] if missing is None else 0.0
     difference, spread = jnp.asarray(trajectory - observed), jnp.asarray(observed - first)

@@ -390,7 +390,7 @@ class Network(struct.PyTreeNode):
         network = self.replace(normaliser=of_x, theta_normaliser=of_theta)
         theta, x = network.to_network(dataset.theta), of_x(dataset.x)
         if self.regression is not None:
-            # Those of the later half of the rounds, which are nearer to the observation than those before.
+            # Simulations of the later half of the rounds, which are nearer to the observation.
             fitted, features = fit_regression(self.regression, theta, dataset.x, dataset.valid, dataset.late)
             network, x = network.replace(regression=fitted), network._beside(dataset.x, features)
         return network.replace(params=self.estimator.begin(self.params, theta, x, dataset.valid, self.views)), x

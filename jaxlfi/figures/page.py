@@ -332,7 +332,7 @@ def _without_escapes(label: str) -> str:
 
 def _figure(name: str, picture: Picture) -> str:
     data = base64.b64encode(picture.path.read_bytes()).decode("ascii")
-    # A third larger than in print (96 pixels an inch), to be read on a screen.
+    # A third larger than in print (96 pixels an inch), for reading on a screen.
     pixels = round(picture.width * 128)
     source = f"data:image/png;base64,{data}"
     alternative = f"{picture.title}. {picture.caption.partition('. ')[0]}"

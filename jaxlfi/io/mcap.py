@@ -138,7 +138,7 @@ def _content(path: Path) -> tuple[list[tuple[Any, Any, Any]], set[str], dict[str
             return messages, others, {record.name: record.metadata for record in reader.iter_metadata()}
     except OSError as error:
         raise ValueError(f"{path}: expected an MCAP file, got {error.strerror}") from error
-    except Exception as error:  # mcap and its decompressors each have their own
+    except Exception as error:  # mcap and its decompressors each raise their own
         raise ValueError(
             f"{path}: expected a complete MCAP file, got a truncated or damaged one; `mcap recover` of the MCAP "
             "command line saves what is left of one"

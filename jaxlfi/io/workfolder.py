@@ -62,7 +62,7 @@ def _exchange(staging: Path, folder: Path) -> None:
     try:
         staging.rename(folder)
     except BaseException:
-        aside.rename(folder)  # where this fails, too, it stays aside
+        aside.rename(folder)  # if this fails, too, it stays aside
         aside.parent.rmdir()
         raise
     shutil.rmtree(aside.parent, ignore_errors=True)

@@ -99,9 +99,9 @@ class SocketRobot:
     def stop(self) -> None:
         """Have the robot stop, and end the connection, upon which it stops in any case."""
         try:
-            self._lines.send("stop")  # which needs no other call to have returned
+            self._lines.send("stop")  # it need not wait for other calls
             while self._lines.receive()["type"] not in ("stopped", "error"):
-                pass  # a reply that came too late
+                pass  # the reply of an earlier call
         except OSError as error:
             raise RobotError(f"{self._name}: no answer to stop: {error}") from error
         finally:

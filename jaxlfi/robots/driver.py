@@ -158,7 +158,7 @@ class Driven:
             {known[name].name: known[name].unit or unit for name, unit in several.items()}
             for several in (signals, controls)
         )
-        if self._watching:  # a name that is a signal's, too, does not tell what is commanded
+        if self._watching:  # if a signal has the same name, it is ambiguous
             for name, (own, factor, offset) in self._controls.items():
                 self._controls[name] = ("" if own in asked else own), factor, offset
             asked, given = {**asked, **given, **asked}, {}

@@ -255,7 +255,7 @@ class _Episode:
             target = loop.target(state)
             with self.interrupts.calling(), self.watchdog.watching("act"):
                 self.robot.act(Command(slot, displacement.copy(), target.copy()))
-            sent = clock.now()  # so that the next command is no closer to this one than its length allows
+            sent = clock.now()  # so that the next command follows at least its length later
             asked = np.full(loop.count, np.nan) if asked is None else asked
             age = np.nan if observation is None else now - start - self.seen[-1][0]
             self.slots.append((asked, displacement, target, observation is None, now - start - slot * loop.period, age))
@@ -290,7 +290,7 @@ class _Episode:
         if self.last is not None and observation.number <= self.last:
             self._count(observation.number, self.last)
             return self._unusable("missing")
-        values = np.array(observation.values)  # a driver may measure into the same array again
+        values = np.array(observation.values)  # a driver may reuse the array
         if values.shape != ((size := loop.measured),):
             raise ValueError(f"robot: expected observations of {size} numbers, got shape {list(values.shape)}")
         if not observation.age <= (loop.period if loop.max_age is None else loop.max_age):  # NaN is late, too

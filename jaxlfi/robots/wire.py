@@ -74,7 +74,7 @@ class Lines:
             while b"\n" not in self._rest:
                 if len(self._rest) > LONGEST:
                     raise RobotError(f"expected a line of at most {LONGEST} bytes, got more")
-                if (left := ends - time.monotonic()) <= 0:  # whoever sends a byte now and then is late all the same
+                if (left := ends - time.monotonic()) <= 0:  # a peer that trickles bytes is late all the same
                     raise TimeoutError("timed out")
                 if others is not None:
                     ready, _, _ = select.select([self._socket, others], [], [], None if timeout is None else left)
@@ -225,7 +225,7 @@ def _refuse_next(listener: socket.socket) -> None:
             connection.settimeout(0.1)
             Lines(connection).send("error", message=BUSY)
         except OSError:
-            return  # it has gone already
+            return  # it is already gone
 
 
 def short(value: Any, length: int = 40) -> str:

@@ -96,7 +96,7 @@ def step(settings: SimOpt, before: Gaussian, theta: Float[Array, "n dim"], costs
         costs: their discrepancies, shape [N]; draws whose simulations failed, NaN or infinite, weigh nothing.
     """
     known = jnp.isfinite(costs)
-    # What failed costs the most: it weighs next to nothing, and is left out of the moments besides.
+    # Failures cost the most, so they weigh next to nothing; the moments leave them out altogether.
     costs = jnp.where(known, costs, jnp.max(jnp.where(known, costs, -jnp.inf)))
     weights = jnp.where(known, jax.nn.softmax(-costs / temperature(costs, settings.epsilon)), 0.0)
     weights /= weights.sum()
