@@ -101,7 +101,7 @@ def _period(times: np.ndarray, values: np.ndarray) -> tuple[float, int]:
     longest = float(np.abs(steps).max(initial=0.0))
     for period in (TURN * max(round(longest / TURN), 1), TURN / 2):
         jumps = np.flatnonzero(np.abs(steps) > period / 2)
-        # A half turn between two samples is also what an arm does that goes from one pose to another.
+        # An arm that goes from one pose to another may also make a half turn between two samples.
         visited = period >= TURN or np.histogram(values, _POSES)[0].all()
         if len(jumps) and visited and np.ptp(values) <= (1 + _BEYOND) * period:
             speeds = np.diff(np.unwrap(values, period=period)) / gaps

@@ -90,7 +90,7 @@ def draw(
         sets = {"posterior": posterior, **sets}
     if other is not None:
         points[f"{SYSID}, 90 %"] = other.theta, other.interval
-    names = [name.replace("/", "/ ") for name in task.names]  # which may be broken at spaces
+    names = [name.replace("/", "/ ") for name in task.names]  # so that lines can break there
     log = [name for name, own in zip(names, task.space.log, strict=True) if own]
     truth = None if task.truth is None else np.asarray(task.truth)
     plot.pairs(sets, names=names, units=task.units, log=log, truth=truth, points=points, path=path, dpi=150)
@@ -196,7 +196,7 @@ def _drawn(task: Task, one: Fit) -> np.ndarray:
     """The same within Phi, in natural units."""
     draws, feasible = _normal_draws(task, one), task.inference.feasible
     inside = np.asarray(feasible.contains(draws))
-    if inside.sum() < plot.MIN_DRAWS:  # as where the recording informs a parameter hardly better than the box does
+    if inside.sum() < plot.MIN_DRAWS:  # such as when the recording says hardly more than the box
         return np.asarray(task.space.to_natural(np.clip(draws, feasible.low, feasible.high)))
     return np.asarray(task.space.to_natural(draws[inside]))
 

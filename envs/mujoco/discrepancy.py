@@ -67,7 +67,7 @@ class Discrepancy:
 
     def draw(self, key: jax.Array, times: Float[np.ndarray, " time"]) -> Float[Array, " time"]:
         """The same for one draw, in JAX: it can be compiled and mapped."""
-        keep = np.exp(-np.diff(times, prepend=-np.inf) / self.time)  # nothing of what was before the first one
+        keep = np.exp(-np.diff(times, prepend=-np.inf) / self.time)  # nothing precedes the first one
 
         def following(before, inputs):
             decay, fresh = inputs

@@ -140,7 +140,7 @@ def effects(
             found["edits"].append((one, d))
             keys.append((name, several))
     ties.refuse_overlaps(keys)
-    # A body's mass scales its inertia; whatever of it is inferred besides is meant as it is.
+    # A body's mass scales its inertia, except for components that are inferred themselves.
     found["edits"].sort(key=lambda pair: not pair[0].name.endswith("/mass"))
     inertials = tuple((inertia.inertial(model, body, body), tuple(several)) for body, several in bodies.items())
     return Effects(**{what: tuple(several) for what, several in found.items()}, **of_clock, inertials=inertials)

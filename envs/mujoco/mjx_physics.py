@@ -91,7 +91,7 @@ class Physics:
         """The state after a step, the signals before it, and whether the step is stable."""
         data = mjx.forward(model, self.data(state, control))
         if self._accelerations:
-            data = mjx.sensor_acc(model, data)  # which forward leaves out without constraints
+            data = mjx.sensor_acc(model, data)  # forward leaves these out without constraints
         values = data.sensordata[self._places]
         after = state_of(INTEGRATORS[model.opt.integrator](model, data))
         return after, values, stable(state.qpos, state.qvel, data.qacc, values)

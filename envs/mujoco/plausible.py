@@ -82,7 +82,7 @@ def check_start(
             continue
         low, high = values[:, where[number]].min(), values[:, where[number]].max()
         off, spread = max(low - first, first - high), float(np.std(log.samples(name)[1]))
-        # What depends on parameters may begin somewhat further than at the few that were tried.
+        # What depends on parameters may start somewhat outside the range of the few that were tried.
         if off > max(FAR * noises[name], LEAST * spread) + (high - low):
             own = f" {unit}" if (unit := measured.unit(model, name)) else ""
             there = f"{low:.4g}" if high - low <= 1e-6 * abs(high) else f"{low:.4g} to {high:.4g}"

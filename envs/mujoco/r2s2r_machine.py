@@ -133,7 +133,7 @@ def whole(path: Path) -> bool:
         for one in filter(Path.exists, (path, loop, report)):  # the report last: after a kill in between the rest
             one.replace(aside / one.name)
         loops.say(f"{path} was cut short: it is kept in {aside}, and recorded again")
-    for left in (path, loop, report):  # of a recording that was not written to its end
+    for left in (path, loop, report):  # an incomplete recording's files
         left.unlink(missing_ok=True)
     return False
 

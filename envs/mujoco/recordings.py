@@ -70,7 +70,7 @@ def renamed(log: Log, known: Sequence[str]) -> Log:
         new = base and (base in known or measured.JOINT.fullmatch(base))
         if not new or name in {*known, *log.units} or base in log.signals:
             continue
-        if len(suffix) > 1 and is_unit(suffix):  # a single letter may as well number motors
+        if len(suffix) > 1 and is_unit(suffix):  # a single letter may number motors
             called[name], units[base] = base, suffix
             say(f"{log.name}: {name}: read as {base} in {suffix}")
     if not called:

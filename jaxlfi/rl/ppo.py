@@ -27,7 +27,7 @@ from jaxlfi.rl.policy import Policy
 from jaxlfi.rl.settings import PPO
 
 try:
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX says there that Warp is not installed
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints there that Warp is not installed
         from brax.training import acting
         from brax.training.agents.ppo import losses, networks
         from brax.training.networks import make_value_network

@@ -118,7 +118,7 @@ def repeat(
 
     def episode(case: tuple[str, ReferenceObject, int]) -> dict[str, Any]:
         name, dlo, place = case
-        sight = sights(jax.random.fold_in(keys[place], 2**31 - 1))  # far from the numbers of frames
+        sight = sights(jax.random.fold_in(keys[place], 2**31 - 1))  # far from the frames' indices
         one = deploy(keys[place], dlo, begins[name](), scenes[place], cameras[place], sight=sight)
         row = _row(name, dlo.name, place, one)
         on_episode()

@@ -65,7 +65,7 @@ def begun(folder: Path, header: Mapping[str, Any]) -> int:
     wanted = {"schema": SCHEMA, "version": VERSION, "size": SIZE, "labels": list(LABELS), **header}
     if folder.exists() and not folder.is_dir():
         raise PicturesError(f"out: expected a new folder, got {folder}, which is a file")
-    # What was killed as it began leaves a part of its first file.
+    # A process killed at its start leaves part of its first file.
     if not folder.exists() or all(path.suffix == ".part" for path in folder.iterdir()):
         folder.mkdir(parents=True, exist_ok=True)
         files.write_json(folder / HEADER, {**wanted, "count": None})
@@ -185,7 +185,7 @@ def _image(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     try:
         with Image.open(path) as image:
             array = np.asarray(image)
-    # Pillow has each of them for a damaged file.
+    # Pillow raises each of them for damaged files.
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise PicturesError(f"{path}: expected a complete PNG file, got a missing or damaged one") from error
     if array.shape != shape or array.dtype != np.uint8:
