@@ -16,7 +16,7 @@ log = true                          # infer its logarithm
 
 [parameters."joint/*/armature"]     # of all joints (`jaxlfi.envs.mujoco.ties`)
 support = [0.5, 2.0]
-tie = "scaled"                      # a factor of each one's own; or "shared", or "mirrored"
+tie = "scaled"                      # a common factor of their own values; or "shared", or "mirrored"
 
 [parameters."body/link/inertial"]   # its whole inertia, ten numbers (`jaxlfi.envs.mujoco.inertia`)
 spread = 0.2                        # about the model's own
@@ -31,7 +31,7 @@ angle = 0.002
 from = "log"                        # or "model", or "keyframe NAME"
 "hinge/qpos" = 0.5                  # given numbers take precedence
 
-[discrepancy]                       # what the model gets wrong: a standard deviation, and for how long (s)
+[discrepancy]                       # the model's error: a standard deviation and a correlation time (s)
 angle = { deviation = 0.01, time = 0.2 }
 
 [supports.wide]                     # another first guess, for --support wide
