@@ -345,8 +345,8 @@ def test_diagnostics():
     plain = page("calibration").replace("**", "")
     for text in (
         f"| {held[0]} truths | {held[1]} | {held[2]} |",
-        f"hold | {densest[0]}, ok | {densest[1]} | {densest[2]}, over-confident |",
-        f"hold | {points[0]}, ok | {points[1]}, over-confident | {points[2]}, over-confident |",
+        f"cover | {densest[0]}, ok | {densest[1]} | {densest[2]}, over-confident |",
+        f"cover | {points[0]}, ok | {points[1]}, over-confident | {points[2]}, over-confident |",
         f"| {classifier[0]}, ok | {classifier[1]} | {classifier[2]}, ok |",
     ):
         assert text in plain
