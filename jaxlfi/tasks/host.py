@@ -24,7 +24,7 @@ class HostSimulator:
     """A simulator that JAX cannot trace, as `Task.simulate`.
 
     It can replace a JAX simulator everywhere except inside `jit` and `vmap`: the run then steps its rounds on the host,
-        and calls the simulator between the compiled parts of a round.
+    and calls the simulator between the compiled parts of a round.
 
     Attributes:
         function: `function(rng, theta[N, D]) -> trajectories [N, ...]` or `-> (trajectories, outcomes [N])`, with a
